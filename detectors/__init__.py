@@ -1,6 +1,8 @@
-"""The path from frames to findings; it runs on real captures without Mitsuba and does not import scenes.
+"""The path from frames to findings; it runs on real captures without Mitsuba and does not import
+scenes.
 
-Detectors are found by name: the built-in ones below, others through the entry point group ``tofpod.detectors``."""
+Detectors are found by name: the built-in ones below, others through the entry point group
+``tofpod.detectors``."""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ if TYPE_CHECKING:
     from harness.vocabulary.config import Config
 
 GROUP = "tofpod.detectors"
-"""Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and ``C(settings)`` a Detector."""
+"""Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and
+``C(settings)`` a Detector."""
 
 BUILT_IN = {
     "fpfh_memory": "detectors.methods.peers:FpfhMemoryDetector",
@@ -37,8 +40,9 @@ def detector_names() -> tuple[str, ...]:
 
 
 def detector_type(name: str) -> Any:
-    """Return the class behind a name; its ``settings_type`` is the Config that validates its settings. Raises UserError
-    on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is not a detector."""
+    """Return the class behind a name; its ``settings_type`` is the Config that validates its
+    settings. Raises UserError on an unknown name, a name taken twice, a package that is not
+    installed, and a plug-in that is not a detector."""
     from harness.vocabulary.config import Config
 
     offer = DETECTORS.offer(name)
@@ -62,8 +66,8 @@ def detector_type(name: str) -> Any:
 
 
 def load_detector(name: str, settings: dict[str, Any]) -> Detector:
-    """Return the detector of that name with these settings (plain data, as YAML holds it). Raises UserError as
-    `detector_type`, and if the settings are not legal (every problem at once)."""
+    """Return the detector of that name with these settings (plain data, as YAML holds it). Raises
+    UserError as `detector_type`, and if the settings are not legal (every problem at once)."""
     from harness.vocabulary.declaration.diagnose import settings_of
 
     kind = detector_type(name)

@@ -1,8 +1,9 @@
-"""The pixels that belong to the target: in a box, in a polygon of the image, or on the nearest large smooth surface.
+"""The pixels that belong to the target: in a box, in a polygon of the image, or on the nearest
+large smooth surface.
 
-Two surfaces are compared at their outlines: one is in front of the other, lies on it or is visible through its hole, or
-they only meet. The surface with the best odds under a model of how people photograph a target is proposed; if the odds
-are poor, the choice is reported as doubtful."""
+Two surfaces are compared at their outlines: one is in front of the other, lies on it or is visible
+through its hole, or they only meet. The surface with the best odds under a model of how people
+photograph a target is proposed; if the odds are poor, the choice is reported as doubtful."""
 
 from __future__ import annotations
 
@@ -22,31 +23,44 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
-CROWD = 4  # the choice is also doubtful if this many other surfaces are at least half as large, as in a heap of stones
+# the choice is also doubtful if this many other surfaces are at least half as large, as in a heap
+# of stones
+CROWD = 4
 CENTRE_SPREAD = 0.25
-"""Standard deviation of the pixels' weights as a share of the picture's sides: people aim at the target."""
-LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
-"""Weight in the view of an object that is as likely the target as the surface under it, or as one far behind it."""
+"""Standard deviation of the pixels' weights as a share of the picture's sides: people aim at the
+target."""
+LYING_WEIGHT = 0.10
+STANDING_WEIGHT = 0.02
+"""Weight in the view of an object that is as likely the target as the surface under it, or as one
+far behind it."""
 OBSTACLE_AREA = 0.2
-"""Area of an object that is as likely the target as the uncut surface behind it, as a share of that surface's area."""
+"""Area of an object that is as likely the target as the uncut surface behind it, as a share of
+that surface's area."""
 GRAZING = 0.5
-"""Cosine of the tilt (60 degrees) from which a surface counts for less: nobody inspects at a grazing angle, and pixels
-that mix two surfaces look like a third surface at such an angle."""
+"""Cosine of the tilt (60 degrees) from which a surface counts for less: nobody inspects at a
+grazing angle, and pixels that mix two surfaces look like a third surface at such an angle."""
 STEEPNESS = 2.0  # odds grow with this power of weights and areas
-SURROUNDED, BORDERING, STEP_PART = 0.7, 0.1, 0.3
-"""Shares of the outline on the surface under an object, and on a neighbour; share of a border that is a step."""
+SURROUNDED = 0.7
+BORDERING = 0.1
+STEP_PART = 0.3
+"""Shares of the outline on the surface under an object, and on a neighbour; share of a border that
+is a step."""
 CUT_OFF = 0.15
-"""Share of the outline on the picture's edge from which a surface continues outside it, as walls and floors do."""
+"""Share of the outline on the picture's edge from which a surface continues outside it, as walls
+and floors do."""
 NOTCHES_PX = (8, 16)
-"""Radii of the discs that close notches of the outline: the edge's blur hides a strip of up to about 8 pixels between a
-hole and the edge, and the hole opens to the outside. Wider gaps belong to the part's shape."""
-ENCLOSED, MOST_SAMPLES = 0.9, 20_000
+"""Radii of the discs that close notches of the outline: the edge's blur hides a strip of up to
+about 8 pixels between a hole and the edge, and the hole opens to the outside. Wider gaps belong to
+the part's shape."""
+ENCLOSED = 0.9
+MOST_SAMPLES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A surface that may be the target. ``own`` (h, w) bool on the choice's ``grid``: its pixels. ``filled``: the same
-    with all that they enclose. ``outline``: the same without other candidates in front of it."""
+    """A surface that may be the target. ``own`` (h, w) bool on the choice's ``grid``: its pixels.
+    ``filled``: the same with all that they enclose. ``outline``: the same without other candidates
+    in front of it."""
 
     own: np.ndarray
     filled: np.ndarray
@@ -71,7 +85,8 @@ class Candidate:
 
     @cached_property
     def extent_m(self) -> tuple[float, float]:
-        """Sides, longer first, of the smallest rectangle in the mean plane that holds 99 % of the surface."""
+        """Sides, longer first, of the smallest rectangle in the mean plane that holds 99 % of the
+        surface."""
         plan = self._plane[0] @ self._plane[1][:, 1:]
         turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
         along = plan @ np.array(
@@ -83,7 +98,8 @@ class Candidate:
 
     @cached_property
     def weight(self) -> float:
-        """Share of the pixels, weighted by a Gaussian about the picture's centre and reduced at a grazing angle."""
+        """Share of the pixels, weighted by a Gaussian about the picture's centre and reduced at a
+        grazing angle."""
         row, column = (
             np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2)
             for n in self.own.shape
@@ -93,7 +109,8 @@ class Candidate:
 
     @cached_property
     def cut_off(self) -> float:
-        """Share of the outline on the picture's edge, or without a pixel grid on the border of the cloud."""
+        """Share of the outline on the picture's edge, or without a pixel grid on the border of the
+        cloud."""
         outline = self.filled & ~(
             cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
         )
@@ -105,8 +122,10 @@ class Candidate:
         return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
 
     def continues(self, other: Candidate, apart_m: float) -> bool:
-        """Return whether this flat surface and the other lie in one plane: 90 % of the points within ``apart_m``."""
-        normal, middle = self._plane[1][:, 0], self._some.mean(axis=0)
+        """Return whether this flat surface and the other lie in one plane: 90 % of the points
+        within ``apart_m``."""
+        normal = self._plane[1][:, 0]
+        middle = self._some.mean(axis=0)
         off_m = [np.quantile(np.abs((each._some - middle) @ normal), 0.9) for each in (self, other)]
         return bool(max(off_m) <= apart_m)
 
@@ -131,8 +150,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Choice:
-    """``candidates``: the proposal first. ``taken``: number, from 1, of the candidate that was taken. ``mask`` (h, w)
-    bool: valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: doubts about the choice."""
+    """``candidates``: the proposal first. ``taken``: number, from 1, of the candidate that was
+    taken. ``mask`` (h, w) bool: valid pixels inside its outline. ``grid``: the cloud, or its
+    raster. ``warnings``: doubts about the choice."""
 
     candidates: tuple[Candidate, ...]
     taken: int
@@ -142,7 +162,8 @@ class Choice:
 
 
 class _Border(NamedTuple):
-    """Border on another surface: its share of the outline, whether it is a step, and its height in metres."""
+    """Border on another surface: its share of the outline, whether it is a step, and its height in
+    metres."""
 
     part: float
     is_step: bool
@@ -180,7 +201,8 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         ours = borders[front].get(back)
         if ours is None or not ours.is_step:
             return None
-        this, other = described[front], described[back]
+        this = described[front]
+        other = described[back]
         covered = f"{100 * this.share:.2g} % of the view"
         if encloses(front, back):
             opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
@@ -203,16 +225,19 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         ), f"the nearer surface covers only {covered}"
 
     def judged(i: int, j: int) -> tuple[float, str]:
-        """Return the probability that surface i rather than j is the target, and the reason for a doubt."""
+        """Return the probability that surface i rather than j is the target, and the reason for a
+        doubt."""
         if i == j:
             return 1.0, ""
-        ahead, behind = before(i, j), before(j, i)
+        ahead = before(i, j)
+        behind = before(j, i)
         if ahead is not None:
             return ahead
         if behind is not None:
             return 1.0 - behind[0], behind[1]
         # if the two only meet or are apart, weight, a frontal view and nearness decide
-        this, other = described[i], described[j]
+        this = described[i]
+        other = described[j]
         ratio = this.weight / max(other.weight, 1e-9)
         facing = math.cos(math.radians(this.tilt_deg)) / max(
             math.cos(math.radians(other.tilt_deg)), 1e-2
@@ -227,8 +252,10 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     order = sorted(numbers, key=lambda number: (-odds[number], number))
     candidates = []
     for number in order:
-        # The outline includes holes that the edge cuts. A surface in front of it that is a better target, or too far
-        # away to lie on it, is left out with all nearer pixels that join it (fingers of a hand); an object on it stays.
+        # The outline includes holes that the edge cuts. A surface in front of it that is a better
+        # target, or too far away to lie on it, is left out with all nearer pixels that join it
+        # (fingers of a hand);
+        # an object on it stays.
         outline = described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
@@ -273,7 +300,8 @@ def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]
     """Return the borders of this surface's outline on other surfaces, by their numbers."""
     apart, nearest = nearest_pixel(surfaces.own[number])
     ring = np.flatnonzero((apart <= surfaces.reach_px + 3) & ~surfaces.filled[number])
-    z, seeds = grid.points_m[..., 2].reshape(-1), nearest.reshape(-1)
+    z = grid.points_m[..., 2].reshape(-1)
+    seeds = nearest.reshape(-1)
     outline = len(np.unique(seeds[ring]))
     found = {}
     for other in range(len(surfaces.own)):
@@ -282,19 +310,22 @@ def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]
         if other != number and part >= BORDERING:
             steps = z[there] - z[seeds[there]]
             behind = steps[steps > surfaces.contact_m]
-            ahead, back = len(behind) / len(steps), float((steps < -surfaces.contact_m).mean())
+            ahead = len(behind) / len(steps)
+            back = float((steps < -surfaces.contact_m).mean())
             away = float(np.median(behind)) if len(behind) else 0.0
             found[other] = _Border(part, ahead >= STEP_PART and ahead > 2.0 * back, away)
     return found
 
 
 RIM_PX = 3
-"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge crosses a third."""
+"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge
+crosses a third."""
 
 
 class _Crop(Config):
-    """``inset_px``: number of pixels to remove along the target's outer rim, where pixels mix target and background.
-    Holes inside the target do not grow; the edge of the image is not a rim."""
+    """``inset_px``: number of pixels to remove along the target's outer rim, where pixels mix
+    target and background. Holes inside the target do not grow; the edge of the image is not a rim.
+    """
 
     inset_px: int = Field(default=0, ge=0, le=200)
 
@@ -306,7 +337,8 @@ class NoCrop(_Crop):
 
 
 class BoxCrop(_Crop):
-    """Takes points in an open box (default: the thesis') in the camera's frame. ``range_max_m``: of sqrt(x^2 + z^2)."""
+    """Takes points in an open box (default: the thesis') in the camera's frame. ``range_max_m``:
+    of sqrt(x^2 + z^2)."""
 
     kind: Literal["box"] = "box"
     x_mm: tuple[float, float] = (-500.0, 400.0)
@@ -333,12 +365,14 @@ class PolygonCrop(_Crop):
 
 
 class AutoCrop(_Crop):
-    """Takes the nearest large smooth surface, or number ``target`` of the candidates that a run lists.
+    """Takes the nearest large smooth surface, or number ``target`` of the candidates that a run
+    lists.
 
-    Neighbours are joined if tilt and noise explain their step in z and the surface bends by at most ``crease_deg`` over
-    ``smooth_px``; then holes are filled, and ``inset_px`` is removed at the rim. A background so near that blur leaves
-    no crease counts as target (13 mm behind the face, at 0.7 m with a 5 x 5 window). A cloud without a grid is treated
-    as a raster of its nearest points."""
+    Neighbours are joined if tilt and noise explain their step in z and the surface bends by at
+    most ``crease_deg`` over ``smooth_px``; then holes are filled, and ``inset_px`` is removed at
+    the rim. A background so near that blur leaves no crease counts as target (13 mm behind the
+    face, at 0.7 m with a 5 x 5 window). A cloud without a grid is treated as a raster of its
+    nearest points."""
 
     kind: Literal["auto"] = "auto"
     inset_px: int = Field(default=RIM_PX, ge=0, le=200)
@@ -349,12 +383,13 @@ class AutoCrop(_Crop):
 
 AnyCrop = NoCrop | BoxCrop | PolygonCrop | AutoCrop
 CropConfig = Annotated[AnyCrop, Field(discriminator="kind")]
-"""A crop as the user writes it: ``kind: none | box | polygon | auto`` and the fields of that kind."""
+"""A crop as the user writes it: ``kind: none | box | polygon | auto`` and the fields of that kind.
+"""
 
 
 def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
-    """Return (h, w) bool: the valid pixels that belong to the target. Raises UserError if no pixel is left, with the
-    cloud's extent, and for a polygon on a cloud without a grid."""
+    """Return (h, w) bool: the valid pixels that belong to the target. Raises UserError if no pixel
+    is left, with the cloud's extent, and for a polygon on a cloud without a grid."""
     valid = cloud.valid
     if not valid.any():
         raise UserError("the cloud has no valid point to crop", fix="check the capture")
@@ -393,19 +428,23 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop of a cloud with a valid point, and all candidates. UserError without ``target``. It is
-    computed once for a cloud."""
+    """Return the automatic crop of a cloud with a valid point, and all candidates. UserError
+    without ``target``. It is computed once for a cloud."""
     if config not in cloud.crops:
         cloud.crops[config] = _choice_of(cloud, config)
     return cast("Choice", cloud.crops[config])
 
 
 def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
+    grid = cloud
+    smooth_px = config.smooth_px
+    inset_px = config.inset_px
+    wanted = config.target
     if not cloud.organised:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
         smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
-        # the cell of the rim, and all cells that may hold a point inset_px - 1 spacings farther inside
+        # the cell of the rim, and all cells that may hold a point inset_px - 1 spacings farther
+        # inside
         inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
     candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
     if wanted is not None and wanted > len(candidates):
@@ -428,7 +467,8 @@ def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
     )
     mask = inset(mask, inset_px)
     if not cloud.organised:
-        kept, mask = mask, cloud.valid.copy()
+        kept = mask
+        mask = cloud.valid.copy()
         mask[mask] = kept[rows, columns]
     mask.flags.writeable = False
     return Choice(candidates, taken, mask, grid, () if wanted else tuple(doubts))

@@ -1,4 +1,5 @@
-"""A base class for detectors that only score pixels: it adds clusters, the quiet threshold and sizes."""
+"""A base class for detectors that only score pixels: it adds clusters, the quiet threshold and
+sizes."""
 
 from __future__ import annotations
 
@@ -19,8 +20,9 @@ from harness.vocabulary.geometry import MM, Cloud
 
 
 class ScoreMapConfig(Config):
-    """Settings that turn a score map into detections. Pixels above the threshold form one detection if a chain of steps
-    of at most ``cluster_distance_mm`` joins them; groups of fewer than ``min_points`` are dropped."""
+    """Settings that turn a score map into detections. Pixels above the threshold form one
+    detection if a chain of steps of at most ``cluster_distance_mm`` joins them; groups of fewer
+    than ``min_points`` are dropped."""
 
     min_points: int = Field(default=1, ge=1)
     cluster_distance_mm: float = Field(default=10.0, gt=0)
@@ -31,9 +33,10 @@ S = TypeVar("S", bound=ScoreMapConfig)
 
 
 class ScoreMapDetector(ABC, Generic[S]):
-    """Implements `detectors.interface.Detector` except `analyse`. A subclass also sets ``name``, ``version`` and, for
-    settings of its own, a ``settings_type`` that derives from `ScoreMapConfig`; the first line of its docstring is its
-    description in ``tofpod ls``. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
+    """Implements `detectors.interface.Detector` except `analyse`. A subclass also sets ``name``,
+    ``version`` and, for settings of its own, a ``settings_type`` that derives from
+    `ScoreMapConfig`; the first line of its docstring is its description in ``tofpod ls``.
+    `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
 
     settings_type: ClassVar[type[ScoreMapConfig]] = ScoreMapConfig
     name: str
@@ -44,7 +47,8 @@ class ScoreMapDetector(ABC, Generic[S]):
 
     @abstractmethod
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few points)."""
+        """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few
+        points)."""
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return clusters of pixels whose score is above the threshold, strongest first."""
@@ -56,7 +60,8 @@ class ScoreMapDetector(ABC, Generic[S]):
         """Return the result of `find` at each of several rising thresholds."""
         pixels = above(evidence, thresholds[0])
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
-        points, scores = cloud.points_m.reshape(-1, 3)[pixels], evidence.score.reshape(-1)[pixels]
+        points = cloud.points_m.reshape(-1, 3)[pixels]
+        scores = evidence.score.reshape(-1)[pixels]
         found = []
         for labels, strengths in zip(
             *self._clusters(self.places(points), scores, thresholds), strict=True
@@ -68,10 +73,12 @@ class ScoreMapDetector(ABC, Generic[S]):
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
-        """Return the exact lowest threshold at which `find` returns nothing; 0 if it never returns anything."""
+        """Return the exact lowest threshold at which `find` returns nothing; 0 if it never returns
+        anything."""
         pixels = above(evidence, 0.0)
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
-        scores, least = evidence.score.reshape(-1)[pixels], self.settings.min_points
+        scores = evidence.score.reshape(-1)[pixels]
+        least = self.settings.min_points
         if least == 1:
             return float(scores.max(initial=0.0))
         # try the highest scores first: they usually contain a cluster
@@ -84,7 +91,8 @@ class ScoreMapDetector(ABC, Generic[S]):
         return 0.0
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the places (n, 3) of points (n, 3); the distances between places decide which points are joined."""
+        """Return the places (n, 3) of points (n, 3); the distances between places decide which
+        points are joined."""
         return points_m
 
     def _clusters(
@@ -102,8 +110,8 @@ class ScoreMapDetector(ABC, Generic[S]):
 
 @dataclass(frozen=True)
 class Findings:
-    """Detections at one threshold: ``scores`` (k,). ``pixels`` (n,): flat, ascending. ``labels`` (n,): the number of
-    the detection that has each pixel, -1 for none. ``centres_m`` (k, 3)."""
+    """Detections at one threshold: ``scores`` (k,). ``pixels`` (n,): flat, ascending. ``labels``
+    (n,): the number of the detection that has each pixel, -1 for none. ``centres_m`` (k, 3)."""
 
     scores: np.ndarray
     pixels: np.ndarray

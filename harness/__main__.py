@@ -1,4 +1,5 @@
-"""The command ``tofpod PROGRAM ...`` runs every program; ``tofpod`` alone lists the most common tasks."""
+"""The command ``tofpod PROGRAM ...`` runs every program; ``tofpod`` alone lists the most common
+tasks."""
 
 import importlib
 import shlex
@@ -207,10 +208,12 @@ def _run(name: str, rest: list[str]) -> int:
 
 
 def _completion() -> str:
-    """Return a shell script that completes programs, options, experiments and cameras, and otherwise file names."""
+    """Return a shell script that completes programs, options, experiments and cameras, and
+    otherwise file names."""
     from scenes.sensor.camera import camera_names
 
-    experiments, cases = sorted(path.stem for path in shipped("experiments").glob("*.yaml")), []
+    experiments = sorted(path.stem for path in shipped("experiments").glob("*.yaml"))
+    cases = []
     for program in PROGRAMS:
         actions = importlib.import_module(program.module).main.parser()._actions
         words = [option for action in actions for option in action.option_strings]

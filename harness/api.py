@@ -1,6 +1,7 @@
 """tofpod from Python, as ``import tofpod`` (or ``harness.api``): a facade over the programs.
 
-Build a target, render what a camera sees of it, draw noisy frames, average them, and search for damage:
+Build a target, render what a camera sees of it, draw noisy frames, average them, and search for
+damage:
 
     >>> import tofpod
     >>> board = tofpod.target(
@@ -17,8 +18,9 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     (1, 'hole')
     >>> figure = tofpod.plot(found)  # a Matplotlib Figure
 
-The examples below continue this one. For a real capture, start with `load`; `sweep` runs whole experiments. A program's
-error message is raised as a `UserError`. Units are SI unless a name states another unit.
+The examples below continue this one. For a real capture, start with `load`; `sweep` runs whole
+experiments. A program's error message is raised as a `UserError`. Units are SI unless a name
+states another unit.
 """
 
 from __future__ import annotations
@@ -64,8 +66,9 @@ __all__ = [
 def target(
     what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False
 ) -> TargetConfig:
-    """Return a target by its name, from a YAML or JSON file, or from a declaration as plain data. ``board`` selects a
-    damaged board of a family (``name: drawn``). Raises UserError with every mistake in the declaration.
+    """Return a target by its name, from a YAML or JSON file, or from a declaration as plain data.
+    ``board`` selects a damaged board of a family (``name: drawn``). Raises UserError with every
+    mistake in the declaration.
 
     >>> len(tofpod.target("thesis").damages), len(tofpod.target("thesis", hole_free=True).damages)
     (11, 0)
@@ -85,16 +88,18 @@ def render(
     cache: str | Path = "results/.cache/renders",
     **work: Any,
 ) -> SimulatedUnit:
-    """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
-    ``cache`` is the folder for stored renders; ``work`` holds settings of `scenes.optics.RenderConfig`, such as
-    ``bounces``. Raises UserError if the camera is unknown or does not see the target.
+    """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the
+    unit's fixed pattern; ``cache`` is the folder for stored renders; ``work`` holds settings of
+    `scenes.optics.RenderConfig`, such as ``bounces``. Raises UserError if the camera is unknown or
+    does not see the target.
 
     >>> unit = tofpod.render(board, "kinect_v2", bounces=0)
     >>> unit.region.shape[1] > 50
     True
     """
     config = settings_of(CameraConfig, {"name": camera, "unit_seed": unit_seed}, "camera")
-    facts, settings = camera_of(config), settings_of(RenderConfig, work, "render")
+    facts = camera_of(config)
+    settings = settings_of(RenderConfig, work, "render")
     view, _ = cached_view(
         target.at_wavelength(facts.optics.wavelength_nm), facts.optics, settings, Path(cache)
     )
@@ -102,7 +107,8 @@ def render(
 
 
 def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
-    """Return ``count`` simulated frames, which are drawn while they are read. ``seed`` draws the noise.
+    """Return ``count`` simulated frames, which are drawn while they are read. ``seed`` draws the
+    noise.
 
     >>> [frame.z_m.shape == unit.region.shape for frame in tofpod.frames(unit, 2).frames()]
     [True, True]
@@ -113,14 +119,16 @@ def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
 
 
 def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
-    """Open a real capture (files or a folder) of any format that ``python -m harness.detect`` reads. ``unit`` is that
-    of the stored depth, such as ``mm`` or ``4000/m``, if the files do not state it. Raises UserError."""
+    """Open a real capture (files or a folder) of any format that ``python -m harness.detect``
+    reads. ``unit`` is that of the stored depth, such as ``mm`` or ``4000/m``, if the files do not
+    state it. Raises UserError."""
     return open_capture([Path(path) for path in paths], unit=unit)
 
 
 def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud:
-    """Average all frames to a cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN where invalid.
-    ``settings`` are those of `detectors.averages.average.AverageConfig`. Raises UserError.
+    """Average all frames to a cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN
+    where invalid. ``settings`` are those of `detectors.averages.average.AverageConfig`. Raises
+    UserError.
 
     >>> tofpod.average(tofpod.frames(unit, 3), "median").n_frames
     3
@@ -131,10 +139,11 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
 def detect(
     cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any
 ) -> Judged:
-    """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's own noise sets it, as
-    in ``python -m harness.detect``; ``evidence.warnings`` of the result say if that is not reliable. ``settings`` are
-    those of the detector; the default detector chooses the shape of its surface by evidence unless they state it.
-    Raises UserError if the cloud cannot be judged.
+    """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's
+    own noise sets it, as in ``python -m harness.detect``; ``evidence.warnings`` of the result say
+    if that is not reliable. ``settings`` are those of the detector; the default detector chooses
+    the shape of its surface by evidence unless they state it. Raises UserError if the cloud cannot
+    be judged.
 
     >>> tofpod.detect(cloud, "thesis", threshold=-1)
     Traceback (most recent call last):
@@ -152,7 +161,8 @@ def detect(
 
 
 def findings_table(found: Judged) -> pd.DataFrame:
-    """Return the findings of `detect` as a DataFrame, strongest first; the columns are the fields of `Finding`.
+    """Return the findings of `detect` as a DataFrame, strongest first; the columns are the fields
+    of `Finding`.
 
     >>> tofpod.findings_table(found)[["kind", "size_from"]].values.tolist()
     [['hole', 'model']]
@@ -172,9 +182,10 @@ def plot(found: Judged, title: str = "") -> Figure:
 def sweep(
     experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1
 ) -> Path:
-    """Run an experiment, or its missing trials, and return its results folder. ``changes`` are those of ``--set``, such
-    as ``"repeats=5"``. With ``jobs`` above 1 it starts processes, so that a script needs ``if __name__ ==
-    "__main__":``. Raises UserError for a wrong experiment, or if trials failed.
+    """Run an experiment, or its missing trials, and return its results folder. ``changes`` are
+    those of ``--set``, such as ``"repeats=5"``. With ``jobs`` above 1 it starts processes, so that
+    a script needs ``if __name__ == "__main__":``. Raises UserError for a wrong experiment, or if
+    trials failed.
 
     >>> tofpod.sweep("averaging", "repeats=0")
     Traceback (most recent call last):
@@ -183,7 +194,8 @@ def sweep(
     """
     from harness.runs.study import run_study  # imports pandas
 
-    found, out = load_experiment(Path(experiment), changes), Path(out)
+    found = load_experiment(Path(experiment), changes)
+    out = Path(out)
     code = run_study(
         found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
     )
@@ -198,7 +210,8 @@ def sweep(
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:
-    """Read a table of a results folder (`results/README.md` describes them). Raises UserError if it is missing."""
+    """Read a table of a results folder (`results/README.md` describes them). Raises UserError if
+    it is missing."""
     import pandas as pd
 
     tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}
@@ -211,8 +224,9 @@ def table(folder: str | Path, name: str) -> pd.DataFrame:
 
 
 def limits(folder: str | Path) -> tuple[SetUpLimit, ...]:
-    """Return the detection limits of a study, such as ``results/detection_limit/latest``, with ``a90_mm``, ``a90_95``,
-    ``statement`` (the curve) and so on. Raises UserError if the folder holds no study."""
+    """Return the detection limits of a study, such as ``results/detection_limit/latest``, with
+    ``a90_mm``, ``a90_95``, ``statement`` (the curve) and so on. Raises UserError if the folder
+    holds no study."""
     return tuple(limit_of(record) for record in read_record(Path(folder)).set_ups)
 
 

@@ -1,4 +1,5 @@
-"""``python -m harness.detect``: finds the damage in a real capture, prints a table and, with --out, writes files."""
+"""``python -m harness.detect``: finds the damage in a real capture, prints a table and, with
+--out, writes files."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""``python -m harness.sweep experiments/averaging.yaml``: runs an experiment and writes its report."""
+"""``python -m harness.sweep experiments/averaging.yaml``: runs an experiment and writes its
+report."""
 
 import argparse
 from pathlib import Path

@@ -62,7 +62,8 @@ def main(arguments: argparse.Namespace, command: str) -> int:
 
 
 def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
-    """Return a target by name, from a file or from a declaration; of a family, the ``board``. Raises UserError."""
+    """Return a target by name, from a file or from a declaration; of a family, the ``board``.
+    Raises UserError."""
     from harness.vocabulary.declaration.diagnose import read_as, settings_of
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.drawn import DrawnTargetConfig

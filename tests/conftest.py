@@ -16,9 +16,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`); not in
-    the process that only hands out tests, which should import nothing of tofpod. Nothing that imports and collection
-    create is garbage: looking for some would take a fifth of their time."""
+    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use
+    (`scenes.render.scene`); not in the process that only hands out tests, which should import
+    nothing of tofpod. Nothing that imports and collection create is garbage: looking for some
+    would take a fifth of their time."""
     gc.disable()
     if "PYTEST_XDIST_WORKER" in os.environ or config.getoption("dist", "no") == "no":
         from scenes.render.scene import load_mitsuba
@@ -30,7 +31,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _share_compilation(number: int, count: int) -> None:
-    """Import all test files, each process from another one on: it finds compiled what the others had before it."""
+    """Import all test files, each process from another one on: it finds compiled what the others
+    had before it."""
     files = sorted(Path(__file__).parent.rglob("test_*.py"))
     first = len(files) * number // count
     for file in (*files[first:], *files[:first]):
@@ -59,7 +61,8 @@ LONGEST = (
         "peers",
     ),
 )
-"""Files of tests of 20 processor seconds and more: processes that begin with these end at about the same time."""
+"""Files of tests of 20 processor seconds and more: processes that begin with these end at about
+the same time."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -68,7 +71,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude what imports and collection have created from garbage collection, which saves 2 % of processor time."""
+    """Exclude what imports and collection have created from garbage collection, which saves 2 % of
+    processor time."""
     gc.enable()
     gc.collect()
     gc.freeze()
@@ -76,7 +80,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call() -> Generator[None, object, object]:
-    """A test that needs Open3D skips, and says which package is missing, where the system lacks a library of it."""
+    """A test that needs Open3D skips, and says which package is missing, where the system lacks a
+    library of it."""
     from detectors.open3d_library import MissingLibrary
 
     try:
@@ -95,7 +100,8 @@ def shared_data() -> Path:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A folder of the session that the first process to need it makes; the other processes of the session wait."""
+    """A folder of the session that the first process to need it makes; the other processes of the
+    session wait."""
     base = factory.getbasetemp()
     home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"shared-{name}"
     home.mkdir(exist_ok=True)
@@ -118,15 +124,16 @@ def control_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the files that a detection writes the pictures take longest: left empty by tests that look at the others."""
+    """Of the files that a detection writes the pictures take longest: left empty by tests that
+    look at the others."""
     monkeypatch.setattr("harness.report.findings._figure", lambda *_: None)
     monkeypatch.setattr("harness.report.findings._save", lambda path, _: path.write_bytes(b""))
 
 
 @pytest.fixture
 def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are drawn but not written, which is most of a page's time, for tests that look at the words about them;
-    ``monkeypatch.undo()`` in one that looks at figures too."""
+    """Figures are drawn but not written, which is most of a page's time, for tests that look at
+    the words about them; ``monkeypatch.undo()`` in one that looks at figures too."""
 
     def save(_figure: object, target: object, **_how: object) -> None:
         target.write_bytes(b"") if isinstance(target, Path) else target.write("<svg></svg>")  # type: ignore[attr-defined]
@@ -136,7 +143,8 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it; not to be changed."""
+    """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it;
+    not to be changed."""
     from tests.support.tiny_sweep import TINY, finished
 
     return (

@@ -1,4 +1,5 @@
-"""Every command and every block of Python in README and docs runs, in its document's order, on small inputs."""
+"""Every command and every block of Python in README and docs runs, in its document's order, on
+small inputs."""
 
 from __future__ import annotations
 
@@ -120,7 +121,8 @@ def test_the_documented_gate_is_a_valid_study(tmp_path):
     compile(block_of("docs/ci_gate.md", "# tests/test_limit.py"), "test_limit.py", "exec")
 
 
-# ---- small experiments -----------------------------------------------------------------------------------------------
+# ---- small experiments
+# -----------------------------------------------------------------------------------------------
 
 BOARD = "source.target.board={width_mm: 190, height_mm: 130, thickness_mm: 12.7}"
 SMALL_STUDY = (
@@ -170,7 +172,8 @@ MORE = {
 
 
 def shrunk(name: str, given: list[str]) -> list[str]:
-    """Return a command's arguments with those that make it small; what the document states comes later and counts."""
+    """Return a command's arguments with those that make it small; what the document states comes
+    later and counts."""
     small = (
         SMALL.get(Path(given[0]).stem, ())
         if name in ("sweep", "export", "dataset", "coverage")
@@ -180,13 +183,15 @@ def shrunk(name: str, given: list[str]) -> list[str]:
     return [given[0], *settings, *given[1:], *MORE.get(name, ())]
 
 
-# ---- small recordings ------------------------------------------------------------------------------------------------
+# ---- small recordings
+# ------------------------------------------------------------------------------------------------
 
 
 def write_capture(
     folder: Path, depth_m: list[np.ndarray], lens: Lens, rgb: np.ndarray | None = None
 ) -> None:
-    """Depth pictures in millimetres, colour where there is some, and the lens, as Open3D's recorder stores them."""
+    """Depth pictures in millimetres, colour where there is some, and the lens, as Open3D's
+    recorder stores them."""
     pictures = [("depth", [np.rint(np.nan_to_num(z_m) / MM).astype(np.uint16) for z_m in depth_m])]
     pictures += (
         [] if rgb is None else [("color", len(depth_m) * [np.ascontiguousarray(rgb[..., ::-1])])]
@@ -215,7 +220,9 @@ def simulated(
         target, "azure_kinect_nfov", bounces=0, cache=home / "results" / ".cache" / "renders"
     )
     lens = unit.camera.nominal_lens
-    cut, rng, whole = unit.region.within(lens.whole), np.random.default_rng(len(place)), []
+    cut = unit.region.within(lens.whole)
+    rng = np.random.default_rng(len(place))
+    whole = []
     for frame in tofpod.frames(unit, 50, seed=int(rng.integers(99))).frames():
         z_m = rng.normal(1.3, 2 * MM, lens.whole.shape) * bool(holes)
         z_m[cut] = np.where(np.isfinite(frame.z_m), frame.z_m, z_m[cut])
@@ -263,13 +270,12 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         home / "casting.stl"
     )
 
-    codes, tapes = (
-        tags({key: (x, y + 0.02) for key, (x, y) in PLACES.items()}),
-        strips(marked_board.STRIPS_M),
-    )
+    codes = tags({key: (x, y + 0.02) for key, (x, y) in PLACES.items()})
+    tapes = strips(marked_board.STRIPS_M)
 
     def paint(xy: np.ndarray) -> np.ndarray:
-        over, under = codes(xy), tapes(xy)
+        over = codes(xy)
+        under = tapes(xy)
         return np.where((over == codes(np.full_like(xy, 9.0))), under, over)
 
     wide = replace(LENS, width=480, height=260, cx=239.5, cy=129.5)
@@ -302,15 +308,18 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def already_run() -> set[str]:
-    """Commands that write into the results that all documents share: the next document need not run them again."""
+    """Commands that write into the results that all documents share: the next document need not
+    run them again."""
     return set()
 
 
-# ---- the commands ----------------------------------------------------------------------------------------------------
+# ---- the commands
+# ----------------------------------------------------------------------------------------------------
 
 
 def filled(words: list[str], home: Path) -> list[str]:
-    """Return words as a shell and a reader would fill them in: patterns of names, and the digests of results."""
+    """Return words as a shell and a reader would fill them in: patterns of names, and the digests
+    of results."""
     whole = []
     for word in words:
         pattern = re.sub(r"<\w+>|\bDIGEST\b", "*", word)

@@ -1,5 +1,6 @@
-"""Averages streamed frames into one cloud. Frames that do not belong are left out and reported. The first
-`REFERENCE_FRAMES` are the reference: mostly bad first frames, or a moving camera, are not corrected."""
+"""Averages streamed frames into one cloud. Frames that do not belong are left out and reported.
+The first `REFERENCE_FRAMES` are the reference: mostly bad first frames, or a moving camera, are
+not corrected."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, combinations, islice
@@ -15,9 +16,11 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, LeftOut, Reason
 
 REFERENCE_FRAMES = 5
-"""The median of five frames tolerates any two bad frames, and needs no more memory than five frames."""
+"""The median of five frames tolerates any two bad frames, and needs no more memory than five
+frames."""
 SAMPLED_PIXELS = 4096
-"""Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
+"""Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to
+0.02 sigma."""
 CORRELATED_PIXELS = (
     25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
 )
@@ -28,12 +31,14 @@ NOT_FINITE = int(Reason.NOT_FINITE)
 class AverageConfig(Config):
     """Settings for averaging frames into one cloud, and for leaving frames out.
 
-    ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds z of all frames in memory); ``clipped``: mean of
-    the samples within ``clip_sigmas`` of the pixel's median over the first five frames. ``frames``: largest number of
-    frames to use. A frame *jumps* if the median over pixels of its difference from the reference exceeds the larger of
-    ``jump_sigmas`` standard errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed*
-    if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times the share in the reference frames) lost their
-    range, or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``."""
+    ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds z of all frames in memory);
+    ``clipped``: mean of the samples within ``clip_sigmas`` of the pixel's median over the first
+    five frames. ``frames``: largest number of frames to use. A frame *jumps* if the median over
+    pixels of its difference from the reference exceeds the larger of ``jump_sigmas`` standard
+    errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed* if
+    more than ``disturbed_fraction`` of its pixels (beyond 1.5 times the share in the reference
+    frames) lost their range, or changed by more than the larger of ``changed_sigmas`` of one
+    frame's noise and ``changed_mm``."""
 
     method: Literal["mean", "median", "clipped"] = "mean"
     frames: int | None = Field(default=None, ge=1)
@@ -51,20 +56,22 @@ class AverageConfig(Config):
 
 MOST_LEFT_OUT = 0.25  # largest share of frames left out that an accident explains
 RECORDED = AverageConfig(disturbed_fraction=0.01)
-"""Settings for recordings, in which a camera may be knocked: a shift by 2 % of the picture's width changes some 2 % of
-the pixels; frames of static real cameras differ from the first by 0.3 % beyond what the reference frames show."""
+"""Settings for recordings, in which a camera may be knocked: a shift by 2 % of the picture's width
+changes some 2 % of the pixels; frames of static real cameras differ from the first by 0.3 % beyond
+what the reference frames show."""
 
 
 def unsteadiness(cloud: Cloud) -> str:
     """Return a warning if too many frames are left out for a steady recording, else ""."""
-    out, frames = len(cloud.left_out), cloud.n_frames + len(cloud.left_out)
+    out = len(cloud.left_out)
+    frames = cloud.n_frames + len(cloud.left_out)
     what = f"{out} of {frames} frames differ from the others and are left out: the camera or the scene moved"
     return what if out > MOST_LEFT_OUT * frames else ""
 
 
 def average(source: FrameSource, config: AverageConfig) -> Cloud:
-    """Average a source's frames. Raises UserError if it has too few frames, frames of different sizes, no valid pixel,
-    or more frames than the median's memory allows."""
+    """Average a source's frames. Raises UserError if it has too few frames, frames of different
+    sizes, no valid pixel, or more frames than the median's memory allows."""
     (cloud,) = _averages(
         source, None if config.frames is None else [config.frames], config
     ).values()
@@ -74,7 +81,8 @@ def average(source: FrameSource, config: AverageConfig) -> Cloud:
 def prefix_averages(
     source: FrameSource, counts: Sequence[int], config: AverageConfig
 ) -> dict[int, Cloud]:
-    """Average the first ``n`` frames for each of ``counts`` in one pass, exactly like `average`. Raises UserError."""
+    """Average the first ``n`` frames for each of ``counts`` in one pass, exactly like `average`.
+    Raises UserError."""
     wanted = sorted(set(counts))
     if not wanted or wanted[0] < 1:
         raise UserError(
@@ -87,10 +95,12 @@ def prefix_averages(
 def _averages(
     source: FrameSource, wanted: list[int] | None, config: AverageConfig
 ) -> dict[int, Cloud]:
-    """Return the averages at these numbers of frames, ascending; if None, the average of all frames."""
+    """Return the averages at these numbers of frames, ascending; if None, the average of all
+    frames."""
     frames = _of_one_size(source, islice(source.frames(), wanted[-1] if wanted else None))
     held = list(islice(frames, REFERENCE_FRAMES))
-    offered, clouds = len(held), {}
+    offered = len(held)
+    clouds = {}
     for n in (n for n in wanted or () if n < offered):
         clouds[n] = FrameSums(source, held[:n], config).cloud()
     if held:
@@ -136,9 +146,10 @@ def _of_one_size(source: FrameSource, frames: Iterator[Frame]) -> Iterator[Frame
 
 
 class FrameSums:
-    """Sums over the frames that belong, from which the mean cloud follows: float64 of z minus a per-pixel offset. The
-    first frames define a good frame: the median of those that agree. ``sample``: flat indices of the judged pixels, all
-    valid in it. The clipped mean uses no larger deviation from the offset than ``gate``."""
+    """Sums over the frames that belong, from which the mean cloud follows: float64 of z minus a
+    per-pixel offset. The first frames define a good frame: the median of those that agree.
+    ``sample``: flat indices of the judged pixels, all valid in it. The clipped mean uses no larger
+    deviation from the offset than ``gate``."""
 
     def __init__(self, source: FrameSource, frames: list[Frame], config: AverageConfig) -> None:
         """Sum the ``frames``, at most `REFERENCE_FRAMES`, which are also the reference."""
@@ -164,11 +175,13 @@ class FrameSums:
 
     def _refer(self, stack: np.ndarray) -> int:
         """Define a good frame from the first frames (r, n); returns n."""
-        config, finite = self.config, np.isfinite(stack)
+        config = self.config
+        finite = np.isfinite(stack)
         usable = np.flatnonzero(2 * finite.sum(axis=0) > finite.any(axis=1).sum())
         self.sample = usable[:: max(1, -(-len(usable) // SAMPLED_PIXELS))]
         sampled = stack[:, self.sample]
-        # the frame closest in range to the others (the earliest on a tie), and each frame's shift against it
+        # the frame closest in range to the others (the earliest on a tie), and each frame's shift
+        # against it
         between = np.diag(np.where(np.isfinite(sampled).any(axis=1), 0.0, np.nan))
         for i, j in combinations(range(len(sampled)), 2):
             between[i, j] = _median_finite(sampled[i] - sampled[j])
@@ -209,7 +222,8 @@ class FrameSums:
         return z.size
 
     def _change(self, z_m: np.ndarray) -> tuple[float, float]:
-        """Return a frame's shift against the reference in metres (NaN for none) and its changed fraction."""
+        """Return a frame's shift against the reference in metres (NaN for none) and its changed
+        fraction."""
         differences = z_m[self.sample] - self.sampled_z_m
         differences = differences.astype(np.float32, copy=False)
         if not np.isfinite(shift := _median_finite(differences)):
@@ -239,7 +253,8 @@ class FrameSums:
         return None
 
     def take(self, frame: Frame) -> None:
-        """Add one frame (h, w), or leave it out. Raises UserError if the median's memory is too small."""
+        """Add one frame (h, w), or leave it out. Raises UserError if the median's memory is too
+        small."""
         fault = self._fault(frame) if self.config.judge_frames else None
         if fault is not None:
             self.left_out.append(LeftOut(frame.name, fault))
@@ -247,7 +262,8 @@ class FrameSums:
         z = frame.z_m.ravel()
         if self.config.method == "median":
             # when the median is taken, the stack is copied once into one block
-            kept, allowed = len(self.stack), int(self.config.median_memory_mb * 1e6)
+            kept = len(self.stack)
+            allowed = int(self.config.median_memory_mb * 1e6)
             needed = 2 * 4 * z.size * (kept + 1)
             if needed > allowed:
                 what = f"{frame.name}: the median of {kept + 1} frames of {z.size} pixels needs {needed / 1e6:.0f} MB,"
@@ -281,8 +297,10 @@ class FrameSums:
             self.rgb_frames += 1
 
     def cloud(self) -> Cloud:
-        """Return the average of the frames so far; NaN where no sample was used. Raises UserError if none was."""
-        source, count = self.source, self.count
+        """Return the average of the frames so far; NaN where no sample was used. Raises UserError
+        if none was."""
+        source = self.source
+        count = self.count
         if not count.any():
             named = "; ".join(f"{left.name}: {left.why}" for left in self.left_out[:3])
             what = f"{source.name}: no pixel has a range in any frame" + (
@@ -329,7 +347,8 @@ class FrameSums:
 def _added(  # type: ignore[no-untyped-def]
     z, reason, gate, offset, count, total, squares, reasons
 ):
-    """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts: within the ``gate``."""
+    """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts:
+    within the ``gate``."""
     used = np.empty(len(z), np.bool_)
     for i in range(len(z)):
         deviation = z[i] - offset[i]
@@ -352,9 +371,11 @@ def _added(  # type: ignore[no-untyped-def]
 
 @numba.njit(**PLAIN)
 def _points(offset, count, total, squares, middle, across, slopes):  # type: ignore[no-untyped-def]
-    """Return mean points (n, 3) and the variance (n,) of z, NaN where there are no samples or fewer than two. Medians
-    (n,) replace the mean z if ``middle`` is not None. ``across`` (n, 2): x and y, or their ``slopes``."""
-    points, variance = np.empty((len(count), 3)), np.empty(len(count))
+    """Return mean points (n, 3) and the variance (n,) of z, NaN where there are no samples or
+    fewer than two. Medians (n,) replace the mean z if ``middle`` is not None. ``across`` (n, 2): x
+    and y, or their ``slopes``."""
+    points = np.empty((len(count), 3))
+    variance = np.empty(len(count))
     for i in range(len(count)):
         n = count[i]
         mean = total[i] / n if n > 0 else np.nan
@@ -374,11 +395,13 @@ def _add_where(values: np.ndarray, used: np.ndarray, total: np.ndarray, count: n
 
 
 def _median_finite(values: np.ndarray) -> float:
-    """Return the median of the finite values, NaN if there are none, in two thirds of NumPy's time."""
+    """Return the median of the finite values, NaN if there are none, in two thirds of NumPy's
+    time."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return np.nan
-    low, high = (len(finite) - 1) // 2, len(finite) // 2
+    low = (len(finite) - 1) // 2
+    high = len(finite) // 2
     ordered = np.partition(finite, (low, high))
     return float(0.5 * (ordered[low] + ordered[high]))
 
@@ -386,7 +409,8 @@ def _median_finite(values: np.ndarray) -> float:
 def pixel_medians(stack: np.ndarray) -> np.ndarray:
     """Return the median (..) of each pixel's finite samples in (r, ..); NaN where there is none."""
     finite = np.isfinite(stack)
-    ordered, count = np.where(finite, stack, np.inf), finite.sum(axis=0)
+    ordered = np.where(finite, stack, np.inf)
+    count = finite.sum(axis=0)
     if len(stack) > 6:  # exchanges of neighbours sort fewer samples in less time
         ordered.sort(axis=0)
     for place in range(len(stack) - 1 if len(stack) <= 6 else 0):

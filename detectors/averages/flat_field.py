@@ -1,8 +1,9 @@
 """A unit's fixed pattern as a map over its sensor: its file, and the correction of a cloud by it.
 
-The pattern is assumed to be a range error along each pixel's ray that is the same in every capture. Not modelled: a
-pattern that changes with distance, temperature or brightness (`detectors.averages.flat_captures` tests the first two), and the
-mixing of pixels by a depth engine's filter at the edge of a hole."""
+The pattern is assumed to be a range error along each pixel's ray that is the same in every
+capture. Not modelled: a pattern that changes with distance, temperature or brightness
+(`detectors.averages.flat_captures` tests the first two), and the mixing of pixels by a depth
+engine's filter at the edge of a hole."""
 
 import json
 from dataclasses import dataclass, replace
@@ -21,8 +22,9 @@ from harness.vocabulary.provenance import check_version
 
 FLAT_FIELD_VERSION = 1
 SAME_LENS = 0.02
-"""Relative difference of focal lengths, and of centres to the width, up to which two lenses may belong to one camera
-and mode: calibrations of one unit differ by less, modes of one camera by more."""
+"""Relative difference of focal lengths, and of centres to the width, up to which two lenses may
+belong to one camera and mode: calibrations of one unit differ by less, modes of one camera by
+more."""
 WELL_COVERED = 0.9
 NEAR_ENOUGH = 1.2  # ratio of distances up to which a pattern counts as measured there
 AGAIN = "run tofpod flatfield on captures of this camera in this mode"
@@ -37,9 +39,10 @@ class FlatFieldConfig(Config):
 
 @dataclass(frozen=True)
 class FlatField:
-    """A unit's fixed pattern. ``error_m`` (h, w): how much farther along its ray each pixel of the whole sensor sees a
-    surface, without smooth parts; NaN where unknown. ``variance_m2`` (h, w) of that error. ``distances_m``: the nearest
-    and the farthest at which it was measured. ``warnings``: full sentences on doubts about it."""
+    """A unit's fixed pattern. ``error_m`` (h, w): how much farther along its ray each pixel of the
+    whole sensor sees a surface, without smooth parts; NaN where unknown. ``variance_m2`` (h, w) of
+    that error. ``distances_m``: the nearest and the farthest at which it was measured.
+    ``warnings``: full sentences on doubts about it."""
 
     error_m: np.ndarray
     variance_m2: np.ndarray
@@ -56,12 +59,14 @@ class FlatField:
 
 
 def corrected(cloud: Cloud, field: FlatField) -> Cloud:
-    """Return the cloud with its points moved along their rays to remove the pattern; points where it is unknown stay.
-    ``mean_variance_m2`` is the frames' noise (None for a single frame) and the map's variance, or the pattern's mean
-    square. Raises UserError if the cloud has no pixel grid or is of another camera, size or lens."""
+    """Return the cloud with its points moved along their rays to remove the pattern; points where
+    it is unknown stay. ``mean_variance_m2`` is the frames' noise (None for a single frame) and the
+    map's variance, or the pattern's mean square. Raises UserError if the cloud has no pixel grid
+    or is of another camera, size or lens."""
     _refuse_other(cloud, field)
     at = cloud.region.within(field.lens.whole)
-    error_m, variance_m2 = field.error_m[at].astype(float), field.variance_m2[at].astype(float)
+    error_m = field.error_m[at].astype(float)
+    variance_m2 = field.variance_m2[at].astype(float)
     known = np.isfinite(error_m)
     range_m = np.linalg.norm(cloud.points_m, axis=-1)
     moved = cloud.points_m * (1 - np.where(known, error_m, 0.0) / range_m)[..., None]
@@ -108,10 +113,8 @@ def _refuse_other(cloud: Cloud, field: FlatField) -> None:
             (getattr(cloud.lens, name), getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")
         ]
         if any(abs(one - other) > SAME_LENS * max(lens.fx, lens.width) for one, other in pairs):
-            ours, theirs = (
-                f"fx {a.fx:.1f}, fy {a.fy:.1f}, centre {a.cx:.1f}, {a.cy:.1f}"
-                for a in (cloud.lens, lens)
-            )
+            ours = f"fx {cloud.lens.fx:.1f}, fy {cloud.lens.fy:.1f}, centre {cloud.lens.cx:.1f}, {cloud.lens.cy:.1f}"
+            theirs = f"fx {lens.fx:.1f}, fy {lens.fy:.1f}, centre {lens.cx:.1f}, {lens.cy:.1f}"
             what = f"the capture's lens ({ours}) is not that of the flat field ({theirs})"
             raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
 
@@ -133,7 +136,8 @@ def save_flat_field(path: Path, field: FlatField) -> None:
 
 
 def load_flat_field(path: Path) -> FlatField:
-    """Read a file of `save_flat_field`. Raises UserError if it is not such a file, is broken, too large or newer."""
+    """Read a file of `save_flat_field`. Raises UserError if it is not such a file, is broken, too
+    large or newer."""
     from detectors.recordings.arrays import load_npz
 
     held = load_npz(path)

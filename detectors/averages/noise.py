@@ -1,4 +1,5 @@
-"""Robust statistics, and the noise of an average: the error that rounding leaves, and the range of shared noise."""
+"""Robust statistics, and the noise of an average: the error that rounding leaves, and the range of
+shared noise."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -8,15 +9,26 @@ import numpy as np
 
 from harness.vocabulary.geometry import Cloud, Frame
 
-REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
-"""Number of frames used; side of the window at the centre of the valid pixels; least number of pixels valid in two
-frames: they show a correlation to 0.07 if 25 pixels are alike."""
-LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX, LONE_OFF_PX = 21, 5.0, 7, 0.3
-"""Side of the square of the local mean in a single frame; deviations that mark an edge; longest lag that is attributed
-to noise and not to a pattern or the surface; largest distance from the middle of the known pixels around."""
-LEAST_FRAMES, SCATTER_PX = 4, 7
-"""Fewest frames whose scatter shows noise; side of the square of its average: to 12 % from 49 x 3 differences."""
-SHARED = 0.1  # correlation below which pixels share no noise: a box of b pixels, up to 9, falls below it at lag b
+REACH_FRAMES = 6
+REACH_WINDOW_PX = 384
+REACH_PIXELS = 5000
+FARTHEST_LAG_PX = 30
+"""Number of frames used; side of the window at the centre of the valid pixels; least number of
+pixels valid in two frames: they show a correlation to 0.07 if 25 pixels are alike."""
+LONE_LEVEL_PX = 21
+LONE_SIGMAS = 5.0
+LONE_MOST_PX = 7
+LONE_OFF_PX = 0.3
+"""Side of the square of the local mean in a single frame; deviations that mark an edge; longest
+lag that is attributed to noise and not to a pattern or the surface; largest distance from the
+middle of the known pixels around."""
+LEAST_FRAMES = 4
+SCATTER_PX = 7
+"""Fewest frames whose scatter shows noise; side of the square of its average: to 12 % from 49 x 3
+differences."""
+# correlation below which pixels share no noise: a box of b pixels, up to 9, falls below it at lag
+# b
+SHARED = 0.1
 
 
 def median_of(values: np.ndarray) -> float:
@@ -31,19 +43,22 @@ def median_of(values: np.ndarray) -> float:
 def quantile_of(values: np.ndarray, share: float) -> float:
     """Return the linearly interpolated quantile of finite values (n,), n >= 1, at this share."""
     place = share * (len(values) - 1)
-    low, high = int(place), min(int(place) + 1, len(values) - 1)
+    low = int(place)
+    high = min(int(place) + 1, len(values) - 1)
     ordered = np.partition(values, (low, high))
     return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
 
 
 def sigma_of(values: np.ndarray) -> float:
-    """Return the robust standard deviation of finite values (n,) about 0: the median magnitude over 0.6745."""
+    """Return the robust standard deviation of finite values (n,) about 0: the median magnitude
+    over 0.6745."""
     return median_of(np.abs(values)) / 0.6745
 
 
 def rounding_left_m2(step_m: float, dither_m2: float) -> float:
-    """Return the variance of the fixed pattern that rounding to a step q leaves in an average of infinitely many
-    frames. With noise of variance s^2 before it is (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
+    """Return the variance of the fixed pattern that rounding to a step q leaves in an average of
+    infinitely many frames. With noise of variance s^2 before it is (q / pi)^2 / 2 * sum_k exp(-4
+    pi^2 k^2 s^2 / q^2) / k^2."""
     k = np.arange(1, 200)
     left = (
         (step_m / np.pi) ** 2
@@ -54,12 +69,14 @@ def rounding_left_m2(step_m: float, dither_m2: float) -> float:
 
 
 def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
-    """Return the variances that rounding of z leaves in the average where ``mask`` (h, w) is true, square metres: of a
-    fixed pattern, which neighbours may share, and of the part that differs from pixel to pixel.
+    """Return the variances that rounding of z leaves in the average where ``mask`` (h, w) is true,
+    square metres: of a fixed pattern, which neighbours may share, and of the part that differs
+    from pixel to pixel.
 
-    Rounding to a step q errs by q / sqrt(12). Noise before the rounding turns part of that into noise, which averages
-    out, and leaves a fixed pattern b^2 (`rounding_left_m2`): b^2 + (q^2 / 12 - b^2) / n after n frames. The whole error
-    remains if the averaged z still lies on the steps, as a median does. Without a step, z counts as float32."""
+    Rounding to a step q errs by q / sqrt(12). Noise before the rounding turns part of that into
+    noise, which averages out, and leaves a fixed pattern b^2 (`rounding_left_m2`): b^2 + (q^2 / 12
+    - b^2) / n after n frames. The whole error remains if the averaged z still lies on the steps,
+    as a median does. Without a step, z counts as float32."""
     z = cloud.points_m[..., 2][mask]
     step = (
         cloud.z_step_m
@@ -79,9 +96,10 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
 
 
 def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
-    """Return the variance (h, w) of the average's z where ``where`` (h, w) is true, from the scatter of its frames
-    nearby, or the typical variance if that is unknown. None without a pixel grid, with fewer than `LEAST_FRAMES`
-    frames, or if fewer than half of the pixels have a scatter."""
+    """Return the variance (h, w) of the average's z where ``where`` (h, w) is true, from the
+    scatter of its frames nearby, or the typical variance if that is unknown. None without a pixel
+    grid, with fewer than `LEAST_FRAMES` frames, or if fewer than half of the pixels have a
+    scatter."""
     seen = where & np.isfinite(cloud.variance_m2)
     if not cloud.organised or cloud.n_frames < LEAST_FRAMES or seen.sum() < 0.5 * where.sum():
         return None
@@ -97,14 +115,16 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
 
 
 def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
-    """Return the standard deviation in metres that rounding leaves in the average: the smallest credible scale."""
+    """Return the standard deviation in metres that rounding leaves in the average: the smallest
+    credible scale."""
     return float(np.sqrt(sum(rounding_variances(cloud, mask))))
 
 
 def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
-    """Return the lag, in pixels, at which neighbours along rows and columns stop sharing noise: the median over pairs
-    of successive frames. A single frame is judged by its deviations from its local mean, if they exceed the rounding to
-    ``z_step_m``. 0 means unknown (no noise beyond rounding, movement, or a curved surface in one frame)."""
+    """Return the lag, in pixels, at which neighbours along rows and columns stop sharing noise:
+    the median over pairs of successive frames. A single frame is judged by its deviations from its
+    local mean, if they exceed the rounding to ``z_step_m``. 0 means unknown (no noise beyond
+    rounding, movement, or a curved surface in one frame)."""
     lags: list[int] = []
     lone = len(frames) == 1
     pictures = [frame.z_m.astype(np.float64) for frame in frames]
@@ -114,9 +134,8 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
         rows, columns = np.isfinite(difference).nonzero()
         if rows.size < REACH_PIXELS:
             continue
-        top, left = (
-            max(0, int(np.median(places)) - REACH_WINDOW_PX // 2) for places in (rows, columns)
-        )
+        top = max(0, int(np.median(rows)) - REACH_WINDOW_PX // 2)
+        left = max(0, int(np.median(columns)) - REACH_WINDOW_PX // 2)
         difference = difference[top : top + REACH_WINDOW_PX, left : left + REACH_WINDOW_PX]
         known = np.isfinite(difference)
         if lone:
@@ -143,15 +162,18 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
 
 def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
     """Return the values (h, w) minus their mean over a square of known ones; 0 where unknown."""
-    weight, total = (
-        cv2.boxFilter(each, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
-        for each in (known.astype(np.float64), np.where(known, values, 0.0))
+    weight = cv2.boxFilter(
+        known.astype(np.float64), -1, (side, side), borderType=cv2.BORDER_CONSTANT
+    )
+    total = cv2.boxFilter(
+        np.where(known, values, 0.0), -1, (side, side), borderType=cv2.BORDER_CONSTANT
     )
     return np.where(known, values - total / np.maximum(weight, 1e-9), 0.0)
 
 
 def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:
-    """Return the first lag along rows at which the mean product of noise falls below `SHARED`; 0 if there is none."""
+    """Return the first lag along rows at which the mean product of noise falls below `SHARED`; 0
+    if there is none."""
 
     def product(lag: int) -> float:
         width = noise.shape[1] - lag

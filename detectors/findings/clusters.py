@@ -1,5 +1,6 @@
-"""Clusters of points by Euclidean distance, at one threshold of their scores or at several. As the threshold falls,
-clusters only grow and join. Points are sorted into cells so small that all points of a cell belong to one cluster."""
+"""Clusters of points by Euclidean distance, at one threshold of their scores or at several. As the
+threshold falls, clusters only grow and join. Points are sorted into cells so small that all points
+of a cell belong to one cluster."""
 
 from typing import Any
 
@@ -8,15 +9,17 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 
-AXIS_BITS, NEAR_CELLS = 21, 2
+AXIS_BITS = 21
+NEAR_CELLS = 2
 MAX_CELLS = 1 << 20  # cells along one axis that a 63-bit key of three axes can hold
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 
 
 def euclidean_clusters(points_m: np.ndarray, distance_m: float, min_points: int = 1) -> np.ndarray:
-    """Label points (n, 3): two are in one cluster if a chain of steps of at most ``distance_m`` joins them, as in
-    MATLAB's ``pcsegdist``. Returns (n,) int64: 0, 1, ... in the order of each cluster's first point, -1 for points with
-    a NaN and in clusters smaller than ``min_points``. Raises UserError if the points spread over too many cells."""
+    """Label points (n, 3): two are in one cluster if a chain of steps of at most ``distance_m``
+    joins them, as in MATLAB's ``pcsegdist``. Returns (n,) int64: 0, 1, ... in the order of each
+    cluster's first point, -1 for points with a NaN and in clusters smaller than ``min_points``.
+    Raises UserError if the points spread over too many cells."""
     labels = np.full(len(points_m), -1, dtype=np.int64)
     finite = np.flatnonzero(np.isfinite(points_m).all(axis=1))
     alike = np.zeros(len(finite))
@@ -33,12 +36,14 @@ def nested_clusters(
     min_points: int,
     thresholds: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Label the finite points (n, 3) with a score (n,) above each of the rising ``thresholds`` (t,), as
-    `euclidean_clusters` does: (t, n) int64, -1 for the others. Also return by label, (t, m), the lowest threshold at
-    which no part of that cluster is found any more: parts with enough points last longest."""
+    """Label the finite points (n, 3) with a score (n,) above each of the rising ``thresholds``
+    (t,), as `euclidean_clusters` does: (t, n) int64, -1 for the others. Also return by label, (t,
+    m), the lowest threshold at which no part of that cluster is found any more: parts with enough
+    points last longest."""
     if not len(points_m):
         return np.zeros((len(thresholds), 0), np.int64), np.zeros((len(thresholds), 0))
-    # slightly less than distance / sqrt(3): rounding must not put two points of a cell farther apart than the distance
+    # slightly less than distance / sqrt(3): rounding must not put two points of a cell farther
+    # apart than the distance
     cells = np.floor((points_m - points_m.min(axis=0)) / (distance_m / np.sqrt(3.0) * (1.0 - 1e-9)))
     if cells.max() >= MAX_CELLS:
         what = f"points spread over {np.ptp(points_m, axis=0).max():.3g} m cannot be clustered with a distance of"
@@ -57,10 +62,8 @@ def nested_clusters(
         np.full((len(thresholds), len(falling)), -1, np.int64),
         np.zeros((len(thresholds), len(starts))),
     )
-    near, ends = (
-        np.empty((2 * NEAR_CELLS + 1) ** 3 * len(starts), np.int64),
-        np.append(starts, len(order)),
-    )
+    near = np.empty((2 * NEAR_CELLS + 1) ** 3 * len(starts), np.int64)
+    ends = np.append(starts, len(order))
     places = points_m, scores, falling, order, ends, key[by_cell[starts]], near
     _nested(*places, distance_m**2, min_points, thresholds, *found)
     return found
@@ -80,16 +83,21 @@ def _nested(  # type: ignore[no-untyped-def]
     points, scores, falling, order, starts, keys, near, limit, least, thresholds, labels, strengths
 ):
     """Write the results of `nested_clusters`. Cell c, in the order of ``keys``, holds the points
-    ``order[starts[c]:starts[c + 1]]``. ``limit``: the squared distance. ``falling``: the points by score."""
-    n, cells, side = len(falling), len(keys), 2 * NEAR_CELLS + 1
-    parent, sizes, held = (
-        np.zeros(cells, np.int64),
-        np.zeros(cells, np.int64),
-        np.zeros(cells, np.int64),
-    )
-    cell, stops, count = np.zeros(n, np.int64), np.zeros(cells + 1, np.int64), 0
-    # near[stops[c]:stops[c + 1]] are near cell c: in each column along z, the cells from the first to the last
-    first, last = np.zeros(side**2, np.int64), np.zeros(side**2, np.int64)
+    ``order[starts[c]:starts[c + 1]]``. ``limit``: the squared distance. ``falling``: the points by
+    score."""
+    n = len(falling)
+    cells = len(keys)
+    side = 2 * NEAR_CELLS + 1
+    parent = np.zeros(cells, np.int64)
+    sizes = np.zeros(cells, np.int64)
+    held = np.zeros(cells, np.int64)
+    cell = np.zeros(n, np.int64)
+    stops = np.zeros(cells + 1, np.int64)
+    count = 0
+    # near[stops[c]:stops[c + 1]] are near cell c: in each column along z, the cells from the first
+    # to the last
+    first = np.zeros(side**2, np.int64)
+    last = np.zeros(side**2, np.int64)
     completed = np.zeros(cells)
     for c in range(cells):
         parent[c], completed[c] = c, -np.inf
@@ -108,7 +116,8 @@ def _nested(  # type: ignore[no-untyped-def]
                 near[count] = other
                 count += 1
         stops[c + 1] = count
-    done, ends = 0, stops[1:].copy()
+    done = 0
+    ends = stops[1:].copy()
     for level in range(len(thresholds) - 1, -1, -1):
         while done < n and scores[falling[done]] > thresholds[level]:
             i = falling[done]
@@ -136,7 +145,8 @@ def _nested(  # type: ignore[no-untyped-def]
             if sizes[root] >= least:
                 completed[root] = max(completed[root], scores[i])
         # clusters are counted from 1 here
-        names, count = np.zeros(cells, np.int64), 0
+        names = np.zeros(cells, np.int64)
+        count = 0
         for i in range(n):
             if scores[i] > thresholds[level]:
                 root = root_of(parent, cell[i])
@@ -153,11 +163,9 @@ def _touches(
 ) -> bool:
     for k in range(start, start + held):
         j = order[k]
-        dx, dy, dz = (
-            points[i, 0] - points[j, 0],
-            points[i, 1] - points[j, 1],
-            points[i, 2] - points[j, 2],
-        )
+        dx = points[i, 0] - points[j, 0]
+        dy = points[i, 1] - points[j, 1]
+        dz = points[i, 2] - points[j, 2]
         if dx * dx + dy * dy + dz * dz <= limit:
             return True
     return False

@@ -1,6 +1,7 @@
-"""Measures the size and the place of a detection: the thesis' extents, and a fitted model of a blurred hole. Where the
-model does not hold, the contour at half depth is measured instead. Depths are measured along the optical axis, positive
-behind the surface; sizes are measured on the surface."""
+"""Measures the size and the place of a detection: the thesis' extents, and a fitted model of a
+blurred hole. Where the model does not hold, the contour at half depth is measured instead. Depths
+are measured along the optical axis, positive behind the surface; sizes are measured on the
+surface."""
 
 from __future__ import annotations
 
@@ -31,25 +32,33 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 
 OTHER_DAMAGE_SIGMAS = 5.0
-"""Pixels of the patch with a larger residual that do not touch the detection belong to other damage."""
+"""Pixels of the patch with a larger residual that do not touch the detection belong to other
+damage."""
 OPEN_M = 20.0 * MM
-"""The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what shows through."""
+"""The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
+shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 NEAR_BLURS = 1.4
-"""Distance from a detection, in sides of the blur, up to which all pixels count if the noise's correlation is known.
-Leaving out 15 of 16 farther pixels raises the standard errors of diameter and depth by 0.5 to 1.5 %."""
+"""Distance from a detection, in sides of the blur, up to which all pixels count if the noise's
+correlation is known. Leaving out 15 of 16 farther pixels raises the standard errors of diameter
+and depth by 0.5 to 1.5 %."""
 EXPLAINED = 0.5
-"""Least share of a detection's mean residual that its fit must explain: correlated noise may absorb a smooth dent."""
-SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
-"""Blurs, smaller than the noise's, that are tried for a recording, and the gain in chi square that accepts them."""
+"""Least share of a detection's mean residual that its fit must explain: correlated noise may
+absorb a smooth dent."""
+SHARPER_PX = (1.0, 2.0, 3.0, 5.0)
+SHARPER_GAIN = 9.0
+"""Blurs, smaller than the noise's, that are tried for a recording, and the gain in chi square that
+accepts them."""
 
 
 class HoleModelConfig(Config):
-    """Assumptions of the model of a blurred hole. ``blur_px``: side of the square over which the camera averages: 5 for
-    the Azure Kinect's depth engine (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``emitter_mm``: position
-    of the light source in the camera's frame. ``linear_depth_mm``: at greater depths, the filter weights a deep
-    neighbour by less than half, and the contour at half depth is more reliable. ``largest_invalid``: share of the disc
-    that may lack a range. ``largest_relative_error``: of the diameter; beyond it, diameter and depth are ambiguous."""
+    """Assumptions of the model of a blurred hole. ``blur_px``: side of the square over which the
+    camera averages: 5 for the Azure Kinect's depth engine (OpenK4A), 3 for the Kinect v2
+    (libfreenect2), 1 for none. ``emitter_mm``: position of the light source in the camera's frame.
+    ``linear_depth_mm``: at greater depths, the filter weights a deep neighbour by less than half,
+    and the contour at half depth is more reliable. ``largest_invalid``: share of the disc that may
+    lack a range. ``largest_relative_error``: of the diameter; beyond it, diameter and depth are
+    ambiguous."""
 
     blur_px: int = Field(default=5, ge=1, le=31)
     emitter_mm: tuple[float, float, float] = (-14.0, 0.0, 1.0)
@@ -66,13 +75,15 @@ class HoleModelConfig(Config):
 
 
 def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
-    """Return the sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or
-    cells: the reach of a recording's noise, else ``config.blur_px``. A map's interpolation between its views' pixels
-    widens it to sqrt(blur^2 + 2) pixels. Cells larger than a pixel are means themselves."""
+    """Return the sides, along columns and rows, of the rectangle over which the cloud is averaged,
+    in its own pixels or cells: the reach of a recording's noise, else ``config.blur_px``. A map's
+    interpolation between its views' pixels widens it to sqrt(blur^2 + 2) pixels. Cells larger than
+    a pixel are means themselves."""
     if cloud.map_views is None or not cloud.organised:
         blur_px = cloud.noise_reach_px or float(config.blur_px)
         return blur_px, blur_px
-    across, down = (np.diff(cloud.points_m[..., k], axis=1 - k) for k in (0, 1))
+    across = np.diff(cloud.points_m[..., 0], axis=1 - 0)
+    down = np.diff(cloud.points_m[..., 1], axis=1 - 1)
     cells = [
         float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 for steps in (across, down)
     ]
@@ -85,9 +96,9 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
 
 
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the thesis' size and centre (3,) of a cluster (n, 3), metres. The size is the mean of the distances
-    between the two extreme points in x and between those in y; the centre is the mean of these four. Of equals, the
-    first counts."""
+    """Return the thesis' size and centre (3,) of a cluster (n, 3), metres. The size is the mean of
+    the distances between the two extreme points in x and between those in y; the centre is the
+    mean of these four. Of equals, the first counts."""
     west, east, north, south = points_m[
         _extremes(points_m, np.zeros(len(points_m), np.int64), 1)[0]
     ]
@@ -96,30 +107,35 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the centres (count, 3) by `extents` of clusters of points (n, 3). ``labels`` (n,): -1 for no cluster."""
+    """Return the centres (count, 3) by `extents` of clusters of points (n, 3). ``labels`` (n,): -1
+    for no cluster."""
     return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
 
 
 @numba.njit(**PLAIN)
 def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices (count, 4) of the points with the least and greatest x, and with the least and greatest y."""
+    """Return the indices (count, 4) of the points with the least and greatest x, and with the
+    least and greatest y."""
     found = np.full((count, 4), -1)
     for i in range(len(labels)):
         for end in range(4 if labels[i] >= 0 else 0):
-            sign, best = 1.0 if end % 2 else -1.0, found[labels[i], end]
+            sign = 1.0 if end % 2 else -1.0
+            best = found[labels[i], end]
             if best < 0 or sign * points[i, end // 2] > sign * points[best, end // 2]:
                 found[labels[i], end] = i
     return found
 
 
 def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:
-    """Measure the thesis' extents and the place on the sensor, if any. ``note`` says why nothing else is measured."""
+    """Measure the thesis' extents and the place on the sensor, if any. ``note`` says why nothing
+    else is measured."""
     points = cloud.points_m.reshape(-1, 3)[detection.pixels]
     diameter, centre = extents(points)
     u = v = np.nan
     if cloud.organised:
         rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
-        u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
+        u = float(columns.mean()) + cloud.region.col0
+        v = float(rows.mean()) + cloud.region.row0
     return Measurement(u, v, len(points), detection.score, diameter, centre, model_note=note)
 
 
@@ -130,7 +146,8 @@ def measure_detection(
     config: HoleModelConfig,
     by_lag: np.ndarray | None = None,
 ) -> Measurement:
-    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag``: the noise's correlation."""
+    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag``: the
+    noise's correlation."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     placed = measure_extents(cloud, detection, "too few valid pixels around it for a model")
@@ -164,30 +181,31 @@ def measure_detection(
 
 
 def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return length, width and direction (3,) of the length of the rectangle on the surface that has the second moments
-    of the residual within ``near`` (h, w) bool, minus those of the blur."""
+    """Return length, width and direction (3,) of the length of the rectangle on the surface that
+    has the second moments of the residual within ``near`` (h, w) bool, minus those of the blur."""
     residual = around.patch.residual_m[near] - around.offset_m
     weight = np.maximum(around.sign * residual, 0.0)
     v, u = np.nonzero(near)
     if not weight.sum() > 0:
         return np.nan, np.nan, np.full(3, np.nan)
-    places, weight = np.stack([u, v]), weight / weight.sum()
+    places = np.stack([u, v])
+    weight = weight / weight.sum()
     places = places - (places @ weight)[:, None]
     moments = (places * weight) @ places.T - np.diag(np.square(around.patch.blur_px)) / 12
     variances, axes = np.linalg.eigh(around.per_px_m.T @ moments @ around.per_px_m)
     # the variance along the surface's normal is the one nearest to 0
-    width_m, length_m = (
-        float(np.sqrt(12.0 * max(each, 0.0))) for each in (sorted(variances)[-2], variances[-1])
-    )
+    width_m = float(np.sqrt(12.0 * max(sorted(variances)[-2], 0.0)))
+    length_m = float(np.sqrt(12.0 * max(variances[-1], 0.0)))
     return length_m, width_m, axes[:, -1]
 
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """A detection and its neighbourhood. ``near`` (h, w) bool: its ``own`` pixels, grown by one more than half of the
-    blur, ``reach_px``. ``offset_m``: residual around it. ``sign``, ``peak_m``: of its own residual, less the offset.
-    ``origin_m``: the surface's point at (``u0``, ``v0``), the detection's centroid. ``sharper_px``: smaller blurs to
-    try, as noise may be blurred more than the scene."""
+    """A detection and its neighbourhood. ``near`` (h, w) bool: its ``own`` pixels, grown by one
+    more than half of the blur, ``reach_px``. ``offset_m``: residual around it. ``sign``,
+    ``peak_m``: of its own residual, less the offset. ``origin_m``: the surface's point at (``u0``,
+    ``v0``), the detection's centroid. ``sharper_px``: smaller blurs to try, as noise may be
+    blurred more than the scene."""
 
     patch: HolePatch
     own: np.ndarray
@@ -210,7 +228,8 @@ class _Surroundings:
 
     def placed(self, measured: Measurement, u: float, v: float) -> Measurement:
         """Return the measurement with the position (u, v) of the patch as its place."""
-        du, dv = u - self.u0, v - self.v0
+        du = u - self.u0
+        dv = v - self.v0
         centre_m = self.origin_m + du * self.per_px_m[0] + dv * self.per_px_m[1]
         return replace(
             measured, u_px=du + measured.u_px, v_px=dv + measured.v_px, model_centre_m=centre_m
@@ -220,14 +239,16 @@ class _Surroundings:
 def _surroundings(
     cloud: Cloud, evidence: Evidence, rows: np.ndarray, columns: np.ndarray, config: HoleModelConfig
 ) -> _Surroundings | None:
-    """Cut out the detection with a margin of twice the blur on each side; None with too few valid pixels around."""
+    """Cut out the detection with a margin of twice the blur on each side; None with too few valid
+    pixels around."""
     h, w = cloud.points_m.shape[:2]
     sides = blur_in_cells(cloud, config)
     blur = max(sides)
     tight = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
     corner = tight.grown(math.ceil(2 * blur) + 2, h, w)
     cut = corner.within(Region(0, h, 0, w))
-    residual, points = evidence.residual_m[cut], cloud.points_m[cut]
+    residual = evidence.residual_m[cut]
+    points = cloud.points_m[cut]
     own = np.zeros(residual.shape, dtype=bool)
     own[rows - corner.row0, columns - corner.col0] = True
     finite = np.isfinite(residual)
@@ -250,7 +271,8 @@ def _surroundings(
     sign = 1.0 if deviations.sum() >= 0 else -1.0
     peak = max(quantile_of(sign * deviations, 0.9), 1e-9)
     # the camera that sees the surface's point, or all the cameras of a map
-    emitter, views = np.array(config.emitter_mm) * MM, cloud.map_views
+    emitter = np.array(config.emitter_mm) * MM
+    views = cloud.map_views
     if cloud.projection == "central":
         sights = [sight(centre, per_px, emitter)]
     elif views is None:
@@ -272,8 +294,9 @@ def _surroundings(
 def local_plane(
     points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by linear
-    regression of directions (in a parallel projection of x and y) and of the surface's z; None if singular."""
+    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v
+    (2, 3), by linear regression of directions (in a parallel projection of x and y) and of the
+    surface's z; None if singular."""
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
     (x, y, z), pixels = points[finite].T, np.nonzero(finite)
     scale = 1.0 if projection == "parallel" else z
@@ -286,13 +309,12 @@ def local_plane(
     except np.linalg.LinAlgError:
         return None
     if projection == "parallel":
-        centre, per_px = beta[0], beta[1:]
+        centre = beta[0]
+        per_px = beta[1:]
     else:
         ray = np.array([*beta[0, :2], 1.0])
-        centre, per_px = (
-            ray * beta[0, 2],
-            beta[1:] * [1.0, 1.0, 0.0] * beta[0, 2] + ray * beta[1:, 2:],
-        )
+        centre = ray * beta[0, 2]
+        per_px = beta[1:] * [1.0, 1.0, 0.0] * beta[0, 2] + ray * beta[1:, 2:]
     if not math.hypot(*normal_of(per_px)) > 1e-12:
         return None
     return centre, per_px
@@ -302,7 +324,9 @@ def _modelled(
     around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray | None
 ) -> tuple[HoleFit | None, str]:
     """Return the fitted hole, or None and the reason why the model does not hold."""
-    own, invalid, patch = around.own, around.invalid, around.patch
+    own = around.own
+    invalid = around.invalid
+    patch = around.patch
     dark = "part of the hole has no range"
     too_deep = f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages evenly"
     inside = own | (invalid & grown(own, 1))
@@ -316,22 +340,27 @@ def _modelled(
     v, u = np.nonzero(near)
     total = max(float(weight.sum()), 1e-12)
     radius = float(np.sqrt(total * around.area_m2 / (np.pi * around.peak_m)))
-    u0, v0 = float(weight @ u) / total, float(weight @ v) / total
+    u0 = float(weight @ u) / total
+    v0 = float(weight @ v) / total
     if patch.used.sum() < 6:
         return None, "the model of a blurred hole does not fit"
     start = (u0, v0, radius, around.sign * around.peak_m, around.offset_m)
     if by_lag is not None:
         known_by = grown(own, round(NEAR_BLURS * max(patch.blur_px)), cv2.MORPH_ELLIPSE)
         patch = whitened(patch, by_lag, around.offset_m, known_by)
-    fit, seen_by, pixels = fit_hole(patch, *start), patch, int(patch.used.sum()) + patch.left_out
+    fit = fit_hole(patch, *start)
+    seen_by = patch
+    pixels = int(patch.used.sum()) + patch.left_out
     for side in around.sharper_px if fit.misfit else ():
         narrower = replace(patch, blur_px=(side, side))
         other = fit_hole(narrower, *start)
         gain = pixels * (fit.misfit**2 - other.misfit**2)
         if other.converged and gain > (SHARPER_GAIN * other.misfit**2 if fit.converged else 0.0):
-            fit, seen_by = other, narrower
+            fit = other
+            seen_by = narrower
     h, w = own.shape
-    row, column = round(fit.v_px), round(fit.u_px)
+    row = round(fit.v_px)
+    column = round(fit.u_px)
     is_near = 0 <= row < h and 0 <= column < w and around.near[row, column]
     fitted = pictures(
         seen_by, np.array([[fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.wall]])
@@ -357,8 +386,8 @@ def _modelled(
 
 
 def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Measurement:
-    """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels without a range that
-    touch the detection count as inside."""
+    """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels
+    without a range that touch the detection count as inside."""
     residual = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
     hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
     top_m = min(around.peak_m, OPEN_M)

@@ -1,14 +1,17 @@
-"""The threshold that a capture determines itself: noise towards the camera shows how often noise looks like damage.
+"""The threshold that a capture determines itself: noise towards the camera shows how often noise
+looks like damage.
 
-Damage lies behind the surface. Peaks in front of the surface are noise, fixed pattern or texture, after objects on the
-target (regions that stand before the surface as a whole; edges in the colour picture or the amplitude) and a margin are
-excluded. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is
-expected, bumps and hole-like calls together. The tail is exponential in (s^q - 1) / q of the score s, minus the
-logarithm by which maxima of normal noise in two dimensions are more frequent. The data weigh the exponents, starting
+Damage lies behind the surface. Peaks in front of the surface are noise, fixed pattern or texture,
+after objects on the target (regions that stand before the surface as a whole; edges in the colour
+picture or the amplitude) and a margin are excluded. The tail of these peaks is extrapolated to the
+threshold at which the wanted number of false calls is expected, bumps and hole-like calls
+together. The tail is exponential in (s^q - 1) / q of the score s, minus the logarithm by which
+maxima of normal noise in two dimensions are more frequent. The data weigh the exponents, starting
 from `PRIOR`; rates and scales are integrated out.
 
-Not modelled: noise that is asymmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
-larger than the noise; objects on clouds without a grid, or that neither stand out nor are visible in a picture."""
+Not modelled: noise that is asymmetric beyond what `skew_of` sees in the core; damage towards the
+camera that is no larger than the noise; objects on clouds without a grid, or that neither stand
+out nor are visible in a picture."""
 
 from __future__ import annotations
 
@@ -25,44 +28,63 @@ from harness.vocabulary.geometry import Cloud
 
 EXPONENTS = np.array([3.0, 2.0, 1.5, 1.0, 0.5, 0.0])
 PRIOR = np.array([0.40, 0.45, 0.07, 0.04, 0.02, 0.02])
-"""Prior weights of exponents: averages of a camera's noise are near normal. From simulated boards of three cameras."""
-WANTED_PEAKS, FEWEST_PEAKS = 60, 8
-"""Numbers of peaks above the floor: the mean excess of 60 is known to 13 %, that of the fewest to 35 %."""
+"""Prior weights of exponents: averages of a camera's noise are near normal. From simulated boards
+of three cameras."""
+WANTED_PEAKS = 60
+FEWEST_PEAKS = 8
+"""Numbers of peaks above the floor: the mean excess of 60 is known to 13 %, that of the fewest to
+35 %."""
 NORMAL_PEAKS = 10.0
-"""Weight of the theory, in peaks: maxima of normal noise with the deviation that a unit of score is meant to be. Ten
-peaks show that deviation to 16 %; robust scales of heavy-tailed noise err by as much."""
-CROWDED, LADDER = 0.6, 1.06
-"""Share of the largest number of findings at any threshold, and the ratio of thresholds tried for the floor."""
-LEAST = 3.0  # lowest threshold in units of score: bounded errors end so near that peaks in front predict nothing behind
+"""Weight of the theory, in peaks: maxima of normal noise with the deviation that a unit of score
+is meant to be. Ten peaks show that deviation to 16 %; robust scales of heavy-tailed noise err by
+as much."""
+CROWDED = 0.6
+LADDER = 1.06
+"""Share of the largest number of findings at any threshold, and the ratio of thresholds tried for
+the floor."""
+# lowest threshold in units of score: bounded errors end so near that peaks in front predict
+# nothing behind
+LEAST = 3.0
 MOST = 10.0
-"""Thresholds above this are seldom due to noise alone, which needs 4 to 7 on all recordings. Averages of 50 simulated
-frames of an L515 need up to 13 on hole-free boards, probably because of the pattern that all frames share."""
+"""Thresholds above this are seldom due to noise alone, which needs 4 to 7 on all recordings.
+Averages of 50 simulated frames of an L515 need up to 13 on hole-free boards, probably because of
+the pattern that all frames share."""
 OBJECT_MARGIN_PX = (
     6  # margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it
 )
-PATCH_PX, LEAST_OBJECT_PX = 5, 100
-"""Side of the square that smooths residual and picture, and least pixels of an object: four such squares."""
-PROUD, PROUD_FOOT = 6.0, 3.0
-"""Smoothed residual of an object in front of the surface, in deviations: at its highest point, and everywhere on it."""
-MARKED = 8.0  # slope of an edge in the picture, in multiples of the median slope: a tag, print, another material
+PATCH_PX = 5
+LEAST_OBJECT_PX = 100
+"""Side of the square that smooths residual and picture, and least pixels of an object: four such
+squares."""
+PROUD = 6.0
+PROUD_FOOT = 3.0
+"""Smoothed residual of an object in front of the surface, in deviations: at its highest point, and
+everywhere on it."""
+# slope of an edge in the picture, in multiples of the median slope: a tag, print, another material
+MARKED = 8.0
 MOST_MASKED = (
     0.5  # largest share of the judged area under objects: the rest must represent the whole
 )
-RIM_PX, RIM_CALLS = 10, 2
-"""Depth of the target's rim, and number of calls behind the surface along it that chance does not explain."""
+RIM_PX = 10
+RIM_CALLS = 2
+"""Depth of the target's rim, and number of calls behind the surface along it that chance does not
+explain."""
 CONTRADICTED = (
-    0.1  # a tail is rejected if the probability of the number of peaks above the threshold is lower
+    # a tail is rejected if the probability of the number of peaks above the threshold is lower
+    0.1
 )
 MOST_SKEW = 0.15
-"""Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as far on one side."""
+"""Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as
+far on one side."""
 DRAWS = 4000
 
 
 @dataclass(frozen=True)
 class OwnThreshold:
-    """``threshold``: in units of score, at which ``expected`` false calls are expected, with the 95 % interval ``low``
-    to ``high``. It is based on ``peaks`` above ``floor``. ``evidence``: what to search, without the ``rim_pixels`` that
-    mix in what lies behind the target. ``doubts``: full sentences on why the numbers cannot be trusted."""
+    """``threshold``: in units of score, at which ``expected`` false calls are expected, with the
+    95 % interval ``low`` to ``high``. It is based on ``peaks`` above ``floor``. ``evidence``: what
+    to search, without the ``rim_pixels`` that mix in what lies behind the target. ``doubts``: full
+    sentences on why the numbers cannot be trusted."""
 
     threshold: float
     expected: float
@@ -79,8 +101,9 @@ class OwnThreshold:
 def own_threshold(
     detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float
 ) -> OwnThreshold:
-    """Find the threshold at which ``false_calls`` (above 0) are expected, from the capture's own peaks towards the
-    camera; at least `LEAST`. With too few peaks the numbers are NaN, and ``doubts`` says so."""
+    """Find the threshold at which ``false_calls`` (above 0) are expected, from the capture's own
+    peaks towards the camera; at least `LEAST`. With too few peaks the numbers are NaN, and
+    ``doubts`` says so."""
     known = np.isfinite(evidence.score)
     covered = np.zeros(known.shape, bool)
     if cloud.organised:
@@ -102,11 +125,14 @@ def own_threshold(
         return OwnThreshold(
             *(float("nan"),) * 4, len(peaks), floor, objects, 0, evidence, tuple(doubts)
         )
-    # Take all peaks, then the higher half, and so on while too many exceed the threshold: a few wide waves of a fixed
-    # pattern are then higher than the noise of many pixels, and one tail does not fit both.
-    falling, number = np.sort(peaks)[::-1], false_calls / 2.0
+    # Take all peaks, then the higher half, and so on while too many exceed the threshold: a few
+    # wide waves of a fixed pattern are then higher than the noise of many pixels, and one tail
+    # does not fit both.
+    falling = np.sort(peaks)[::-1]
+    number = false_calls / 2.0
     while True:
-        tail, half = Tail.of(falling, floor), len(falling) // 2
+        tail = Tail.of(falling, floor)
+        half = len(falling) // 2
         seen = int((falling > tail.threshold(number)).sum())
         if half < FEWEST_PEAKS or special.gammainc(seen, number) > CONTRADICTED:
             break
@@ -129,7 +155,8 @@ def own_threshold(
         doubts.append(
             f"{share} lies under or beside objects, and the rest may not stand for the whole"
         )
-    expected, searched = 2.0 * tail.expected(threshold), _only(evidence, ~rim)
+    expected = 2.0 * tail.expected(threshold)
+    searched = _only(evidence, ~rim)
     counts = (tail.peaks, tail.floor, objects, int(rim.sum()))
     return OwnThreshold(threshold, expected, low, high, *counts, searched, tuple(doubts))
 
@@ -137,12 +164,14 @@ def own_threshold(
 def each_object_once(
     cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]
 ) -> tuple[Detection, ...]:
-    """Return the findings, strongest first, with each object on the target as one finding: findings that reach its
-    margin and are weaker belong to it. An object with a single finding keeps it. Nothing is joined without a pixel
-    grid, or if objects would cover more than `MOST_MASKED`."""
+    """Return the findings, strongest first, with each object on the target as one finding:
+    findings that reach its margin and are weaker belong to it. An object with a single finding
+    keeps it. Nothing is joined without a pixel grid, or if objects would cover more than
+    `MOST_MASKED`."""
     if not cloud.organised or not found:
         return found
-    proud, known = _proud(cloud, evidence), np.isfinite(evidence.score)
+    proud = _proud(cloud, evidence)
+    known = np.isfinite(evidence.score)
     if (proud & known).sum() > MOST_MASKED * known.sum():
         return found
     labels, count = ndimage.label(proud, np.ones((3, 3)))
@@ -174,7 +203,8 @@ def behind(evidence: Evidence) -> np.ndarray:
 
 
 def skew_of(evidence: Evidence) -> float:
-    """Return Bowley's skewness of the residual, -1 to 1; damage on less than a quarter hardly changes it."""
+    """Return Bowley's skewness of the residual, -1 to 1; damage on less than a quarter hardly
+    changes it."""
     low, middle, high = np.quantile(
         evidence.residual_m[np.isfinite(evidence.residual_m)], (0.25, 0.5, 0.75)
     )
@@ -183,7 +213,8 @@ def skew_of(evidence: Evidence) -> float:
 
 @dataclass(frozen=True)
 class Tail:
-    """Peaks above a floor: ``sums`` (e,) of their transformed excesses, ``weights`` (e,) of the exponents."""
+    """Peaks above a floor: ``sums`` (e,) of their transformed excesses, ``weights`` (e,) of the
+    exponents."""
 
     floor: float
     peaks: int
@@ -209,7 +240,8 @@ class Tail:
         return np.array([float(_excess(ratio, exponent, self.floor)[0]) for exponent in EXPONENTS])
 
     def expected(self, threshold: float) -> float:
-        """Return the mean number of peaks above a threshold, over all rates and scales that the peaks allow."""
+        """Return the mean number of peaks above a threshold, over all rates and scales that the
+        peaks allow."""
         excesses = self._excesses(threshold)
         return float(
             (
@@ -220,7 +252,8 @@ class Tail:
         )
 
     def threshold(self, number: float) -> float:
-        """Return the threshold at which this number of peaks is expected; the floor if fewer are expected there."""
+        """Return the threshold at which this number of peaks is expected; the floor if fewer are
+        expected there."""
         if number >= self.peaks:
             return self.floor
 
@@ -248,19 +281,22 @@ class Tail:
 
 
 def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
-    """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which peaks become fewer.
-    The exponent 2 is that of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2) (Adler 1981)."""
+    """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which
+    peaks become fewer. The exponent 2 is that of normal noise, whose maxima in two dimensions fall
+    as s exp(-s^2 / 2) (Adler 1981)."""
     power = np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
     return np.asarray(floor**2 * (power - _crowd(floor) * np.log(ratios)))
 
 
 def _crowd(floor: float) -> float:
-    """Return the logarithmic part of the excess; at most half of it for low floors, where that law does not hold."""
+    """Return the logarithmic part of the excess; at most half of it for low floors, where that law
+    does not hold."""
     return min(floor**-2.0, 0.5)
 
 
 def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: connected regions, wider than noise, that are in front of the surface as a whole."""
+    """Return (h, w) bool: connected regions, wider than noise, that are in front of the surface as
+    a whole."""
     known = np.isfinite(evidence.residual_m)
     weights = _boxed(known.astype(np.float64))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -295,7 +331,8 @@ def _boxed(image: np.ndarray) -> np.ndarray:
 
 
 def _depth_px(whole: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge does not count as a rim."""
+    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge does not
+    count as a rim."""
     return np.asarray(ndimage.distance_transform_edt(np.pad(whole, 1, mode="edge"))[1:-1, 1:-1])
 
 
@@ -326,7 +363,8 @@ def _peaks(
 def _mixed_rim(
     detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float
 ) -> np.ndarray:
-    """Return (h, w) bool: a band along the outline, as wide as the zone of frequent calls behind the surface."""
+    """Return (h, w) bool: a band along the outline, as wide as the zone of frequent calls behind
+    the surface."""
     known = np.isfinite(evidence.score)
     whole = holes_filled(known)
     depth = _depth_px(whole).reshape(-1)

@@ -1,5 +1,6 @@
-"""The templates of the matched filters, and the whitening of noise. Pictures are residuals in standard deviations of
-the local noise, on grids padded by the longest lag, so that nothing wraps around."""
+"""The templates of the matched filters, and the whitening of noise. Pictures are residuals in
+standard deviations of the local noise, on grids padded by the longest lag, so that nothing wraps
+around."""
 
 import math
 from collections.abc import Callable
@@ -15,23 +16,31 @@ import scipy.linalg
 from detectors.findings.clusters import PLAIN
 
 Filters = tuple[np.ndarray, np.ndarray]
-SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
-"""Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
-of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
+SMALL_RADII_PX = (0.5, 1.5)
+HALVES_PX = ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
+"""Radii of small discs, and the positions between pixels at which they are compared: half a pixel
+costs up to a seventh of the score if the window has sharp sides. The first radius stands for all
+holes smaller than a pixel."""
 RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)  # radii of further discs
-DEEP_PX, DEEP_WINDOW_PX = 1.0, 3
-"""Radius of a disc that only the lens blurs, and the window with which it is compared too: a filter that weighs pixels
-by phase (libfreenect2) does not average narrow deep holes. The bank's discs have .74 of the score of such a hole."""
+DEEP_PX = 1.0
+DEEP_WINDOW_PX = 3
+"""Radius of a disc that only the lens blurs, and the window with which it is compared too: a
+filter that weighs pixels by phase (libfreenect2) does not average narrow deep holes. The bank's
+discs have .74 of the score of such a hole."""
 DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
 """Radii of paraboloids. They are denser because before a fixed pattern the rims decide."""
-SLOT_PX, SLOTS_DEG = (12.0, 2.0), tuple(15.0 * k for k in range(12))
-"""Length and width of slots, and their angles to the rows: shorter than most, so that a few angles suffice."""
+SLOT_PX = (12.0, 2.0)
+SLOTS_DEG = tuple(15.0 * k for k in range(12))
+"""Length and width of slots, and their angles to the rows: shorter than most, so that a few angles
+suffice."""
 WINDOWS_PX = (1, 3, 5)
-"""Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1: only the lens blurs."""
+"""Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1:
+only the lens blurs."""
 LENS_BLUR_PX = 0.6
 LONGEST_LAG_PX = 28  # lag at which Parzen's window fades the covariance to 0
 COARSE_PX = 9.0
-"""Radius from which only every second pixel is scored: between these pixels, scores change by some hundredths."""
+"""Radius from which only every second pixel is scored: between these pixels, scores change by some
+hundredths."""
 LEAST_POWER = 0.01  # least value of the spectrum, as a share of its mean
 MOST_WHITENED = 2000  # most pixels whose dense covariance is factored: 0.1 s and 32 MB
 SIDES_PX = (
@@ -45,29 +54,36 @@ SIDES_PX = (
     18,
 )  # half-sides that a `Worth` may have: the visible share is computed once for each
 GRID = 96  # side of the grid that holds the widest template and the reach of its whitened edge
-CONVERGED, MOST_ITERATIONS, FADED = 0.15, 80, 0.3
-"""Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
+CONVERGED = 0.15
+MOST_ITERATIONS = 80
+FADED = 0.3
+"""Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown
+pixels."""
 EDGE_PX = 7.0
-"""Depth of an outline's pixels among which errors count, in units of the sum of what is unknown around its pixels."""
+"""Depth of an outline's pixels among which errors count, in units of the sum of what is unknown
+around its pixels."""
 TAPS = np.array([1.0, 2.0, 3.0], np.float32) / np.float32(9.0)
-"""Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill unknown pixels."""
+"""Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill
+unknown pixels."""
 
 
 def grid_of(
     shape: tuple[int, ...], least: int = GRID, more: int = LONGEST_LAG_PX
 ) -> tuple[int, ...]:
-    """Return the grid for transforms of pictures of this shape, as they are fast; it holds every template, and its half
-    is even. ``least``: its least side without the margin of ``more`` pixels."""
+    """Return the grid for transforms of pictures of this shape, as they are fast; it holds every
+    template, and its half is even. ``least``: its least side without the margin of ``more``
+    pixels."""
     return tuple(
         8 * scipy.fft.next_fast_len(math.ceil((max(side, least) + more) / 8)) for side in shape
     )
 
 
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: mean
-    products of pairs of known pixels, faded out by Parzen's window."""
+    """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in
+    the middle: mean products of pairs of known pixels, faded out by Parzen's window."""
     lags = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
-    sums, counts = (_by_lag(quiet * image, shape) for image in (noise, np.float32(1.0)))
+    sums = _by_lag(quiet * noise, shape)
+    counts = _by_lag(quiet * np.float32(1.0), shape)
     lag = np.minimum(np.hypot(lags[:, None], lags) / LONGEST_LAG_PX, 1.0)
     parzen = np.where(lag <= 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * (1.0 - lag) ** 3)
     return np.asarray(parzen * sums / np.maximum(counts, 1.0), np.float32)
@@ -75,7 +91,8 @@ def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...
 
 def _by_lag(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the sums of products of an image's pairs of pixels by lag, up to `LONGEST_LAG_PX`."""
-    whole, reach = np.zeros(shape, np.float32), np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+    whole = np.zeros(shape, np.float32)
+    reach = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
     whole[: image.shape[0], : image.shape[1]] = image
     cv2.dft(whole, dst=whole)
     cv2.mulSpectrums(whole, whole, 0, c=whole, conjB=True)
@@ -85,7 +102,8 @@ def _by_lag(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the power spectrum of an autocovariance on ``shape``, ordered as by `scipy.fft.rfft2`."""
+    """Return the power spectrum of an autocovariance on ``shape``, ordered as by
+    `scipy.fft.rfft2`."""
     power = scipy.fft.rfft2(_centred(covariance, shape)).real
     return np.asarray(
         np.maximum(power, max(LEAST_POWER * float(power.mean()), 1e-12)).astype(np.float32)
@@ -93,15 +111,17 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def correlation(covariance: np.ndarray) -> np.ndarray:
-    """Return the correlation (2 `LONGEST_LAG_PX` + 1, squared) by lag of noise with the `spectrum` of a covariance."""
+    """Return the correlation (2 `LONGEST_LAG_PX` + 1, squared) by lag of noise with the `spectrum`
+    of a covariance."""
     reach = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
     lags = scipy.fft.irfft2(spectrum(covariance, (GRID, GRID)), (GRID, GRID))[np.ix_(reach, reach)]
     return np.asarray(lags / lags[LONGEST_LAG_PX, LONGEST_LAG_PX], np.float64)
 
 
 def window_of(covariance: np.ndarray) -> int:
-    """Return the side of `WINDOWS_PX` that the noise indicates: averaging over a square makes the covariance fall
-    steadily with the lag up to its side, and bend there. A correlation of neighbours below 0.5 means no averaging."""
+    """Return the side of `WINDOWS_PX` that the noise indicates: averaging over a square makes the
+    covariance fall steadily with the lag up to its side, and bend there. A correlation of
+    neighbours below 0.5 means no averaging."""
     middle = len(covariance) // 2
     by_lag = (covariance[middle, middle:] + covariance[middle:, middle]) / 2.0
     if by_lag[1] < 0.5 * by_lag[0]:
@@ -120,8 +140,9 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
-    """Return the power spectrum of noise with this covariance on the grid of pictures of this ``shape``, and its
-    inverse on a smaller grid, where what wraps around costs no steps. Both are packed as by `cv2.dft`, over sizes."""
+    """Return the power spectrum of noise with this covariance on the grid of pictures of this
+    ``shape``, and its inverse on a smaller grid, where what wraps around costs no steps. Both are
+    packed as by `cv2.dft`, over sizes."""
     powers = []
     for each in (grid_of(shape), grid_of(shape, 2 * LONGEST_LAG_PX, 4)):
         power = cv2.dft(_centred(covariance, each))
@@ -143,17 +164,24 @@ def inverse_times(
     start: np.ndarray | None = None,
     error: float = CONVERGED,
 ) -> np.ndarray:
-    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C. Conjugate gradients go on from
-    ``start`` (r, c) until scores near unknown pixels, where errors gather, err by some ``error`` deviations. The
-    preconditioner fills unknown pixels from their neighbours, applies the stationary inverse, and then the transpose of
-    the filling: with zeros instead, ragged outlines and missing pixels take up to four times the steps. It would still
-    be too large along outlines: damping it the more, the less is known around a pixel, saves a fifth of the steps."""
+    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C. Conjugate
+    gradients go on from ``start`` (r, c) until scores near unknown pixels, where errors gather,
+    err by some ``error`` deviations. The preconditioner fills unknown pixels from their
+    neighbours, applies the stationary inverse, and then the transpose of the filling: with zeros
+    instead, ragged outlines and missing pixels take up to four times the steps. It would still be
+    too large along outlines: damping it the more, the less is known around a pixel, saves a fifth
+    of the steps."""
     (h, w), mask, (power, inverse) = values.shape, known.astype(np.float32), by
-    wide, whole, onward = np.zeros_like(power), np.empty_like(power), np.empty_like(mask)
-    tight, share, towards = np.zeros_like(inverse), np.empty_like(inverse), np.empty_like(mask)
+    wide = np.zeros_like(power)
+    whole = np.empty_like(power)
+    onward = np.empty_like(mask)
+    tight = np.zeros_like(inverse)
+    share = np.empty_like(inverse)
+    towards = np.empty_like(mask)
     tight[:h, :w] = mask
     near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)[:h, :w]
-    damp, unknown = mask * np.sqrt(near), float(mask.sum() - np.vdot(mask, near))
+    damp = mask * np.sqrt(near)
+    unknown = float(mask.sum() - np.vdot(mask, near))
     enough = error**2 * min(EDGE_PX * unknown, float(mask.sum()))
     _spread(mask, mask, np.ones_like(share), False, share)
     share = (1.0 - tight) / (share + FADED)
@@ -170,7 +198,8 @@ def inverse_times(
         filled = filtered(_spread(image, damp, share, False, tight), inverse, tight)
         return _spread(filled, share, damp, True, towards)
 
-    solution, rest = np.zeros_like(mask), values * mask
+    solution = np.zeros_like(mask)
+    rest = values * mask
     if start is not None:
         solution = mask * start
         rest -= covered(solution)
@@ -182,7 +211,8 @@ def inverse_times(
         step = product / float(np.vdot(direction, covered(direction)))
         cv2.scaleAdd(direction, step, solution, dst=solution)
         cv2.scaleAdd(onward, -step, rest, dst=rest)
-        before, product = product, float(np.vdot(rest, conditioned(rest)))
+        before = product
+        product = float(np.vdot(rest, conditioned(rest)))
         cv2.scaleAdd(direction, product / before, towards, dst=direction)
     return solution
 
@@ -191,17 +221,24 @@ def inverse_times(
 def _spread(
     image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool, out: np.ndarray
 ) -> np.ndarray:
-    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the
-    grid ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share a corner."""
+    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred
+    by `TAPS`, into the grid ``out``; or if ``back``, the transpose: the image plus s blurred,
+    times ``outer``. Grids share a corner."""
     (height, width), (h, w) = out.shape, image.shape
     columns, (one, two, three) = max(width, w), (TAPS[0], TAPS[1], TAPS[2])
-    lines, down = np.zeros((5, columns), np.float32), np.zeros(columns + 4, np.float32)
+    lines = np.zeros((5, columns), np.float32)
+    down = np.zeros(columns + 4, np.float32)
     # views instead of offsets, so that the compiler uses vectors
-    left, beside, middle, next_to, right = down, down[1:], down[2 : 2 + columns], down[3:], down[4:]
+    left = down
+    beside = down[1:]
+    middle = down[2 : 2 + columns]
+    next_to = down[3:]
+    right = down[4:]
     for i in range(height + 2):
         line = lines[i % 5]
         if i < h:
-            seen, by = image[i], inner[i]
+            seen = image[i]
+            by = inner[i]
             for j in range(w):
                 line[j] = seen[j] * by[j]
         else:
@@ -209,8 +246,12 @@ def _spread(
                 line[j] = 0
         row = i - 2
         if row >= 0:
-            above, over, own = lines[(i + 1) % 5], lines[(i + 2) % 5], lines[(i + 3) % 5]
-            under, to, times = lines[(i + 4) % 5], out[row], outer[row]
+            above = lines[(i + 1) % 5]
+            over = lines[(i + 2) % 5]
+            own = lines[(i + 3) % 5]
+            under = lines[(i + 4) % 5]
+            to = out[row]
+            times = outer[row]
             for j in range(columns):
                 middle[j] = one * (above[j] + line[j]) + two * (over[j] + under[j]) + three * own[j]
             add = image[row] if back else own
@@ -231,20 +272,22 @@ def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def responses(
     spectrum_of: np.ndarray, pair: np.ndarray, out: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and theirs (`spectra`). For
-    a `halved` picture, they are those in the middles of 2 x 2 pixels."""
+    """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and
+    theirs (`spectra`). For a `halved` picture, they are those in the middles of 2 x 2 pixels."""
     whole = np.multiply(spectrum_of, pair, out=out).view(np.float32).reshape(*pair.shape, 2)
     return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE))
 
 
 def halved(spectrum_of: np.ndarray) -> np.ndarray:
-    """Return the spectrum of a picture sampled in the middles of 2 x 2 pixels, without higher frequencies."""
+    """Return the spectrum of a picture sampled in the middles of 2 x 2 pixels, without higher
+    frequencies."""
     return _low(spectrum_of) * _middles(spectrum_of.shape)
 
 
 @lru_cache(maxsize=4)
 def _middles(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the factors that shift a spectrum's lower half by half a pixel and scale it to a quarter of the pixels."""
+    """Return the factors that shift a spectrum's lower half by half a pixel and scale it to a
+    quarter of the pixels."""
     cycles = np.add.outer(*(np.fft.fftfreq(side // 2) / 2 for side in shape))
     factors = np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
     # the highest frequency has no sign, so that half a pixel of it is not real
@@ -259,8 +302,9 @@ def _low(spectrum_of: np.ndarray) -> np.ndarray:
 
 
 class Template(NamedTuple):
-    """A damage's picture on a square of odd side. ``radius_px``: of a disc of equal size. ``halves`` (down, right):
-    offset of its centre from the middle in half pixels. ``coarse``: whether it is scored on every second pixel."""
+    """A damage's picture on a square of odd side. ``radius_px``: of a disc of equal size.
+    ``halves`` (down, right): offset of its centre from the middle in half pixels. ``coarse``:
+    whether it is scored on every second pixel."""
 
     image: np.ndarray
     radius_px: float
@@ -270,9 +314,10 @@ class Template(NamedTuple):
 
 
 class Worth(NamedTuple):
-    """``energy``: whitened energy of a template. ``sides`` (along columns, along rows): of the rectangle that spreads
-    as widely, in pixels of its scores' picture. ``raised``: amount by which the square of a score exceeds that of the
-    template with the most independent places where maxima are equally rare; half of it for the many wide templates."""
+    """``energy``: whitened energy of a template. ``sides`` (along columns, along rows): of the
+    rectangle that spreads as widely, in pixels of its scores' picture. ``raised``: amount by which
+    the square of a score exceeds that of the template with the most independent places where
+    maxima are equally rare; half of it for the many wide templates."""
 
     energy: float
     sides: tuple[int, int]
@@ -281,15 +326,15 @@ class Worth(NamedTuple):
 
 def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     """Return each template's `Worth` under noise with this spectrum on `GRID`."""
-    found, crowds = [], []
+    found = []
+    crowds = []
     for cut, squares, beside, weights in _energies(window_px):
         white = 1.0 / np.sqrt(power[cut])
-        side, pairs = (
-            len(white),
-            (white * np.roll(white, 1, axis=0), white * np.roll(white, -1, axis=1)),
-        )
+        side = len(white)
+        pairs = (white * np.roll(white, 1, axis=0), white * np.roll(white, -1, axis=1))
         energy, of_rows, of_columns = (squares @ (weights * np.square(white).ravel()).T).T
-        # Parseval's theorem: a second moment over space is the energy of a derivative over frequency
+        # Parseval's theorem: a second moment over space is the energy of a derivative over
+        # frequency
         spread = [
             2.0 * (energy - of @ each.ravel()) for of, each in zip(beside, pairs, strict=True)
         ]
@@ -304,10 +349,8 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
             for each, (across, along) in zip(energy.tolist(), halves.tolist(), strict=True)
         ]
     # slots of all angles together are as rare as one round template
-    most, alike = (
-        max(crowds),
-        [len(SLOTS_DEG) if template.slot else 1 for template in bank(window_px)],
-    )
+    most = max(crowds)
+    alike = [len(SLOTS_DEG) if template.slot else 1 for template in bank(window_px)]
     rarer = (most / (crowd * number) for crowd, number in zip(crowds, alike, strict=True))
     return tuple(
         each._replace(raised=max(math.log(by), 0.0)) for each, by in zip(found, rarer, strict=True)
@@ -318,9 +361,10 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
 def _energies(
     window_px: int,
 ) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, list[np.ndarray], np.ndarray]]:
-    """Return what `worths` sums over half of the spectra (r, c) on `GRID`, of fine and coarse templates: where these
-    frequencies lie, the squares (t, r c) of the magnitudes, their products (t, r c) with those of the frequencies above
-    and to the right, and the weights (3, r c) of the squares: 1, and the squares of both frequencies."""
+    """Return what `worths` sums over half of the spectra (r, c) on `GRID`, of fine and coarse
+    templates: where these frequencies lie, the squares (t, r c) of the magnitudes, their products
+    (t, r c) with those of the frequencies above and to the right, and the weights (3, r c) of the
+    squares: 1, and the squares of both frequencies."""
     sizes = [
         np.abs(scipy.fft.rfft2(_centred(template.image, (GRID, GRID))))
         for template in bank(window_px)
@@ -342,7 +386,8 @@ def _energies(
             2.0 * values * np.roll(values, -1, axis=2),
         ]
         beside[1][..., -1] = 0.0
-        rows, columns = np.fft.fftfreq(side)[:, None] ** 2, (np.arange(side // 2 + 1) / side) ** 2
+        rows = np.fft.fftfreq(side)[:, None] ** 2
+        columns = (np.arange(side // 2 + 1) / side) ** 2
         weights = np.stack([half + 0.0 * rows, half * rows, half * columns + 0.0 * rows]).reshape(
             3, -1
         )
@@ -357,9 +402,10 @@ def _energies(
 def spectra(
     shape: tuple[int, ...], window_px: int
 ) -> tuple[tuple[np.ndarray, tuple[int, ...]], ...]:
-    """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height 1 on a grid, and
-    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the size
-    of the inverse transform. Coarse templates have only the lower half."""
+    """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height
+    1 on a grid, and their numbers in the `bank`: one complex transform correlates a real picture
+    with both. They are divided by the size of the inverse transform. Coarse templates have only
+    the lower half."""
     pairs = []
     for coarse in (False, True):
         numbers = [
@@ -381,7 +427,8 @@ def spectra(
 
 @lru_cache(maxsize=3)
 def bank(window_px: int) -> tuple[Template, ...]:
-    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids and slots; coarse ones last."""
+    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids and slots;
+    coarse ones last."""
 
     def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0)) -> Template:
         def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -405,7 +452,8 @@ def bank(window_px: int) -> tuple[Template, ...]:
 
     def seen(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float) -> np.ndarray:
         """Return a shape of x and y in pixels, averaged over pixels and blurred by a lens."""
-        finer, half = 4, int(reach_px + 5)
+        finer = 4
+        half = int(reach_px + 5)
         places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
         height = shape(places[None, :], places[:, None]).astype(float)
         pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
@@ -415,7 +463,8 @@ def bank(window_px: int) -> tuple[Template, ...]:
 
     small = (disc(radius_px, off) for radius_px in SMALL_RADII_PX for off in HALVES_PX)
     sharp = [*small, *map(disc, RADII_PX), *map(dent, DENT_RADII_PX), *map(slot, SLOTS_DEG)]
-    window, border = (window_px, window_px), cv2.BORDER_CONSTANT
+    window = (window_px, window_px)
+    border = cv2.BORDER_CONSTANT
     found = [
         each._replace(image=np.asarray(cv2.blur(each.image, window, borderType=border)))
         for each in sharp
@@ -427,9 +476,10 @@ def bank(window_px: int) -> tuple[Template, ...]:
 def covariance_factor(
     used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
 ) -> np.ndarray | None:
-    """Return the lower triangular L (n, n) of the covariance L L' of the errors at the ``used`` pixels (r, c). None if
-    there are too many pixels, or if the correlation is unknown or zero. Errors are noise of one ``deviation`` and the
-    model's own (r, c), both with the ``correlation`` by lag (odd, odd)."""
+    """Return the lower triangular L (n, n) of the covariance L L' of the errors at the ``used``
+    pixels (r, c). None if there are too many pixels, or if the correlation is unknown or zero.
+    Errors are noise of one ``deviation`` and the model's own (r, c), both with the ``correlation``
+    by lag (odd, odd)."""
     if correlation is None or np.count_nonzero(used) > MOST_WHITENED:
         return None
     matrix = _lower_covariance(*np.nonzero(used), model_error[used], deviation**2, correlation)
@@ -449,22 +499,23 @@ def _lower_covariance(  # type: ignore[no-untyped-def]
     )
     for i in range(len(rows)):
         for j in range(i + 1):
-            row, column = rows[i] - rows[j] + down, columns[i] - columns[j] + right
+            row = rows[i] - rows[j] + down
+            column = columns[i] - columns[j] + right
             if row < len(correlation) and 0 <= column < correlation.shape[1]:
                 found[i, j] = correlation[row, column] * (variance + error[i] * error[j])
     return found
 
 
 def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
-    """Return S' S (p, p); S is the columns (h, w, p), zero outside, summed over ``down`` x ``across`` windows."""
+    """Return S' S (p, p); S is the columns (h, w, p), zero outside, summed over ``down`` x
+    ``across`` windows."""
     h, w, count = columns.shape
     padded = np.zeros((h + down - 1, w + across - 1, count))
     padded[:h, :w] = columns
-    size, last, border = (
-        (across, down),
-        (across - 1, down - 1),
-        cv2.BORDER_CONSTANT,
-    )  # windows end at their pixel
+    # windows end at their pixel
+    size = (across, down)
+    last = (across - 1, down - 1)
+    border = cv2.BORDER_CONSTANT
     summed = cv2.boxFilter(
         padded, -1, size, anchor=last, normalize=False, borderType=border
     ).reshape(-1, count)

@@ -1,8 +1,9 @@
-"""Methods of other fields and libraries behind the same interface, for comparison on the same clouds.
+"""Methods of other fields and libraries behind the same interface, for comparison on the same
+clouds.
 
-`m3c2` uses py4dgeo's distance to a surface and its level of detection; `plane_ransac` uses Open3D's plane;
-`fpfh_memory` compares shape features with those of undamaged targets. Each has the settings and the formula of its
-source; none knows the camera's noise."""
+`m3c2` uses py4dgeo's distance to a surface and its level of detection; `plane_ransac` uses
+Open3D's plane; `fpfh_memory` compares shape features with those of undamaged targets. Each has the
+settings and the formula of its source; none knows the camera's noise."""
 
 import logging
 import os
@@ -32,14 +33,16 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.seeds import random_stream
 
-LOD_SIGMAS = 1.96  # standard deviations in py4dgeo's level of detection, which holds 95 % of chance differences
+# standard deviations in py4dgeo's level of detection, which holds 95 % of chance differences
+LOD_SIGMAS = 1.96
 LEAST_SAMPLES = 4  # fewest points of a cylinder in each cloud: fewer do not show the scatter
 MOST_ALONE = 0.01  # share of the target without a counterpart that gives a warning
 
 
 class PlaneRansacConfig(ScoreMapConfig):
-    """``inlier_mm``: distance up to which a point supports the plane; the default is about three deviations of a single
-    frame of a continuous-wave camera. ``iterations``: largest number of triples of points; ``seed``: draws them."""
+    """``inlier_mm``: distance up to which a point supports the plane; the default is about three
+    deviations of a single frame of a continuous-wave camera. ``iterations``: largest number of
+    triples of points; ``seed``: draws them."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     inlier_mm: float = Field(default=2.0, gt=0)
@@ -48,16 +51,19 @@ class PlaneRansacConfig(ScoreMapConfig):
 
 
 class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
-    """Open3D's plane by random sampling; the score is the residual over its median absolute deviation.
+    """Open3D's plane by random sampling; the score is the residual over its median absolute
+    deviation.
 
-    Not modelled: any other shape (all of a curved target scores), and noise that differs from place to place."""
+    Not modelled: any other shape (all of a curved target scores), and noise that differs from
+    place to place."""
 
     settings_type: ClassVar[type[PlaneRansacConfig]] = PlaneRansacConfig
     name = "plane_ransac"
     version = 2
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score |residual| / deviation in the crop. Raises UserError if its points determine no plane."""
+        """Score |residual| / deviation in the crop. Raises UserError if its points determine no
+        plane."""
         mask = crop(cloud, self.settings.crop)
         points = cloud.points_m[mask]
         # sorted by z, so that the triples do not depend on the orientation of the grid
@@ -71,13 +77,14 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
         fitted = -(a * points[:, 0] + b * points[:, 1] + d) / c
         residual = points[:, 2] - fitted
         scale = max(sigma_of(residual), rounding_floor(cloud, mask))
-        score, residual_m, z_m = (
-            on_grid(each, mask) for each in (np.abs(residual) / scale, residual, fitted)
-        )
+        score = on_grid(np.abs(residual) / scale, mask)
+        residual_m = on_grid(residual, mask)
+        z_m = on_grid(fitted, mask)
         return Evidence(score, residual_m, z_m, scale, {"surface": "plane", "points": len(points)})
 
     def _plane(self, points: np.ndarray) -> tuple[float, ...]:
-        """Return (a, b, c, d) of the plane a x + b y + c z + d = 0, of least squares over its supporting points."""
+        """Return (a, b, c, d) of the plane a x + b y + c z + d = 0, of least squares over its
+        supporting points."""
         with open3d_on_one_thread() as o3d:
             o3d.utility.random.seed(
                 int(random_stream(self.settings.seed, self.name).integers(2**31))
@@ -90,12 +97,14 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
 
 
 class M3c2Config(ScoreMapConfig):
-    """``reference``: a capture of the same target without damage, in any format that ``harness.detect`` reads and in
-    the frame of the clouds; without it, distances are to ``surface``, fitted to the cloud itself.
-    ``registration_error_mm``: the error between both; null: estimated from the scatter of the distances.
-    ``cylinder_radius_mm``: half of the scale over which points are averaged; 4 mm holds some 20 pixels of an Azure
-    Kinect at 0.7 m, as Lague et al. recommend. ``normal_radius_mm``: radius of the neighbourhood for a normal, 20 times
-    a noise of 1 mm. ``reach_mm``: half of a cylinder's length; points deeper than it have no counterpart."""
+    """``reference``: a capture of the same target without damage, in any format that
+    ``harness.detect`` reads and in the frame of the clouds; without it, distances are to
+    ``surface``, fitted to the cloud itself. ``registration_error_mm``: the error between both;
+    null: estimated from the scatter of the distances. ``cylinder_radius_mm``: half of the scale
+    over which points are averaged; 4 mm holds some 20 pixels of an Azure Kinect at 0.7 m, as Lague
+    et al. recommend. ``normal_radius_mm``: radius of the neighbourhood for a normal, 20 times a
+    noise of 1 mm. ``reach_mm``: half of a cylinder's length; points deeper than it have no
+    counterpart."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -107,26 +116,32 @@ class M3c2Config(ScoreMapConfig):
 
 
 class M3c2Detector(ScoreMapDetector[M3c2Config]):
-    """Distance to a surface or a reference scan by M3C2 (py4dgeo), over the deviation in its level of detection.
+    """Distance to a surface or a reference scan by M3C2 (py4dgeo), over the deviation in its level
+    of detection.
 
-    Means over cylinders along the normal (Lague, Brodu and Leroux, ISPRS J. 82 (2013), 10). A score of 1.96 is the
-    level of detection: LoD / 1.96 = sqrt(s1^2 / n1 + s2^2 / n2) + registration error. Not modelled: noise that
-    neighbours share, for which the level is too low, and a rim inside a cylinder, which counts as its scatter."""
+    Means over cylinders along the normal (Lague, Brodu and Leroux, ISPRS J. 82 (2013), 10). A
+    score of 1.96 is the level of detection: LoD / 1.96 = sqrt(s1^2 / n1 + s2^2 / n2) +
+    registration error. Not modelled: noise that neighbours share, for which the level is too low,
+    and a rim inside a cylinder, which counts as its scatter."""
 
     settings_type: ClassVar[type[M3c2Config]] = M3c2Config
     name = "m3c2"
     version = 2
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score |distance| / deviation in the crop. Raises UserError if no point has a counterpart."""
-        mask, settings = crop(cloud, self.settings.crop), self.settings
+        """Score |distance| / deviation in the crop. Raises UserError if no point has a
+        counterpart."""
+        mask = crop(cloud, self.settings.crop)
+        settings = self.settings
         points = cloud.points_m[mask]
         if settings.reference is None:
             ground = background(cloud, mask, settings.surface)
-            notes, warnings = {**ground.notes, "surface": ground.description}, [ground.warning]
+            notes = {**ground.notes, "surface": ground.description}
+            warnings = [ground.warning]
             feet = np.column_stack([points[:, :2], ground.surface_z_m[mask]])
         else:
-            notes, warnings = {"surface": f"reference scan {settings.reference}"}, []
+            notes = {"surface": f"reference scan {settings.reference}"}
+            warnings = []
             feet = self._below(points, cloud.projection == "central")
         known = np.isfinite(feet[:, 2])
         before = feet[known] if settings.reference is None else self._reference_m
@@ -161,13 +176,15 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
             "registration_error_m": error_m,
             "without_counterpart": alone,
         }
-        residual_m, z_m = (on_grid(each, mask) for each in (points[:, 2] - feet[:, 2], feet[:, 2]))
+        residual_m = on_grid(points[:, 2] - feet[:, 2], mask)
+        z_m = on_grid(feet[:, 2], mask)
         scale_m = median_of(deviation_m[judged])
         doubts = tuple(filter(None, warnings))
         return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, doubts, behind=signed > 0)
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the places across the view, so that a rim and the points deep behind it are one finding."""
+        """Return the places across the view, so that a rim and the points deep behind it are one
+        finding."""
         return points_m * [1.0, 1.0, 0.0]
 
     @cached_property
@@ -178,30 +195,30 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         return cloud.points_m[cloud.valid]
 
     def _below(self, points: np.ndarray, central: bool) -> np.ndarray:
-        """Return where the rays through points (n, 3) meet the reference (n, 3), by linear interpolation."""
+        """Return where the rays through points (n, 3) meet the reference (n, 3), by linear
+        interpolation."""
         (plan, reference), z = (
             (each[:, :2] for each in (points, self._reference_m)),
             self._reference_m[:, 2],
         )
         if central:
-            plan, reference = plan / points[:, 2:], reference / z[:, None]
+            plan = plan / points[:, 2:]
+            reference = reference / z[:, None]
         feet_z = LinearNDInterpolator(reference, z)(plan)
         return np.column_stack([plan * feet_z[:, None] if central else plan, feet_z])
 
     def _distances(
         self, feet: np.ndarray, before: np.ndarray, after: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (n,) of points ``after`` (m, 3) behind points ``before`` (k, 3) at each foot (n, 3), and
-        its deviation; NaN if a cylinder holds too few points."""
+        """Return the distance (n,) of points ``after`` (m, 3) behind points ``before`` (k, 3) at
+        each foot (n, 3), and its deviation; NaN if a cylinder holds too few points."""
         py4dgeo = _py4dgeo()
         with threadpoolctl.threadpool_limits(1, user_api="openmp"):
             epochs = tuple(
                 py4dgeo.Epoch(np.ascontiguousarray(points)) for points in (before, after)
             )
-            normal_m, radius_m = (
-                self.settings.normal_radius_mm * MM,
-                self.settings.cylinder_radius_mm * MM,
-            )
+            normal_m = self.settings.normal_radius_mm * MM
+            radius_m = self.settings.cylinder_radius_mm * MM
             sizes = {
                 "normal_radii": (normal_m,),
                 "cyl_radius": radius_m,
@@ -216,8 +233,8 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
 
 
 def _py4dgeo() -> Any:
-    """Return the module, but without its log, which it prints and writes into the working folder, and without the
-    number of threads that it sets for all programs started from here."""
+    """Return the module, but without its log, which it prints and writes into the working folder,
+    and without the number of threads that it sets for all programs started from here."""
     threads = os.environ.get("OMP_NUM_THREADS")
     import py4dgeo
 
@@ -230,9 +247,10 @@ def _py4dgeo() -> Any:
 
 
 class FpfhMemoryConfig(ScoreMapConfig):
-    """``normal_neighbours``, ``feature_neighbours``: typical number of points in the sphere of a normal and of a
-    feature. ``pool_px``: side of the square over which features are averaged. The paper's program has 30, 100 and 8.
-    ``memory``: number of features of undamaged targets that are kept. ``surface``: the reference of sizes."""
+    """``normal_neighbours``, ``feature_neighbours``: typical number of points in the sphere of a
+    normal and of a feature. ``pool_px``: side of the square over which features are averaged. The
+    paper's program has 30, 100 and 8. ``memory``: number of features of undamaged targets that are
+    kept. ``surface``: the reference of sizes."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -245,11 +263,12 @@ class FpfhMemoryConfig(ScoreMapConfig):
 class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     """Fast point feature histograms (Open3D) against the nearest in a memory of undamaged targets.
 
-    Horwitz and Hoshen, "Back to the Feature", CVPR workshops 2023: FPFH (Rusu et al., ICRA 2009), averaged over a
-    window; the memory is a greedy k-centre coreset (Roth et al., CVPR 2022); the score is the Euclidean distance to its
-    nearest feature, in units of the median distance of one more undamaged target. A wide hole shows by its rim alone,
-    and a sharp step deeper than the spheres is missed. Not done: the paper's smoothing of scores. A score is not a
-    length; ``scale_m`` is the deviation of the residuals."""
+    Horwitz and Hoshen, "Back to the Feature", CVPR workshops 2023: FPFH (Rusu et al., ICRA 2009),
+    averaged over a window; the memory is a greedy k-centre coreset (Roth et al., CVPR 2022); the
+    score is the Euclidean distance to its nearest feature, in units of the median distance of one
+    more undamaged target. A wide hole shows by its rim alone, and a sharp step deeper than the
+    spheres is missed. Not done: the paper's smoothing of scores. A score is not a length;
+    ``scale_m`` is the deviation of the residuals."""
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"
@@ -262,7 +281,8 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         self._learned = learned
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return ``memory`` (m, 33) and ``unit`` (): a cloud's median distance. Raises UserError for a single cloud."""
+        """Return ``memory`` (m, 33) and ``unit`` (): a cloud's median distance. Raises UserError
+        for a single cloud."""
         if len(hole_free) < 2:
             raise UserError(f"the detector {self.name!r} learns from at least two hole-free clouds")
         of_clouds = []
@@ -282,7 +302,8 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         return FpfhMemoryDetector(self.settings, learned)
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score the distance from the memory in the crop. Raises UserError without a memory, and for few points."""
+        """Score the distance from the memory in the crop. Raises UserError without a memory, and
+        for few points."""
         if self._learned is None:
             what = f"the detector {self.name!r} has no memory of hole-free targets to compare this cloud with"
             fix = "use it in a study, which has hole-free boards, or call its `calibrate` with clouds of your own"
@@ -307,14 +328,16 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     def _features(
         self, cloud: Cloud, mask: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the averaged features (n, 33) of the masked points, and their rows and columns (n,)."""
-        settings, points = self.settings, np.ascontiguousarray(cloud.points_m[mask])
+        """Return the averaged features (n, 33) of the masked points, and their rows and columns
+        (n,)."""
+        settings = self.settings
+        points = np.ascontiguousarray(cloud.points_m[mask])
         if len(points) <= settings.feature_neighbours:
             raise UserError(
                 f"{len(points)} points are too few for features of {settings.feature_neighbours}"
             )
-        # one radius everywhere: two points at a rim may share their nearest points, and only rounding would distinguish
-        # their normals
+        # one radius everywhere: two points at a rim may share their nearest points, and only
+        # rounding would distinguish their normals
         wanted = [settings.normal_neighbours, settings.feature_neighbours]
         radii_m = np.median(cKDTree(points).query(points, k=wanted)[0], axis=0)
         with open3d_on_one_thread() as o3d:
@@ -326,7 +349,8 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
                 o3d.pipelines.registration.compute_fpfh_feature(listed, of_features).data
             ).T
         rows, columns = np.nonzero(mask) if cloud.organised else raster(points, cloud)[1:3]
-        rows, columns = rows - rows.min(), columns - columns.min()
+        rows = rows - rows.min()
+        columns = columns - columns.min()
         # the last channel counts points
         image = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1, features.shape[1] + 1))
         np.add.at(image, (rows, columns), np.column_stack([features, np.ones(len(features))]))
@@ -337,9 +361,11 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
 
 def coreset(features: np.ndarray, size: int) -> np.ndarray:
-    """Return at most ``size`` of the features (n, k): the most central one, then always the one farthest from these."""
+    """Return at most ``size`` of the features (n, k): the most central one, then always the one
+    farthest from these."""
     apart = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
-    taken, apart = [int(apart.argmin())], np.full(len(features), np.inf)
+    taken = [int(apart.argmin())]
+    apart = np.full(len(features), np.inf)
     while len(taken) < size:
         apart = np.minimum(apart, ((features - features[taken[-1]]) ** 2).sum(axis=1))
         if apart.max() == 0.0:

@@ -1,6 +1,7 @@
-"""The thesis' detector: it clusters points that lie more than k deviations from a surface. The defaults follow the
-text: a robust cubic and a robust deviation of the residual. Its script uses ``surface: {method: least_squares,
-drop_cross_terms: true}, scale: raw_z_std`` with k = 1.2. `highest_before` follows the text's rule against outliers."""
+"""The thesis' detector: it clusters points that lie more than k deviations from a surface. The
+defaults follow the text: a robust cubic and a robust deviation of the residual. Its script uses
+``surface: {method: least_squares, drop_cross_terms: true}, scale: raw_z_std`` with k = 1.2.
+`highest_before` follows the text's rule against outliers."""
 
 from typing import ClassVar, Literal
 
@@ -17,10 +18,11 @@ from harness.vocabulary.geometry import Cloud
 
 
 class ThesisConfig(ScoreMapConfig):
-    """``scale``: the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``, ``raw_z_std``, or
-    ``highest_before``, the cloud's largest residual towards the camera, where no hole can be; k = 1 then requires a
-    residual behind the surface to exceed it. With a shape other than ``polynomial``, the unit is the local noise.
-    ``use_variance``: whether a map's stated variance scales the unit at each point (not with ``raw_z_std``)."""
+    """``scale``: the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``,
+    ``raw_z_std``, or ``highest_before``, the cloud's largest residual towards the camera, where no
+    hole can be; k = 1 then requires a residual behind the surface to exceed it. With a shape other
+    than ``polynomial``, the unit is the local noise. ``use_variance``: whether a map's stated
+    variance scales the unit at each point (not with ``raw_z_std``)."""
 
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -29,7 +31,8 @@ class ThesisConfig(ScoreMapConfig):
 
 
 class ThesisDetector(ScoreMapDetector[ThesisConfig]):
-    """The thesis' detector: clusters of points that lie k deviations off a surface through the cropped cloud."""
+    """The thesis' detector: clusters of points that lie k deviations off a surface through the
+    cropped cloud."""
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
@@ -37,7 +40,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     @property
     def default_threshold(self) -> float | None:
-        """The threshold k that the thesis states: 1 with ``highest_before``, none with other scales."""
+        """The threshold k that the thesis states: 1 with ``highest_before``, none with other
+        scales."""
         return 1.0 if self.settings.scale == "highest_before" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
@@ -51,7 +55,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         residual = z - fitted
         floor = rounding_floor(cloud, mask)
         deviation = self._stated_deviation(cloud, mask)
-        off, kind = residual if deviation is None else residual / deviation, self.settings.scale
+        off = residual if deviation is None else residual / deviation
+        kind = self.settings.scale
         if kind == "mad":
             spread = sigma_of(off)
         elif kind == "highest_before":
@@ -66,27 +71,25 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             "spread_m": spread * typical,
             "floor_m": floor,
         }
-        score, residual_m, z_m = (
-            on_grid(each, mask) for each in (np.abs(residual) / scale, residual, fitted)
-        )
+        score = on_grid(np.abs(residual) / scale, mask)
+        residual_m = on_grid(residual, mask)
+        z_m = on_grid(fitted, mask)
         return Evidence(score, residual_m, z_m, float(np.median(scale)), notes)
 
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
-        """Analyse with a surface whose shape is chosen. One unit of score is the noise around each pixel."""
+        """Analyse with a surface whose shape is chosen. One unit of score is the noise around each
+        pixel."""
         behind = background(cloud, mask, self.settings.surface)
-        unit, stated = (
-            np.maximum(behind.noise_m, rounding_floor(cloud, mask)),
-            self._stated_deviation(cloud, mask),
-        )
+        unit = np.maximum(behind.noise_m, rounding_floor(cloud, mask))
+        stated = self._stated_deviation(cloud, mask)
         if stated is not None:
-            deviation, known = on_grid(stated, mask), np.isfinite(behind.residual_m)
+            deviation = on_grid(stated, mask)
+            known = np.isfinite(behind.residual_m)
             unit = np.maximum(
                 unit, sigma_of(behind.residual_m[known] / deviation[known]) * deviation
             )
-        score, notes = (
-            np.abs(behind.residual_m) / unit,
-            {"surface": behind.description, **behind.notes},
-        )
+        score = np.abs(behind.residual_m) / unit
+        notes = {"surface": behind.description, **behind.notes}
         warnings = (behind.warning,) if behind.warning else ()
         return Evidence(
             score, behind.residual_m, behind.surface_z_m, float(np.nanmedian(unit)), notes, warnings

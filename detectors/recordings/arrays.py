@@ -1,9 +1,11 @@
-"""Captures from files of arrays: which array holds the distances, and what its axes mean; height maps; bare numbers.
+"""Captures from files of arrays: which array holds the distances, and what its axes mean; height
+maps; bare numbers.
 
-The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
-A height map's pixels are a stated pitch apart. It becomes a cloud in parallel projection: x and y count from its
-middle; z points away from the viewer and is `DISTANCE_M` at the median height. If no unit is stated, the program takes
-micrometres, millimetres or metres, whichever makes the relief a plausible share of the extent."""
+The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need
+pickle, are refused. A height map's pixels are a stated pitch apart. It becomes a cloud in parallel
+projection: x and y count from its middle; z points away from the viewer and is `DISTANCE_M` at the
+median height. If no unit is stated, the program takes micrometres, millimetres or metres,
+whichever makes the relief a plausible share of the extent."""
 
 from __future__ import annotations
 
@@ -50,7 +52,8 @@ def load_npy(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name. Raises UserError if it is broken, too large, or has objects."""
+    """Return the arrays of an ``.npz`` file by name. Raises UserError if it is broken, too large,
+    or has objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
@@ -61,14 +64,16 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_mat(path: Path) -> dict[str, np.ndarray]:
-    """Return the numeric arrays of a ``.mat`` file by name; (h, w, 3, k) has its frames moved first. Raises UserError
-    for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file."""
+    """Return the numeric arrays of a ``.mat`` file by name; (h, w, 3, k) has its frames moved
+    first. Raises UserError for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken
+    file."""
     import scipy.io
 
     fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
     with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
-            # cells and structs hold no frames, and deeply nested ones end the process without a message
+            # cells and structs hold no frames, and deeply nested ones end the process without a
+            # message
             flat = [
                 name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")
             ]
@@ -89,7 +94,8 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_picture(path: Path) -> dict[str, np.ndarray]:
-    """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files and pictures."""
+    """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files
+    and pictures."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(
         cv2.utils.logging.LOG_LEVEL_SILENT
@@ -132,16 +138,20 @@ SENSOR_SIZES = (
         (1280, 1024),
     ),
 )  # (width, height) of the depth images of usual cameras
-SAME_SCENE, SEVERAL = 0.05, 8
-"""Largest relative difference of the median pixel between successive frames, and number of frames examined."""
+SAME_SCENE = 0.05
+SEVERAL = 8
+"""Largest relative difference of the median pixel between successive frames, and number of frames
+examined."""
 NEIGHBOURS = 0.1
-"""Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
+"""Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a
+wrong layout by 100 %."""
 
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Whole frames of ``width`` x ``height`` numbers, row by row, from byte ``offset`` of a file on. ``step``: bytes
-    from pixel to pixel, more than a number's if brightness and confidence lie between."""
+    """Whole frames of ``width`` x ``height`` numbers, row by row, from byte ``offset`` of a file
+    on. ``step``: bytes from pixel to pixel, more than a number's if brightness and confidence lie
+    between."""
 
     width: int
     height: int
@@ -175,7 +185,8 @@ class RawLoader:
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
         """Map the frames (n, h, w). Raises UserError if there is none."""
-        kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
+        kind = np.dtype(self.kind)
+        size = path.stat().st_size - self.offset
         frame = self.width * self.height * self.step
         if size < frame:
             needs = f"a frame of {self.width} x {self.height} numbers in steps of {self.step} bytes needs {frame}"
@@ -189,7 +200,8 @@ class RawLoader:
         }
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
-        """Return the number of bytes after the last frame. Raises UserError if neighbours differ too much."""
+        """Return the number of bytes after the last frame. Raises UserError if neighbours differ
+        too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
             what = (
@@ -204,7 +216,8 @@ class RawLoader:
 
 
 def raw_layout_of(path: Path) -> UserError:
-    """Return the error for a file of bare numbers, with the layouts of common cameras that fit its size."""
+    """Return the error for a file of bare numbers, with the layouts of common cameras that fit its
+    size."""
     size = path.stat().st_size
     layouts = {
         f"{w}x{h}": size // (w * h)
@@ -229,14 +242,17 @@ AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
 FEWEST_ROWS = 8  # of an image; an array with fewer rows is a table of points
 FRAMES_OF_POINTS = 20
-"""(a, b, 3) counts as a frames of b points, not as a grid, from b = 20 a on: no sensor is that wide."""
+"""(a, b, 3) counts as a frames of b points, not as a grid, from b = 20 a on: no sensor is that
+wide."""
 
 Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
-"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a note on the axes."""
+"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a
+note on the axes."""
 
 
 def open_arrays(path: Path, given: Given) -> Recording:
-    """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array or several fit."""
+    """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array
+    or several fit."""
     load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
     if given.pitch is not None:
         return _open_height_map(path, load, given)
@@ -267,7 +283,8 @@ def open_arrays(path: Path, given: Given) -> Recording:
 
 
 def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording:
-    """Open files of arrays of one kind as one capture, in the order given. Raises UserError as `open_arrays` does."""
+    """Open files of arrays of one kind as one capture, in the order given. Raises UserError as
+    `open_arrays` does."""
     first = open_arrays(paths[0], given)
 
     def read() -> Iterator[Frame]:
@@ -278,7 +295,8 @@ def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording
 
 
 def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
-    """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y, colour or amplitude."""
+    """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y,
+    colour or amplitude."""
     changed = [
         each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)
     ]
@@ -292,7 +310,8 @@ def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int
 
 
 def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
-    """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis first."""
+    """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis
+    first."""
     arrays = load(path)
     name, array = _named_array(str(path), arrays, DISTANCE_NAMES, given.array)
     if array.size == 0:
@@ -313,10 +332,8 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
         found = next((beside[key] for key in names if key in beside), None)
         return found if found is not None and found.size == size else None
 
-    rgb, amplitude = (
-        named(COLOUR_NAMES, 3 * math.prod(shape)),
-        named(AMPLITUDE_NAMES, math.prod(shape)),
-    )
+    rgb = named(COLOUR_NAMES, 3 * math.prod(shape))
+    amplitude = named(AMPLITUDE_NAMES, math.prod(shape))
     if rgb is not None:
         if rgb.dtype.kind == "f":
             rgb = np.nan_to_num(
@@ -328,8 +345,9 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
 
 
 def _frames_are_last(array: np.ndarray) -> bool:
-    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks them. With three
-    planes, the content decides: x, y and z of points are not nearly equal everywhere, repeated distances are."""
+    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks
+    them. With three planes, the content decides: x, y and z of points are not nearly equal
+    everywhere, repeated distances are."""
     if not _is_deep(array):
         return False
     return array.shape[2] != 3 or all(
@@ -344,14 +362,16 @@ def _is_deep(array: np.ndarray) -> bool:
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
     """Return the median relative difference where both have a number; infinity if there is none."""
     both = (first > 0) & (second > 0)
-    before, after = (plane[both].astype(np.float64) for plane in (first, second))
+    before = first[both].astype(np.float64)
+    after = second[both].astype(np.float64)
     return float(np.median(np.abs(before - after) / before)) if both.any() else float("inf")
 
 
 def _named_array(
     name: str, arrays: Arrays, usual: Sequence[str], given: str | None
 ) -> tuple[str, np.ndarray]:
-    """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else the only one."""
+    """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else
+    the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (given or "").partition(":")
     if not key:
@@ -372,7 +392,8 @@ def _named_array(
         raise UserError(
             f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}"
         )
-    array, name = arrays[key], f"{name}: {key}" if key else name
+    array = arrays[key]
+    name = f"{name}: {key}" if key else name
     if number:
         array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
@@ -380,7 +401,8 @@ def _named_array(
                 f"--array {given}: no such part of {name} {array.shape}",
                 legal="NAME, or NAME:0 onwards",
             )
-        array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
+        array = array[int(number)]
+        name = f"{name if key else name + ': '}:{number}"
     refuse_narrow(name, array.dtype)
     return name, array
 
@@ -419,11 +441,13 @@ DOWN_NAMES = (
 )  # names of arrays whose numbers grow away from the viewer
 DISTANCE_M = 1.0
 RELIEF = (5e-4, 0.5)
-"""Plausible relief (1st to 99th percentile) over the map's shorter side: of two units, 1000 apart, only one fits."""
+"""Plausible relief (1st to 99th percentile) over the map's shorter side: of two units, 1000 apart,
+only one fits."""
 
 
 def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
-    """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be determined."""
+    """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be
+    determined."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
@@ -484,7 +508,8 @@ def _map_frames(
 
 
 def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.ndarray]:
-    """Return the name and the map (h, w). Raises UserError for several maps, which are not frames of one capture."""
+    """Return the name and the map (h, w). Raises UserError for several maps, which are not frames
+    of one capture."""
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
     values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
     if values.ndim == 3:

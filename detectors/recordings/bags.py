@@ -1,8 +1,9 @@
-"""ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2 as captures.
+"""ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2
+as captures.
 
-``rosbags`` unpacks whole chunks, so it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
-driver publishes with it. If the rays of a CameraInfo pass through a cloud's points, z and that lens are used: a pixel's
-ray is then the same in all frames."""
+``rosbags`` unpacks whole chunks, so it runs within `files.limited_memory`. A depth image needs the
+CameraInfo that its driver publishes with it. If the rays of a CameraInfo pass through a cloud's
+points, z and that lens are used: a pixel's ray is then the same in all frames."""
 
 from __future__ import annotations
 
@@ -57,8 +58,9 @@ class Bag:
         return next(self.messages(topic), ("", None))[1]
 
     def messages(self, topic: str) -> Iterator[tuple[str, Any]]:
-        """Yield (name, message) of a topic in the order of their times within each file, one held at a time. Raises
-        UserError if a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
+        """Yield (name, message) of a topic in the order of their times within each file, one held
+        at a time. Raises UserError if a file is damaged or a message is larger than
+        `MAX_MESSAGE_BYTES`."""
         types = _types(self._is_ros1)
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
@@ -105,7 +107,8 @@ class Bag:
 
 @lru_cache
 def _types(is_ros1: bool) -> Any:
-    """Return the message types. They are kept, because the code that reads a type is made when it is first used."""
+    """Return the message types. They are kept, because the code that reads a type is made when it
+    is first used."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
@@ -127,7 +130,8 @@ def is_bag(path: Path) -> bool:
 
 
 def find_bag(path: Path) -> Bag:
-    """Return a folder or file as a bag. Raises UserError if its description or one of its files is missing."""
+    """Return a folder or file as a bag. Raises UserError if its description or one of its files is
+    missing."""
     if path.is_file():
         return Bag(path, (path,))
     metadata = path / METADATA
@@ -166,11 +170,13 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
 RAY_TOLERANCE_PX = 0.01
-"""A lens fits if each point lies within this distance of its pixel's ray: far more than the error of float32."""
+"""A lens fits if each point lies within this distance of its pixel's ray: far more than the error
+of float32."""
 
 
 def open_bag(path: Path, given: Given) -> Recording:
-    """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens does not fit."""
+    """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens
+    does not fit."""
     bag = find_bag(path)
     chosen, note = _chosen_topic(bag, given)
     if bag.first(chosen) is None:
@@ -185,7 +191,8 @@ def open_bag(path: Path, given: Given) -> Recording:
 
 
 def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Frame]:
-    """Yield the images or clouds of one topic, one frame per message. ``by_lens``: x and y come from the lens."""
+    """Yield the images or clouds of one topic, one frame per message. ``by_lens``: x and y come
+    from the lens."""
     for name, message in bag.messages(topic):
         frame = frame_of_message(name, message, scale_m)
         yield replace(frame, xy_m=None) if by_lens else frame
@@ -220,10 +227,8 @@ def _open_clouds(bag: Bag, topic: str, given: Given) -> Recording:
         lens = next(fitting, None)
         if lens is None:
             note = "no CameraInfo in the bag fits the points; each frame's own x and y are averaged"
-    read, unit_from = (
-        partial(_frames, bag, topic, scale_m, lens is not None),
-        "ROS, whose clouds are in metres",
-    )
+    read = partial(_frames, bag, topic, scale_m, lens is not None)
+    unit_from = "ROS, whose clouds are in metres"
     more = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
     return Recording.begun(bag.path.name, read, scale_m, **more)
 
@@ -249,7 +254,8 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
             message = bag.first(name)
             if message is not None and 1e-6 <= message.data <= 1:
                 # the option is a float32: 0.00025 is stored as 0.00025000001
-                scale_m, unit_from = float(f"{message.data:.6g}"), name
+                scale_m = float(f"{message.data:.6g}")
+                unit_from = name
     scale_m = scale_m or default_metres(stored.dtype)
     read = partial(_frames, bag, topic, scale_m, by_lens=False)
     return Recording.begun(bag.path.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
@@ -257,7 +263,8 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
 
 def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
     """Return the topic to read, and a note on the other topics."""
-    path, topics = bag.path, bag.topics
+    path = bag.path
+    topics = bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     images = _depth_topics(bag)
     both = ", ".join([*clouds, *images])
@@ -297,7 +304,8 @@ def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
 
 
 def _depth_topics(bag: Bag) -> list[str]:
-    """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and no copies."""
+    """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and
+    no copies."""
     found = []
     for topic in (
         name
@@ -329,7 +337,8 @@ def _infos_of(bag: Bag, topic: str) -> list[str]:
 
 
 def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
-    """Return the lens of depth images. Raises UserError if the bag has none for them, or one of another model."""
+    """Return the lens of depth images. Raises UserError if the bag has none for them, or one of
+    another model."""
     every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
@@ -349,15 +358,17 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A rectified image has the
-    lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are accounted for."""
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A
+    rectified image has the lens P and no distortion. K and P are of the whole sensor: binning and
+    the region of interest are accounted for."""
     d, k, p = (
         np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float)
         for key in ("d", "k", "p")
     )
     d = np.zeros(0) if is_rectified or not d.any() else d
     model = str(message.distortion_model)
-    across, down = max(1, int(message.binning_x)), max(1, int(message.binning_y))
+    across = max(1, int(message.binning_x))
+    down = max(1, int(message.binning_y))
     roi = message.roi
     width, height = (
         (int(roi.width), int(roi.height))
@@ -376,7 +387,8 @@ def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = Fals
     if not np.isfinite([*d, fx, fy, cx, cy]).all() or not (fx > 0 and fy > 0):
         return f"states the focal length {fx:g}, {fy:g}, as an uncalibrated camera does"
     # pixel positions count from the first pixel's centre, which lies half a pixel inside
-    cx, cy = (cx - roi.x_offset + 0.5) / across - 0.5, (cy - roi.y_offset + 0.5) / down - 0.5
+    cx = (cx - roi.x_offset + 0.5) / across - 0.5
+    cy = (cy - roi.y_offset + 0.5) / down - 0.5
     distortion = tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8))))
     return Lens(
         shape[1], shape[0], float(fx / across), float(fy / down), float(cx), float(cy), distortion

@@ -1,9 +1,11 @@
-"""Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv, .asc, .pts).
+"""Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv,
+.asc, .pts).
 
-Open3D drops the grid and fills a truncated PLY with zeros, so the header is read here: a PCD is organised if HEIGHT >
-1, a PLY if it states num_cols and num_rows. A list has one point per line: x y z, then an intensity, or red green blue,
-or both, unless a line of names says otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-given by a lens with as many pixels, or by a common sensor size on which x/z and y/z rise evenly."""
+Open3D drops the grid and fills a truncated PLY with zeros, so the header is read here: a PCD is
+organised if HEIGHT > 1, a PLY if it states num_cols and num_rows. A list has one point per line: x
+y z, then an intensity, or red green blue, or both, unless a line of names says otherwise. Its grid
+is stated by a comment or a first line of two whole numbers, or given by a lens with as many
+pixels, or by a common sensor size on which x/z and y/z rise evenly."""
 
 import codecs
 import io
@@ -28,7 +30,8 @@ from harness.vocabulary.geometry import Frame, Lens
 CLOUDS = (".ply", ".pcd")
 POINT_LISTS = (".xyz", ".asc", ".pts", ".txt", ".csv")
 RASTER_CORRELATION = 0.999
-"""Correlation of x/z with the column and y/z with the row on a true pixel grid; a distorted lens reduces it by 1 %."""
+"""Correlation of x/z with the column and y/z with the row on a true pixel grid; a distorted lens
+reduces it by 1 %."""
 
 
 def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
@@ -49,7 +52,8 @@ def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
 def _frames(
     paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: float
 ) -> Iterator[Frame]:
-    """Yield one cloud per file, (h, w), or (1, n) without a grid. ``lens`` only tells if a list fills a pixel grid."""
+    """Yield one cloud per file, (h, w), or (1, n) without a grid. ``lens`` only tells if a list
+    fills a pixel grid."""
     for path in paths:
         points, grid, rgb, amplitude = reader(path, lens)
         amplitude = None if amplitude is None else amplitude.astype(np.float32).reshape(grid)
@@ -123,7 +127,8 @@ def _read_cloud(
         what = f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
         raise UserError(what, legal=LEGAL_CLOUD, fix="copy or export it again")
     attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
-    points, rgb = attributes["positions"], attributes.get("colors")
+    points = attributes["positions"]
+    rgb = attributes.get("colors")
     if rgb is not None and rgb.dtype != np.uint8:  # floating-point colours run from 0 to 1
         rgb = np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
     grey = (
@@ -133,12 +138,16 @@ def _read_cloud(
 
 
 def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return width, height (1 without a grid) and the least number of bytes of a file with this header."""
+    """Return width, height (1 without a grid) and the least number of bytes of a file with this
+    header."""
     end = re.search(rb"end_header\r?\n", content)
     if not content.startswith(b"ply") or end is None:
         raise UserError(f"{path}: is not a PLY file, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
-    points, bytes_each, element, names = 0, 0, "", list[str]()
+    points = 0
+    bytes_each = 0
+    element = ""
+    names = list[str]()
     for words in (line.split() for line in lines if line.strip()):
         if words[0] == "element" and len(words) == 3:
             if words[1] == "vertex" and points:
@@ -177,7 +186,8 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
         return int(text)
 
     with read_errors(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
-        width, height = count(fields["WIDTH"][0]), count(fields["HEIGHT"][0])
+        width = count(fields["WIDTH"][0])
+        height = count(fields["HEIGHT"][0])
         points = count(fields["POINTS"][0]) if "POINTS" in fields else width * height
         sizes = [count(text) for text in fields["SIZE"]]
         counts = (
@@ -258,7 +268,8 @@ def _numbers(line: str) -> list[float] | None:
 
 
 def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
-    """Return numbers (n, columns). A comma within numbers that semicolons or tabs separate is a decimal point."""
+    """Return numbers (n, columns). A comma within numbers that semicolons or tabs separate is a
+    decimal point."""
     import pandas
 
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)
@@ -288,7 +299,8 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
 
 
 def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]:
-    """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name them."""
+    """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name
+    them."""
     bare = re.sub(r"\([^)]*\)|\[[^]]*\]", " ", line).strip(" #/\t\r,;").lower()
     names = [COLUMNS.get(word, "") for word in re.split(r"[,;\s]+", bare)]
     count = values.shape[1]

@@ -1,8 +1,10 @@
-"""Recordings of cameras by their own programs: Azure Kinects (.mkv), iPhones and iPads (Stray Scanner, Record3D).
+"""Recordings of cameras by their own programs: Azure Kinects (.mkv), iPhones and iPads (Stray
+Scanner, Record3D).
 
-k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres, 0 = none) and
-attaches the factory calibration. Phones store ARKit's depth, a confidence from 0 to 2 for each pixel (0 is no return),
-the lens of the colour camera, and poses; the program warns if these show movement."""
+k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres,
+0 = none) and attaches the factory calibration. Phones store ARKit's depth, a confidence from 0 to
+2 for each pixel (0 is no return), the lens of the colour camera, and poses; the program warns if
+these show movement."""
 
 import re
 import zipfile
@@ -40,11 +42,14 @@ from harness.vocabulary.geometry import Frame, Lens, transform_points
 TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
 SEGMENT_ID = bytes.fromhex("18538067")
-WAITING = 4  # most captures that wait for their other pictures; the recorder interleaves tracks within one frame
+# most captures that wait for their other pictures; the recorder interleaves tracks within one
+# frame
+WAITING = 4
 
 
 def open_mkv(path: Path, given: Given) -> Recording:
-    """Open a recording with its own calibration, or with the given lens. Raises UserError if it has no depth."""
+    """Open a recording with its own calibration, or with the given lens. Raises UserError if it
+    has no depth."""
     _refuse_truncated(path)
     with _opened(path) as container:
         tracks = _tracks(container)
@@ -85,7 +90,8 @@ def open_mkv(path: Path, given: Given) -> Recording:
     )
     note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
     scale_m = given.scale_m or UNITS_M["mm"]
-    read, notes = partial(_frames, path, scale_m, lens, colour), () if colour is None else (note,)
+    read = partial(_frames, path, scale_m, lens, colour)
+    notes = () if colour is None else (note,)
     more = {"files": (path, *lens_files), "lens": lens, "notes": notes}
     return Recording.begun(
         path.name, read, scale_m, True, unit_from="k4arecorder, which writes millimetres", **more
@@ -93,7 +99,8 @@ def open_mkv(path: Path, given: Given) -> Recording:
 
 
 def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
-    """Yield one frame per depth picture. Raises UserError if the file is truncated or cannot be decoded."""
+    """Yield one frame per depth picture. Raises UserError if the file is truncated or cannot be
+    decoded."""
     slopes = lens.region_slopes(lens.whole)
     for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
         infrared = pictures.get("IR")
@@ -111,14 +118,16 @@ def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None)
 def colour_on_depth(
     z_m: np.ndarray, slopes: np.ndarray, colour: ColourCamera, picture: np.ndarray
 ) -> np.ndarray:
-    """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour is missing. Not
-    modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect)."""
+    """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour
+    is missing. Not modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect).
+    """
     points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1) * z_m[..., None]
     points_colour = transform_points(colour.T_colour_depth, points)
     seen = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
     at = np.full((*z_m.shape, 2), -1e3, np.float32)
     at[seen] = colour.lens.project(points_colour[seen])
-    # Beyond the frame the rational distortion may fold back into it; true rays there are steeper than the corner's.
+    # Beyond the frame the rational distortion may fold back into it; true rays there are steeper
+    # than the corner's.
     corner = np.abs(
         colour.lens.slopes(
             np.array([0, colour.lens.width - 1]), np.array([0, colour.lens.height - 1])
@@ -141,7 +150,8 @@ def colour_on_depth(
 def _opened(path: Path) -> Any:
     import av
 
-    # without these, the decoder guesses the format from the content: a playlist called .mkv would open addresses
+    # without these, the decoder guesses the format from the content: a playlist called .mkv would
+    # open addresses
     only = {"protocol_whitelist": "file", "format_whitelist": "matroska,webm"}
     with read_errors(f"{path}: cannot be opened as a recording", LEGAL_MKV):
         return av.open(f"file:{path}", format="matroska", options=only)
@@ -154,7 +164,8 @@ def _tracks(container: Any) -> dict[str, Any]:
 
 
 def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
-    """Yield the pictures of one instant (within half a frame period) by track title, in order of time."""
+    """Yield the pictures of one instant (within half a frame period) by track title, in order of
+    time."""
     waiting: list[tuple[float, dict[str, np.ndarray]]] = []
     for title, time_s, period_s, picture in _pictures(path, with_colour):
         home = next(
@@ -175,7 +186,8 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
-    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError if it is broken."""
+    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError
+    if it is broken."""
     with _opened(path) as container:
         tracks = {
             title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"
@@ -191,7 +203,8 @@ def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float
                 title = title_of[packet.stream.index]
                 for picture in packet.decode():
                     form = "rgb24" if title == "COLOR" else "gray16le"
-                    # The depth camera may be set to expose after the colour camera; both belong to one capture.
+                    # The depth camera may be set to expose after the colour camera; both belong to
+                    # one capture.
                     shift_s = 0.0 if title == "COLOR" else delay_s
                     yield (
                         title,
@@ -206,7 +219,8 @@ def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float
 
 
 def _refuse_truncated(path: Path) -> None:
-    """Compare the file's length with what its Segment element states (Matroska: an ID, then a variable-length size)."""
+    """Compare the file's length with what its Segment element states (Matroska: an ID, then a
+    variable-length size)."""
     with path.open("rb") as file:
         head = file.read(4096)
     at = head.find(SEGMENT_ID) + len(SEGMENT_ID)
@@ -219,7 +233,8 @@ def _refuse_truncated(path: Path) -> None:
     length = 9 - head[at].bit_length()
     bits = 7 * length
     size = int.from_bytes(head[at : at + length], "big") & ((1 << bits) - 1)
-    expected, found = at + length + size, path.stat().st_size
+    expected = at + length + size
+    found = path.stat().st_size
     if size != (1 << bits) - 1 and found < expected:
         what = f"{path}: is truncated: {found} of {expected} bytes"
         raise UserError(what, legal="a whole recording", fix="copy or record it again")
@@ -230,7 +245,8 @@ LEGAL_STRAY = (
 )
 LEGAL_R3D = "Record3D's .r3d: metadata and rgbd/*.depth"
 COLOUR_WIDTHS = (1920, 1280, 640, 3840)
-"""Widths of the pictures to which ARKit's lens may refer; all have a ratio of 4 : 3, like its depth."""
+"""Widths of the pictures to which ARKit's lens may refer; all have a ratio of 4 : 3, like its
+depth."""
 BLUR_PX = 0.5  # motion by this much of a pixel blurs an edge more than the sensor does
 
 
@@ -245,7 +261,8 @@ def _recording(
     scale_m: float,
     writer: str,
 ) -> Recording:
-    """Return the recording of either program. ``size``: width, height. ``poses``: places, quaternions, their source."""
+    """Return the recording of either program. ``size``: width, height. ``poses``: places,
+    quaternions, their source."""
     lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
     notes = (
         ()
@@ -273,8 +290,12 @@ def _frame(name: str, stored: np.ndarray, confidence: np.ndarray | None, scale_m
 
 def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, int]) -> Lens:
     """Scale the lens of a colour picture to the depth picture of the same view."""
-    across, down = size[0] / max(colour[0], 1), size[1] / max(colour[1], 1)
-    fx, fy, cx, cy = float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
+    across = size[0] / max(colour[0], 1)
+    down = size[1] / max(colour[1], 1)
+    fx = float(k[0, 0])
+    fy = float(k[1, 1])
+    cx = float(k[0, 2])
+    cy = float(k[1, 2])
     good = (
         np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
     )
@@ -295,9 +316,11 @@ def _motion_warnings(
     lens: Lens,
     median_m: float,
 ) -> tuple[str, ...]:
-    """Warn if the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the target."""
+    """Warn if the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the
+    target."""
     chosen = frames or slice(None)
-    places_m, turns = places_m[chosen], turns[chosen]
+    places_m = places_m[chosen]
+    turns = turns[chosen]
     if len(places_m) < 2 or not np.isfinite([*places_m.ravel(), *turns.ravel()]).all():
         return ()
     moved_m = float(np.linalg.norm(places_m - places_m[0], axis=1).max())
@@ -318,13 +341,15 @@ def is_stray(folder: Path) -> bool:
 
 
 def open_stray(folder: Path, given: Given) -> Recording:
-    """Open Stray Scanner's folder. Raises UserError if a file is broken or the lens's resolution is unknown."""
+    """Open Stray Scanner's folder. Raises UserError if a file is broken or the lens's resolution
+    is unknown."""
     depths = depth_files(folder / "depth")
     height, width = read_depth_png(depths[0]).shape
     beside = [folder / "confidence" / path.name for path in depths]
     confidences = tuple(path if path.is_file() else None for path in beside)
     scale_m = given.scale_m or UNITS_M["mm"]
-    matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
+    matrix = folder / "camera_matrix.csv"
+    odometry = folder / "odometry.csv"
 
     def scaled_lens() -> Lens:
         k = _table(matrix)
@@ -347,10 +372,8 @@ def open_stray(folder: Path, given: Given) -> Recording:
             sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
             yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
 
-    motion, writer = (
-        (poses[:, :3], poses[:, 3:], odometry.name),
-        "Stray Scanner, which writes millimetres",
-    )
+    motion = (poses[:, :3], poses[:, 3:], odometry.name)
+    writer = "Stray Scanner, which writes millimetres"
     return _recording(
         folder, given, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer
     )
@@ -370,7 +393,8 @@ def _table(path: Path) -> np.ndarray:
 
 
 def open_r3d(path: Path, given: Given) -> Recording:
-    """Open Record3D's .r3d. Raises UserError if it is broken, or if pyliblzfse, which unpacks its depth, is missing."""
+    """Open Record3D's .r3d. Raises UserError if it is broken, or if pyliblzfse, which unpacks its
+    depth, is missing."""
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
             held = ", ".join(archive.namelist()[:6]) or "nothing"
@@ -379,7 +403,8 @@ def open_r3d(path: Path, given: Given) -> Recording:
     with read_errors(f"{path}: its metadata cannot be read", LEGAL_R3D):
         info = strict_json(content)
         k = np.array([float(x) for x in info["K"]]).reshape(3, 3).T
-        width, height = int(info.get("dw", 192)), int(info.get("dh", 256))
+        width = int(info.get("dw", 192))
+        height = int(info.get("dh", 256))
         colour = int(info["w"]), int(info["h"])
         poses = np.array(info.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
     refuse_pixels(str(path), width, height)
@@ -402,7 +427,8 @@ def open_r3d(path: Path, given: Given) -> Recording:
                     scale_m,
                 )
 
-    motion, writer = (poses[:, 4:], poses[:, :4], "its metadata"), "Record3D, which writes metres"
+    motion = (poses[:, 4:], poses[:, :4], "its metadata")
+    writer = "Record3D, which writes metres"
     return _recording(
         path, given, read, (width, height), scaled_lens, (path,), motion, scale_m, writer
     )
@@ -428,7 +454,8 @@ def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
 def _plane(
     path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tuple[int, int]
 ) -> np.ndarray:
-    """Unpack an entry by Apple's LZFSE into numbers (h, w). Raises UserError unless it gives exactly as many."""
+    """Unpack an entry by Apple's LZFSE into numbers (h, w). Raises UserError unless it gives
+    exactly as many."""
     packed = _content(path, archive, name)
     try:
         import liblzfse  # type: ignore[import-not-found]

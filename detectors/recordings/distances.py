@@ -1,4 +1,5 @@
-"""Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its origin."""
+"""Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its
+origin."""
 
 import math
 import re
@@ -10,22 +11,26 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Reason
 
 UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "in": 0.0254, "tum": 1 / 5000}
-"""Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre."""
+"""Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre.
+"""
 LEGAL_UNITS = (
     "mm, cm, m, um, in (inch), tum (5000 to the metre), or N/m for N to the metre (4000/m)"
 )
-NEAREST_M, FARTHEST_M = 0.05, 20.0
+NEAREST_M = 0.05
+FARTHEST_M = 20.0
 """Bounds of a plausible median distance: no time-of-flight camera works nearer or sees farther."""
 FARTHEST_ASIDE = (
     4.0  # largest ratio of the median point's distance from the axis to its z: 76 degrees
 )
 RAYS_TELL = 3.0
-"""Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a pipe's up to 2."""
+"""Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a
+pipe's up to 2."""
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
 CAMERA_FRAME = "the camera's frame: x right, y down, z forward from the lens"
 TURNED_SHARE = 0.99
-"""Least share of points with z below 0 for which the cloud is turned: no camera measures behind itself."""
+"""Least share of points with z below 0 for which the cloud is turned: no camera measures behind
+itself."""
 
 
 def metres_per_unit(unit: str) -> float:
@@ -39,12 +44,14 @@ def metres_per_unit(unit: str) -> float:
 
 
 def default_metres(dtype: np.dtype) -> float:
-    """Return the usual unit of stored numbers: millimetres for integers, metres for floating point."""
+    """Return the usual unit of stored numbers: millimetres for integers, metres for floating
+    point."""
     return UNITS_M["mm"] if dtype.kind in "iu" else UNITS_M["m"]
 
 
 def refuse_narrow(name: str, dtype: np.dtype) -> None:
-    """Raise UserError if the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
+    """Raise UserError if the numbers cannot be distances: 8 bit, boolean, complex, text or
+    objects."""
     is_narrow = dtype.kind in "iu" and dtype.itemsize == 1
     if is_narrow or dtype.kind not in "iuf":
         what = (
@@ -66,9 +73,9 @@ def frame_of(
     rgb: np.ndarray | None = None,
     amplitude: np.ndarray | None = None,
 ) -> Frame:
-    """Convert stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres to a frame. 0 and
-    `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError if most, not all, is
-    negative."""
+    """Convert stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres to a frame. 0
+    and `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises
+    UserError if most, not all, is negative."""
     stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
@@ -109,15 +116,17 @@ def frame_of(
 
 SHARED_CODE = 20  # pixels that must share a number before it can be a full scale
 ISOLATED = 4.0
-"""Factor between codes and all distances: a wall four times as far as the rest has more than a few distances."""
+"""Factor between codes and all distances: a wall four times as far as the rest has more than a few
+distances."""
 FEW_CODES = 8
 
 
 def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
-    """Return the numbers among ``stored`` (n,), finite and not 0, that cannot be distances: they mean "no return". Four
-    kinds: the largest number of the type (in metres, 65.535); a full scale of fewer bits (4095, 65534 ..) that many
-    pixels share, well beyond all others; at most `FEW_CODES` different numbers that are `ISOLATED` times farther than
-    all others or, for integers, nearer; at most three negative numbers. Codes amid distances are not found."""
+    """Return the numbers among ``stored`` (n,), finite and not 0, that cannot be distances: they
+    mean "no return". Four kinds: the largest number of the type (in metres, 65.535); a full scale
+    of fewer bits (4095, 65534 ..) that many pixels share, well beyond all others; at most
+    `FEW_CODES` different numbers that are `ISOLATED` times farther than all others or, for
+    integers, nearer; at most three negative numbers. Codes amid distances are not found."""
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
@@ -141,7 +150,8 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
             break
         codes.append(float(top))
         rest = below
-    # Between neighbours that differ by a factor of four, an octave is empty: most frames need no sorting.
+    # Between neighbours that differ by a factor of four, an octave is empty: most frames need no
+    # sorting.
     if rest.size and not np.bincount((octaves := np.frexp(rest)[1]) - octaves.min()).all():
         different = np.unique(rest)
         ratios = different[1:] / different[:-1].astype(np.float64)
@@ -176,15 +186,22 @@ UNIT_NAMES = {
 READINGS = {
     **{"mm": (0.867, 0.15), "4000/m": (0.08, 0.0), "tum": (0.03, 0.0), "10000/m": (0.015, 0.0)},
     **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "in": (0.0003, 0.01), "m": (0.0, 0.8)},
-}  # units and how common each is among integers and floating-point numbers: guesses that hardly move a decision
+    # units and how common each is among integers and floating-point numbers: guesses that hardly move
+    # a decision
+}
 NEAR_M = (
     0.8,
     1.8,
 )  # middle and spread (a factor) of the usual distances of targets: 95 % are within 0.25 to 2.6 m
-NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
-"""A distance above the first has at least the second as its share of the most common distance's weight."""
-SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: no warning from the first on; below the second, the user must decide; below the third, not listed."""
+NEAR_LIMIT_M = 0.15
+FAR_FLOOR = 0.05
+"""A distance above the first has at least the second as its share of the most common distance's
+weight."""
+SURE = 0.98
+LIKELY = 0.75
+SHOWN = 0.003
+"""Probabilities: no warning from the first on; below the second, the user must decide; below the
+third, not listed."""
 MILLIMETRE_SIZES = {
     **{
         (640, 576): 4.5,
@@ -194,13 +211,16 @@ MILLIMETRE_SIZES = {
         (512, 424): 8.0,
         (256, 192): 8.0,
     }
-}  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
+    # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
+}
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
-"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and their added weight."""
+"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and
+their added weight."""
 
 
 class Unit(NamedTuple):
-    """Metres in one stored number, and the ``origin`` of this unit. ``warning``: a reason for doubt, else ""."""
+    """Metres in one stored number, and the ``origin`` of this unit. ``warning``: a reason for
+    doubt, else ""."""
 
     scale_m: float
     origin: str
@@ -208,9 +228,10 @@ class Unit(NamedTuple):
 
 
 def scale_in(statements: dict[str, Any], median: float) -> float | None:
-    """Return metres in one stored number if names with values state it, else None. Values are metres (RealSense:
-    0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a unit's name. They differ by powers of 1000,
-    so the ``median`` stored number decides between them."""
+    """Return metres in one stored number if names with values state it, else None. Values are
+    metres (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a
+    unit's name. They differ by powers of 1000, so the ``median`` stored number decides between
+    them."""
     for key, value in statements.items():
         if re.sub("[^a-z]", "", str(key).lower()) not in UNIT_KEYS:
             continue
@@ -232,12 +253,14 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
 
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
-    """Return the unit of numbers (n,) if nothing states it. ``size``: width and height of the image.
+    """Return the unit of numbers (n,) if nothing states it. ``size``: width and height of the
+    image.
 
-    Each of `READINGS` is weighted by how common it is and by the distance that it gives the nearest tenth of the
-    points, which usually holds the target (`NEAR_M`). A common divisor of all numbers supports the unit in which they
-    are whole millimetres. Image sizes that only cameras with 1 mm have support that unit (`MILLIMETRE_SIZES`), and
-    exclude it beyond their range. Raises UserError if no reading is clearly the most likely, with their distances."""
+    Each of `READINGS` is weighted by how common it is and by the distance that it gives the
+    nearest tenth of the points, which usually holds the target (`NEAR_M`). A common divisor of all
+    numbers supports the unit in which they are whole millimetres. Image sizes that only cameras
+    with 1 mm have support that unit (`MILLIMETRE_SIZES`), and exclude it beyond their range.
+    Raises UserError if no reading is clearly the most likely, with their distances."""
     near, median = (
         float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5))
     )
@@ -278,10 +301,8 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
             else f"--unit: {LEGAL_UNITS}"
         )
         raise UserError(what, fix=fix)
-    scale_m, usual = (
-        metres_per_unit(best),
-        f"what is usual for {'integers' if integers else 'floating-point numbers'}",
-    )
+    scale_m = metres_per_unit(best)
+    usual = f"what is usual for {'integers' if integers else 'floating-point numbers'}"
     if math.isclose(scale_m, usual_m):
         if chances[best] >= SURE:
             return Unit(scale_m, usual)
@@ -297,7 +318,8 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:
-    """Return the coarsest common rounding step of which all valid distances are multiples; 0 if there is none."""
+    """Return the coarsest common rounding step of which all valid distances are multiples; 0 if
+    there is none."""
     values = z_m[np.isfinite(z_m)].astype(np.float64)
     for step_m in COMMON_STEPS_M:
         turns = values / step_m
@@ -340,10 +362,12 @@ def refuse_far_aside(frame: Frame) -> None:
 
 
 def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
-    """Return a sentence if ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
+    """Return a sentence if ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w,
+    2), else "".
 
-    For a plane, 1/z is a plane over the slopes, so its bends over an eighth of the picture are only noise. If z is a
-    length along the ray, that holds for 1/z times the ray's length at z = 1."""
+    For a plane, 1/z is a plane over the slopes, so its bends over an eighth of the picture are
+    only noise. If z is a length along the ray, that holds for 1/z times the ray's length at z = 1.
+    """
     with np.errstate(invalid="ignore"):
         inverse = 1.0 / z_m.astype(np.float64)
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]

@@ -1,4 +1,5 @@
-"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure Kinect's calibration."""
+"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure
+Kinect's calibration."""
 
 import json
 import re
@@ -15,7 +16,8 @@ from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, st
 from harness.vocabulary.geometry import Lens, OtherLens
 
 Mode = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""A readout of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in pixels."""
+"""A readout of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in
+pixels."""
 DEPTH_MODES: dict[str, Mode] = {
     "NFOV_2X2BINNED": ((512, 512), (96, 90), (320, 288)),
     "NFOV_UNBINNED": ((1024, 1024), (192, 180), (640, 576)),
@@ -28,14 +30,16 @@ OWN_LENS = "record again, or give a lens with --intrinsics FILE"
 
 
 class ColourCamera(NamedTuple):
-    """The colour camera beside the depth camera: ``T_colour_depth`` maps points (metres) from depth to colour."""
+    """The colour camera beside the depth camera: ``T_colour_depth`` maps points (metres) from
+    depth to colour."""
 
     lens: Lens
     T_colour_depth: np.ndarray
 
 
 def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
-    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for any other content."""
+    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for
+    any other content."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
     with read_errors(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
@@ -47,7 +51,8 @@ def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
 
 
 def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
-    """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode or a bad file."""
+    """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode
+    or a bad file."""
     if mode not in DEPTH_MODES:
         raise UserError(
             f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES)
@@ -70,13 +75,15 @@ def depth_mode_of_size(width: int, height: int) -> str | None:
 def colour_camera(
     name: str, cameras: dict[str, Any], width: int, height: int
 ) -> ColourCamera | None:
-    """Return the colour camera in the mode of this image's size, None without one. Raises UserError without a lens."""
+    """Return the colour camera in the mode of this image's size, None without one. Raises
+    UserError without a lens."""
     if (width, height) not in COLOUR_SIZES:
         return None
     rows = width * 3 // 4  # the sensor is 4 : 3, and wider images are its middle
     camera, parameters = _camera(name, cameras, "PhotoVideo")
     if camera["SensorWidth"] * 9 == camera["SensorHeight"] * 16:
-        # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from row 384.
+        # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from
+        # row 384.
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
         parameters[3] = parameters[3] * 2304 / 3072
     T_colour_depth = np.eye(4)
@@ -102,10 +109,8 @@ def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str,
     legal = f"SensorWidth and SensorHeight, {MODEL} with 14 finite parameters"
     with read_errors(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
         is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
-        model, numbers = (
-            camera["Intrinsics"]["ModelType"],
-            [float(x) for x in camera["Intrinsics"]["ModelParameters"]],
-        )
+        model = camera["Intrinsics"]["ModelType"]
+        numbers = [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
     known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
     if not known or numbers[10] or numbers[11]:
         what = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
@@ -164,10 +169,13 @@ SIZES = (
 )
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
 MODELS = ("distortion_model", "model", "camera_model")
-"""Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion."""
+"""Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion.
+"""
 FAR_OFF = 0.2
-"""Largest distance of a principal point from the middle, as a share of the image, without doubt about the lens."""
-NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
+"""Largest distance of a principal point from the middle, as a share of the image, without doubt
+about the lens."""
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+MAX_MATRIX_TEXT = 2000
 NESTED = 3  # levels of mappings in a file in which a lens is sought
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LARGEST = 1e12  # largest number that a lens may state, in any unit
@@ -191,10 +199,12 @@ def lens_for(
     beside: Sequence[Path] = (),
     hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
-    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
-    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError if no lens is stated
-    (``hint`` ends its advice), or only that of other images."""
-    lens, file = given.lens, given.intrinsics
+    """Return the lens of depth images and the files that state it: --intrinsics, the named
+    camera's, the capture's ``own``, or the first file named like a lens in the folders ``beside``.
+    Raises UserError if no lens is stated (``hint`` ends its advice), or only that of other images.
+    """
+    lens = given.lens
+    file = given.intrinsics
     if lens is None and file is None:
         lens = own()
         names = [
@@ -225,8 +235,8 @@ def lens_for(
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
-    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError if it is missing, unreadable,
-    of another image size, or of a lens model that is not known."""
+    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError if it is
+    missing, unreadable, of another image size, or of a lens model that is not known."""
     data = parsed_lens(path)
     if "CalibrationInformation" in data:
         mode = depth_mode_of_size(width, height)
@@ -253,7 +263,10 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
     side = across / width
-    fx, fy, cx, cy = fx / side, fy / side, (cx + 0.5) / side - 0.5, (cy + 0.5) / side - 0.5
+    fx = fx / side
+    fy = fy / side
+    cx = (cx + 0.5) / side - 0.5
+    cy = (cy + 0.5) / side - 0.5
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
     if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
@@ -275,7 +288,8 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; bare numbers get names. Raises UserError if it is neither JSON nor YAML."""
+    """Return the file's mapping; bare numbers get names. Raises UserError if it is neither JSON
+    nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
@@ -294,7 +308,8 @@ def parsed_lens(path: Path) -> dict[str, Any]:
                 )  # `_number` names a key whose value is not a number
             else:
                 refuse_bytes(str(path), len(text), MAX_BYTES)
-                # OpenCV's first line, "%YAML:1.0", is not a YAML directive; its matrices are mappings under a tag
+                # OpenCV's first line, "%YAML:1.0", is not a YAML directive; its matrices are
+                # mappings under a tag
                 body = "\n".join(
                     "" if line.startswith("%YAML") else line for line in text.splitlines()
                 )
@@ -304,7 +319,8 @@ def parsed_lens(path: Path) -> dict[str, Any]:
                 f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS
             ) from error
         except DeclarationError as error:
-            first, at = error.problems[0], error.problems[0].place
+            first = error.problems[0]
+            at = error.problems[0].place
             raise UserError(
                 f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS
             ) from error
@@ -325,8 +341,9 @@ def mappings(
 
 
 def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
-    """Return the mapping in a file that holds the lens: if several differ, those of this image size, then those with a
-    name that contains "depth". Raises UserError if there is none, or if several remain."""
+    """Return the mapping in a file that holds the lens: if several differ, those of this image
+    size, then those with a name that contains "depth". Raises UserError if there is none, or if
+    several remain."""
     found = [
         pair
         for pair in mappings(data)
@@ -372,7 +389,8 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
-    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as Open3D's
+    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as
+    # Open3D's
     return (m[0], m[4], m[6], m[7]) if m[6] or m[7] else (m[0], m[4], m[2], m[5])
 
 

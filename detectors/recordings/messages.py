@@ -1,6 +1,7 @@
 """ROS messages: depth images and point clouds as frames (common_interfaces, REP 103 and 118).
 
-``compressedDepth``: twelve bytes (a format, two numbers of the quantisation), then a PNG or RVL (Wilson 2017)."""
+``compressedDepth``: twelve bytes (a format, two numbers of the quantisation), then a PNG or RVL
+(Wilson 2017)."""
 
 import struct
 from typing import Any
@@ -33,7 +34,8 @@ CONFIG_BYTES = 12
 
 
 def encoding_of(message: Any) -> str:
-    """Return the encoding of a picture's numbers: for a compressed picture that of its content, "" for colour."""
+    """Return the encoding of a picture's numbers: for a compressed picture that of its content, ""
+    for colour."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     encoding, _, transport = str(message.format).partition(";")
@@ -41,7 +43,8 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """Return the stored numbers (h, w), uint16 or float32. Raises UserError if depth is missing or truncated."""
+    """Return the stored numbers (h, w), uint16 or float32. Raises UserError if depth is missing or
+    truncated."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
         what = encoding or getattr(message, "format", "")
@@ -53,8 +56,10 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
 
 
 def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray:
-    """Return a (height, width) view of a message's data. Raises UserError if the data are too short."""
-    height, width = int(message.height), int(message.width)
+    """Return a (height, width) view of a message's data. Raises UserError if the data are too
+    short."""
+    height = int(message.height)
+    width = int(message.width)
     refuse_pixels(name, width, height)
     data = np.asarray(message.data, np.uint8)
     if (
@@ -67,7 +72,8 @@ def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray
 
 
 def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
-    """Unpack the picture of compressedDepth. Depth of 32FC1 is stored as a / (number - b), and 0 is no return."""
+    """Unpack the picture of compressedDepth. Depth of 32FC1 is stored as a / (number - b), and 0
+    is no return."""
     if len(data) <= CONFIG_BYTES:
         raise UserError(
             f"{name}: is truncated ({len(data)} bytes)", legal=LEGAL_IMAGE, fix="record it again"
@@ -90,7 +96,8 @@ def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
 
 
 def _rvl(name: str, content: bytes) -> np.ndarray:
-    """Unpack width and height, then runs of zeros and differences, in numbers of three bits per nibble."""
+    """Unpack width and height, then runs of zeros and differences, in numbers of three bits per
+    nibble."""
     width, height = struct.unpack_from("<II", content.ljust(8, b"\0"))
     refuse_pixels(name, width, height)
     words = np.frombuffer(content, "<u4", (len(content) - 8) // 4, 8)
@@ -116,7 +123,8 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
         pixel += int(numbers[at])
         filled[pixel : pixel + run] = True
         folded.append(numbers[at + 2 : at + 2 + run])
-        pixel, at = pixel + run, at + 2 + run
+        pixel = pixel + run
+        at = at + 2 + run
     differences = np.concatenate(folded)
     stored = np.zeros(filled.size, np.uint16)
     stored[filled] = np.cumsum(differences >> 1 ^ -(differences & 1)).astype(np.uint16)
@@ -124,8 +132,9 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
 
 
 def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
-    """Convert a depth image or a PointCloud2 to a frame, (1, n) without a grid; NaN means no return. Raises UserError
-    if x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs."""
+    """Convert a depth image or a PointCloud2 to a frame, (1, n) without a grid; NaN means no
+    return. Raises UserError if x, y or z is missing, a field lies outside its point, or the data
+    are shorter than the layout needs."""
     if not hasattr(message, "point_step"):
         frame = frame_of(name, stored_depth(name, message), scale_m)
     else:
@@ -154,9 +163,10 @@ def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
 
 def _points(name: str, message: Any) -> np.ndarray:
     """Return a (height, width) structured array over the message's data: a view, not a copy."""
-    height, width, step, row = (
-        int(n) for n in (message.height, message.width, message.point_step, message.row_step)
-    )
+    height = int(message.height)
+    width = int(message.width)
+    step = int(message.point_step)
+    row = int(message.row_step)
     if height * width == 0:
         raise UserError(f"{name}: holds no points ({width} x {height})", legal=LEGAL_CLOUD)
     order = ">" if message.is_bigendian else "<"

@@ -47,10 +47,8 @@ LISTS: dict[str, ListOpener] = {
 }
 """File suffixes for which several files with the same suffix form one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
-PICTURE, HDF5 = (
-    SAVE.format("cv2", "cv2.imread('FILE', -1)"),
-    SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]"),
-)
+PICTURE = SAVE.format("cv2", "cv2.imread('FILE', -1)")
+HDF5 = SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
     **{".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}", ".pgm": PICTURE},
     **dict.fromkeys((".h5", ".hdf5"), HDF5),
@@ -62,9 +60,10 @@ HELD = 6  # most names of a folder's contents in a message
 
 
 def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements: Any) -> Recording:
-    """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of the stored distances
-    (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other ``statements`` are the fields of
-    `recording.Given`. Raises UserError for every fault of the files."""
+    """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of
+    the stored distances (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other
+    ``statements`` are the fields of `recording.Given`. Raises UserError for every fault of the
+    files."""
     paths = [Path(path) for path in paths]
     if not paths:
         raise UserError("no capture is named", legal=LEGAL_FORMATS)
@@ -82,23 +81,28 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
                 _opened(paths, replace(given, scale_m=stated.scale_m)), selection=given.frames
             )
     first, *second = islice(recording.frames(), 2)
-    lens, doubts = recording.lens, [stated.warning]
+    lens = recording.lens
+    doubts = [stated.warning]
     if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
         doubts += [
             "the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"
         ]
     if recording.slopes is not None and first.xy_m is None:
         doubts += [ray_lengths_doubt(first.z_m, recording.slopes)]
-    notes, warnings = [*recording.notes, *first.notes], [*recording.warnings, *doubts]
+    notes = [*recording.notes, *first.notes]
+    warnings = [*recording.warnings, *doubts]
     if isinstance(lens, OtherLens):
-        notes, warnings = [*notes, lens.note], [*warnings, lens.warning]
+        notes = [*notes, lens.note]
+        warnings = [*warnings, lens.warning]
         recording = replace(recording, lens=lens.plain)
-    notes, warnings = list(filter(None, notes)), list(filter(None, warnings))
+    notes = list(filter(None, notes))
+    warnings = list(filter(None, warnings))
     return replace(recording, unit_from=stated.origin, notes=tuple(notes), warnings=tuple(warnings))
 
 
 def _unit_not_stated(recording: Recording) -> Unit:
-    """Return a unit that the format leaves open: from a file beside the capture, the named camera, or the data."""
+    """Return a unit that the format leaves open: from a file beside the capture, the named camera,
+    or the data."""
     found = (frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected())
     z_m = next((each for each in found if each.size), None)
     if z_m is None:
@@ -116,7 +120,8 @@ def _unit_not_stated(recording: Recording) -> Unit:
 
 
 def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's first file."""
+    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's
+    first file."""
     for folder in dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ()):
         beside = (
             path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}"))
@@ -130,7 +135,8 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
 
 def _opened(paths: list[Path], given: Given) -> Recording:
     """Open a capture by the first format that its paths fit."""
-    path, is_single = paths[0], len(paths) == 1
+    path = paths[0]
+    is_single = len(paths) == 1
     suffix, *more = {each.suffix.lower() for each in paths}
     opener: Callable[[Path, Given], Recording] | None = FILES.get(suffix) if is_single else None
     if is_single and path.is_dir():

@@ -18,13 +18,15 @@ from harness.vocabulary.files import limited_memory
 from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 ROUND_TRIP_PX = 0.1
-"""If a pixel's ray does not return to it within this distance, the lens model has no direction for it."""
+"""If a pixel's ray does not return to it within this distance, the lens model has no direction for
+it."""
 NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
 def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
-    """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and limit its memory."""
+    """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and
+    limit its memory."""
     try:
         with limited_memory():
             yield
@@ -43,10 +45,11 @@ def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> 
 
 @dataclass(frozen=True)
 class Given:
-    """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
-    ``intrinsics``: a file with the depth pixels' lens, preferred to one that comes with the frames. ``lens``: the same
-    as a value. ``frames``: selects frames by number. ``topic``: of a ROS bag. ``array``: NAME or NAME:NUMBER in a file
-    of arrays. ``pitch``: of a height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
+    """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the
+    format's usual one. ``intrinsics``: a file with the depth pixels' lens, preferred to one that
+    comes with the frames. ``lens``: the same as a value. ``frames``: selects frames by number.
+    ``topic``: of a ROS bag. ``array``: NAME or NAME:NUMBER in a file of arrays. ``pitch``: of a
+    height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
 
     scale_m: float | None = None
     intrinsics: Path | None = None
@@ -62,10 +65,11 @@ class Given:
 class Recording:
     """A real capture as a `harness.vocabulary.geometry.FrameSource`.
 
-    ``read``: yields the frames in order; each call starts again. ``shape``: (height, width). ``scale_m``: metres in one
-    stored unit. ``files``: all files whose content can change a result. ``notes``: how the files were interpreted.
-    ``warnings``: full sentences on doubts about the distances; every program shows them first. ``selection``: picks
-    frames. ``unit_from``: origin of the unit; "" if the data decide."""
+    ``read``: yields the frames in order; each call starts again. ``shape``: (height, width).
+    ``scale_m``: metres in one stored unit. ``files``: all files whose content can change a result.
+    ``notes``: how the files were interpreted. ``warnings``: full sentences on doubts about the
+    distances; every program shows them first. ``selection``: picks frames. ``unit_from``: origin
+    of the unit; "" if the data decide."""
 
     name: str
     read: Callable[[], Iterator[Frame]]
@@ -113,7 +117,8 @@ class Recording:
 
     @cached_property
     def slopes(self) -> np.ndarray | None:
-        """Slopes x/z, y/z (h, w, 2) of pixels; NaN where the distortion has no inverse. None if frames carry points."""
+        """Slopes x/z, y/z (h, w, 2) of pixels; NaN where the distortion has no inverse. None if
+        frames carry points."""
         return None if self.lens is None else _returning_slopes(self.lens, self.region)
 
     def selected(self) -> Iterator[Frame]:
@@ -122,8 +127,10 @@ class Recording:
         return islice(self.read(), chosen.start, chosen.stop, chosen.step)
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the selected frames. Raises UserError for different sizes, a wrong unit, or if no pixel is valid."""
-        count, judged = 0, False
+        """Yield the selected frames. Raises UserError for different sizes, a wrong unit, or if no
+        pixel is valid."""
+        count = 0
+        judged = False
         for frame in self.selected():
             count += 1
             if frame.z_m.shape != self.shape:

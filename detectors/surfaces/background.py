@@ -1,9 +1,11 @@
-"""The undamaged surface behind a cloud: its shape is chosen by evidence, and its goodness of fit is judged.
+"""The undamaged surface behind a cloud: its shape is chosen by evidence, and its goodness of fit
+is judged.
 
-Each shape is fitted to the medians of cells of some 16 pixels or more, and predicts tiles of cells that were left out
-of the fit; the simplest shape whose errors are not significantly larger than the best shape's is taken. If neighbouring
-cells still depart together, smooth free forms of ever shorter wavelength are tried. Not modelled: creases, several
-sheets, surfaces with real structure as small as damage."""
+Each shape is fitted to the medians of cells of some 16 pixels or more, and predicts tiles of cells
+that were left out of the fit; the simplest shape whose errors are not significantly larger than
+the best shape's is taken. If neighbouring cells still depart together, smooth free forms of ever
+shorter wavelength are tried. Not modelled: creases, several sheets, surfaces with real structure
+as small as damage."""
 
 from __future__ import annotations
 
@@ -32,28 +34,47 @@ from detectors.surfaces.surface import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
-MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 64, 600, 40
-"""Most cells; points per cell, at least and where there are enough; enough cells; fewest cells to choose a shape."""
-TILE_CELLS, FOLDS = 3, 5
-"""Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the tiles are dealt."""
-LEAST_SCALE_M = 0.04  # largest width of damage, unless the settings differ: no free form that could follow it is chosen
-WORTH = 0.1  # a shape is as good as the best if its error of prediction is larger by at most this share of the noise
-NOISIER = 1.25  # five standard errors of the median of 49 deviations of 16 pixels each; below it, noise counts as even
+MOST_CELLS = 3600
+CELL_POINTS = 16
+EVEN_CELL_POINTS = 64
+ENOUGH_CELLS = 600
+FEW_CELLS = 40
+"""Most cells; points per cell, at least and where there are enough; enough cells; fewest cells to
+choose a shape."""
+TILE_CELLS = 3
+FOLDS = 5
+"""Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the
+tiles are dealt."""
+# largest width of damage, unless the settings differ: no free form that could follow it is chosen
+LEAST_SCALE_M = 0.04
+# a shape is as good as the best if its error of prediction is larger by at most this share of the
+# noise
+WORTH = 0.1
+# five standard errors of the median of 49 deviations of 16 pixels each; below it, noise counts as
+# even
+NOISIER = 1.25
 STEEPEST_DEG = 75.0
-"""Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its noise grows."""
-FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
-"""Share of the area with structure from which a free form is tried, and from which a warning of a misfit is given."""
+"""Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its
+noise grows."""
+FREE_FORM_FROM = 0.02
+MISFIT_FROM = 0.1
+"""Share of the area with structure from which a free form is tried, and from which a warning of a
+misfit is given."""
 STATED = ("polynomial", "mesh")  # shapes that the user states
-STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
-"""Side of the block averaged to see structure, least significance of structure, and share of a pixel's noise."""
+STRUCTURE_CELLS = 5
+STRUCTURE_SIGMAS = 4.0
+SEEN = 0.5
+"""Side of the block averaged to see structure, least significance of structure, and share of a
+pixel's noise."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and z of the cloud
-    minus the surface; NaN where it is not judged. ``noise_m`` (h, w): standard deviation of the residuals nearby,
-    without the surface's own misfit. ``scale_m``: width above which a free form follows shallow damage. ``warning``: a
-    sentence if remaining structure could be mistaken for damage."""
+    """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface,
+    and z of the cloud minus the surface; NaN where it is not judged. ``noise_m`` (h, w): standard
+    deviation of the residuals nearby, without the surface's own misfit. ``scale_m``: width above
+    which a free form follows shallow damage. ``warning``: a sentence if remaining structure could
+    be mistaken for damage."""
 
     surface_z_m: np.ndarray
     residual_m: np.ndarray
@@ -66,8 +87,9 @@ class Background:
 
 @dataclass(frozen=True)
 class _Cells:
-    """``points`` (c, 3) metres: a ray through each cell and its median z. ``weights`` (c,). ``noise`` (c,): of a pixel.
-    ``level_noise``: of a median. ``of`` (n,): each point's cell or -1. ``side``: in the picture's units."""
+    """``points`` (c, 3) metres: a ray through each cell and its median z. ``weights`` (c,).
+    ``noise`` (c,): of a pixel. ``level_noise``: of a median. ``of`` (n,): each point's cell or -1.
+    ``side``: in the picture's units."""
 
     points: np.ndarray
     weights: np.ndarray
@@ -88,11 +110,13 @@ class _Cells:
 
     @property
     def pixel_noise(self) -> float:
-        """Return the standard deviation of a pixel: about its cell's median, combined with that of the median."""
+        """Return the standard deviation of a pixel: about its cell's median, combined with that of
+        the median."""
         return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
 
     def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
-        """Return the cells with medians and deviations of the points' residuals (n,); some cells are then dropped."""
+        """Return the cells with medians and deviations of the points' residuals (n,); some cells
+        are then dropped."""
         medians, deviations = _group_medians(residuals, self.of, len(self.points))
         z = fit(self.points) + medians
         known = np.isfinite(z)
@@ -117,9 +141,10 @@ class _Shape(NamedTuple):
 
 
 def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
-    """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true. Deterministic. Raises
-    UserError if the points do not determine it."""
-    points, central = np.ascontiguousarray(cloud.points_m[mask]), cloud.projection == "central"
+    """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true.
+    Deterministic. Raises UserError if the points do not determine it."""
+    points = np.ascontiguousarray(cloud.points_m[mask])
+    central = cloud.projection == "central"
     cells = _cells(points, cloud)
     if cells is None:
         name, fit = _stated(
@@ -129,7 +154,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         noise_m = sigma_of(points[:, 2] - fitted)
         warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
         few: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
-        z_m, residual_m = (on_grid(each, mask) for each in (fitted, points[:, 2] - fitted))
+        z_m = on_grid(fitted, mask)
+        residual_m = on_grid(points[:, 2] - fitted, mask)
         return Background(
             z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, few
         )
@@ -146,14 +172,16 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
             shape = (
                 _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
             )
-        name, fit, wavelength = shape.name, shape.fit, shape.wavelength
+        name = shape.name
+        fit = shape.fit
+        wavelength = shape.wavelength
 
     fitted = fit(points)
     residuals = points[:, 2] - fitted
     unseen = ~np.isfinite(fitted)
     if cells.central:
-        # only the few pixels near the steepest incidence are examined one by one; a ray that misses the surface
-        # beside the pixel gives NaN, which is not below the limit either
+        # only the few pixels near the steepest incidence are examined one by one; a ray that
+        # misses the surface beside the pixel gives NaN, which is not below the limit either
         near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
         looked = np.flatnonzero((cells.of < 0) | near[cells.of])
         unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
@@ -163,7 +191,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     fitted[unseen] = np.nan
     cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)
-    text, scale_m = name, None
+    text = name
+    scale_m = None
     if wavelength is not None:
         scale_m = 0.5 * wavelength * cells.side_m / cells.side
         text += f", which absorbs shallow damage wider than {scale_m / MM:.0f} mm"
@@ -172,7 +201,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
             config.shape == "mesh"
         )
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
-    # a pixel's noise near each cell: the target's median, or the median over 7 x 7 cells if that is much larger
+    # a pixel's noise near each cell: the target's median, or the median over 7 x 7 cells if that
+    # is much larger
     padded = np.pad(cells.image(cells.noise), 3, constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))[
         cells.row, cells.column
@@ -183,15 +213,16 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     noise = np.where(
         cells.of >= 0, np.where(local > NOISIER * pixel, local, pixel)[cells.of], pixel
     )
-    z_m, residual_m, noise_map_m = (
-        on_grid(each, mask) for each in (fitted, points[:, 2] - fitted, noise)
-    )
+    z_m = on_grid(fitted, mask)
+    residual_m = on_grid(points[:, 2] - fitted, mask)
+    noise_map_m = on_grid(noise, mask)
     notes.update(shape=name, steep_share=float(unseen.mean()))
     return Background(z_m, residual_m, noise_map_m, text, scale_m, warning, notes)
 
 
 def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
-    """Return a sentence if a stated ``surface`` leaves structure like damage in ``residual_m`` (h, w), else ""."""
+    """Return a sentence if a stated ``surface`` leaves structure like damage in ``residual_m`` (h,
+    w), else ""."""
     mask = np.isfinite(residual_m)
     cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:
@@ -211,7 +242,8 @@ def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> 
 
 
 def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
-    """Return the cells of points (n, 3) of a cloud, not yet `refreshed`; None if too few are filled."""
+    """Return the cells of points (n, 3) of a cloud, not yet `refreshed`; None if too few are
+    filled."""
     if len(points) < FEW_CELLS * CELL_POINTS:
         return None
     central = cloud.projection == "central" and float(points[:, 2].min()) > 0
@@ -223,7 +255,8 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     )
     side = float(np.sqrt(extent.prod() * wanted / len(points)))
     for _ in range(3):
-        across, down = (((each - each.min()) / side).astype(np.int64) for each in (x, y))
+        across = ((x - x.min()) / side).astype(np.int64)
+        down = ((y - y.min()) / side).astype(np.int64)
         columns = int(across.max()) + 1
         keys = down * columns + across
         counts = np.bincount(keys)
@@ -235,10 +268,13 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     number[held] = np.arange(len(held))
     of = number[keys]
     row, column = np.divmod(held, columns)
-    x, y, z = (np.bincount(keys, each)[held] / counts[held] for each in (x, y, points[:, 2]))
+    x = np.bincount(keys, x)[held] / counts[held]
+    y = np.bincount(keys, y)[held] / counts[held]
+    z = np.bincount(keys, points[:, 2])[held] / counts[held]
     side_m = side * (float(np.median(points[:, 2])) if central else 1.0)
     rays = np.column_stack([x, y]) * (z[:, None] if central else 1.0)
-    weights, none = np.minimum(counts[held] / wanted, 1.0), np.zeros(len(held))
+    weights = np.minimum(counts[held] / wanted, 1.0)
+    none = np.zeros(len(held))
     return _Cells(
         np.column_stack([rays, z]), weights, none, 0.0, of, row, column, side, side_m, central
     )
@@ -248,18 +284,21 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
 def _group_medians(
     values: np.ndarray, group: np.ndarray, groups: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of each group's finite values, and their median distance from it over 0.6745; else NaN."""
+    """Return the median of each group's finite values, and their median distance from it over
+    0.6745; else NaN."""
     starts = np.zeros(groups + 1, np.int64)
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
             starts[group[i] + 1] += 1
     starts = np.cumsum(starts)
-    at, held = starts[:-1].copy(), np.empty(starts[-1])
+    at = starts[:-1].copy()
+    held = np.empty(starts[-1])
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
             held[at[group[i]]] = values[i]
             at[group[i]] += 1
-    medians, deviations = np.full(groups, np.nan), np.full(groups, np.nan)
+    medians = np.full(groups, np.nan)
+    deviations = np.full(groups, np.nan)
     for g in range(groups):
         if starts[g + 1] > starts[g]:
             some = held[starts[g] : starts[g + 1]]
@@ -270,11 +309,13 @@ def _group_medians(
 
 @numba.njit(cache=True, nogil=True)
 def _median(values: np.ndarray) -> float:
-    """Return the median of values (n,), which it sorts (Shell 1959): numba's own takes 2 s longer to compile."""
+    """Return the median of values (n,), which it sorts (Shell 1959): numba's own takes 2 s longer
+    to compile."""
     gap = len(values) // 2
     while gap > 0:
         for i in range(gap, len(values)):
-            value, j = values[i], i
+            value = values[i]
+            j = i
             while j >= gap and values[j - gap] > value:
                 values[j] = values[j - gap]
                 j -= gap
@@ -284,7 +325,8 @@ def _median(values: np.ndarray) -> float:
 
 
 def _cell_noise(image: np.ndarray) -> tuple[float, float]:
-    """Return the deviation of cells' medians and their neighbours' correlation, from second differences."""
+    """Return the deviation of cells' medians and their neighbours' correlation, from second
+    differences."""
 
     def bend(step: int) -> float:
         bends = [
@@ -294,7 +336,8 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
         some = some[np.isfinite(some)]
         return sigma_of(some) if len(some) else 0.0
 
-    near, far = bend(1), bend(2)
+    near = bend(1)
+    far = bend(2)
     # for cells with variance s^2 and correlation r with direct neighbours: (6 - 8 r) s^2 and 6 s^2
     deviation = max(near, far) / np.sqrt(6.0)
     return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
@@ -303,7 +346,8 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
 def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     shapes: list[_Shape] = []
     errors: list[np.ndarray] = []
-    worth, auto = WORTH * cells.pixel_noise, config.shape == "auto"
+    worth = WORTH * cells.pixel_noise
+    auto = config.shape == "auto"
     degrees = {degree: partial(polynomial, degree=degree) for degree in (1, 2, 3, 4, 5)}
     formulas: list[tuple[str, Any]] = [
         ("plane", degrees[1]),
@@ -342,8 +386,10 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
 def _fitted(
     cells: _Cells, name: str, fit_to: Any, wavelength: float | None, widened: bool = False
 ) -> _Shape | None:
-    """Fit with bisquare weights, ``widened`` by the flanks of dents; None if the fit misses a fiftieth of the cells."""
-    weights, floor = cells.weights, 0.2 * cells.pixel_noise / np.sqrt(CELL_POINTS)
+    """Fit with bisquare weights, ``widened`` by the flanks of dents; None if the fit misses a
+    fiftieth of the cells."""
+    weights = cells.weights
+    floor = 0.2 * cells.pixel_noise / np.sqrt(CELL_POINTS)
     for _ in range(6):
         fit = fit_to(cells.points, weights)
         if fit is None:
@@ -352,7 +398,8 @@ def _fitted(
         known = np.isfinite(error) & (cells.weights > 0)
         if known.sum() < 0.98 * (cells.weights > 0).sum():
             return None
-        scale, before = max(sigma_of(error[known]), floor), weights
+        scale = max(sigma_of(error[known]), floor)
+        before = weights
         robust = bisquare_weights(np.where(known, error, np.inf), BISQUARE_TUNING * scale)
         if widened:
             # pairs of neighbouring cells without weight, and the neighbours of these pairs
@@ -371,8 +418,10 @@ def _fitted(
 
 
 def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
-    """Return the median size (tiles,) of the errors in each tile of cells, predicted from the tiles of other folds."""
-    across, down = cells.column // TILE_CELLS, cells.row // TILE_CELLS
+    """Return the median size (tiles,) of the errors in each tile of cells, predicted from the
+    tiles of other folds."""
+    across = cells.column // TILE_CELLS
+    down = cells.row // TILE_CELLS
     fold = (across + 2 * down) % FOLDS
     error = np.full(len(cells.points), np.inf)
     for left_out in range(FOLDS):
@@ -386,7 +435,8 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
 
 
 def _simplest(errors: list[np.ndarray], worth: float) -> int:
-    """Return the first shape whose mean error exceeds the least by at most ``worth`` or a standard error."""
+    """Return the first shape whose mean error exceeds the least by at most ``worth`` or a standard
+    error."""
     best = int(np.argmin([each.mean() for each in errors]))
     for i, each in enumerate(errors):
         difference = each - errors[best]
@@ -402,7 +452,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     error = cells.points[:, 2] - fit(cells.points)
     image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
     (noise, shared), pixel = _cell_noise(image), cells.pixel_noise
-    # compact findings differ from their neighbourhood's median; structure is the neighbourhood itself
+    # compact findings differ from their neighbourhood's median; structure is the neighbourhood
+    # itself
     valid = np.isfinite(image)
     limit = np.nanmedian(np.abs(image)) / 0.6745 * BISQUARE_TUNING
     used = valid & (np.abs(np.nan_to_num(image)) < max(limit, BISQUARE_TUNING * noise))
@@ -411,7 +462,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
         cv2.boxFilter(each, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
         for each in (used.astype(float), np.where(used, image, 0.0))
     )
-    smooth, enough = total / np.maximum(count, 1), valid & (count >= 9)
+    smooth = total / np.maximum(count, 1)
+    enough = valid & (count >= 9)
     chance = STRUCTURE_SIGMAS * noise * (1 + 2 * shared) / np.sqrt(np.maximum(count, 1))
     beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * pixel))
     rms_m = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
@@ -430,7 +482,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
 
 
 def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
-    """Return the angles (n,) between the rays and the surface's normals, from the surface's slope over one ``step``."""
+    """Return the angles (n,) between the rays and the surface's normals, from the surface's slope
+    over one ``step``."""
 
     def on_surface(dx: float, dy: float) -> np.ndarray:
         rays = points / points[:, 2:] + [dx, dy, 0.0]

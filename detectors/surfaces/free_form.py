@@ -11,8 +11,11 @@ from detectors.findings.clusters import PLAIN
 from detectors.surfaces.surface import RIDGE, Fit
 
 KNOTS_PER_WAVELENGTH = 4.0
-"""Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the penalty in charge."""
-MOST_KNOTS = 64  # most knots along one side: limits time and memory; the free form may then be smoother than requested
+"""Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the
+penalty in charge."""
+# most knots along one side: limits time and memory; the free form may then be smoother than
+# requested
+MOST_KNOTS = 64
 
 
 def free_form(
@@ -23,17 +26,20 @@ def free_form(
     cell: float,
     central: bool,
 ) -> Fit:
-    """Fit a base shape plus tensor-product cubic B-splines in the picture's plane, penalised on third derivatives
-    (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones less (as its sixth power); in units of
-    x/z (central) or metres, as ``cell``, the spacing of the points."""
+    """Fit a base shape plus tensor-product cubic B-splines in the picture's plane, penalised on
+    third derivatives (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones
+    less (as its sixth power); in units of x/z (central) or metres, as ``cell``, the spacing of the
+    points."""
     places = picture_places(points, central)
-    low, extent = places.min(axis=0), np.ptp(places, axis=0)
+    low = places.min(axis=0)
+    extent = np.ptp(places, axis=0)
     spacing = max(wavelength / KNOTS_PER_WAVELENGTH, float(extent.max()) / MOST_KNOTS)
     counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 3
     residual = points[:, 2] - base(points)
     w = np.where(np.isfinite(residual), weights, 0.0)
     values, numbers = _splines((places - low) / spacing, counts)
-    # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the factor
+    # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the
+    # factor
     stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
     # LAPACK's upper bands
     width = int(3 * counts[1] + 3)
@@ -58,7 +64,8 @@ def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
 
 @numba.njit(**PLAIN)
 def _spline(place: float, count: int, out: np.ndarray) -> int:
-    """Fill (4,) with the cubic splines that reach a place, the nearest on the knots, and return the first's number."""
+    """Fill (4,) with the cubic splines that reach a place, the nearest on the knots, and return
+    the first's number."""
     x = min(max(place, 0.0), count - 3.0) if np.isfinite(place) else 0.0
     first = min(int(x), count - 4)
     t = x - first
@@ -71,13 +78,13 @@ def _spline(place: float, count: int, out: np.ndarray) -> int:
 @numba.njit(**PLAIN)
 def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the 16 products of cubic splines that reach each place (n, 2), and their numbers."""
-    values, numbers = np.empty((len(places), 16)), np.empty((len(places), 16), np.int64)
-    down, across = np.empty(4), np.empty(4)
+    values = np.empty((len(places), 16))
+    numbers = np.empty((len(places), 16), np.int64)
+    down = np.empty(4)
+    across = np.empty(4)
     for i in range(len(places)):
-        row, column = (
-            _spline(places[i, 0], counts[0], down),
-            _spline(places[i, 1], counts[1], across),
-        )
+        row = _spline(places[i, 0], counts[0], down)
+        column = _spline(places[i, 1], counts[1], across)
         for k in range(16):
             values[i, k] = down[k // 4] * across[k % 4]
             numbers[i, k] = (row + k // 4) * counts[1] + column + k % 4
@@ -92,11 +99,14 @@ def _normal_bands(
     width: int,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted normal matrix of the splines as upper bands (width + 1, size), and the right side (size,)."""
+    """Return the weighted normal matrix of the splines as upper bands (width + 1, size), and the
+    right side (size,)."""
     weighted = weights[:, None] * values
     a, b = np.triu_indices(16)
-    rows, columns = numbers[:, a], numbers[:, b]
-    places, squares = (width + rows - columns) * size + columns, weighted[:, a] * values[:, b]
+    rows = numbers[:, a]
+    columns = numbers[:, b]
+    places = (width + rows - columns) * size + columns
+    squares = weighted[:, a] * values[:, b]
     banded = np.bincount(places.ravel(), squares.ravel(), (width + 1) * size).reshape(
         width + 1, size
     )
@@ -108,7 +118,9 @@ def _spline_sums(
     points: np.ndarray, central: bool, low: np.ndarray, spacing: float, coefficients: np.ndarray
 ) -> np.ndarray:
     """Return the splines' sum (n,) by coefficients (rows, columns) at points (n, 3)."""
-    out, down, across = np.empty(len(points)), np.empty(4), np.empty(4)
+    out = np.empty(len(points))
+    down = np.empty(4)
+    across = np.empty(4)
     rows, columns = coefficients.shape
     for i in range(len(points)):
         z = points[i, 2] if central else 1.0
@@ -126,7 +138,8 @@ def _spline_sums(
 
 @lru_cache(maxsize=32)
 def _penalty(rows: int, columns: int) -> sparse.coo_array:
-    """Return the upper half of the sum of squared third differences of coefficients, mixed ones three times."""
+    """Return the upper half of the sum of squared third differences of coefficients, mixed ones
+    three times."""
 
     def squared(count: int, order: int) -> np.ndarray:
         differences = np.diff(np.eye(count), order, axis=0)

@@ -1,4 +1,5 @@
-"""Finds the large connected smooth surfaces of a cloud. A pipe up to its limb is one; two faces of a box are two."""
+"""Finds the large connected smooth surfaces of a cloud. A pipe up to its limb is one; two faces of
+a box are two."""
 
 import math
 from dataclasses import dataclass
@@ -13,35 +14,50 @@ from detectors.findings.clusters import PLAIN
 from detectors.masks import components, grown, holes_filled, nearest_pixel, parts_with, shrunk
 from harness.vocabulary.geometry import MM, Cloud, Region
 
-MAX_SURFACE_TILT, STEP_SIGMAS = 6.0, 6.0
-"""tan(80.5 degrees): a steeper step is an edge. A step of fewer standard deviations of a difference may be noise."""
+MAX_SURFACE_TILT = 6.0
+STEP_SIGMAS = 6.0
+"""tan(80.5 degrees): a steeper step is an edge. A step of fewer standard deviations of a
+difference may be noise."""
 BRIDGED_PX = 2  # largest distance from which a pixel without a return takes its point
-SMOOTH_MM, MIXED_PX = 16.0, 3
-"""Width of the window on a coarse grid, and half of the least number of pixels over which a bend is judged."""
-NORMAL_NOISE, WIDEST_SMOOTH_PX = 0.06, 41
-"""Largest noise of the smoothed surface's slope, radians; noisier clouds use a wider window, up to this one."""
-LEAST_SHARE, LEAST_PX = (
-    0.004,
-    100,
-)  # a surface with a smaller share of all pixels or fewer pixels is not a candidate
+SMOOTH_MM = 16.0
+MIXED_PX = 3
+"""Width of the window on a coarse grid, and half of the least number of pixels over which a bend
+is judged."""
+NORMAL_NOISE = 0.06
+WIDEST_SMOOTH_PX = 41
+"""Largest noise of the smoothed surface's slope, radians; noisier clouds use a wider window, up to
+this one."""
+# a surface with a smaller share of all pixels or fewer pixels is not a candidate
+LEAST_SHARE = 0.004
+LEAST_PX = 100
 LEAST_SHARED_PX = 10  # pixels that the rims of two surfaces must share to be merged
-CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
-"""Two surfaces touch at a common border if their step there is smaller; the noise of a difference raises this limit."""
+CONTACT_MM = 5.0
+CONTACT_SIGMAS = 3.0
+"""Two surfaces touch at a common border if their step there is smaller; the noise of a difference
+raises this limit."""
 RIM_TURN_DEG = (
     10.0  # largest turn of a rim from the surface inside it, beyond the bend of that surface
 )
-MOST_SURFACES, WIDE_PART = 8, 0.1
-"""Most surfaces; least share of pixels at the middle of a full window: a smoothed step has no such pixel."""
+MOST_SURFACES = 8
+WIDE_PART = 0.1
+"""Most surfaces; least share of pixels at the middle of a full window: a smoothed step has no such
+pixel."""
 WIDEST_SLOPE = 5.7
-"""tan(80 degrees): no camera sees so far off its axis; a cloud with a larger slope was not recorded from its origin."""
-CELL_SPACINGS, CELL_GROWTH, CELLS_FILLED, MAX_RASTER = 1.5, 1.25, 0.99, 4096
-"""Least side of a raster's cell in spacings; its growth until this share of cells hold a point; most cells a side."""
+"""tan(80 degrees): no camera sees so far off its axis; a cloud with a larger slope was not
+recorded from its origin."""
+CELL_SPACINGS = 1.5
+CELL_GROWTH = 1.25
+CELLS_FILLED = 0.99
+MAX_RASTER = 4096
+"""Least side of a raster's cell in spacings; its growth until this share of cells hold a point;
+most cells a side."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """``own`` (n, h, w) bool: each surface's pixels, largest core first. ``filled`` (n, h, w) bool: the same with all
-    that they enclose. ``contact_m``: smaller steps do not count. ``reach_px``: smoothing's reach from an edge."""
+    """``own`` (n, h, w) bool: each surface's pixels, largest core first. ``filled`` (n, h, w)
+    bool: the same with all that they enclose. ``contact_m``: smaller steps do not count.
+    ``reach_px``: smoothing's reach from an edge."""
 
     own: np.ndarray
     filled: np.ndarray
@@ -50,16 +66,20 @@ class Surfaces:
 
 
 def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces:
-    """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider in noisy clouds."""
-    points, seen = np.array(cloud.points_m, np.float64), cloud.valid
+    """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider in
+    noisy clouds."""
+    points = np.array(cloud.points_m, np.float64)
+    seen = cloud.valid
     valid = seen
     if seen.any() and not seen.all():
         apart, nearest = nearest_pixel(seen)
         valid = apart <= BRIDGED_PX
         gaps = valid & ~seen
         points[gaps] = points.reshape(-1, 3)[nearest[gaps]]
-    # noise of a difference between neighbours, from the lowest quarter of the second differences of z along rows
-    # (three quarters of the picture may be rubble): they have sqrt(6) of white noise's sigma, first differences sqrt(2)
+    # noise of a difference between neighbours, from the lowest quarter of the second differences
+    # of z along rows (three quarters of the picture may be rubble): they have sqrt(6) of white
+    # noise's sigma,
+    # first differences sqrt(2)
     z = np.ascontiguousarray(cloud.points_m[..., 2])
     bends = np.abs(z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2])
     bends = bends[np.isfinite(bends)]
@@ -69,13 +89,15 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     steps = np.hypot(np.diff(points[::4, :, 0], axis=1), np.diff(points[::4, :, 1], axis=1))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     pitch_m = quantile_of(steps, 0.1) if len(steps) else 0.0
-    window, half = smooth_px, max(smooth_px // 2, 1)
+    window = smooth_px
+    half = max(smooth_px // 2, 1)
     if pitch_m:
         # a central difference of the mean of n x n pixels has noise_m / (sqrt(2) n^1.5 pitch)
         by_noise = (noise_m / (math.sqrt(2.0) * NORMAL_NOISE * pitch_m)) ** (2.0 / 3.0)
         wanted = max(min(smooth_px, SMOOTH_MM * MM / pitch_m), by_noise, 3.0)
         window = min(2 * int(wanted / 2.0) + 1, max(WIDEST_SMOOTH_PX, smooth_px))
-        # a camera that interpolates spreads a step over several pixels: on a coarse grid, over more than the window
+        # a camera that interpolates spreads a step over several pixels: on a coarse grid, over
+        # more than the window
         half = max(window // 2, min(MIXED_PX, int(0.75 * SMOOTH_MM * MM / pitch_m)), 1)
 
     size = (window, window)
@@ -97,8 +119,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     cores, sizes = components(valid & ~bent, right, down)
     count = _keep_large(cores, sizes, window)
 
-    # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given back if no step
-    # and no other surface's core separates them from the core
+    # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given
+    # back if no step and no other surface's core separates them from the core
     reach = window // 2 + 1 + half
     own = np.zeros((count, *valid.shape), dtype=bool)
     for number, mask in enumerate(own, start=1):
@@ -125,19 +147,26 @@ def _before_lens(points: np.ndarray) -> bool:
 def links(
     points_m: np.ndarray, tilt: float, noise_m: float, central: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h,
-    w). ``central``: distances across are measured between the two rays at the nearer depth."""
+    """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and
+    its lower neighbour (h, w). ``central``: distances across are measured between the two rays at
+    the nearer depth."""
     h, w, _ = points_m.shape
     linked = np.zeros((2, h, w), np.bool_)
     for v in range(h):
         for u in range(w):
             for way in range(2):
-                row, column = v + way, u + 1 - way
+                row = v + way
+                column = u + 1 - way
                 if row < h and column < w:
-                    here, there, ours, theirs = points_m[v, u], points_m[row, column], 1.0, 1.0
+                    here = points_m[v, u]
+                    there = points_m[row, column]
+                    ours = 1.0
+                    theirs = 1.0
                     if central:
-                        ours, theirs = min(there[2] / here[2], 1.0), min(here[2] / there[2], 1.0)
-                    dx, dy = there[0] * theirs - here[0] * ours, there[1] * theirs - here[1] * ours
+                        ours = min(there[2] / here[2], 1.0)
+                        theirs = min(here[2] / there[2], 1.0)
+                    dx = there[0] * theirs - here[0] * ours
+                    dy = there[1] * theirs - here[1] * ours
                     linked[way, v, u] = (
                         abs(there[2] - here[2]) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
                     )
@@ -146,17 +175,23 @@ def links(
 
 @numba.njit(**PLAIN)
 def unit_normals(surface_m: np.ndarray) -> np.ndarray:
-    """Return the normals (h, w, 3) of a surface's points (h, w, 3), from central differences; 0 if the area is 0."""
+    """Return the normals (h, w, 3) of a surface's points (h, w, 3), from central differences; 0 if
+    the area is 0."""
     h, w, _ = surface_m.shape
-    normals, along, down = np.zeros((h, w, 3)), np.empty(3), np.empty(3)
+    normals = np.zeros((h, w, 3))
+    along = np.empty(3)
+    down = np.empty(3)
     for v in range(h):
-        above, below = max(v - 1, 0), min(v + 1, h - 1)
+        above = max(v - 1, 0)
+        below = min(v + 1, h - 1)
         for u in range(w):
-            left, right = max(u - 1, 0), min(u + 1, w - 1)
+            left = max(u - 1, 0)
+            right = min(u + 1, w - 1)
             for k in range(3):  # the length of either step does not matter
                 along[k] = surface_m[v, right, k] - surface_m[v, left, k]
                 down[k] = surface_m[below, u, k] - surface_m[above, u, k]
-            x, y = along[1] * down[2] - along[2] * down[1], along[2] * down[0] - along[0] * down[2]
+            x = along[1] * down[2] - along[2] * down[1]
+            y = along[2] * down[0] - along[0] * down[2]
             z = along[0] * down[1] - along[1] * down[0]
             length = max(math.sqrt(x * x + y * y + z * z), 1e-15)
             normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = (
@@ -168,7 +203,8 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
 
 
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
-    """Return (h, w) bool: whether the unit normals ``half`` pixels to either side enclose a wider angle."""
+    """Return (h, w) bool: whether the unit normals ``half`` pixels to either side enclose a wider
+    angle."""
     turned = np.zeros(normals.shape[:2], dtype=bool)
     for ahead, middle, back in (
         (np.s_[2 * half :], np.s_[half:-half], np.s_[: -2 * half]),
@@ -179,7 +215,8 @@ def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
 
 
 class _Smooth(NamedTuple):
-    """Points (n, 3), their local means, the unit normals of the means, and whether rays meet in the origin."""
+    """Points (n, 3), their local means, the unit normals of the means, and whether rays meet in
+    the origin."""
 
     points_m: np.ndarray
     means_m: np.ndarray
@@ -187,15 +224,18 @@ class _Smooth(NamedTuple):
     central: bool
 
     def misses_m(self, pixels: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-        """Return the distances in depth (n,) of the points at ``pixels`` from the planes at ``seeds``."""
-        points, normals = self.points_m[pixels], self.normals[seeds]
+        """Return the distances in depth (n,) of the points at ``pixels`` from the planes at
+        ``seeds``."""
+        points = self.points_m[pixels]
+        normals = self.normals[seeds]
         height = ((self.means_m[seeds] - points) * normals).sum(axis=1)
         way = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
         return np.abs(height) / np.maximum(np.abs((normals * way).sum(axis=1)), 1e-3)
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
-    """Return the number of candidates: cores that are large enough, and wider than the ramp of a smoothed edge."""
+    """Return the number of candidates: cores that are large enough, and wider than the ramp of a
+    smoothed edge."""
     large = int((sizes >= max(LEAST_PX, int(LEAST_SHARE * cores.size))).sum())
     kept = []
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
@@ -216,7 +256,8 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
 def _joined(
     own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
 ) -> np.ndarray:
-    """Return ``own`` with surfaces merged, also in ``cores``, if their rims share pixels and their planes agree."""
+    """Return ``own`` with surfaces merged, also in ``cores``, if their rims share pixels and their
+    planes agree."""
     stays = np.arange(len(own))
     for i in range(len(own)):
         for j in range(i + 1, len(own)):
@@ -236,7 +277,8 @@ def _joined(
 
 
 def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> None:
-    """Give each pixel of several rims to the surface whose plane, extended from its core, is nearest."""
+    """Give each pixel of several rims to the surface whose plane, extended from its core, is
+    nearest."""
     pixels = np.flatnonzero(own.sum(axis=0) > 1)
     if not len(pixels):
         return
@@ -260,7 +302,8 @@ def _trim_rims(
     reach: int,
     apart_m: float,
 ) -> None:
-    """Remove the parts of each surface's rim that depart from the surface inside, and pixels connected only by them."""
+    """Remove the parts of each surface's rim that depart from the surface inside, and pixels
+    connected only by them."""
     points, means, normals, _ = smooth
     for number in range(len(own)):
         # the picture's edge is a rim too: a strip of background may lie there
@@ -287,12 +330,16 @@ def _trim_rims(
 
 @numba.njit(**PLAIN)
 def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # type: ignore[no-untyped-def]
-    """Return whether each of the pixels (n,) departs from the surface at its seed (n,) farther inside."""
+    """Return whether each of the pixels (n,) departs from the surface at its seed (n,) farther
+    inside."""
     found = np.zeros(len(pixels), np.bool_)
     for i in range(len(pixels)):
-        pixel, seed = pixels[i], seeds[i]
-        row, column = seed // w, seed % w
-        down, across = row - pixel // w, column - pixel % w
+        pixel = pixels[i]
+        seed = seeds[i]
+        row = seed // w
+        column = seed % w
+        down = row - pixel // w
+        across = column - pixel % w
         step = reach / max(math.sqrt(down**2 + across**2), 1.0)
         # the bend of the surface over the same distance inwards, radians per metre
         end = min(max(round(row + down * step), 0), h - 1) * w + min(
@@ -311,11 +358,12 @@ def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # typ
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:
-    """Return a grid with an empty border that holds, in each cell, the nearest of the points (n, 3); each point's row
-    and column; and the side of a cell in distances between neighbours."""
+    """Return a grid with an empty border that holds, in each cell, the nearest of the points (n,
+    3); each point's row and column; and the side of a cell in distances between neighbours."""
     from scipy.spatial import cKDTree
 
-    plan, z = points[:, :2], points[:, 2:]
+    plan = points[:, :2]
+    z = points[:, 2:]
     if _before_lens(points):
         plan = plan / z
     # the 90th percentile of the distances to the nearest neighbour, from about 2000 places
@@ -325,8 +373,8 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     side = max(CELL_SPACINGS * spacing, float(np.ptp(plan, axis=0).max()) / MAX_RASTER)
     while True:
         columns, rows = np.floor((plan - plan.min(axis=0)) / side).astype(int).T
-        # share of filled cells in blocks of 2 x 2 that hold a place and whose eight neighbours do: a gap that is
-        # wider than a block does not come from a lack of points
+        # share of filled cells in blocks of 2 x 2 that hold a place and whose eight neighbours do:
+        # a gap that is wider than a block does not come from a lack of points
         held = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
         held[rows, columns] = True
         in_block = held.reshape(held.shape[0] // 2, 2, held.shape[1] // 2, 2).sum(axis=(1, 3))
@@ -334,13 +382,15 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
         if not inner.any() or float(in_block[inner].mean()) / 4.0 >= CELLS_FILLED:
             break
         side *= CELL_GROWTH
-    rows, columns = rows + 1, columns + 1
+    rows = rows + 1
+    columns = columns + 1
     shape = (int(rows.max()) + 2, int(columns.max()) + 2)
     image = np.full((*shape, 3), np.nan)
     # numpy keeps the last value of a repeated index
     far_first = np.argsort(-points[:, 2], kind="stable")
     image[rows[far_first], columns[far_first]] = points[far_first]
-    none, zeros = np.full(shape, np.nan), np.zeros(shape, dtype=np.uint8)
+    none = np.full(shape, np.nan)
+    zeros = np.zeros(shape, dtype=np.uint8)
     region = Region(0, shape[0], 0, shape[1])
     grid = Cloud(image, zeros, zeros.astype(int), none, region, cloud.z_step_m, cloud.n_frames)
     return grid, rows, columns, side / spacing

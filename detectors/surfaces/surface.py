@@ -1,9 +1,9 @@
-"""Shapes of a target, fitted to points that include damage: polynomials z(x, y) (the thesis' "robust cubic" and others)
-and quadrics (sphere, cylinder, cone, ...).
+"""Shapes of a target, fitted to points that include damage: polynomials z(x, y) (the thesis'
+"robust cubic" and others) and quadrics (sphere, cylinder, cone, ...).
 
-Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated
-noise, overhangs, creases, several sheets. Damage of one to three sigma shifts point-wise robust fits by a third of a
-sigma."""
+Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in
+x and y, correlated noise, overhangs, creases, several sheets. Damage of one to three sigma shifts
+point-wise robust fits by a third of a sigma."""
 
 from __future__ import annotations
 
@@ -25,23 +25,33 @@ from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
 
 SAMPLE_POINTS = 2048
 BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
-LTS_SAMPLE, LTS_SMALL, LTS_STARTS, LTS_KEPT, LTS_STEPS = 8192, 600, 500, 10, 10
-"""FAST-LTS: points in the large and in the first sample, elemental starts, continued starts and their steps."""
+LTS_SAMPLE = 8192
+LTS_SMALL = 600
+LTS_STARTS = 500
+LTS_KEPT = 10
+LTS_STEPS = 10
+"""FAST-LTS: points in the large and in the first sample, elemental starts, continued starts and
+their steps."""
 LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: it tolerates up to 45 % damage
 LTS_SEED = 20201102
-LAR_THINNING, LAR_STEPS, HALVINGS = 12, 60, 12
+LAR_THINNING = 12
+LAR_STEPS = 60
+HALVINGS = 12
 KNEES = np.array(
     [1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6]
 )  # knees of Huber's function, in units of the median |r|
-BISQUARE_CONVERGED, GAP_CONVERGED = 1e-2, 1e-6
-"""Bisquare stops below this share of a standard error of the fit, LAR if the relative duality gap is this small."""
+BISQUARE_CONVERGED = 1e-2
+GAP_CONVERGED = 1e-6
+"""Bisquare stops below this share of a standard error of the fit, LAR if the relative duality gap
+is this small."""
 TINY_M = 1e-9  # residuals below a nanometre are rounding errors
 
 Solution = tuple[np.ndarray, str]  # coefficients (p,) and a description of the fit
 
 
 class ReferenceConfig(Config):
-    """The part's own mesh, which may be open. ``front``: the axis of the file that points to the camera."""
+    """The part's own mesh, which may be open. ``front``: the axis of the file that points to the
+    camera."""
 
     file: Annotated[str, Field(min_length=1, max_length=1000, description=FILES)]
     unit: FileUnit = "mm"
@@ -49,12 +59,13 @@ class ReferenceConfig(Config):
 
 
 class SurfaceConfig(Config):
-    """``shape``: ``polynomial``, of the stated total ``degree`` (3: MATLAB's poly33); ``auto``, the simplest of plane,
-    polynomials, quadric and free form that the cloud supports; ``free_form``; or ``mesh``, the ``reference`` fitted to
-    the cloud. ``scale_mm``: width above which a free form follows the cloud. ``method``: ``lar`` least absolute
-    residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` bisquare from a FAST-LTS
-    start, which tolerates damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: whether terms in
-    both x and y are left out (as in the thesis' script)."""
+    """``shape``: ``polynomial``, of the stated total ``degree`` (3: MATLAB's poly33); ``auto``,
+    the simplest of plane, polynomials, quadric and free form that the cloud supports;
+    ``free_form``; or ``mesh``, the ``reference`` fitted to the cloud. ``scale_mm``: width above
+    which a free form follows the cloud. ``method``: ``lar`` least absolute residuals; ``bisquare``
+    Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` bisquare from a FAST-LTS
+    start, which tolerates damage of a third of the surface; ``least_squares``.
+    ``drop_cross_terms``: whether terms in both x and y are left out (as in the thesis' script)."""
 
     shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
     reference: ReferenceConfig | None = None
@@ -72,7 +83,8 @@ class SurfaceConfig(Config):
 
 @dataclass(frozen=True)
 class Chebyshev:
-    """Products T_a(u) T_b(v) for rows (a, b) of ``powers`` (p, 2); (u, v) = ((x, y) - ``middle_m``) / ``half_m``."""
+    """Products T_a(u) T_b(v) for rows (a, b) of ``powers`` (p, 2); (u, v) = ((x, y) -
+    ``middle_m``) / ``half_m``."""
 
     powers: np.ndarray
     middle_m: np.ndarray
@@ -82,17 +94,16 @@ class Chebyshev:
     def over(cls, xy_m: np.ndarray, degree: int, cross_terms: bool = True) -> Chebyshev:
         """Return the products up to a total degree over places (n, 2), which may coincide."""
         orders = [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
-        low, high = (np.array([end(xy_m[:, 0]), end(xy_m[:, 1])]) for end in (np.min, np.max))
+        low = np.array([np.min(xy_m[:, 0]), np.min(xy_m[:, 1])])
+        high = np.array([np.max(xy_m[:, 0]), np.max(xy_m[:, 1])])
         # separable polynomials f(x) + g(y) stay separable under scaling of each axis
         powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
         return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
 
     def basis(self, xy_m: np.ndarray) -> np.ndarray:
         """Return the products (p, n) at places (n, 2)."""
-        products, places_m = (
-            np.empty((len(self.powers), len(xy_m))),
-            np.ascontiguousarray(xy_m.T, np.float64),
-        )
+        products = np.empty((len(self.powers), len(xy_m)))
+        places_m = np.ascontiguousarray(xy_m.T, np.float64)
         _write_products(places_m, self.powers, self.middle_m, self.half_m, products)
         return products
 
@@ -104,7 +115,9 @@ class Chebyshev:
         )
 
 
-AT_ONCE, BLOCK = 4096, 512  # places whose products, and whose orders of u and v, stay in the caches
+# places whose products, and whose orders of u and v, stay in the caches
+AT_ONCE = 4096
+BLOCK = 512
 
 
 @numba.njit(**PLAIN)
@@ -127,11 +140,9 @@ def _write_products(xy_m, powers, middle_m, half_m, products):  # type: ignore[n
         for axis in range(2):
             _write_orders(xy_m[axis, first:last], middle_m[axis], half_m[axis], orders[axis])
         for j in range(len(powers)):
-            u, v, product = (
-                orders[0, powers[j, 0]],
-                orders[1, powers[j, 1]],
-                products[j, first:last],
-            )
+            u = orders[0, powers[j, 0]]
+            v = orders[1, powers[j, 1]]
+            product = products[j, first:last]
             for i in range(len(product)):
                 product[i] = u[i] * v[i]
 
@@ -145,7 +156,8 @@ class Surface:
     note: str
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return z in metres at x, y of one shape; NaN where they are NaN. Polynomials extrapolate badly."""
+        """Return z in metres at x, y of one shape; NaN where they are NaN. Polynomials extrapolate
+        badly."""
         x, y = np.broadcast_arrays(
             np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
         )
@@ -154,7 +166,8 @@ class Surface:
         ).reshape(x.shape)
 
     def gradients(self, x_m: np.ndarray, y_m: np.ndarray, step_m: float) -> np.ndarray:
-        """Return (..., 3) gradients of z less the surface, (-dz/dx, -dz/dy, 1), at x, y by central differences."""
+        """Return (..., 3) gradients of z less the surface, (-dz/dx, -dz/dy, 1), at x, y by central
+        differences."""
         ways = ((step_m, 0.0), (0.0, step_m))
         twice = [
             self.evaluate(x_m - dx, y_m - dy) - self.evaluate(x_m + dx, y_m + dy) for dx, dy in ways
@@ -165,9 +178,10 @@ class Surface:
 def fit_surface(
     x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: SurfaceConfig
 ) -> Surface:
-    """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute residuals, bisquare
-    within 0.05 standard errors of the fixed point of all points. Deterministic. Raises UserError if there are fewer
-    points than coefficients, or if all points lie on a line."""
+    """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute
+    residuals, bisquare within 0.05 standard errors of the fixed point of all points.
+    Deterministic. Raises UserError if there are fewer points than coefficients, or if all points
+    lie on a line."""
     terms = (
         (2 * config.degree + 1)
         if config.drop_cross_terms
@@ -176,10 +190,8 @@ def fit_surface(
     if len(z_m) < terms:
         degree = f"a surface of degree {config.degree}"
         what = f"{len(z_m)} valid points cannot determine the {terms} coefficients of {degree}"
-        legal, fix = (
-            f"at least {terms} points",
-            "widen the crop, lower surface.degree, or check the capture",
-        )
+        legal = f"at least {terms} points"
+        fix = "widen the crop, lower surface.degree, or check the capture"
         raise UserError(what, legal=legal, fix=fix)
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
     chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
@@ -202,7 +214,8 @@ def fit_surface(
         start = _lts_start(*_thinned(basis, z, LTS_SAMPLE))
         c, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
     else:
-        c, note = plain[0], "least squares"
+        c = plain[0]
+        note = "least squares"
     c = c.copy()
     c[0] += middle
     return Surface(chebyshev, c, note)
@@ -211,7 +224,8 @@ def fit_surface(
 def _solved(
     basis: np.ndarray, z: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p, p), or None."""
+    """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p,
+    p), or None."""
     weighted = basis if weight is None else basis * weight
     factor = _factor(weighted @ basis.T)
     return None if factor is None else (dpotrs(factor, weighted @ z, lower=True)[0], factor)
@@ -229,7 +243,8 @@ def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray,
     stride = len(z) // points
     if stride < 2:
         return basis, z
-    few_basis, few_z = np.ascontiguousarray(basis[:, ::stride]), np.ascontiguousarray(z[::stride])
+    few_basis = np.ascontiguousarray(basis[:, ::stride])
+    few_z = np.ascontiguousarray(z[::stride])
     return (basis, z) if _solved(few_basis, few_z) is None else (few_basis, few_z)
 
 
@@ -237,10 +252,12 @@ def _lar(
     basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray = KNEES
 ) -> Solution:
     """Find the L1 solution by smoothing (Madsen and Nielsen 1993)."""
-    c, margin = start, np.inf
+    c = start
+    margin = np.inf
     few_basis, few_z = _thinned(basis, z, max(SAMPLE_POINTS, len(z) // LAR_THINNING))
     if len(few_z) < len(z):
-        c, knees = _lar(few_basis, few_z, start, KNEES[:3])[0], knees[2:]
+        c = _lar(few_basis, few_z, start, KNEES[:3])[0]
+        knees = knees[2:]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
     r = z - c @ basis
@@ -259,7 +276,9 @@ def _lar(
             if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
                 break
             reach *= 3.0
-        c, r, margin = new, after, min(margin, 5.0 * knee / scale)
+        c = new
+        r = after
+        margin = min(margin, 5.0 * knee / scale)
         sizes = np.abs(r)
         inside = sizes[sizes <= knee]
         gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
@@ -272,10 +291,12 @@ def _lar(
 def _huber(
     rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), the inner normal matrix's lower
-    half."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), the inner
+    normal matrix's lower half."""
     terms = len(c)
-    value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
+    value = 0.0
+    pull = np.zeros(terms)
+    inside = np.zeros((terms, terms))
     for i in range(len(z)):
         r = z[i]
         for j in range(terms):
@@ -300,7 +321,8 @@ def _smoothed_descent(
     knee: float,
     enough: float,
 ) -> np.ndarray:
-    """Minimise sum huber(r, knee) - c' far_pull by Newton steps, or by majorising steps, which always descend."""
+    """Minimise sum huber(r, knee) - c' far_pull by Newton steps, or by majorising steps, which
+    always descend."""
 
     def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         value, pull, inside = _huber(rows, z, c, knee)
@@ -313,7 +335,8 @@ def _smoothed_descent(
 
     value, c, pull, inside = state(start)
     for _ in range(LAR_STEPS):
-        factor, moved = _factor(inside), None
+        factor = _factor(inside)
+        moved = None
         if factor is not None:
             way = knee * dpotrs(factor, pull, lower=True)[0]
             if way @ pull < enough:
@@ -335,7 +358,8 @@ def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
 
 
 def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: str) -> Solution:
-    """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points."""
+    """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all
+    points."""
     few_basis, few_z = _thinned(basis, z, SAMPLE_POINTS)
     inner = _reweighted(few_basis, few_z, start, 50, note)
     return inner if len(few_z) == len(z) else _reweighted(basis, z, inner[0], 8, note)
@@ -346,12 +370,14 @@ def _reweighted(
 ) -> Solution:
     plain = _solved(basis, z)
     assert plain is not None
-    c, terms = plain[0] if start is None else start, len(basis)
+    c = plain[0] if start is None else start
+    terms = len(basis)
     leverage = ((np.linalg.inv(plain[1]) @ basis) ** 2).sum(axis=0)
     adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
     for _ in range(steps):
         adjusted = (z - c @ basis) * adjust
-        # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each term
+        # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each
+        # term
         sizes = np.abs(adjusted)
         place = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
         scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
@@ -359,7 +385,8 @@ def _reweighted(
         if found is None:
             return c, note + "; stopped: too few points kept weight"
         new, factor = found
-        # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
+        # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance
+        # times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
         if moved < BISQUARE_CONVERGED * np.sqrt(terms):
@@ -373,7 +400,8 @@ def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
     (terms, points), ridge = few_basis.shape, 1e-12 * np.eye(len(few_basis))
 
     def concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -> np.ndarray:
-        """Return coefficients (m, p) after this many steps, those with the least sum of the smallest squares first."""
+        """Return coefficients (m, p) after this many steps, those with the least sum of the
+        smallest squares first."""
         kept = min(len(z), max(int(LTS_COVERAGE * len(z)), (len(z) + terms + 1) // 2))
         products = (basis[:, None] * basis).reshape(-1, len(z)).T
         for _ in range(steps):
@@ -393,13 +421,17 @@ def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 Fit = Callable[[np.ndarray], np.ndarray]
-"""Maps measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the surface."""
-RIDGE = 1e-9  # share of the largest diagonal element, added to every one so that normal equations stay regular
+"""Maps measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the
+surface."""
+# share of the largest diagonal element, added to every one so that normal equations stay regular
+RIDGE = 1e-9
 
 
 def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
-    """Fit Chebyshev products of total degree ``degree`` by weighted least squares; regular for any points."""
-    chebyshev, level = Chebyshev.over(points[:, :2], degree), float(points[:, 2].mean())
+    """Fit Chebyshev products of total degree ``degree`` by weighted least squares; regular for any
+    points."""
+    chebyshev = Chebyshev.over(points[:, :2], degree)
+    level = float(points[:, 2].mean())
     basis = chebyshev.basis(points[:, :2])
     coefficients = _ridged(basis.T, points[:, 2] - level, weights)
     coefficients[0] += level
@@ -415,8 +447,9 @@ def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarra
 
 
 def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
-    """Fit the quadric with the least weighted squares along the rays, to first order: Taubin's algebraic fit (1991),
-    then Gauss-Newton. None if it has no single sheet. ``central``: rays leave the origin, else along z."""
+    """Fit the quadric with the least weighted squares along the rays, to first order: Taubin's
+    algebraic fit (1991), then Gauss-Newton. None if it has no single sheet. ``central``: rays
+    leave the origin, else along z."""
     middle = np.average(points, axis=0, weights=weights)
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
     scaled = (points - middle) / size
@@ -460,14 +493,14 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
     )
 
     def z_at(q: np.ndarray) -> np.ndarray:
-        """Return t at which start + t ray meets the quadric where F grows along the ray with the sheet's sign."""
+        """Return t at which start + t ray meets the quadric where F grows along the ray with the
+        sheet's sign."""
         if central:
-            start, ray = np.broadcast_to(-middle / size, q.shape), q / q[:, 2:] / size
+            start = np.broadcast_to(-middle / size, q.shape)
+            ray = q / q[:, 2:] / size
         else:
-            start, ray = (
-                (q * [1.0, 1.0, 0.0] - middle) / size,
-                np.broadcast_to([0.0, 0.0, 1.0 / size], q.shape),
-            )
+            start = (q * [1.0, 1.0, 0.0] - middle) / size
+            ray = np.broadcast_to([0.0, 0.0, 1.0 / size], q.shape)
         a = np.einsum("ni,ij,nj->n", ray, matrix, ray)
         b = 2 * np.einsum("ni,ij,nj->n", start, matrix, ray) + ray @ c[6:9]
         k = np.einsum("ni,ij,nj->n", start, matrix, start) + start @ c[6:9] + c[9]

@@ -1,4 +1,5 @@
-"""Several views of one target: each a cloud in its own camera's frame, the first being the reference."""
+"""Several views of one target: each a cloud in its own camera's frame, the first being the
+reference."""
 
 from dataclasses import dataclass
 
@@ -10,7 +11,8 @@ from harness.vocabulary.geometry import Cloud
 
 @dataclass(frozen=True)
 class View:
-    """A view. ``T_reference_view_guess`` (4, 4): rough pose, its camera frame to the first view's; None: unknown."""
+    """A view. ``T_reference_view_guess`` (4, 4): rough pose, its camera frame to the first view's;
+    None: unknown."""
 
     name: str
     cloud: Cloud
@@ -19,7 +21,8 @@ class View:
 
 @dataclass(frozen=True)
 class PreparedView:
-    """A view with its target cut out and its marks found. ``inside`` (h, w) bool: valid pixels of the target."""
+    """A view with its target cut out and its marks found. ``inside`` (h, w) bool: valid pixels of
+    the target."""
 
     view: View
     inside: np.ndarray

@@ -1,6 +1,7 @@
-"""Compares the set-ups of one experiment: each one's smallest hole, measures and camera, and the cost of each effect.
-The smallest hole that a set-up finds is given as a step on its ladder of sizes, and as the size found in half of the
-trials: a point on a monotone curve through the rates, not a probability of detection in the sense of the handbooks."""
+"""Compares the set-ups of one experiment: each one's smallest hole, measures and camera, and the
+cost of each effect. The smallest hole that a set-up finds is given as a step on its ladder of
+sizes, and as the size found in half of the trials: a point on a monotone curve through the rates,
+not a probability of detection in the sense of the handbooks."""
 
 import json
 from collections.abc import Mapping
@@ -18,7 +19,8 @@ from harness.records.trials import EFFECTS, ResultTables
 
 MEASURES = ("extent", "model")
 KEYS = ["variant", "frames"]
-RESAMPLES = 1000  # the 2.5 % quantile is then the 25th smallest, stable to about 5 % of the interval's width
+# the 2.5 % quantile is then the 25th smallest, stable to about 5 % of the interval's width
+RESAMPLES = 1000
 HALF = 0.5
 LIMIT_RULE = (
     "The detection limit is the smallest true diameter for which every hole as large or larger counts as found. "
@@ -30,14 +32,16 @@ LIMIT_RULE = (
 
 @dataclass(frozen=True)
 class Ladder:
-    """Detections of one set-up. ``diameters_mm`` (h,): of the holes, ascending. ``detected``: (repeats, h) bool."""
+    """Detections of one set-up. ``diameters_mm`` (h,): of the holes, ascending. ``detected``:
+    (repeats, h) bool."""
 
     diameters_mm: np.ndarray
     detected: np.ndarray
 
     @cached_property
     def half_mm(self) -> float:
-        """The 50 % size; the least size if it is found more often than not, infinity if no size is."""
+        """The 50 % size; the least size if it is found more often than not, infinity if no size
+        is."""
         repeats, holes = self.detected.shape
         return float(self._half_sizes(np.ones((1, repeats)), np.ones((1, holes)))[0])
 
@@ -48,7 +52,8 @@ class Ladder:
 
     @cached_property
     def half_draws_mm(self) -> np.ndarray:
-        """The 50 % sizes (`RESAMPLES`,) of the two-way bootstrap, drawn alike for equal holes and repeats."""
+        """The 50 % sizes (`RESAMPLES`,) of the two-way bootstrap, drawn alike for equal holes and
+        repeats."""
         rng = np.random.default_rng(0)
         repeats, holes = self.detected.shape
         of_repeats = rng.multinomial(repeats, np.full(repeats, 1 / repeats), RESAMPLES)
@@ -61,10 +66,12 @@ class Ladder:
         return self._half_sizes(of_repeats, of_holes)
 
     def _half_sizes(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
-        """Return 50 % sizes (n,), with repeats (n, repeats) and holes (n, h) weighted by how often they were drawn."""
+        """Return 50 % sizes (n,), with repeats (n, repeats) and holes (n, h) weighted by how often
+        they were drawn."""
         by_hole = of_repeats @ self.detected / of_repeats.sum(axis=1, keepdims=True) * of_holes
         sizes, starts = np.unique(self.diameters_mm, return_index=True)
-        hits, drawn = (np.add.reduceat(counts, starts, axis=1) for counts in (by_hole, of_holes))
+        hits = np.add.reduceat(by_hole, starts, axis=1)
+        drawn = np.add.reduceat(of_holes, starts, axis=1)
         return half_size(sizes, hits / drawn)
 
 
@@ -77,19 +84,23 @@ def ladder_of(holes: pd.DataFrame) -> Ladder:
 
 
 def found_limit_mm(summary: pd.DataFrame) -> float:
-    """Return the limit by `LIMIT_RULE` from rows of one set-up and frames; NaN if it misses the largest hole."""
-    missed = summary["true_diameter_mm"][summary["status"] != "found"].max()  # NaN if there is none
+    """Return the limit by `LIMIT_RULE` from rows of one set-up and frames; NaN if it misses the
+    largest hole."""
+    # NaN if there is none
+    missed = summary["true_diameter_mm"][summary["status"] != "found"].max()
     return float(summary["true_diameter_mm"][~(summary["true_diameter_mm"] <= missed)].min())
 
 
 def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Return the sizes (n,) in mm at which monotone rates (n, s) first reach one half, interpolated linearly; the least
-    size if its rate does already, infinity if none does."""
+    """Return the sizes (n,) in mm at which monotone rates (n, s) first reach one half,
+    interpolated linearly; the least size if its rate does already, infinity if none does."""
     monotone = np.array([isotonic_regression(row).x for row in np.asarray(rates, float)])
     reached = monotone >= HALF - 1e-12
     last = np.argmax(reached, axis=1)
-    before, rows = np.maximum(last - 1, 0), np.arange(len(monotone))
-    low, high = monotone[rows, before], monotone[rows, last]
+    before = np.maximum(last - 1, 0)
+    rows = np.arange(len(monotone))
+    low = monotone[rows, before]
+    high = monotone[rows, last]
     share = np.where(last > 0, (HALF - low) / np.where(high > low, high - low, 1.0), 0.0)
     found = sizes_mm[before] + share * (sizes_mm[last] - sizes_mm[before])
     return np.where(reached.any(axis=1), found, np.inf)
@@ -106,14 +117,13 @@ def set_ups_of(tables: ResultTables) -> list[str]:
 def compare_set_ups(
     tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
 ) -> pd.DataFrame:
-    """Return one row per finished (variant, frames), variants in the given order, with the axes' columns. ``half_*``:
-    only for set-ups, and with ``half_sizes``, as they need a bootstrap. ``<measure>_*``: for each measure, of all
-    single diameters of found holes against the truth. ``<measure>_place_*``: of distances from the largest hole (none
-    if several are largest). Also: noise of averaged z on probes, means over hole-free runs of ``tables.noise``."""
-    summary, halved = (
-        summary[summary["variant"].isin(variants)],
-        set_ups_of(tables) if half_sizes else [],
-    )
+    """Return one row per finished (variant, frames), variants in the given order, with the axes'
+    columns. ``half_*``: only for set-ups, and with ``half_sizes``, as they need a bootstrap.
+    ``<measure>_*``: for each measure, of all single diameters of found holes against the truth.
+    ``<measure>_place_*``: of distances from the largest hole (none if several are largest). Also:
+    noise of averaged z on probes, means over hole-free runs of ``tables.noise``."""
+    summary = summary[summary["variant"].isin(variants)]
+    halved = set_ups_of(tables) if half_sizes else []
     groups = summary.groupby(KEYS, sort=False)
     table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
     if table.empty:
@@ -143,7 +153,8 @@ def compare_set_ups(
 
 
 def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str, Any]:
-    """Return a summary of the holes of one set-up at one number of frames, from its summary rows ``part``."""
+    """Return a summary of the holes of one set-up at one number of frames, from its summary rows
+    ``part``."""
     first = part.iloc[0]
     trials = tables.holes[
         (tables.holes["variant"] == first["variant"]) & (tables.holes["frames"] == first["frames"])
@@ -169,7 +180,8 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
         }
     of_found = trials[trials["hole"].isin(found)]
     largest = int((part["true_diameter_mm"] == part["true_diameter_mm"].max()).sum())
-    # Distances count from the largest hole; if several are largest, any may be the largest cluster.
+    # Distances count from the largest hole; if several are largest, any may be the largest
+    # cluster.
     away = of_found[(of_found["true_offset_mm"] > 0) & (largest == 1)]
     for measure in MEASURES:
         size = of_found[f"{measure}_diameter_mm"] - of_found["true_diameter_mm"]
@@ -182,14 +194,17 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
 
 
 def effect_costs(tables: ResultTables) -> pd.DataFrame:
-    """Return the table of effects: the cost of each effect alone (nothing else on) and last (all others on), and of all
-    together, for each place on the experiment's other axes and number of frames. Costs are paired changes of the 50 %
-    size; those of set-ups that were not finished with the same repeats are left out."""
+    """Return the table of effects: the cost of each effect alone (nothing else on) and last (all
+    others on), and of all together, for each place on the experiment's other axes and number of
+    frames. Costs are paired changes of the 50 % size; those of set-ups that were not finished with
+    the same repeats are left out."""
     set_ups = tables.variants[tables.variants["switches"] != ""]
     if set_ups.empty:
         return EFFECTS.frame([])
     names = dict(zip(tables.axes["path"], tables.axes["name"], strict=True))
-    axes, nothing, found = list(tables.axes["path"])[1:], frozenset[str](), list[dict[str, Any]]()
+    axes = list(tables.axes["path"])[1:]
+    nothing = frozenset[str]()
+    found = list[dict[str, Any]]()
     for values, part in (
         set_ups.groupby(axes, sort=False, dropna=False) if axes else [((), set_ups)]
     ):
@@ -237,15 +252,17 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
 def _cost(
     ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]
 ) -> dict[str, Any]:
-    """Return the paired difference of two set-ups with its interval, and whether both sizes lie on the ladder (else it
-    is only a bound); empty if either was not finished, or not with the same repeats."""
+    """Return the paired difference of two set-ups with its interval, and whether both sizes lie on
+    the ladder (else it is only a bound); empty if either was not finished, or not with the same
+    repeats."""
     if (
         off not in ladders
         or on not in ladders
         or ladders[off].detected.shape != ladders[on].detected.shape
     ):
         return {}
-    before, after = ladders[off], ladders[on]
+    before = ladders[off]
+    after = ladders[on]
     with np.errstate(
         invalid="ignore"
     ):  # both off the ladder: a difference of infinities is unknown

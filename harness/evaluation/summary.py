@@ -1,4 +1,5 @@
-"""Rates, means and intervals of rows per trial, and the error of an averaged range against the number of frames."""
+"""Rates, means and intervals of rows per trial, and the error of an averaged range against the
+number of frames."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ from harness.records.trials import TRIALS, TRUTH
 HoleState = Literal["found", "missed", "undecided"]
 Measure = Literal["extent", "model"]
 
-MAIN = "main"  # the variant that the experiment declares; all others change a fact that the thesis leaves open
+# the variant that the experiment declares; all others change a fact that the thesis leaves open
+MAIN = "main"
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, and as undecided otherwise."
@@ -27,18 +29,20 @@ TRUTH_COLUMNS = [column.name for column in TRUTH]
 
 
 def by_hole(names: pd.Series) -> pd.Series:
-    """Return a sort key: holes by number if they have one ("2" before "11"), then the others by name."""
+    """Return a sort key: holes by number if they have one ("2" before "11"), then the others by
+    name."""
     return names.map(
         lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name))
     )
 
 
 def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """Return one row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval. ``axes``:
-    columns to keep. ``status`` is by `FOUND_RULE`. ``extent_``: the thesis' measure. ``model_``: of the fit; its bias
-    of depth is relative to ``seen_depth_mm`` (behind a through-hole the backing is visible).
-    ``model_diameter_covered``: share of fits within 1.96 standard errors. Means are over detected trials only: the
-    sizes of a hole detected in few trials are those of its lucky trials."""
+    """Return one row per (variant, frames, hole): counts, rates, sizes and positions, each with
+    its interval. ``axes``: columns to keep. ``status`` is by `FOUND_RULE`. ``extent_``: the
+    thesis' measure. ``model_``: of the fit; its bias of depth is relative to ``seen_depth_mm``
+    (behind a through-hole the backing is visible). ``model_diameter_covered``: share of fits
+    within 1.96 standard errors. Means are over detected trials only: the sizes of a hole detected
+    in few trials are those of its lucky trials."""
     holes = with_columns(holes)
     groups = holes.groupby(GROUP, sort=False)
     out = groups[[*axes, *TRUTH_COLUMNS]].first()
@@ -74,23 +78,23 @@ def found_rule(trials: int) -> str:
 
 
 def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:
-    """Return each hole's status by `FOUND_RULE`, in the holes' order; empty if the variant lacks these frames."""
+    """Return each hole's status by `FOUND_RULE`, in the holes' order; empty if the variant lacks
+    these frames."""
     rows = summary[(summary["variant"] == variant) & (summary["frames"] == frames)]
     return dict(zip(rows["hole"], rows["status"], strict=True))
 
 
 def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per (variant, frames, role): runs, false calls, and their rate per run with Garwood's Poisson
-    interval. Only runs judged at a threshold count. For hole-free runs that set it (their threshold is NaN),
-    ``quiet_runs`` is their number and ``quiet_highest`` the highest of their quiet thresholds."""
+    """Return one row per (variant, frames, role): runs, false calls, and their rate per run with
+    Garwood's Poisson interval. Only runs judged at a threshold count. For hole-free runs that set
+    it (their threshold is NaN), ``quiet_runs`` is their number and ``quiet_highest`` the highest
+    of their quiet thresholds."""
     keys = ["variant", "frames"]
     judged = runs[runs["threshold"].notna()].assign(
         threshold_mm=lambda r: r["threshold"] * r["scale_mm"]
     )
-    counts, means = (
-        {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")},
-        ("threshold", "threshold_mm"),
-    )
+    counts = {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")}
+    means = ("threshold", "threshold_mm")
     counts |= {name: (name, "mean") for name in (*means, "surface_noise_mm")}
     out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(**counts)
     quiet = runs[runs["role"] == "hole_free"].groupby(keys, as_index=False)
@@ -109,7 +113,8 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
 
 def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:
     """Return means, standard deviations and biases of one measure's diameters and offsets."""
-    diameter, offset = groups[f"{measure}_diameter_mm"], groups[f"{measure}_offset_mm"]
+    diameter = groups[f"{measure}_diameter_mm"]
+    offset = groups[f"{measure}_offset_mm"]
     out = diameter.agg(measured="count", diameter_mean_mm="mean", diameter_std_mm="std")
     out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
     out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(
@@ -122,7 +127,8 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """Return depths, which only the model gives, and each fit's stated standard errors, compared with the truth."""
+    """Return depths, which only the model gives, and each fit's stated standard errors, compared
+    with the truth."""
     miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes[
         "model_diameter_se_mm"
     ]
@@ -137,7 +143,8 @@ def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
 
 
 def _order(column: pd.Series) -> pd.Series:
-    """Return a sort key of one group column: the main variant first, holes by number, frames as numbers."""
+    """Return a sort key of one group column: the main variant first, holes by number, frames as
+    numbers."""
     if column.name == "hole":
         return by_hole(column)
     if column.name == "variant":
@@ -159,16 +166,18 @@ def hole_list(names: Iterable[str]) -> str:
 
 
 BLOCKS = 40
-"""Blocks of neighbouring probe pixels that the bootstrap resamples: a camera's filter correlates neighbours, so pixels
-are not exchangeable, but contiguous blocks far larger than the filter nearly are. 40 give a quantile."""
+"""Blocks of neighbouring probe pixels that the bootstrap resamples: a camera's filter correlates
+neighbours, so pixels are not exchangeable, but contiguous blocks far larger than the filter nearly
+are. 40 give a quantile."""
 COLUMNS = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
 COLUMNS += ["systematic_mm", "displacement_mm", "total_rms_mm"]
 
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """Effect of averaging. ``slope``: exponent of the temporal noise against the number of frames (white noise: -0.5).
-    ``systematic_ratio``: systematic error (offset and pattern) of the longest over the shortest average."""
+    """Effect of averaging. ``slope``: exponent of the temporal noise against the number of frames
+    (white noise: -0.5). ``systematic_ratio``: systematic error (offset and pattern) of the longest
+    over the shortest average."""
 
     slope: float
     slope_interval: Interval
@@ -180,27 +189,24 @@ class NoiseLaw:
 
 
 def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per (variant, frames): root mean squares over the probe pixels, in mm. ``temporal``: deviation
-    over repeats. ``offset``: mean error. ``pattern``: deviation over pixels of the mean error, minus the remaining
-    noise of few repeats. ``systematic``: offset and pattern. ``displacement``: deviation over repeats of the whole
-    cloud, in no other column. ``guide``: the shortest average's temporal noise, falling as 1/sqrt(N). Pixels without a
-    value are out."""
+    """Return one row per (variant, frames): root mean squares over the probe pixels, in mm.
+    ``temporal``: deviation over repeats. ``offset``: mean error. ``pattern``: deviation over
+    pixels of the mean error, minus the remaining noise of few repeats. ``systematic``: offset and
+    pattern. ``displacement``: deviation over repeats of the whole cloud, in no other column.
+    ``guide``: the shortest average's temporal noise, falling as 1/sqrt(N). Pixels without a value
+    are out."""
     rows = []
     for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
         moments = _moments(part)
         if len(moments):
             variance, offset, *_ = mean = moments.mean(axis=0)
-            pattern2, repeats = (
-                float(_pattern_variance(mean, len(moments))),
-                int(part["repeats"].median()),
-            )
+            pattern2 = float(_pattern_variance(mean, len(moments)))
+            repeats = int(part["repeats"].median())
             temporal, systematic, total = np.sqrt(
                 [variance, offset**2 + pattern2, variance + offset**2 + pattern2]
             )
-            displacement, start = (
-                float(part["displacement_std_mm"].median()),
-                (variant, frames, len(moments), repeats),
-            )
+            displacement = float(part["displacement_std_mm"].median())
+            start = (variant, frames, len(moments), repeats)
             rows.append(
                 (*start, temporal, offset, np.sqrt(pattern2), systematic, displacement, total)
             )
@@ -216,20 +222,24 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
 def fit_floor(
     frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray
 ) -> float:
-    """Return the error that averaging cannot remove, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with
-    both parts non-negative, weighted for equal relative error. NaN below two different numbers of frames."""
-    n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
+    """Return the error that averaging cannot remove, in mm, of ``total^2 = white^2 / N +
+    floor^2``: least squares with both parts non-negative, weighted for equal relative error. NaN
+    below two different numbers of frames."""
+    n = np.asarray(frames, float)
+    total2 = np.asarray(total_rms_mm, float) ** 2
     usable = np.isfinite(total2) & (total2 > 0)
     if len(np.unique(n[usable])) < 2:
         return np.nan
-    n, total2 = n[usable], total2[usable]
+    n = n[usable]
+    total2 = total2[usable]
     design = np.column_stack([1 / n, np.ones_like(n)]) / total2[:, None]
     return float(np.sqrt(nnls(design, np.ones_like(n))[0][1]))
 
 
 def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
-    """Fit the exponent of the temporal noise and the change of the systematic error, with block-bootstrap intervals, to
-    pixels that have a value at every number of frames. None below two of either, or without temporal noise."""
+    """Fit the exponent of the temporal noise and the change of the systematic error, with
+    block-bootstrap intervals, to pixels that have a value at every number of frames. None below
+    two of either, or without temporal noise."""
     rows = probes[probes["variant"] == variant]
     frames = np.array(sorted(rows["frames"].unique()), float)
     if len(frames) < 2:
@@ -246,7 +256,8 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
         return None
     blocks = min(BLOCKS, pixels)
     edges = np.linspace(0, pixels, blocks + 1).astype(int)
-    sums, counts = np.add.reduceat(stacked, edges[:-1], axis=0), np.diff(edges)
+    sums = np.add.reduceat(stacked, edges[:-1], axis=0)
+    counts = np.diff(edges)
     x = np.log(frames) - np.log(frames).mean()
 
     def means(indices: np.ndarray) -> np.ndarray:
@@ -256,14 +267,16 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
         return (0.5 * np.log(means(indices)[..., 0]) @ x) / (x @ x)
 
     def ratio(indices: np.ndarray) -> np.ndarray:
-        """Return the systematic error of the longest over the shortest average; NaN if the latter is 0."""
+        """Return the systematic error of the longest over the shortest average; NaN if the latter
+        is 0."""
         mean = means(indices)
         systematic = np.sqrt(mean[..., 1] ** 2 + _pattern_variance(mean, pixels))
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(systematic[:, 0] > 0, systematic[:, -1] / systematic[:, 0], np.nan)
 
     whole = np.arange(blocks)[None]
-    exponent, change = float(slope(whole)[0]), float(ratio(whole)[0])
+    exponent = float(slope(whole)[0])
+    change = float(ratio(whole)[0])
     intervals = bootstrap(slope, blocks), bootstrap(ratio, blocks)
     return NoiseLaw(
         exponent, intervals[0], change, intervals[1], int(frames[0]), int(frames[-1]), pixels
@@ -271,11 +284,10 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
 
 
 def _moments(part: pd.DataFrame) -> np.ndarray:
-    """Return (pixels, 4): temporal variance, mean error, its square, temporal variance left in the mean error."""
-    error, variance = (
-        part["mean_error_mm"].to_numpy(float),
-        part["temporal_std_mm"].to_numpy(float) ** 2,
-    )
+    """Return (pixels, 4): temporal variance, mean error, its square, temporal variance left in the
+    mean error."""
+    error = part["mean_error_mm"].to_numpy(float)
+    variance = part["temporal_std_mm"].to_numpy(float) ** 2
     moments = np.stack(
         [variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1
     )
@@ -283,6 +295,7 @@ def _moments(part: pd.DataFrame) -> np.ndarray:
 
 
 def _pattern_variance(mean: np.ndarray, pixels: int) -> np.ndarray:
-    """Return the variance over pixels of the mean error, minus leftover temporal variance, from means of `_moments`."""
+    """Return the variance over pixels of the mean error, minus leftover temporal variance, from
+    means of `_moments`."""
     unbiased = (mean[..., 2] - mean[..., 1] ** 2) * (pixels / max(pixels - 1, 1))
     return np.maximum(unbiased - mean[..., 3], 0.0)

@@ -1,4 +1,5 @@
-"""Finds mistakes that involve several keys of an experiment, or things outside the file: names, files, views."""
+"""Finds mistakes that involve several keys of an experiment, or things outside the file: names,
+files, views."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -29,14 +30,16 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
 
-CAMERA_NAME, DETECTOR_NAME = ("source", "camera", "name"), ("detector", "name")
+CAMERA_NAME = ("source", "camera", "name")
+DETECTOR_NAME = ("detector", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")
 
 
 def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Validate an experiment's data; return its declaration (None if it is not valid) and all problems."""
+    """Validate an experiment's data; return its declaration (None if it is not valid) and all
+    problems."""
     config, problems = validated(ExperimentConfig, source, splices_of(source.data))
     for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
         name = shape.get(source.data, path)
@@ -50,10 +53,8 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     if config is None or problems:
         return config, problems
     if config.capture.average.frames is not None:
-        place, message = (
-            source.key_place_of(("capture", "average", "frames")),
-            "the number of frames is set by",
-        )
+        place = source.key_place_of(("capture", "average", "frames"))
+        message = "the number of frames is set by"
         problems.append(Problem(f"{message} `capture.frames`", place, fix="remove this key"))
     if isinstance(config.source, SimulatedSource):
         for check in (_target_problems, _mapping_problems, _flat_field_problems):
@@ -64,9 +65,11 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """Find contradictions between a study, a family of boards and a threshold that is calibrated on boards."""
+    """Find contradictions between a study, a family of boards and a threshold that is calibrated
+    on boards."""
     target = config.source.target if isinstance(config.source, SimulatedSource) else None
-    drawn, calibrate = isinstance(target, DrawnTargetConfig), config.threshold.calibrate
+    drawn = isinstance(target, DrawnTargetConfig)
+    calibrate = config.threshold.calibrate
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
     if config.study is None and drawn:
         fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
@@ -83,7 +86,8 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
         yield Problem(
             "a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix
         )
-    # the criterion of a hit and the wanted rate of false calls are rules of the study, equal for all set-ups
+    # the criterion of a hit and the wanted rate of false calls are rules of the study, equal for
+    # all set-ups
     for path in config.sweep:
         if (
             path.split(".")[0] == "matching"
@@ -101,8 +105,10 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             "a study calibrates its threshold on separate boards", place, fix="write `boards: 60`"
         )
     elif calibrate is not None and calibrate.boards is not None:
-        # the number of boards bounds the rate that they can show, even if their whole face is judged: a new run exceeds
-        # the highest of n with probability 1 / (n + 1), and has a false call with 1 - exp(-rate * area)
+        # the number of boards bounds the rate that they can show, even if their whole face is
+        # judged: a new run exceeds the highest of n with probability 1 / (n + 1), and has a false
+        # call with 1 - exp(-rate *
+        # area)
         rate_per_m2 = calibrate.false_calls_per_m2 or 0.0
         area_m2 = target.board.width_mm * target.board.height_mm * MM**2
         needed = ceil(-1 / expm1(-rate_per_m2 * area_m2) * (1 - 1e-12)) - 1
@@ -147,8 +153,9 @@ def _declared(config: AnyTargetConfig) -> TargetConfig:
 def _unseen(
     camera: CameraConfig, views: AnyViews | None, declared: AnyTargetConfig
 ) -> tuple[KeyPath, UserError] | None:
-    """Return why the camera does not see the target, and the key that causes it: an unknown camera, no albedo at its
-    wavelength, or `_unseen_pose`. A family is checked in its extreme poses, first in a single view."""
+    """Return why the camera does not see the target, and the key that causes it: an unknown
+    camera, no albedo at its wavelength, or `_unseen_pose`. A family is checked in its extreme
+    poses, first in a single view."""
     target = _declared(declared)
     path: KeyPath = CAMERA_NUMBERS if camera.numbers else CAMERA_NAME
     try:
@@ -174,12 +181,14 @@ def _unseen(
 def _unseen_pose(
     optics: Optics, views: AnyViews | None, target: TargetConfig
 ) -> tuple[KeyPath, UserError] | None:
-    """Return the mistake of the first pose that sees nothing of the face within range, and the key that causes it."""
+    """Return the mistake of the first pose that sees nothing of the face within range, and the key
+    that causes it."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:
         first = error.errors()[0]
-        key, value = str(first["loc"][-1]), first["input"]
+        key = str(first["loc"][-1])
+        value = first["input"]
         legal = shape.legal_at(shape.Declared(type(target.pose), {}, {}).at((key,)))
         message = f"a view's pose is not legal: {key} would be {value:g}"
         return VIEWS, UserError(message, legal=legal, fix="lower the spread or the sway")
@@ -201,7 +210,8 @@ def _mapping_problems(
     config: ExperimentConfig, simulated: SimulatedSource, source: Source
 ) -> Iterator[Problem]:
     """Find contradictions between several views and their mapping into one cloud."""
-    views, mapping = simulated.views, config.mapping
+    views = simulated.views
+    mapping = config.mapping
     if views is None and mapping is not None:
         fix = "declare source.views, for instance {kind: arc, count: 3, spread_deg: 40.0}"
         yield Problem("a mapping needs several views", source.place_of(("mapping",)), fix=fix)
@@ -226,7 +236,8 @@ def _flat_field_problems(
 ) -> Iterator[Problem]:
     """Report a flat field whose plane lies outside the camera's range."""
     try:
-        flat_field, optics = config.capture.flat_field, camera_of(simulated.camera).optics
+        flat_field = config.capture.flat_field
+        optics = camera_of(simulated.camera).optics
     except UserError:
         return  # reported together with the target's pose
     if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
@@ -240,7 +251,8 @@ def _flat_field_problems(
 def _capture_problems(
     config: ExperimentConfig, capture: CaptureSource, source: Source
 ) -> Iterator[Problem]:
-    """Find files that are missing or cannot be read, and keys that only a simulated source can have."""
+    """Find files that are missing or cannot be read, and keys that only a simulated source can
+    have."""
     missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
     for number, path in ((number, Path(capture.paths[number])) for number in missing):
         near = nearest(path.name, [file.name for file in path.parent.glob("*")])
@@ -248,10 +260,8 @@ def _capture_problems(
         yield Problem(f"{path}: there is no such file or folder", place, nearest=near)
     lens = capture.intrinsics
     if unknown := bool(lens) and lens not in camera_names() and not Path(str(lens)).is_file():
-        legal, place = (
-            f"a file, or one of {', '.join(camera_names())}",
-            source.place_of(("source", "intrinsics")),
-        )
+        legal = f"a file, or one of {', '.join(camera_names())}"
+        place = source.place_of(("source", "intrinsics"))
         yield Problem(f"{lens}: is neither a file nor a camera", place, legal)
     try:
         if not missing and not unknown:
@@ -260,10 +270,8 @@ def _capture_problems(
         yield Problem(
             error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix
         )
-    apart, hole_free = (
-        "a flat field needs a simulated unit",
-        "only on hole-free repeats, which a capture does not have",
-    )
+    apart = "a flat field needs a simulated unit"
+    hole_free = "only on hole-free repeats, which a capture does not have"
     for key, value, message, fix in (
         (
             "capture.flat_field",

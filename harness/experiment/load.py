@@ -1,4 +1,5 @@
-"""Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at once."""
+"""Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at
+once."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -35,7 +36,8 @@ from scenes.sensor.camera import (
     numbers_of_lens,
 )
 
-EXPERIMENT_VERSION = 1  # Version of the resolved experiment in a result folder; raised when a key changes its meaning
+# Version of the resolved experiment in a result folder; raised when a key changes its meaning
+EXPERIMENT_VERSION = 1
 STAMP_KIND = "experiment"
 
 
@@ -46,9 +48,10 @@ def load_experiment(
     *,
     quick: bool = False,
 ) -> Experiment:
-    """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises DeclarationError with all
-    problems. The lens of a recording ``calibration`` replaces the camera file's nominal lens (`lens_numbers`).
-    ``quick`` reduces repeats and boards and drops the sensitivity study; ``overrides`` take precedence."""
+    """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises
+    DeclarationError with all problems. The lens of a recording ``calibration`` replaces the camera
+    file's nominal lens (`lens_numbers`). ``quick`` reduces repeats and boards and drops the
+    sensitivity study; ``overrides`` take precedence."""
     recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
@@ -67,17 +70,20 @@ def load_experiment(
     points, unfolding = unfolded(source, None if problems else config)
     if problems or unfolding or config is None:
         raise DeclarationError(str(path), [*problems, *unfolding])
-    data, varied = config.to_data(), [*config.sweep]
+    data = config.to_data()
+    varied = [*config.sweep]
     for variation in config.sensitivity.vary if config.sensitivity else ():
         varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
     if any(each.startswith("detector") for each in varied):
-        # a detector may fill some settings from others (a preset); written out, they would override a varied preset
+        # a detector may fill some settings from others (a preset); written out, they would
+        # override a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
     return Experiment(config, points, data, source)
 
 
 def _quick(data: Any) -> list[str]:
-    """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no sensitivity."""
+    """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no
+    sensitivity."""
     title = shape.get(data, ("title",)) or shape.get(data, ("name",))
     overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
@@ -97,8 +103,8 @@ def _quick(data: Any) -> list[str]:
 
 
 def _experiment_file(path: Path) -> Path:
-    """Return the file for a path, or for the name of tofpod's own experiment, which may also be that of a folder here
-    (``detectors``). Raises UserError."""
+    """Return the file for a path, or for the name of tofpod's own experiment, which may also be
+    that of a folder here (``detectors``). Raises UserError."""
     if path.is_file() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
@@ -111,12 +117,14 @@ def _experiment_file(path: Path) -> Path:
 
 
 def resolved_yaml(experiment: Experiment) -> str:
-    """Return the experiment as YAML with its version and every default; loading it gives the same points."""
+    """Return the experiment as YAML with its version and every default; loading it gives the same
+    points."""
     return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
 
 
 def _with_absolute_paths(source: Source, folder: Path) -> Source:
-    """Make file paths absolute: they are relative to the YAML's folder, or in ``--set`` to the current folder."""
+    """Make file paths absolute: they are relative to the YAML's folder, or in ``--set`` to the
+    current folder."""
     data = source.data
     swept: KeyPath = ("sweep", dotted(checks.CAMERA_NAME))
     listed = shape.get(data, swept)
@@ -143,7 +151,8 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
 
 
 def _with_calibration(source: Source, recording: Path) -> Source:
-    """Add the recording's lens to the camera's replaced numbers; it takes precedence over the lens in the file."""
+    """Add the recording's lens to the camera's replaced numbers; it takes precedence over the lens
+    in the file."""
     if shape.get(source.data, ("source", "kind")) != "simulated":
         raise UserError(
             "a real capture has its own lens",
@@ -169,8 +178,9 @@ def _with_calibration(source: Source, recording: Path) -> Source:
 
 
 def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
-    """Return the ``source.camera.numbers`` that give the cameras the lens of a recording. Raises UserError if the
-    recording cannot be read, states no lens, or has another size than a camera's sensor."""
+    """Return the ``source.camera.numbers`` that give the cameras the lens of a recording. Raises
+    UserError if the recording cannot be read, states no lens, or has another size than a camera's
+    sensor."""
     from detectors.recordings import open_capture  # imports the readers of all formats
 
     lens = None

@@ -1,8 +1,9 @@
 """Declares the keys of an experiment's YAML, and its points with their digests.
 
-This module holds the ranges of single fields; `checks` holds conditions on several fields. A digest covers only content
-that can change a result: not the name, the number of repeats or the other points. So a new value on an axis leaves all
-other points, their seeds and their finished trials unchanged."""
+This module holds the ranges of single fields; `checks` holds conditions on several fields. A
+digest covers only content that can change a result: not the name, the number of repeats or the
+other points. So a new value on an axis leaves all other points, their seeds and their finished
+trials unchanged."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
 Boards = Annotated[int, Field(ge=1, le=MAX_BOARDS)]
 ListAsTuple = BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values)
-"""Strict mode rejects a list in place of a tuple; `Config` converts lists, but not those within a mapping."""
+"""Strict mode rejects a list in place of a tuple; `Config` converts lists, but not those within a
+mapping."""
 AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), ListAsTuple]
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Label = Annotated[
@@ -54,7 +56,8 @@ StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100),
 
 
 class SimulatedSource(Config):
-    """Frames of a simulated camera that views a declared target from one pose or from several ``views``."""
+    """Frames of a simulated camera that views a declared target from one pose or from several
+    ``views``."""
 
     kind: Literal["simulated"]
     target: AnyTargetConfig
@@ -66,7 +69,8 @@ class SimulatedSource(Config):
 
 
 class CaptureSource(Config):
-    """Frames of a real capture; see `detectors.recordings.open_capture`. Paths are relative to the YAML's folder."""
+    """Frames of a real capture; see `detectors.recordings.open_capture`. Paths are relative to the
+    YAML's folder."""
 
     kind: Literal["capture"]
     paths: tuple[FileName, ...] = Field(
@@ -103,8 +107,9 @@ class DetectorConfig(Config):
 
 
 class CalibrateConfig(Config):
-    """Calibration of the threshold on hole-free boards: the lowest k without a detection in ``repeats`` runs of the
-    same set-up or, in a study, the lowest k that meets the rate of false calls on ``boards`` extra boards."""
+    """Calibration of the threshold on hole-free boards: the lowest k without a detection in
+    ``repeats`` runs of the same set-up or, in a study, the lowest k that meets the rate of false
+    calls on ``boards`` extra boards."""
 
     repeats: Repeats | None = None
     boards: Boards | None = Field(None, description="in a study: extra boards for calibration only")
@@ -150,8 +155,9 @@ class ThresholdConfig(Config):
 
 
 class MatchingConfig(Config):
-    """The rule by which a detection counts as a hit: it is matched one to one with the nearest damage within a radius
-    on the face. The distance to long damage (slot, gouge, chip) is the distance to its centre line."""
+    """The rule by which a detection counts as a hit: it is matched one to one with the nearest
+    damage within a radius on the face. The distance to long damage (slot, gouge, chip) is the
+    distance to its centre line."""
 
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
     overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
@@ -184,7 +190,8 @@ class LabelledVariation(Config):
 
 
 class SensitivityConfig(Config):
-    """Variations of the experiment, one at a time, each with a few numbers of frames and fewer repeats."""
+    """Variations of the experiment, one at a time, each with a few numbers of frames and fewer
+    repeats."""
 
     repeats: Repeats
     calibration_repeats: Repeats | None = Field(
@@ -197,9 +204,10 @@ class SensitivityConfig(Config):
 
 
 class StudyConfig(Config):
-    """A study of the probability of detection on random boards: ``boards`` have damage, and false calls are counted on
-    ``hole_free_boards``. All set-ups inspect the same boards, each with ``repeats`` draws of noise. ``units`` are
-    cameras with different fixed patterns: all of them inspect each damaged board, another one each hole-free board."""
+    """A study of the probability of detection on random boards: ``boards`` have damage, and false
+    calls are counted on ``hole_free_boards``. All set-ups inspect the same boards, each with
+    ``repeats`` draws of noise. ``units`` are cameras with different fixed patterns: all of them
+    inspect each damaged board, another one each hole-free board."""
 
     boards: Boards
     hole_free_boards: Boards
@@ -274,10 +282,11 @@ NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches",
 
 @dataclass(frozen=True)
 class Point:
-    """A resolved experiment without axes. ``values`` maps dotted paths to the values that make the point. ``variant``
-    labels its set-up or variation, ``label`` the point. ``axes`` holds the values of all axes but the number of frames.
-    ``reference`` is the set-up with the same ``axes`` that a variation varies ("" for none), else the point's own.
-    ``digest`` identifies the point's results, ``frames_key`` those of its frames."""
+    """A resolved experiment without axes. ``values`` maps dotted paths to the values that make the
+    point. ``variant`` labels its set-up or variation, ``label`` the point. ``axes`` holds the
+    values of all axes but the number of frames. ``reference`` is the set-up with the same ``axes``
+    that a variation varies ("" for none), else the point's own. ``digest`` identifies the point's
+    results, ``frames_key`` those of its frames."""
 
     label: str
     variant: str
@@ -292,7 +301,8 @@ class Point:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A valid experiment with its points. ``data`` is the resolved declaration as plain data, ``source`` the input."""
+    """A valid experiment with its points. ``data`` is the resolved declaration as plain data,
+    ``source`` the input."""
 
     config: ExperimentConfig
     points: tuple[Point, ...]
@@ -301,7 +311,8 @@ class Experiment:
 
     @property
     def digest(self) -> str:
-        """The digest over all points with their repeats, in order, which names the experiment's results."""
+        """The digest over all points with their repeats, in order, which names the experiment's
+        results."""
         points = [
             [point.variant, point.label, point.digest, point.config.repeats]
             for point in self.points
@@ -311,7 +322,8 @@ class Experiment:
         )
 
     def folder(self, results: Path) -> Path:
-        """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads out of it."""
+        """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads
+        out of it."""
         return inside(Path(results), self.config.name, self.digest)
 
 
@@ -329,7 +341,8 @@ def point_of(
         # the full target, or the distribution of a family of boards, and the camera's numbers
         drawn = isinstance(source.target, DrawnTargetConfig)
         target = source.target.to_data() if drawn else source.target.declare().to_data()
-        camera, work = camera_of(source.camera), source.render.to_data()
+        camera = camera_of(source.camera)
+        work = source.render.to_data()
         frames = {"kind": source.kind, "target": target, "render": work}
         frames["camera"] = {
             **source.camera.to_data(),
@@ -359,7 +372,8 @@ def detector_version(config: ExperimentConfig) -> int:
 
 @lru_cache(maxsize=1000)
 def recording_of(source: CaptureSource) -> Recording:
-    """Open the recording of a source, and read and check its first frame. Raises UserError for faulty files."""
+    """Open the recording of a source, and read and check its first frame. Raises UserError for
+    faulty files."""
     from detectors.recordings import open_capture  # imports the readers of all formats
 
     name = source.intrinsics

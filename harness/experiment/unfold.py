@@ -1,5 +1,6 @@
-"""Applies ``--set path=value``, unfolds axes, switches and variations into points, and validates each of them, with
-problems at the value that causes them. Set-ups differ in the axes other than the number of frames."""
+"""Applies ``--set path=value``, unfolds axes, switches and variations into points, and validates
+each of them, with problems at the value that causes them. Set-ups differ in the axes other than
+the number of frames."""
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
@@ -33,7 +34,8 @@ class PathError(UserError):
 
 
 def key_path(text: str) -> KeyPath:
-    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the file."""
+    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the
+    file."""
     head, _, rest = text.partition(".")
     if head == "sweep" and rest:
         return (head, rest)
@@ -49,12 +51,14 @@ def set_path(
     declared: shape.Declared | None = None,
     above: KeyPath = (),
 ) -> Any:
-    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``, missing mappings on
-    the way get their defaults, and a new kind of a mapping (``merge.kind``) drops the keys of the former kind.
-    ``above`` is the path of ``data`` itself. Raises PathError if the path cannot be followed."""
+    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``,
+    missing mappings on the way get their defaults, and a new kind of a mapping (``merge.kind``)
+    drops the keys of the former kind. ``above`` is the path of ``data`` itself. Raises PathError
+    if the path cannot be followed."""
     if not path:
         return value
-    key, rest = _index(data, path[0], above), path[1:]
+    key = _index(data, path[0], above)
+    rest = path[1:]
     full_path = (*above, key)
     if isinstance(data, list):
         if key >= len(data):
@@ -73,7 +77,8 @@ def set_path(
     around = declared.at(above) if declared and not rest else None
     kinds = shape.kinds_of(around)
     if kinds and kinds[0] == key:
-        old, new = (shape.model_for(around, kind) for kind in (data, {**data, key: value}))
+        old = shape.model_for(around, data)
+        new = shape.model_for(around, {**data, key: value})
         gone = {*(old.model_fields if old else ())} - {*(new.model_fields if new else ())}
         data = {name: held for name, held in data.items() if name not in gone}
     return {**data, key: set_path(inner, rest, value, declared, full_path)}
@@ -88,7 +93,8 @@ def _index(data: Any, key: str | int, above: KeyPath) -> Any:
 
 
 def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -> Problem | None:
-    """Return the problem for a path that the declaration lacks, with the nearest legal path; None for a legal path."""
+    """Return the problem for a path that the declaration lacks, with the nearest legal path; None
+    for a legal path."""
     for depth in range(1, len(path) + 1):
         if declared.at(path[:depth]) is None:
             known = [
@@ -107,7 +113,8 @@ def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -
 def overridden(
     source: Source, overrides: Sequence[str], declared_of: shape.DeclaredOf
 ) -> tuple[Source, list[Problem]]:
-    """Return the source with every legal ``path=value`` applied in order, and the problems of the illegal ones."""
+    """Return the source with every legal ``path=value`` applied in order, and the problems of the
+    illegal ones."""
     problems: list[Problem] = []
     parts = [
         (text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("="))))
@@ -120,7 +127,8 @@ def overridden(
                 Problem("not of the form path=value", place, "capture.frames=10", fix=fix)
             )
             continue
-        path, declared = key_path(name.strip()), declared_of(source.data)
+        path = key_path(name.strip())
+        declared = declared_of(source.data)
         try:
             value = parse_yaml(text, OPTION, start=len(name) + 1, is_argument=True)
             problem = path_problem(path, declared, place)
@@ -143,8 +151,10 @@ def overridden(
     return source, problems
 
 
-MAX_POINTS = 10_000  # More than a machine can run in a week; larger numbers come from mistyped axes
-MAX_SHOWN = 20  # Most problems of combinations, which are found one point at a time and are similar
+# More than a machine can run in a week; larger numbers come from mistyped axes
+MAX_POINTS = 10_000
+# Most problems of combinations, which are found one point at a time and are similar
+MAX_SHOWN = 20
 FRAMES = "capture.frames"
 SWITCHES = "switches"  # Key of the file that states the path of a mapping of switches
 FIXED = (
@@ -161,7 +171,8 @@ FIXED = (
 
 @dataclass(frozen=True)
 class Setting:
-    """A path with its value, the place of that value in the source, and its name (``path=value`` if empty)."""
+    """A path with its value, the place of that value in the source, and its name (``path=value``
+    if empty)."""
 
     path: str
     value: Any
@@ -171,7 +182,8 @@ class Setting:
 
 @dataclass(frozen=True)
 class Draft:
-    """An unresolved point. ``named_at`` is the place of its label or last value; ``frames`` are a variation's."""
+    """An unresolved point. ``named_at`` is the place of its label or last value; ``frames`` are a
+    variation's."""
 
     label: str
     variant: str
@@ -184,7 +196,8 @@ class Draft:
 def unfolded(
     source: Source, config: ExperimentConfig | None
 ) -> tuple[tuple[Point, ...], list[Problem]]:
-    """Return all points in order, or all problems of axes and variations. ``config``: None if other keys are wrong."""
+    """Return all points in order, or all problems of axes and variations. ``config``: None if
+    other keys are wrong."""
     sweep = shape.child(source.data, "sweep")
     axes = [
         [Setting(path, value, ("sweep", path, index)) for index, value in enumerate(values)]
@@ -215,13 +228,15 @@ def unfolded(
 
 
 def _written_variations(data: Any) -> Iterator[Draft]:
-    """Yield the variations as the file states them, without the numbers of frames of the sensitivity study."""
+    """Yield the variations as the file states them, without the numbers of frames of the
+    sensitivity study."""
     vary = shape.get(data, ("sensitivity", "vary"))
     for index, variation in enumerate(vary if isinstance(vary, list) else ()):
         at: KeyPath = ("sensitivity", "vary", index)
-        path, values, label, together = (
-            shape.child(variation, key) for key in ("path", "values", "label", "set")
-        )
+        path = shape.child(variation, "path")
+        values = shape.child(variation, "values")
+        label = shape.child(variation, "label")
+        together = shape.child(variation, "set")
         frames = _frame_settings(shape.child(variation, "frames"), (*at, "frames"))
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
@@ -272,8 +287,11 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
 
 
 def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting], list[Problem]]:
-    """Return an axis over the mapping of switches that the file names: none on, each alone, all but each, and all."""
-    path, place, problems = config.switches or "", source.place_of((SWITCHES,)), []
+    """Return an axis over the mapping of switches that the file names: none on, each alone, all
+    but each, and all."""
+    path = config.switches or ""
+    place = source.place_of((SWITCHES,))
+    problems = []
     found = shape.get(config.to_data(), key_path(path))
     names = (
         [*found]
@@ -291,7 +309,8 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
             problems.append(
                 Problem(message, place, fix="sweep other keys, or leave the switches out")
             )
-    alone, whole = [frozenset({name}) for name in names], frozenset(names)
+    alone = [frozenset({name}) for name in names]
+    whole = frozenset(names)
 
     def label(on: frozenset[str]) -> str:
         few = {0: "none", len(whole): "all", 1: f"{''.join(on)} alone"}
@@ -315,7 +334,8 @@ def _variation_problems(
                 else source.key_place_of(setting.written_at)
             )
             yield from _path_problems(setting.path, at, source, (*FIXED, FRAMES))
-    # a variation needs a set-up of the main experiment with the same number of frames for comparison
+    # a variation needs a set-up of the main experiment with the same number of frames for
+    # comparison
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
     main = main or [shape.get(source.data, ("capture", "frames"))]
     listed_at: KeyPath = ("sensitivity", "frames")
@@ -342,7 +362,8 @@ def _path_problems(
 def _resolved(
     draft: Draft, source: Source, keep_all: bool
 ) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Return a point's declaration, or its problems: at the wrong value, or else (if ``keep_all``) at its name."""
+    """Return a point's declaration, or its problems: at the wrong value, or else (if ``keep_all``)
+    at its name."""
     place = source.place_of(draft.named_at)
     located = replace(
         source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")}
@@ -375,8 +396,10 @@ def _resolved(
 def _drafts(
     axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
 ) -> Iterator[Draft]:
-    """Yield the product of the axes (the last varies fastest), then all variations with all numbers of frames."""
-    names, texts = names_of(telling), dict[int, str]()
+    """Yield the product of the axes (the last varies fastest), then all variations with all
+    numbers of frames."""
+    names = names_of(telling)
+    texts = dict[int, str]()
     for axis in axes:
         for setting in axis if axis[0].path in telling else ():
             value = value_text(
@@ -404,10 +427,8 @@ def _drafts(
     )
     for variation in variations:
         for frames in variation.frames or common:
-            label, settings = (
-                f"{variation.label}, {FRAMES}={frames.value}",
-                (frames, *variation.settings),
-            )
+            label = f"{variation.label}, {FRAMES}={frames.value}"
+            settings = (frames, *variation.settings)
             yield replace(variation, label=label, variant=variation.label, settings=settings)
 
 
@@ -420,7 +441,8 @@ def _points(
     known: dict[tuple[str, str], Draft] = {}
     set_ups: dict[str, str] = {}
     for draft in drafts:
-        # a set-up and a variation, or two set-ups with long values that are shortened, may get the same name
+        # a set-up and a variation, or two set-ups with long values that are shortened, may get the
+        # same name
         values = [setting.value for setting in draft.settings if setting.path != FRAMES]
         if called.setdefault(draft.variant, values) != values:
             message = f"two different set-ups are called `{draft.variant}`"
@@ -436,7 +458,8 @@ def _points(
             break
         if config is None or found:
             continue
-        study, calibrate = experiment.sensitivity, config.threshold.calibrate
+        study = experiment.sensitivity
+        calibrate = config.threshold.calibrate
         if draft.is_variation and study is not None:
             if (
                 calibrate is not None
@@ -446,7 +469,8 @@ def _points(
                 calibrate = calibrate.model_copy(update={"repeats": study.calibration_repeats})
             threshold = config.threshold.model_copy(update={"calibrate": calibrate})
             config = config.model_copy(update={"repeats": study.repeats, "threshold": threshold})
-        # the resolved values of the axes identify set-ups, and the set-up that a variation is compared with
+        # the resolved values of the axes identify set-ups, and the set-up that a variation is
+        # compared with
         data = json.loads(json.dumps(config.to_data())) if axes else {}
         placed = {path: shape.get(data, key_path(path)) for path in axes}
         point = point_of(

@@ -1,4 +1,5 @@
-"""The arguments of `harness.detect` as settings: a detector, the merging of views, captures, stated poses."""
+"""The arguments of `harness.detect` as settings: a detector, the merging of views, captures,
+stated poses."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "matched"
-PREFIX = "mapping."  # prefix of the --set keys for merging views; all other keys are the detector's
+# prefix of the --set keys for merging views; all other keys are the detector's
+PREFIX = "mapping."
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
 """Settings that state a polynomial: without them, the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
@@ -155,7 +157,8 @@ def detector_of(
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
-    """Return the settings that merge views into one cloud. Raises UserError with every problem at once."""
+    """Return the settings that merge views into one cloud. Raises UserError with every problem at
+    once."""
     from detectors.views.mapping.settings import MappingConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 
@@ -172,7 +175,8 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
-    """Return the crop's declaration from text, with the number of the automatic crop's candidate. Raises UserError."""
+    """Return the crop's declaration from text, with the number of the automatic crop's candidate.
+    Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
         what = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
@@ -205,7 +209,8 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
 
 
 def assign(settings: dict[str, Any], assignment: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError without one."""
+    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError
+    without one."""
     path, equals, text = assignment.partition("=")
     if not (path and equals):
         raise UserError(
@@ -234,7 +239,8 @@ def opened(
         from scenes.sensor.camera import lens_named, lens_names
 
         if str(intrinsics) in lens_names():
-            file, lens = None, lens_named(str(intrinsics))
+            file = None
+            lens = lens_named(str(intrinsics))
         elif not file.exists():
             legal = f"a file, or one of the cameras {', '.join(lens_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
@@ -244,7 +250,8 @@ def opened(
 def opened_as(
     camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any
 ) -> Recording:
-    """Open a capture; if it states no lens and none is given, the nominal lens of ``camera`` is used."""
+    """Open a capture; if it states no lens and none is given, the nominal lens of ``camera`` is
+    used."""
     try:
         return opened(paths, intrinsics, **reading)
     except UserError:
@@ -265,13 +272,15 @@ LEGAL_POSES = (
     f" under the key {POSES_KEY}; or lines of"
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
-RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
+# tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
+RIGID_WITHIN = 1e-4
 FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in millimetres lie beyond
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
-    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
-    UserError if the file cannot be read, has another number of poses, or one that is not rigid or too far."""
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any
+    common frame. Raises UserError if the file cannot be read, has another number of poses, or one
+    that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert
@@ -315,7 +324,8 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
 
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
-    """Parse a list of matrices: bare, in an object from `tofpod export`, or in one without a version."""
+    """Parse a list of matrices: bare, in an object from `tofpod export`, or in one without a
+    version."""
     import numpy as np
 
     data = strict_json(text)

@@ -1,4 +1,5 @@
-"""The results as text for the terminal, as facts for JSON files, and as a 3-D scene for the browser."""
+"""The results as text for the terminal, as facts for JSON files, and as a 3-D scene for the
+browser."""
 
 from __future__ import annotations
 
@@ -51,7 +52,8 @@ def print_notes(notes: Iterable[str]) -> None:
 def print_capture(
     recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str
 ) -> None:
-    """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), one per line."""
+    """Print the frames, those left out, and the points that the crop keeps (``kept``, of the
+    cloud), one per line."""
     height, width = cloud.valid.shape
     size = f"{width} x {height} pixels" if cloud.organised else f"{width} points"
     print(f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)} averaged, {size}")
@@ -90,13 +92,15 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
 
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
-    """Return the automatic crop's choice by settings; None for another crop. Raises UserError as the crop does."""
+    """Return the automatic crop's choice by settings; None for another crop. Raises UserError as
+    the crop does."""
     config = getattr(settings, "crop", None)
     return choice_of(cloud, config) if isinstance(config, AutoCrop) and cloud.valid.any() else None
 
 
 def print_choice(choice: Choice | None) -> None:
-    """Print the surface that was taken, and each other candidate with the option that takes it, one per line."""
+    """Print the surface that was taken, and each other candidate with the option that takes it,
+    one per line."""
     if choice is None or not choice.candidates:
         return
     texts = list(map(described_text, choice.candidates))
@@ -127,7 +131,8 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
 def pictures(
     choice: Choice | None, name: str = "targets.png"
 ) -> dict[str, Callable[[Path], object]]:
-    """Return the writer of the candidates' numbered picture, by file name, for `report.findings.write_findings`."""
+    """Return the writer of the candidates' numbered picture, by file name, for
+    `report.findings.write_findings`."""
     if choice is None or not choice.candidates:
         return {}
     outlines = [candidate.outline for candidate in choice.candidates]
@@ -216,8 +221,10 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
 
 
 def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
-    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around each finding."""
-    cloud, merged = judged.cloud, mapped.merged
+    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around
+    each finding."""
+    cloud = judged.cloud
+    merged = mapped.merged
     valid = cloud.valid.reshape(-1)
     detected = np.zeros(valid.size, bool)
     for detection in judged.detections:

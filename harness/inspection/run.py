@@ -1,4 +1,5 @@
-"""The steps of `harness.detect`: one capture, or several views merged into one cloud, judged and reported alike."""
+"""The steps of `harness.detect`: one capture, or several views merged into one cloud, judged and
+reported alike."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
     from detectors.views.mapping.settings import MappingConfig
     from detectors.views.registration.registered import Registration
 
-DEFAULT_K = 5.0  # robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
+# robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
+DEFAULT_K = 5.0
 FAINT_CALLS = (
     0.05  # noise explains a finding if at least this many false calls of its score are expected
 )
@@ -56,7 +58,8 @@ THRESHOLDS = (
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage above a threshold and missing returns, each damage and each object once, and measure them."""
+    """Find damage above a threshold and missing returns, each damage and each object once, and
+    measure them."""
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
@@ -75,7 +78,8 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
-    """Return the detector's evidence, with a warning if it fitted a stated surface that does not fit."""
+    """Return the detector's evidence, with a warning if it fitted a stated surface that does not
+    fit."""
     evidence = detector.analyse(cloud)
     doubt = (
         ""
@@ -85,8 +89,10 @@ def analysed(detector: Detector, cloud: Cloud) -> Evidence:
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
-OPEN_MM, FILTER_PX = 75.0, 3.0
-"""Depth beyond which a hole shows objects far behind it; least width of a filter that hides its rim."""
+OPEN_MM = 75.0
+FILTER_PX = 3.0
+"""Depth beyond which a hole shows objects far behind it; least width of a filter that hides its
+rim."""
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
@@ -108,9 +114,10 @@ def threshold_of(
     evidence: Evidence,
     quiet: Callable[[], tuple[float, str]],
 ) -> tuple[float, str, Evidence]:
-    """Return the threshold, its origin, and the evidence to search with it. The threshold is given, calibrated on a
-    quiet capture (by ``quiet``), the detector's own, or from the capture's peaks towards the camera, which may leave
-    out a rim that cannot be judged; if these cannot be trusted, it is a fallback with warnings."""
+    """Return the threshold, its origin, and the evidence to search with it. The threshold is
+    given, calibrated on a quiet capture (by ``quiet``), the detector's own, or from the capture's
+    peaks towards the camera, which may leave out a rim that cannot be judged; if these cannot be
+    trusted, it is a fallback with warnings."""
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
@@ -155,9 +162,10 @@ def threshold_of(
 
 
 def with_faint_warning(judged: Judged, threshold: float) -> Judged:
-    """Add a warning if noise explains more of the findings than the expected false calls, in a capture that set its own
-    threshold. The logarithm of the number of false calls is assumed to fall with the square of the score, as for normal
-    noise, through the peaks above the floor and the upper 95 % bound of the number expected at the threshold."""
+    """Add a warning if noise explains more of the findings than the expected false calls, in a
+    capture that set its own threshold. The logarithm of the number of false calls is assumed to
+    fall with the square of the score, as for normal noise, through the peaks above the floor and
+    the upper 95 % bound of the number expected at the threshold."""
     null = judged.evidence.notes.get("own_null", {"threshold": None})
     if threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
         return judged
@@ -179,15 +187,17 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
 
 
 def with_size_warnings(judged: Judged) -> Judged:
-    """Add warnings if findings reach the rim of the judged area, because the rest of them was not seen, and if distant
-    surfaces show through holes: the camera's filter, as wide as the noise's reach, then draws them over the rim."""
+    """Add warnings if findings reach the rim of the judged area, because the rest of them was not
+    seen, and if distant surfaces show through holes: the camera's filter, as wide as the noise's
+    reach, then draws them over the rim."""
     cloud = judged.cloud
     if not cloud.organised:
         return judged
     outside = np.pad(
         ~holes_filled(np.isfinite(judged.evidence.residual_m)), 1, constant_values=True
     )
-    rim, doubts = grown(outside, 1)[1:-1, 1:-1].ravel(), []
+    rim = grown(outside, 1)[1:-1, 1:-1].ravel()
+    doubts = []
     both = zip(judged.findings, judged.detections, strict=True)
     if cut := [str(finding.id) for finding, detection in both if rim[detection.pixels].any()]:
         doubts.append(
@@ -223,7 +233,8 @@ START_FROM_MARKS = (
 
 @dataclass(frozen=True)
 class Inspection:
-    """The results of a run. ``mapped``: None for one capture. ``registrations``: data of registrations.json."""
+    """The results of a run. ``mapped``: None for one capture. ``registrations``: data of
+    registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -246,7 +257,8 @@ class Inspection:
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
+    """Open, average, register and merge views, judge, print, and write with --out. Returns 0.
+    Raises UserError."""
     config = cli.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
     cli.refuse_misfits(arguments, paths)
@@ -280,7 +292,8 @@ def inspect(arguments: argparse.Namespace) -> int:
             choices.append(
                 output.choice_by(config or getattr(detector, "settings", None), view.cloud)
             )
-    mapped, registrations = None, dict[str, Any]()
+    mapped = None
+    registrations = dict[str, Any]()
     if config:
         mapped, registrations = _merged(arguments, config, recordings, views, choices)
     cloud = mapped.merged.cloud if mapped else views[0].cloud
@@ -351,8 +364,9 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks (printed at once, as they explain later failures), register and merge. Also return the
-    data of registrations.json. Raises UserError if a view has no target, or for all views that cannot be placed."""
+    """Find targets and marks (printed at once, as they explain later failures), register and
+    merge. Also return the data of registrations.json. Raises UserError if a view has no target, or
+    for all views that cannot be placed."""
     from detectors.views.mapping.merge import Mapped, merge, prepare
     from detectors.views.registration.by_marks import register_by_marks
     from detectors.views.registration.register import register
@@ -369,7 +383,8 @@ def _merged(
         output.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
         output.print_marks(ready)
         prepared.append(ready)
-    reference, has_poses = prepared[0], arguments.poses is not None
+    reference = prepared[0]
+    has_poses = arguments.poses is not None
     if config.registration.method in START_FROM_MARKS and not has_poses:
         for number, ready in enumerate(prepared):
             guess = np.eye(4)
@@ -403,7 +418,8 @@ def _merged(
 
 
 def _registration_data(mapped: Mapped) -> dict[str, Any]:
-    """Return registrations as plain data (metres in matrices, else millimetres), and checks that need no truth."""
+    """Return registrations as plain data (metres in matrices, else millimetres), and checks that
+    need no truth."""
     from detectors.views.registration.by_marks import held_out_error_m
     from detectors.views.registration.registered import plane_through, predicted_error_m, thinned
 
@@ -446,12 +462,10 @@ def _registration_data(mapped: Mapped) -> dict[str, Any]:
 
 
 def _print(run: Inspection) -> None:
-    cloud, evidence, crop, choice = (
-        run.result.cloud,
-        run.result.evidence,
-        run.arguments.crop,
-        run.choices[0],
-    )
+    cloud = run.result.cloud
+    evidence = run.result.evidence
+    crop = run.arguments.crop
+    choice = run.choices[0]
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
     # with several views, doubts about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
@@ -491,15 +505,18 @@ def _print(run: Inspection) -> None:
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the facts in the JSON file besides the findings, with the origin and digests of all files read."""
-    evidence, arguments = run.result.evidence, run.arguments
+    """Return the facts in the JSON file besides the findings, with the origin and digests of all
+    files read."""
+    evidence = run.result.evidence
+    arguments = run.arguments
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}
     if run.mapped is None or run.config is None:
         facts["target"] = output.choice_facts(run.choices[0])
         facts["capture"] = output.capture_facts(run.recordings[0], run.result.cloud)
     else:
-        merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
+        merged = run.mapped.merged
+        cell_mm = None if run.cell_m is None else run.cell_m / MM
         facts["frame"] = (
             "of the merged cloud; registrations.json has its pose relative to the first view's camera"
         )
@@ -542,11 +559,10 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
-    mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
-    count, limit = (
-        len(run.result.detections),
-        output.threshold_text(run.threshold, run.result.evidence),
-    )
+    mapped = run.mapped
+    beside = dict[str, Callable[[Path], object]]()
+    count = len(run.result.detections)
+    limit = output.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
     if run.seen is not None:

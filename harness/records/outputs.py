@@ -1,4 +1,5 @@
-"""Declares the files that programs write into a results folder, for `tofpod clean` and `results/README.md`."""
+"""Declares the files that programs write into a results folder, for `tofpod clean` and
+`results/README.md`."""
 
 import re
 from dataclasses import dataclass
@@ -9,8 +10,9 @@ FolderKind = Literal["results", "capture"]
 
 @dataclass(frozen=True)
 class Output:
-    """A file, or several if ``name`` holds * or ?. ``note`` describes its content. ``place`` is a results folder or a
-    real capture's folder in it. ``of`` is the kind of experiment or program that writes it; empty for every sweep."""
+    """A file, or several if ``name`` holds * or ?. ``note`` describes its content. ``place`` is a
+    results folder or a real capture's folder in it. ``of`` is the kind of experiment or program
+    that writes it; empty for every sweep."""
 
     name: str
     note: str

@@ -1,10 +1,11 @@
 """Declarations of result tables: a new column is one line.
 
-A `Table` has a name, a note on what a row is, and columns. A `Column` has a ``name`` for data files, whose ending is
-its unit, and a ``label`` for pages and terminals; either may be empty. Its ``value`` is a dotted path of a row's
-attributes (a pair of paths for an estimate and its interval) or a function of the row; without it, the row is a mapping
-with an entry of the same name. The ``note`` gives the column's meaning; ``text`` formats a value. An estimate with an
-interval fills three columns of a file (``speed_m``, ``speed_low_m``, ``speed_high_m``) and one column of a page.
+A `Table` has a name, a note on what a row is, and columns. A `Column` has a ``name`` for data
+files, whose ending is its unit, and a ``label`` for pages and terminals; either may be empty. Its
+``value`` is a dotted path of a row's attributes (a pair of paths for an estimate and its interval)
+or a function of the row; without it, the row is a mapping with an entry of the same name. The
+``note`` gives the column's meaning; ``text`` formats a value. An estimate with an interval fills
+three columns of a file (``speed_m``, ``speed_low_m``, ``speed_high_m``) and one column of a page.
 
     name = Column("animal", "animal", "species.name", "name of the species")
     speed = Column("speed_m", "speed (m/s)", ("speed", "interval"), "metres in a second")
@@ -33,7 +34,8 @@ from harness.vocabulary.text import Cell, Grid, Tone
 if TYPE_CHECKING:
     import pandas as pd
 
-LISTS_AT_ONCE = 1_000  # number of rows whose lists are expanded to rows of a file at a time; they take about 5 MB
+# number of rows whose lists are expanded to rows of a file at a time; they take about 5 MB
+LISTS_AT_ONCE = 1_000
 UNITS = {
     "_per_m2": "1/m²",
     "_m2": "m²",
@@ -48,7 +50,8 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval, NaN if unknown; shown as ``> most`` beyond ``most``, with ``≤`` if ``at_most``."""
+    """A number with its interval, NaN if unknown; shown as ``> most`` beyond ``most``, with ``≤``
+    if ``at_most``."""
 
     value: float
     low: float = np.nan
@@ -66,10 +69,9 @@ class Estimate:
 def _share(share: float | Estimate) -> str:
     """Return a share as text, such as ``0.12 % (0.05 to 0.2 %)``."""
     estimate = share if isinstance(share, Estimate) else Estimate(share)
-    value, low, high = (
-        f"{100 * x:.{2 if x < 0.995 else 3}g}"
-        for x in (estimate.value, estimate.low, estimate.high)
-    )
+    value = f"{100 * estimate.value:.{(2 if estimate.value < 0.995 else 3)}g}"
+    low = f"{100 * estimate.low:.{(2 if estimate.low < 0.995 else 3)}g}"
+    high = f"{100 * estimate.high:.{(2 if estimate.high < 0.995 else 3)}g}"
     ends = f" ({low} to {high} %)" if np.isfinite(estimate.low) else ""
     return text.UNKNOWN_TEXT if np.isnan(estimate.value) else f"{value} %{ends}"
 
@@ -88,8 +90,9 @@ FORMATS: dict[str, Callable[[Any], str]] = {
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a result table, as the module's docstring describes it. ``interval``: its values are `Estimate`.
-    ``spread``: they are mappings, and each key becomes a column. ``brief``: text at a terminal, False to hide it."""
+    """A column of a result table, as the module's docstring describes it. ``interval``: its values
+    are `Estimate`. ``spread``: they are mappings, and each key becomes a column. ``brief``: text
+    at a terminal, False to hide it."""
 
     name: str
     label: str = ""
@@ -139,9 +142,10 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A result table. ``note`` says what a row is, ``order`` names the columns that sort rows, ``formats`` its files,
-    ``digits`` the precision of CSV, ``title`` the title at a terminal. ``always`` writes it even without rows; ``left``
-    columns hold text on a page; ``lists`` names columns whose list elements become rows of the files."""
+    """A result table. ``note`` says what a row is, ``order`` names the columns that sort rows,
+    ``formats`` its files, ``digits`` the precision of CSV, ``title`` the title at a terminal.
+    ``always`` writes it even without rows; ``left`` columns hold text on a page; ``lists`` names
+    columns whose list elements become rows of the files."""
 
     name: str
     note: str
@@ -213,8 +217,9 @@ class Table:
         heads: Mapping[str, str] | None = None,
         only: Collection[str] = (),
     ) -> Grid:
-        """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only`` lists the labels to
-        show; ``heads`` replaces declared labels, and an empty label hides its column."""
+        """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only``
+        lists the labels to show; ``heads`` replaces declared labels, and an empty label hides its
+        column."""
         shown = [
             column
             for column in self.columns
@@ -235,8 +240,9 @@ class Table:
 def write_table(
     folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a table's files: CSV, and Parquet with units and notes in its schema and ``about`` as JSON under "tofpod".
-    Without rows, the files of an earlier run are removed. Raises UserError if the folder cannot be written."""
+    """Write a table's files: CSV, and Parquet with units and notes in its schema and ``about`` as
+    JSON under "tofpod". Without rows, the files of an earlier run are removed. Raises UserError if
+    the folder cannot be written."""
     for ending, name in zip(table.formats, table.files, strict=True):
         if frame.empty and not table.always:
             (Path(folder) / name).unlink(missing_ok=True)

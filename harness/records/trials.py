@@ -1,6 +1,8 @@
-"""Tables of trials: the measurements of each trial, and summaries of experiments that are not studies.
+"""Tables of trials: the measurements of each trial, and summaries of experiments that are not
+studies.
 
-Columns declare only a name and a note; their values come from `harness.trials.trial` and `harness.evaluation`."""
+Columns declare only a name and a note; their values come from `harness.trials.trial` and
+`harness.evaluation`."""
 
 from __future__ import annotations
 
@@ -276,7 +278,8 @@ def _mean(kind: str, label: str) -> Column:
 
 
 def _error(kind: str, label: str) -> Column:
-    """Return a column for pages with a mean error, its standard deviation and the number of values."""
+    """Return a column for pages with a mean error, its standard deviation and the number of
+    values."""
 
     def error(row: Mapping[str, Any]) -> str:
         count = int(row[f"{kind}_n"])
@@ -634,9 +637,10 @@ def _empty() -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class ResultTables:
-    """Tables of trials as declared above; ``holes`` is `TRIALS`. A table that an experiment lacks is empty.
-    ``variants`` has a row per set-up and then per variation: variant, reason, settings, is_variation, reference,
-    switches, and the axes. ``axes`` has the path, name and unit of every axis on which set-ups differ, in order."""
+    """Tables of trials as declared above; ``holes`` is `TRIALS`. A table that an experiment lacks
+    is empty. ``variants`` has a row per set-up and then per variation: variant, reason, settings,
+    is_variation, reference, switches, and the axes. ``axes`` has the path, name and unit of every
+    axis on which set-ups differ, in order."""
 
     holes: pd.DataFrame
     runs: pd.DataFrame
@@ -671,7 +675,8 @@ class ResultTables:
 # ---------------------------------------------------------------- real captures
 
 FINDINGS_VERSION = 3
-"""The version is increased when the meaning of a column or key changes; the last column of the CSV states it."""
+"""The version is increased when the meaning of a column or key changes; the last column of the CSV
+states it."""
 FINDINGS_OF_CAPTURE = Table(
     outputs.FINDINGS.name.removesuffix(".csv"),
     outputs.FINDINGS.note,

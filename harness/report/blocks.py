@@ -1,6 +1,8 @@
-"""Parts of pages: the skeleton with the stylesheet, blocks, figures as SVG or PNG. All text but `Markup` is escaped.
+"""Parts of pages: the skeleton with the stylesheet, blocks, figures as SVG or PNG. All text but
+`Markup` is escaped.
 
-page(title, answer, [heading("Limits"), LIMITS.grid(rows).html(), figure(figures, "curves", "Each stroke is ...")])"""
+page(title, answer, [heading("Limits"), LIMITS.grid(rows).html(), figure(figures, "curves", "Each
+stroke is ...")])"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ NAMED = 3  # Most trials that are named for the same failure
 
 
 def template(name: str, folder: Path | None = None) -> Template:
-    """Load a template from ``folder`` or from this folder; undefined names are errors, and text is escaped."""
+    """Load a template from ``folder`` or from this folder; undefined names are errors, and text is
+    escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -65,7 +68,8 @@ def page(
     under: Iterable[Markup] = (),
     warnings: Iterable[str] = (),
 ) -> str:
-    """Return a whole page: ``title``, ``warnings``, the ``answer`` in large letters, parts ``under`` it, the body."""
+    """Return a whole page: ``title``, ``warnings``, the ``answer`` in large letters, parts
+    ``under`` it, the body."""
     parts = {"body": joined(body), "under": joined(under), "warnings": list(warnings)}
     return template("page.html").render(title=title, answer=answer, **parts)
 
@@ -86,7 +90,9 @@ def joined(parts: Iterable[str | Markup], between: str = "\n") -> Markup:
     return Markup(between).join(escape(part) for part in parts)
 
 
-heading, subheading, paragraph = (partial(tag, name) for name in ("h2", "h3", "p"))
+heading = partial(tag, "h2")
+subheading = partial(tag, "h3")
+paragraph = partial(tag, "p")
 note = partial(tag, "p", kind="note")
 
 
@@ -96,7 +102,8 @@ def bullets(items: Iterable[str | Markup]) -> Markup:
 
 
 def figure(figures: Mapping[str, str], name: str, caption: str) -> Markup:
-    """Return a figure of ``figures`` (SVG text by name) with its caption, or a note that its data were not stored."""
+    """Return a figure of ``figures`` (SVG text by name) with its caption, or a note that its data
+    were not stored."""
     if name not in figures:
         return note("No data for this figure were stored.")
     return tag(
@@ -127,7 +134,8 @@ def command_of(command: str) -> list[Markup]:
 def closing(
     provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = ""
 ) -> list[Markup]:
-    """Return the last sections of every sweep's page. ``left_out`` is a sentence on frames excluded from averages."""
+    """Return the last sections of every sweep's page. ``left_out`` is a sentence on frames
+    excluded from averages."""
     reasons: dict[str, list[str]] = {}
     for failure in provenance.get("failures", ()):
         reasons.setdefault(f"{failure['state']}: {failure['why']}", []).append(failure["what"])
@@ -144,10 +152,8 @@ def closing(
     keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
     lines = []
     for key in (*SHOWN_FIRST, *keys):
-        name, value = (
-            key.replace("_mm", " (mm)").replace("_", " "),
-            plain(provenance.get(key, "not recorded")),
-        )
+        name = key.replace("_mm", " (mm)").replace("_", " ")
+        value = plain(provenance.get(key, "not recorded"))
         lines.append(tag("tr", tag("th", name, scope="row"), tag("td", value)))
     parts += [heading("Provenance")]
     table = tag("table", tag("tbody", joined(lines)), kind="prov")
@@ -161,7 +167,8 @@ def closing(
 
 
 def plain(value: Any) -> str:
-    """Return a recorded value as text: yes or no, ``name: value`` pairs, or a list; never in Python's notation."""
+    """Return a recorded value as text: yes or no, ``name: value`` pairs, or a list; never in
+    Python's notation."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, Mapping):
@@ -173,16 +180,17 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-# Okabe and Ito's palette (Color Universal Design, 2008), which remains distinguishable with common colour blindness
-BLUE, ORANGE, GREEN, RED, SKY, PURPLE = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#56B4E9",
-    "#CC79A7",
-)
-INK, GREY, PALE = "#1d2530", "#6b7480", "#e9ecef"
+# Okabe and Ito's palette (Color Universal Design, 2008), which remains distinguishable with common
+# colour blindness
+BLUE = "#0072B2"
+ORANGE = "#E69F00"
+GREEN = "#009E73"
+RED = "#D55E00"
+SKY = "#56B4E9"
+PURPLE = "#CC79A7"
+INK = "#1d2530"
+GREY = "#6b7480"
+PALE = "#e9ecef"
 DAMAGE = "#ff00ff"  # magenta, the colour of damage in the clouds of the thesis
 
 STYLE: dict[str, Any] = {
@@ -202,13 +210,15 @@ STYLE: dict[str, Any] = {
     "svg.fonttype": "path",
     "image.interpolation": "nearest",
 }
-COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE), "osD^vP"
+COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
+MARKERS = "osD^vP"
 
 
 def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figure], None]) -> str:
-    """Draw a figure of ``size_in`` (width, height) inches; return it as an inline ``<svg>`` with the label ``alt`` and
-    the values of its lines, which are shown under the pointer. ``name`` seeds the ids in it, so that a page can hold
-    several figures. The text contains no dates and no random numbers."""
+    """Draw a figure of ``size_in`` (width, height) inches; return it as an inline ``<svg>`` with
+    the label ``alt`` and the values of its lines, which are shown under the pointer. ``name``
+    seeds the ids in it, so that a page can hold several figures. The text contains no dates and no
+    random numbers."""
     buffer = io.StringIO()
     drawn = _save(
         buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None}
@@ -228,19 +238,20 @@ def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figur
 
 
 def _values(figure: Figure) -> list[dict[str, Any]]:
-    """Return each panel's box (left, top, right, bottom), axis and lines. A line is its name, then x and y in the
-    drawing and on the axes for at most `MOST_VALUES` points. Lengths are in points from the upper left."""
-    panels, scale, height = [], 72 / figure.dpi, figure.bbox.height
+    """Return each panel's box (left, top, right, bottom), axis and lines. A line is its name, then
+    x and y in the drawing and on the axes for at most `MOST_VALUES` points. Lengths are in points
+    from the upper left."""
+    panels = []
+    scale = 72 / figure.dpi
+    height = figure.bbox.height
     for axes in figure.axes:
         names = {
             id(bars[0]): bars.get_label() for bars in axes.containers if hasattr(bars, "has_yerr")
         }
         lines = []
         for line in axes.get_lines():
-            name, xy = (
-                str(names.get(id(line), line.get_label())),
-                np.asarray(line.get_xydata(), float),
-            )
+            name = str(names.get(id(line), line.get_label()))
+            xy = np.asarray(line.get_xydata(), float)
             xy = xy[np.isfinite(xy).all(axis=1)]
             if name.startswith("_") or len(xy) < 2 or line.get_transform() != axes.transData:
                 continue
@@ -264,7 +275,8 @@ def plain_decades(axis: Axis) -> None:
 
 
 def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], None]) -> None:
-    """Draw a figure of ``size_in`` (width, height) inches to a PNG with 160 dpi; the same data give the same bytes."""
+    """Draw a figure of ``size_in`` (width, height) inches to a PNG with 160 dpi; the same data
+    give the same bytes."""
     with atomic_path(path) as temporary:
         _save(temporary, size_in, draw, format="png", metadata={"Software": None})
 

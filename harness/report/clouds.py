@@ -1,6 +1,8 @@
-"""Figures of damage as a detector sees it: the residuals of whole clouds and of single damages, from stored trials.
+"""Figures of damage as a detector sees it: the residuals of whole clouds and of single damages,
+from stored trials.
 
-All residuals share a colour scale: linear within 1 mm, logarithmic beyond, red behind the surface, blue before it."""
+All residuals share a colour scale: linear within 1 mm, logarithmic beyond, red behind the surface,
+blue before it."""
 
 from __future__ import annotations
 
@@ -28,10 +30,11 @@ Where = Literal["below", "at", "above"]
 
 @dataclass(frozen=True, eq=False)
 class StudyExample:
-    """A crop (h, w) of a run's pixel grid around a damage. ``where`` compares its size with the set-up's limit.
-    ``diameter_mm`` and ``depth_mm`` are true values; ``pod`` is the curve's at that size. ``score`` is NaN if no pixel
-    there was judged; ``threshold`` has the same units. ``residual_mm`` and ``detected`` are as in `ExampleCloud`.
-    ``outline_px`` (k, 2) is the true rim as (column, row) from the first pixel, ``pitch_mm`` a pixel on the board."""
+    """A crop (h, w) of a run's pixel grid around a damage. ``where`` compares its size with the
+    set-up's limit. ``diameter_mm`` and ``depth_mm`` are true values; ``pod`` is the curve's at
+    that size. ``score`` is NaN if no pixel there was judged; ``threshold`` has the same units.
+    ``residual_mm`` and ``detected`` are as in `ExampleCloud`. ``outline_px`` (k, 2) is the true
+    rim as (column, row) from the first pixel, ``pitch_mm`` a pixel on the board."""
 
     variant: str
     frames: int
@@ -78,7 +81,8 @@ SIZES: dict[Where, str] = {"below": "Smaller", "at": "Middle", "above": "Larger"
 
 
 class Cut(NamedTuple):
-    """A crop of a pixel grid around a damage: residual and findings (h, w), rim (k, 2), a pixel's width, and texts."""
+    """A crop of a pixel grid around a damage: residual and findings (h, w), rim (k, 2), a pixel's
+    width, and texts."""
 
     residual_mm: np.ndarray
     detected: np.ndarray
@@ -90,7 +94,8 @@ class Cut(NamedTuple):
 
 
 def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
-    """Draw each cloud's residuals, the pixels of findings, and rings at the true holes (dashed if not found)."""
+    """Draw each cloud's residuals, the pixels of findings, and rings at the true holes (dashed if
+    not found)."""
     norm = residual_norm(np.concatenate([cloud.residual_mm[cloud.inside] for cloud in clouds]))
     boxes = []
     for cloud in clouds:
@@ -136,7 +141,8 @@ def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
 def examples_figure(
     name: str, examples: Sequence[StudyExample], title: str, *, by_limit: bool = True
 ) -> str:
-    """Draw a set-up's examples. The columns are below, at and above the limit, or sizes if not ``by_limit``."""
+    """Draw a set-up's examples. The columns are below, at and above the limit, or sizes if not
+    ``by_limit``."""
     titles = TITLES if by_limit else SIZES
     columns = []
     for where in get_args(Where):
@@ -192,7 +198,8 @@ def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
             axes.plot(*np.vstack([cut.rim_px, cut.rim_px[:1]]).T, color=INK, lw=1.3)
             height, width = cut.residual_mm.shape
             axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), yticks=[])
-            middle, step = (width - 1) / 2, 10 / cut.pitch_mm
+            middle = (width - 1) / 2
+            step = 10 / cut.pitch_mm
             axes.set_xticks(
                 [middle - step, middle, middle + step], ["−10", "0", "10 mm"], fontsize=8
             )

@@ -1,4 +1,5 @@
-"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with coloured damage.
+"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with
+coloured damage.
 
 All files of a run are first written under temporary names and renamed together at the end."""
 
@@ -24,16 +25,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DAMAGE_RGB = (255, 0, 255)
-ELONGATED = 2.0  # least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1 mm
+# least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1
+# mm
+ELONGATED = 2.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A row: the better of both measures in the camera frame; NaN if nothing could be measured. ``kind`` is ``hole``,
-    ``bump`` or ``no return``. ``length_mm`` and ``width_mm`` are the sides of a rectangle with the residual's second
-    moments; ``angle_deg`` is the longer side's angle from x towards y, -90 to 90, across the line of sight.
-    ``size_from`` is ``model`` (blurred hole, standard errors), ``contour`` (half depth), ``extent`` (extreme points) or
-    ``area`` (no return); ``depth_from`` is the same, ``extreme residual`` of the cluster's points, or ``none``."""
+    """A row: the better of both measures in the camera frame; NaN if nothing could be measured.
+    ``kind`` is ``hole``, ``bump`` or ``no return``. ``length_mm`` and ``width_mm`` are the sides
+    of a rectangle with the residual's second moments; ``angle_deg`` is the longer side's angle
+    from x towards y, -90 to 90, across the line of sight. ``size_from`` is ``model`` (blurred
+    hole, standard errors), ``contour`` (half depth), ``extent`` (extreme points) or ``area`` (no
+    return); ``depth_from`` is the same, ``extreme residual`` of the cluster's points, or ``none``.
+    """
 
     id: int
     kind: str
@@ -61,7 +66,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with a detector's results. ``missing`` are its missing returns, None without a pixel grid."""
+    """A cloud with a detector's results. ``missing`` are its missing returns, None without a pixel
+    grid."""
 
     cloud: Cloud
     evidence: Evidence
@@ -79,7 +85,8 @@ class Judged:
 def finding_of(
     number: int, evidence: Evidence, detection: Detection, measured: Measurement
 ) -> Finding:
-    """Return the row of a detection: the model's numbers if they exist, or else those of the extents."""
+    """Return the row of a detection: the model's numbers if they exist, or else those of the
+    extents."""
     modelled = math.isfinite(measured.model_diameter_m)
     placed = bool(np.isfinite(measured.model_centre_m).all())
     x_mm, y_mm, z_mm = (
@@ -93,12 +100,15 @@ def finding_of(
         if math.isnan(measured.model_diameter_se_m)
         else "model"
     )
-    depth_m, depth_from = measured.model_depth_m, size_from
+    depth_m = measured.model_depth_m
+    depth_from = size_from
     if detection.kind == "no return":
-        size_from, depth_from = "area", "none"
+        size_from = "area"
+        depth_from = "none"
     elif math.isnan(depth_m):
         residuals = evidence.residual_m.reshape(-1)[detection.pixels]
-        depth_m, depth_from = float(residuals[np.argmax(np.abs(residuals))]), "extreme residual"
+        depth_m = float(residuals[np.argmax(np.abs(residuals))])
+        depth_from = "extreme residual"
     kind = detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole"
     place = (measured.u_px, measured.v_px, x_mm, y_mm, z_mm)
     sizes = (diameter_m / MM, depth_m / MM, measured.volume_m3 / MM**3)
@@ -121,8 +131,9 @@ def write_findings(
     cloud_name: str = outputs.CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about`` besides the findings;
-    ``beside`` maps names of further files to functions that write them. Raises UserError if writing fails."""
+    """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about``
+    besides the findings; ``beside`` maps names of further files to functions that write them.
+    Raises UserError if writing fails."""
     is_new, (cloud, missing, detections) = (
         not folder.exists(),
         (judged.cloud, judged.missing, judged.detections),
@@ -165,7 +176,8 @@ def csv_text(findings: Sequence[Finding]) -> str:
 
 
 def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
-    """Return the findings with both measures and their standard errors, then ``about``; unknown numbers are null."""
+    """Return the findings with both measures and their standard errors, then ``about``; unknown
+    numbers are null."""
     rows = [
         asdict(finding)
         | {
@@ -184,7 +196,8 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
 
 
 def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
-    """Return the valid points (camera frame, metres, float32) as a binary PLY: damage magenta, the rest coloured."""
+    """Return the valid points (camera frame, metres, float32) as a binary PLY: damage magenta, the
+    rest coloured."""
     import trimesh
 
     colours = np.full((cloud.valid.size, 3), 160, np.uint8)
@@ -199,19 +212,20 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 
 
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
-WIDTH_IN, DPI = 11.0, 150
-TAKEN, OTHERS = (
-    "#ff00ff",
-    ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff"),
-)
-"""Colours that differ from grey and from one another, also for viewers with red-green blindness."""
+WIDTH_IN = 11.0
+DPI = 150
+TAKEN = "#ff00ff"
+OTHERS = ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
+"""Colours that differ from grey and from one another, also for viewers with red-green blindness.
+"""
 Box = tuple[float, float, float, float]
 
 
 def findings_figure(
     cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str
 ) -> Figure:
-    """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan view in mm."""
+    """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan
+    view in mm."""
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
     residual_mm = evidence.residual_m / MM
@@ -228,7 +242,8 @@ def findings_figure(
             )
         else:
             judged = np.isfinite(residual_mm)
-            x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
+            x = cloud.points_m[..., 0][judged] / MM
+            y = cloud.points_m[..., 1][judged] / MM
             shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
         residual_bar(figure, shown, "mm behind (+) or before (−) the surface", ax=list(axes))
         for panel in axes:
@@ -241,7 +256,8 @@ def findings_figure(
 def save_blind_map(
     path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]
 ) -> None:
-    """Write a PNG with each pixel's share of frames without a return, the outline, and findings without a return."""
+    """Write a PNG with each pixel's share of frames without a return, the outline, and findings
+    without a return."""
     box = _around(cloud, missing.outline)
 
     def draw(figure: Figure) -> None:
@@ -258,10 +274,8 @@ def save_blind_map(
         )
         if min(missing.outline.shape) > 1 and not missing.outline.all():
             height, width = missing.outline.shape
-            columns, rows = (
-                np.arange(width) + cloud.region.col0,
-                np.arange(height) + cloud.region.row0,
-            )
+            columns = np.arange(width) + cloud.region.col0
+            rows = np.arange(height) + cloud.region.row0
             axes.contour(
                 columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8
             )
@@ -289,7 +303,8 @@ def save_blind_map(
 def save_targets(
     path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int
 ) -> None:
-    """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and numbers from 1."""
+    """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and
+    numbers from 1."""
     import cv2
     from matplotlib.patheffects import withStroke
 
@@ -303,7 +318,8 @@ def save_targets(
         for number, (outline, text) in enumerate(zip(outlines, texts, strict=True), start=1):
             chosen = number == taken
             colour = TAKEN if chosen else next(colours)
-            x, y = np.arange(-1, width + 1), np.arange(-1, height + 1)
+            x = np.arange(-1, width + 1)
+            y = np.arange(-1, height + 1)
             padded = np.pad(outline, 1)
             axes.contour(
                 x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4
@@ -351,14 +367,16 @@ def _height_in(box: Box) -> float:
 
 
 def _around(cloud: Cloud, part: np.ndarray) -> Box:
-    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a margin of a twelfth."""
+    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a margin of
+    a twelfth."""
     left, right, bottom, top = _edges(cloud)
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
         return left, right, bottom, top
-    u0, u1, v0, v1 = (
-        float(n) for n in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1)
-    )
+    u0 = float(columns.min())
+    u1 = float(columns.max() + 1)
+    v0 = float(rows.min())
+    v1 = float(rows.max() + 1)
     margin = max(u1 - u0, v1 - v0) / 12.0
     sides = left + np.array([u0 - margin, u1 + margin]), top + np.array([v1 + margin, v0 - margin])
     (a, b), (c, d) = np.clip(sides[0], left, right), np.clip(sides[1], top, bottom)
@@ -366,11 +384,13 @@ def _around(cloud: Cloud, part: np.ndarray) -> Box:
 
 
 def _edges(cloud: Cloud) -> Box:
-    """Return (left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid; down is positive."""
+    """Return (left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid;
+    down is positive."""
     if cloud.organised:
         region = cloud.region
         return region.col0 - 0.5, region.col1 - 0.5, region.row1 - 0.5, region.row0 - 0.5
-    x, y = (cloud.points_m[..., axis][cloud.valid] / MM for axis in (0, 1))
+    x = cloud.points_m[..., 0][cloud.valid] / MM
+    y = cloud.points_m[..., 1][cloud.valid] / MM
     return float(x.min()), float(x.max()), float(y.max()), float(y.min())
 
 
@@ -387,7 +407,9 @@ def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]])
     for number, detection in numbered:
         if cloud.organised:
             rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
-            u, v, margin = columns + cloud.region.col0, rows + cloud.region.row0, 3.0
+            u = columns + cloud.region.col0
+            v = rows + cloud.region.row0
+            margin = 3.0
         else:
             u, v = (cloud.points_m.reshape(-1, 3)[detection.pixels] / MM).T[:2]
             margin = 2.0

@@ -47,7 +47,8 @@ LIKELIEST = 10  # set-ups that the posterior's table shows
 
 
 def _posterior_section(posterior: pd.DataFrame) -> list[Any]:
-    """Return a heading, a small diagram for each axis, and the likeliest set-ups, from the result of `posterior_of`."""
+    """Return a heading, a small diagram for each axis, and the likeliest set-ups, from the result
+    of `posterior_of`."""
     axes = posterior[posterior["axis"] != SET_UP]
     names = list(dict.fromkeys(axes["axis"]))
 
@@ -84,7 +85,8 @@ def _posterior_section(posterior: pd.DataFrame) -> list[Any]:
 
 
 def rates_figure(main: pd.DataFrame) -> str:
-    """Draw each hole's share of repeats that detected it (with Wilson intervals) against its diameter, by frames."""
+    """Draw each hole's share of repeats that detected it (with Wilson intervals) against its
+    diameter, by frames."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -117,7 +119,8 @@ def rates_figure(main: pd.DataFrame) -> str:
 
 
 def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int]) -> str:
-    """Draw the smallest diameter found against the last axis, with a panel for each number of frames."""
+    """Draw the smallest diameter found against the last axis, with a panel for each number of
+    frames."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(frames), squeeze=False)[0]
@@ -144,21 +147,24 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
                 ylim=(0, top), ylabel="smallest diameter found (mm)", xlabel=layout.column_name
             )
             axes.set_title(many(n, "frame"))
-        columns = int(15 * width_in / (6 + max(map(len, layout.rows))))  # about 15 letters per inch
+        # about 15 letters per inch
+        columns = int(15 * width_in / (6 + max(map(len, layout.rows))))
         figure.legend(
             *panels[0].get_legend_handles_labels(),
             loc="outside lower center",
             ncols=max(columns, 1),
         )
 
-    width_in, height_in = 1 + 3.2 * len(frames), 3.2 + 0.1 * len(layout.rows)
+    width_in = 1 + 3.2 * len(frames)
+    height_in = 3.2 + 0.1 * len(layout.rows)
     return blocks.svg(
         "limits", (width_in, height_in), "Smallest diameter found by each set-up.", draw
     )
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
-    """Draw a variant's temporal, systematic and total error against frames, with the 1/sqrt(N) guide and the floor."""
+    """Draw a variant's temporal, systematic and total error against frames, with the 1/sqrt(N)
+    guide and the floor."""
     frames = noise["frames"].to_numpy(float)
     floor_mm = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
 
@@ -198,17 +204,16 @@ def noise_figure(noise: pd.DataFrame) -> str:
 
 
 def cost_text(cost: sections.Row) -> str:
-    """Return a loss in the table of effects as ``+0.42 mm (0.30 to 0.55)``, or as a bound if a size is out of range."""
+    """Return a loss in the table of effects as ``+0.42 mm (0.30 to 0.55)``, or as a bound if a
+    size is out of range."""
     if not np.isfinite(cost["loss_mm"]):
         return (
             "outside the range of sizes"
             if np.isnan(cost["loss_mm"])
             else f"{'+' if cost['loss_mm'] > 0 else '−'}∞"
         )
-    low, high = (
-        f"{end:+.2f}" if np.isfinite(end) else "∞"
-        for end in (cost["loss_low_mm"], cost["loss_high_mm"])
-    )
+    low = f"{cost['loss_low_mm']:+.2f}" if np.isfinite(cost["loss_low_mm"]) else "∞"
+    high = f"{cost['loss_high_mm']:+.2f}" if np.isfinite(cost["loss_high_mm"]) else "∞"
     bound = "" if cost["on_ladder"] else ", a bound: a size lies outside the range"
     return f"{cost['loss_mm']:+.2f} mm ({low} to {high}{bound})".replace("-", "−")
 
@@ -216,7 +221,8 @@ def cost_text(cost: sections.Row) -> str:
 def costs_by_place(
     costs: pd.DataFrame,
 ) -> dict[tuple[str, int], dict[tuple[str, str], sections.Row]]:
-    """Return the rows of the table of effects by (place, frames), then by (effect, other effects that are on)."""
+    """Return the rows of the table of effects by (place, frames), then by (effect, other effects
+    that are on)."""
     found: dict[tuple[str, int], dict[tuple[str, str], sections.Row]] = {}
     for row in sections.records(costs):
         found.setdefault((row["place"], int(row["frames"])), {})[row["effect"], row["against"]] = (
@@ -226,8 +232,10 @@ def costs_by_place(
 
 
 def effects_figure(costs: pd.DataFrame) -> str:
-    """Draw bars of every effect's cost with 95 % intervals, one panel for each place and number of frames."""
-    names, places = list(dict.fromkeys(costs["effect"])), costs_by_place(costs)
+    """Draw bars of every effect's cost with 95 % intervals, one panel for each place and number of
+    frames."""
+    names = list(dict.fromkeys(costs["effect"]))
+    places = costs_by_place(costs)
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(places), squeeze=False, sharex=True, sharey=True)[0]
@@ -290,8 +298,9 @@ CAMERA = (
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of set-ups in a table: the last of several axes across, the others down. ``rows`` maps the text of a
-    row to its set-ups. ``columns`` are the last axis's values, ``column_values`` the same as numbers."""
+    """The layout of set-ups in a table: the last of several axes across, the others down. ``rows``
+    maps the text of a row to its set-ups. ``columns`` are the last axis's values,
+    ``column_values`` the same as numbers."""
 
     rows: Mapping[str, Sequence[str]]
     columns: tuple[str, ...] = ()
@@ -334,13 +343,12 @@ def set_ups_html(
 ) -> str:
     """Return the page of several set-ups as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
-    compared, costs, posterior = (
-        of_set_ups(found[SET_UPS], tables),
-        found[trials.EFFECTS],
-        found.get(trials.POSTERIOR),
-    )
+    compared = of_set_ups(found[SET_UPS], tables)
+    costs = found[trials.EFFECTS]
+    posterior = found.get(trials.POSTERIOR)
     verdict = next(iter(verdicts_of(found)), None)
-    layout, frames = Layout.of(tables), sections.shown_frames(compared)
+    layout = Layout.of(tables)
+    frames = sections.shown_frames(compared)
     figures: dict[str, str] = {}
     if len(compared) and layout.column_values and len(layout.rows) <= 2 * len(COLOURS):
         figures["limits"] = limits_figure(compared, layout, frames)
@@ -375,7 +383,8 @@ def set_ups_html(
 def set_ups_answer(
     compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdict: Verdict | None
 ) -> str:
-    """State each row's holes found with the most frames, the effect with the largest loss, and the verdict on C11."""
+    """State each row's holes found with the most frames, the effect with the largest loss, and the
+    verdict on C11."""
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
     frames = sections.shown_frames(compared)
@@ -458,10 +467,11 @@ def write_report(
     facts: Mapping[str, Any] | None = None,
     found: Summaries | None = None,
 ) -> Path:
-    """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups, or of maps, with a
-    page for each map of ``examples`` beside it. `harness.report.blocks.closing` describes ``provenance``; ``facts`` is
-    the resolved experiment as plain data, ``found`` the result of `summaries`. Claims need the thesis' target.
-    The same input gives the same bytes. Raises UserError if the folder cannot be written."""
+    """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups,
+    or of maps, with a page for each map of ``examples`` beside it. `harness.report.blocks.closing`
+    describes ``provenance``; ``facts`` is the resolved experiment as plain data, ``found`` the
+    result of `summaries`. Claims need the thesis' target. The same input gives the same bytes.
+    Raises UserError if the folder cannot be written."""
     about = sections.About(
         provenance, experiment_yaml_text, title, is_thesis(facts or {}), facts or {}
     )
@@ -488,9 +498,9 @@ def report_html(
 ) -> str:
     """Return the page of an experiment with one set-up as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
-    main, noise, calls = (
-        found[key][found[key]["variant"] == MAIN] for key in (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS)
-    )
+    main = found[SUMMARY][found[SUMMARY]["variant"] == MAIN]
+    noise = found[NOISE_BY_FRAMES][found[NOISE_BY_FRAMES]["variant"] == MAIN]
+    calls = found[FALSE_CALLS][found[FALSE_CALLS]["variant"] == MAIN]
     verdicts = verdicts_of(found)
     frames = sorted(int(n) for n in main["frames"].unique())
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
@@ -521,7 +531,8 @@ def report_html(
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:
-    """State which holes were found with the most and the fewest frames (``main``: summary rows), and the verdicts."""
+    """State which holes were found with the most and the fewest frames (``main``: summary rows),
+    and the verdicts."""
     if main.empty:
         return "No trial of the main experiment finished, so there is no answer."
     frames = sorted(int(n) for n in main["frames"].unique())

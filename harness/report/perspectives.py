@@ -1,4 +1,5 @@
-"""The page of an experiment with several views: the gain of more views, and the effects of registering and merging."""
+"""The page of an experiment with several views: the gain of more views, and the effects of
+registering and merging."""
 
 from __future__ import annotations
 
@@ -53,7 +54,9 @@ def perspectives_html(
 ) -> str:
     """Return the page as text; see `harness.report.page.write_report`."""
     found = found or summaries(tables, with_claims=about.with_claims)
-    compared, errors, verdicts = found[SET_UPS], found[REGISTRATION_ERRORS], verdicts_of(found)
+    compared = found[SET_UPS]
+    errors = found[REGISTRATION_ERRORS]
+    verdicts = verdicts_of(found)
     cases = maps.map_cases(tables, found[SUMMARY])
     set_ups = compared[~compared["is_variation"]] if len(compared) else compared
     own = tables.registrations[tables.registrations["variant"].isin(set_ups_of(tables))]
@@ -92,7 +95,8 @@ def perspectives_html(
 
 
 def found_figure(rows: Sequence[sections.Row]) -> str:
-    """Draw the number of holes found against the number of views, with a line per registration and merging method."""
+    """Draw the number of holes found against the number of views, with a line per registration and
+    merging method."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -100,7 +104,8 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         for number, way in enumerate(ways):
             of_way = [row for row in rows if (row["registration"], row["merge"]) == way]
             own = sorted((row["views"], len(row["found"])) for row in of_way)
-            colour, marker = (each[number % len(each)] for each in (blocks.COLOURS, blocks.MARKERS))
+            colour = blocks.COLOURS[number % len(blocks.COLOURS)]
+            marker = blocks.MARKERS[number % len(blocks.MARKERS)]
             shift = 0.04 * (number - len(ways) / 2)  # separates equal counts
             views, counts = np.array(sorted(own), float).T
             label = maps.label_of(method_text(way[0]), way[1])
@@ -116,7 +121,8 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
 
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
-    """State how many holes one view finds, how many the most views find by the best method, and the verdicts."""
+    """State how many holes one view finds, how many the most views find by the best method, and
+    the verdicts."""
     sentences = []
     for case in cases:
         alone = case.single()
@@ -160,7 +166,8 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
-    """Return the file of each browser map beside the report, sorted by frames (most first), views and method."""
+    """Return the file of each browser map beside the report, sorted by frames (most first), views
+    and method."""
     files: dict[str, MappedExample] = {}
     for example in sorted(
         examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant)
@@ -180,10 +187,8 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
 
 def map_text(example: MappedExample) -> str:
     """Describe one map in words."""
-    variation, way = (
-        f": {example.variant}" if example.is_variation else "",
-        method_text(example.registration),
-    )
+    variation = f": {example.variant}" if example.is_variation else ""
+    way = method_text(example.registration)
     way = maps.label_of(way, example.merge)
     return f"{many(example.views, 'view')} ({way}), {maps.frames_text(example.frames)}{variation}"
 
@@ -217,7 +222,8 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
                         (registrations["method"] == method) & (registrations["frames"] == n)
                     ]
                     x = place + 0.36 * (side - (len(frames) - 1) / 2)
-                    good, bad = maps.trusted(rows), rows[rows["failure"] != ""]
+                    good = maps.trusted(rows)
+                    bad = rows[rows["failure"] != ""]
                     colour = METHOD_COLOURS.get(method, blocks.SKY)
                     for chosen, marker, shade, size in (
                         (good, "o", colour, 2.2),

@@ -1,4 +1,5 @@
-"""Presents a probability of detection curve: tables for terminal and page, and a figure with the inspections."""
+"""Presents a probability of detection curve: tables for terminal and page, and a figure with the
+inspections."""
 
 from __future__ import annotations
 
@@ -22,8 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-MOST_MARKS = 2000  # most inspections that a figure draws as vector marks; if there are more, they are rasterised
-STRIPE = 0.10  # height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD
+# most inspections that a figure draws as vector marks; if there are more, they are rasterised
+MOST_MARKS = 2000
+# height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD
+STRIPE = 0.10
 VALIDITY = (
     "The limit holds for inspections like these: the same kind of flaws and parts, the same procedure, and the sizes "
     "inspected. Targets are assumed to be independent. Sizes beyond the largest target are extrapolated."
@@ -87,7 +90,8 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 def sizes_grid(statement: PodStatement) -> Grid:
     """Return the table of a50, a90 and a90/95 with the method of each."""
     of_models = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
-    digits, unit = _digits(statement), statement.unit
+    digits = _digits(statement)
+    unit = statement.unit
     rows = [
         (name, sized(getattr(statement, name), unit, digits), "estimate") for name in ("a50", "a90")
     ]
@@ -122,7 +126,8 @@ MODELS = Table(
 
 
 def models_grid(statement: PodStatement) -> Grid:
-    """Return the table of models; it marks the model of the curve, and the models whose bounds are compared with it."""
+    """Return the table of models; it marks the model of the curve, and the models whose bounds are
+    compared with it."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
     return MODELS.grid(
         statement.models, heads={name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
@@ -162,7 +167,8 @@ def answer(statement: PodStatement) -> str:
 
 
 def sized(value: float, unit: str, digits: int = 2) -> str:
-    """Return a size with that many significant digits and its unit, or "not reached" if it is not finite."""
+    """Return a size with that many significant digits and its unit, or "not reached" if it is not
+    finite."""
     if not np.isfinite(value):
         return "not reached"
     decimals = max(0, digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2]))
@@ -180,7 +186,8 @@ def plain(text: str) -> str:
 
 
 def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figure], None]]:
-    """Return the figure's size and the function that draws it: a second panel shows signals, if there are any."""
+    """Return the figure's size and the function that draws it: a second panel shows signals, if
+    there are any."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
@@ -243,7 +250,8 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
 
 
 def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray) -> None:
-    """Draw each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke; equal sizes are spread in height."""
+    """Draw each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke; equal sizes are
+    spread in height."""
     # multiples of the golden ratio spread the strokes without random numbers
     spread = STRIPE * np.asarray((np.arange(len(size)) * 0.6180339887498949) % 1.0)
     style: dict[str, Any] = {
@@ -267,7 +275,8 @@ def hits_in_view(axes: Axes, beside: float = STRIPE + 0.06) -> None:
 
 
 def draw_signals(axes: Axes, statement: PodStatement) -> None:
-    """Draw signals against sizes, the fitted line with one standard deviation, the decision, and censored signals."""
+    """Draw signals against sizes, the fitted line with one standard deviation, the decision, and
+    censored signals."""
     model = statement.signal
     assert model is not None
     sizes = statement.sizes
@@ -287,10 +296,8 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
     for value in (model.left, model.right):
         if value is not None:
             axes.axhline(value, color=GREY, lw=1.0, ls="--")
-    left, right = (
-        -np.inf if model.left is None else model.left,
-        np.inf if model.right is None else model.right,
-    )
+    left = -np.inf if model.left is None else model.left
+    right = np.inf if model.right is None else model.right
     kept = (statement.read.response > left) & (statement.read.response < right)
     many = len(kept) > MOST_MARKS
     marks: dict[str, Any] = {
@@ -308,7 +315,8 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
             "color": PURPLE,
             "label": f"censored, {' or '.join(ends)}",
         }
-        size, signal = statement.read.size[~kept], statement.read.response[~kept]
+        size = statement.read.size[~kept]
+        signal = statement.read.response[~kept]
         axes.scatter(size, signal, s=18, lw=1, rasterized=many, **censored)
     if model.log_signal:
         axes.set_yscale("log")

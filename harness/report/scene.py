@@ -1,4 +1,5 @@
-"""Draws the scene of an experiment: camera, target and the surface behind it, from the side and not to scale."""
+"""Draws the scene of an experiment: camera, target and the surface behind it, from the side and
+not to scale."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,11 +15,10 @@ BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_m
 
 
 def scene_svg(facts: Mapping[str, Any]) -> Markup:
-    """Return the picture with its caption; empty if ``facts``, the resolved experiment, hold no simulated target."""
-    cameras, distances = (
-        _values(facts, "source.camera.name"),
-        _values(facts, "source.target.distance_m"),
-    )
+    """Return the picture with its caption; empty if ``facts``, the resolved experiment, hold no
+    simulated target."""
+    cameras = _values(facts, "source.camera.name")
+    distances = _values(facts, "source.target.distance_m")
     if not (cameras and distances):
         return Markup("")
     names = [camera_title(name) for name in cameras]
@@ -52,7 +52,8 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
 
 
 def _values(facts: Mapping[str, Any], path: str) -> list[Any]:
-    """Return a setting's values: those of its axis, or the experiment's single value; empty if it has none."""
+    """Return a setting's values: those of its axis, or the experiment's single value; empty if it
+    has none."""
     if path in (axes := facts.get("sweep") or {}):
         return [value for value in axes[path] if value is not None]
     value = shape.get(facts, tuple(path.split(".")))

@@ -24,8 +24,9 @@ Row = Mapping[str, Any]
 
 
 class About(NamedTuple):
-    """Title and origin of a report. ``provenance`` is as in `harness.report.blocks.closing`; ``facts`` is the resolved
-    experiment as plain data. ``with_claims`` says whether the target is that of the thesis."""
+    """Title and origin of a report. ``provenance`` is as in `harness.report.blocks.closing`;
+    ``facts`` is the resolved experiment as plain data. ``with_claims`` says whether the target is
+    that of the thesis."""
 
     provenance: Mapping[str, Any]
     experiment_yaml_text: str
@@ -42,7 +43,8 @@ def sweep_page(
     figures: Mapping[str, str],
     **parts: Any,
 ) -> str:
-    """Return a sweep's page from the template ``name``, with the sections of all pages and its own ``parts``."""
+    """Return a sweep's page from the template ``name``, with the sections of all pages and its own
+    ``parts``."""
     warnings = about.provenance.get("warnings", ())
     base = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
     seen = (
@@ -68,7 +70,8 @@ CALLS_NOTE = (
 
 
 class Varied(NamedTuple):
-    """A variation with one number of frames: its row of `SET_UPS`, and the row of the set-up that it changes."""
+    """A variation with one number of frames: its row of `SET_UPS`, and the row of the set-up that
+    it changes."""
 
     variant: Row
     row: Row | None
@@ -130,8 +133,9 @@ VARIED = Table(
 def varied_section(
     tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = ""
 ) -> Markup:
-    """Return the sensitivity study: each variation beside the set-up that it changes (or else ``of``) with as many
-    frames (or else the most). ``compared`` comes from `compare_set_ups`; empty ``frames`` show all."""
+    """Return the sensitivity study: each variation beside the set-up that it changes (or else
+    ``of``) with as many frames (or else the most). ``compared`` comes from `compare_set_ups`;
+    empty ``frames`` show all."""
     by_variant: dict[str, list[Row]] = {}
     for row in records(compared):
         if not frames or row["frames"] in frames:
@@ -161,10 +165,12 @@ def varied_section(
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
-    """Return a heading and the table of claims; empty without verdicts, as on pages of other targets."""
+    """Return a heading and the table of claims; empty without verdicts, as on pages of other
+    targets."""
     if not verdicts:
         return Markup("")
-    rows, keys = [vars(verdict) for verdict in verdicts], ("claim", "says", "verdict", "evidence")
+    rows = [vars(verdict) for verdict in verdicts]
+    keys = ("claim", "says", "verdict", "evidence")
     criteria = fold(
         "Criteria, fixed in advance", CLAIMS.grid(rows, only=("claim", "criterion")).html()
     )
@@ -174,7 +180,8 @@ def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
-    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
+    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without
+    verdicts."""
     parts = []
     for answer in MARKS:
         if names := [verdict.claim for verdict in verdicts if verdict.verdict == answer]:
@@ -195,8 +202,10 @@ def rule_note(repeats: int, *more: str) -> Markup:
 
 
 def left_out(runs: pd.DataFrame) -> str:
-    """State how many frames were left out of averages as disturbed, over all runs; empty if there were none."""
-    out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
+    """State how many frames were left out of averages as disturbed, over all runs; empty if there
+    were none."""
+    out = int(runs["left_out"].sum())
+    used = int(runs["frames_used"].sum())
     return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
 
 
@@ -225,7 +234,8 @@ def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
 
 
 def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
-    """Return the main set-up's share of detections by hole and frames, with intervals (page) or sizes (terminal)."""
+    """Return the main set-up's share of detections by hole and frames, with intervals (page) or
+    sizes (terminal)."""
     summary = summary[summary["variant"] == MAIN]
     frames = sorted(int(n) for n in summary["frames"].unique())
 
@@ -254,7 +264,8 @@ def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
     counted = [f"N={n}" if terminal else many(n, "frame") for n in frames]
     heads = ["hole", "drill", "mm", *counted, *(("extent mm", "model mm") if terminal else ())]
     if all(cells[1] == "–" for cells in rows):
-        heads, rows = [heads[0], *heads[2:]], [[cells[0], *cells[2:]] for cells in rows]
+        heads = [heads[0], *heads[2:]]
+        rows = [[cells[0], *cells[2:]] for cells in rows]
     return Grid.of(heads, rows, 1, "holes detected of trials, by number of averaged frames (N)")
 
 
@@ -265,9 +276,11 @@ def set_ups_grid(compared: pd.DataFrame, *, terminal: bool = False) -> Grid:
 
 
 def ways_grid(compared: pd.DataFrame) -> Grid:
-    """Return the holes found for each method of registering and merging (down) and each number of views (across)."""
+    """Return the holes found for each method of registering and merging (down) and each number of
+    views (across)."""
     rows = [row for row in records(compared) if not row["is_variation"]]
-    frames, views = shown_frames(compared), sorted({row["views"] for row in rows})
+    frames = shown_frames(compared)
+    views = sorted({row["views"] for row in rows})
     several = len({row["place"] for row in rows}) > 1
     by_way: dict[str, dict[tuple[int, int], Row]] = {}
     for row in rows:
@@ -278,7 +291,8 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
         undecided = f"+{len(row['undecided'])}" if row and row["undecided"] else ""
         return "–" if row is None else f"{len(row['found'])}{undecided}"
 
-    heads, cells = ("registration, merge", *(many(n, "view") for n in views)), []
+    heads = ("registration, merge", *(many(n, "view") for n in views))
+    cells = []
     for way, found in by_way.items():
         cells.append(
             [way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)]

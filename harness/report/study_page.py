@@ -37,7 +37,8 @@ ROW = 0.035  # height of a set-up's rows of hits above 1 and of misses below 0, 
 
 
 def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:
-    """Return the set-ups for figures: all, or `MOST_CURVES` spread evenly from the smallest limit to the largest."""
+    """Return the set-ups for figures: all, or `MOST_CURVES` spread evenly from the smallest limit
+    to the largest."""
     by_limit = sorted(set_ups, key=lambda set_up: set_up.limit.a90_95.value)
     places = np.linspace(0, len(by_limit) - 1, min(MOST_CURVES, len(by_limit))).round().astype(int)
     chosen = {id(by_limit[place]) for place in places}
@@ -59,17 +60,17 @@ def _names_across(names: Sequence[str]) -> int:
 
 
 def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
-    """Draw the curves and bands of all set-ups over a common axis of sizes, a mark at each a90/95 within it, and each
-    inspection as a stroke at its true size: hits above 1, misses below 0, with a row for each set-up."""
-    axes, names = figure.subplots(), [name_of(limit) for limit in limits]
+    """Draw the curves and bands of all set-ups over a common axis of sizes, a mark at each a90/95
+    within it, and each inspection as a stroke at its true size: hits above 1, misses below 0, with
+    a row for each set-up."""
+    axes = figure.subplots()
+    names = [name_of(limit) for limit in limits]
     axes.axhspan(1, 2, color=PALE, lw=0)
     axes.axhspan(-1, 0, color=PALE, lw=0)
     for number, limit in enumerate(limits):
-        statement, colour, seen = (
-            limit.statement,
-            COLOURS[number % len(COLOURS)],
-            limit.record.inspected,
-        )
+        statement = limit.statement
+        colour = COLOURS[number % len(COLOURS)]
+        seen = limit.record.inspected
         name = plain(fill(names[number], LONGEST_NAME))
         if statement is not None:
             line = STYLES[number // len(COLOURS) % len(STYLES)]
@@ -107,7 +108,8 @@ def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
 
 
 def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
-    """Draw the depth found 90 % of the time with its interval against diameter, with a line for each set-up."""
+    """Draw the depth found 90 % of the time with its interval against diameter, with a line for
+    each set-up."""
     surfaces = [(result.limit, result.surface) for result in results if result.surface is not None][
         : len(COLOURS)
     ]
@@ -117,10 +119,8 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for (limit, surface), colour in zip(surfaces, COLOURS, strict=False):
-            low, high = (
-                np.nan_to_num(surface.d90_low_mm),
-                np.nan_to_num(surface.d90_high_mm, nan=np.inf),
-            )
+            low = np.nan_to_num(surface.d90_low_mm)
+            high = np.nan_to_num(surface.d90_high_mm, nan=np.inf)
             inside = (surface.d90_mm >= surface.depth_range_mm[0]) & (
                 surface.d90_mm <= surface.depth_range_mm[1]
             )
@@ -147,11 +147,13 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
 
 
 def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
-    """Return the range of sizes inspected with a margin of 4 % of it, or a tenth of the size if there is only one."""
+    """Return the range of sizes inspected with a margin of 4 % of it, or a tenth of the size if
+    there is only one."""
     sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
     if not len(sizes):
         return 0.0, 1.0
-    low, high = float(sizes.min()), float(sizes.max())
+    low = float(sizes.min())
+    high = float(sizes.max())
     margin = 0.04 * (high - low) or 0.1 * abs(high) or 0.5
     return (max(low - margin, 0.5 * low) if low > 0 else low - margin), high + margin
 
@@ -166,7 +168,8 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
                 left.plot(roc.false, roc.true, color=colour, lw=1.5, label=f"{roc.area:.3f}")
                 left.plot(*roc.at, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
             if (curve := result.free_response) is not None:
-                # thresholds without false calls have no place on a logarithmic axis; they are drawn at its left end
+                # thresholds without false calls have no place on a logarithmic axis; they are
+                # drawn at its left end
                 least = 0.5 / curve.area_m2
                 calls = np.maximum(curve.false_calls_per_m2, least)
                 middle.fill_between(
@@ -182,10 +185,8 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
                 area = (
                     f"AU-PRO {pixels.pro:.3f}" if np.isfinite(pixels.pro) else "AU-PRO not reached"
                 )
-                x, y = (
-                    np.append(pixels.false[kept], PRO_LIMIT),
-                    np.append(pixels.overlap[kept], end),
-                )
+                x = np.append(pixels.false[kept], PRO_LIMIT)
+                y = np.append(pixels.overlap[kept], end)
                 right.plot(x, y, color=colour, lw=1.6, label=area)
         left.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls=":")
         left.set(
@@ -226,7 +227,8 @@ WIDTH_CHARACTERS = 60
 
 
 def axis_figure(axis: study.AxisGroup, name: str) -> str:
-    """Draw a90 with its interval over boards and a90/95 for each value of the axis; arrows mark sizes far beyond."""
+    """Draw a90 with its interval over boards and a90/95 for each value of the axis; arrows mark
+    sizes far beyond."""
     shown = list(axis.lines.items())[: len(COLOURS)]
     every = [limit for _, line in shown for limit in line.limits]
     top_mm = ROOM * max((limit.largest_mm for limit in every if limit.inspections), default=np.inf)
@@ -237,7 +239,8 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        # intervals of several lines are drawn side by side, 2.5 % of the axis apart, or less if places are close
+        # intervals of several lines are drawn side by side, 2.5 % of the axis apart, or less if
+        # places are close
         scale = np.log(places) if logarithmic else places
         nearest = float(np.diff(np.sort(scale)).min()) if len(scale) > 1 else 1.0
         step = min(0.025 * (float(np.ptp(scale)) or 1.0), 0.6 * nearest / len(shown))
@@ -337,8 +340,10 @@ def study_html(
     resolved_yaml: str,
     title: str,
 ) -> str:
-    """Return the page as text; the same input gives the same bytes. ``examples`` are used after the other figures."""
-    limits, rows = result.limits, study.study_tables(result)
+    """Return the page as text; the same input gives the same bytes. ``examples`` are used after
+    the other figures."""
+    limits = result.limits
+    rows = study.study_tables(result)
     inspections = [limit.record.inspected for limit in limits]
     groups = {
         f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)
@@ -357,7 +362,8 @@ def study_html(
         else {}
     )
     figures |= {"operating": operating_figure(curved)} if curved else {}
-    named, examples = list[tuple[str, str]](), list(examples)
+    named = list[tuple[str, str]]()
+    examples = list(examples)
     for limit in (set_up.limit for set_up in shown):
         record = limit.record
         own = [
@@ -366,7 +372,8 @@ def study_html(
             if (example.variant, example.frames) == (record.variant, record.frames)
         ]
         if own:
-            title_of, name = name_of(limit), f"examples-{len(named) + 1}"
+            title_of = name_of(limit)
+            name = f"examples-{len(named) + 1}"
             named.append((title_of, name))
             figures[name] = examples_figure(name, own, title_of, by_limit=is_within_sizes(limit))
 
@@ -429,7 +436,8 @@ def _axis_caption(group: study.AxisGroup) -> str:
 
 
 def _surface_notes(result: StudyResult) -> list[str]:
-    """Return the reasons why there is no surface over diameter and depth, or notes on it, with their set-ups."""
+    """Return the reasons why there is no surface over diameter and depth, or notes on it, with
+    their set-ups."""
     reasons: dict[str, list[str]] = {}
     for set_up in result.set_ups:
         why = f"No surface: {set_up.surface_why}" if set_up.surface is None else set_up.surface.note

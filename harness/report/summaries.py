@@ -24,19 +24,20 @@ LISTS = (
 
 
 def is_thesis(facts: Mapping[str, Any]) -> bool:
-    """Return whether the resolved experiment ``facts`` has the target of the thesis, whose claims are scored."""
+    """Return whether the resolved experiment ``facts`` has the target of the thesis, whose claims
+    are scored."""
     return (facts.get("source", {}).get("target") or {}).get("name") == "thesis"
 
 
 def summaries(
     tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True
 ) -> Summaries:
-    """Return all tables for a page; claims, which use the pictures ``examples``, and posterior only ``with_claims``."""
-    paths, set_ups = [str(path) for path in tables.axes["path"]], set_ups_of(tables)
-    summary, everything = (
-        summarise_holes(tables.holes, paths),
-        [str(name) for name in tables.variants["variant"]],
-    )
+    """Return all tables for a page; claims, which use the pictures ``examples``, and posterior
+    only ``with_claims``."""
+    paths = [str(path) for path in tables.axes["path"]]
+    set_ups = set_ups_of(tables)
+    summary = summarise_holes(tables.holes, paths)
+    everything = [str(name) for name in tables.variants["variant"]]
     found = {trials.SUMMARY: summary, trials.FALSE_CALLS: false_calls(tables.runs)}
     found[trials.NOISE_BY_FRAMES] = noise_against_frames(tables.probes)
     verdicts: Sequence[Verdict] = ()
@@ -55,10 +56,8 @@ def summaries(
         found[trials.SET_UPS] = compared
         found[trials.EFFECTS] = effect_costs(tables)
         if with_claims and several:
-            verdict, posterior = (
-                claim_c11(summary, paths),
-                posterior_of(of_set_ups(summary, tables), paths),
-            )
+            verdict = claim_c11(summary, paths)
+            posterior = posterior_of(of_set_ups(summary, tables), paths)
             verdicts = [verdict] if verdict else ()
             found |= {} if posterior is None else {trials.POSTERIOR: posterior}
         elif with_claims:

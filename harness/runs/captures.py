@@ -25,15 +25,19 @@ from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 
 def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
-    """Judge every point's capture, write its findings to ``<folder>/<number>/``, and a table of all. Returns 0."""
+    """Judge every point's capture, write its findings to ``<folder>/<number>/``, and a table of
+    all. Returns 0."""
     folder = experiment.folder(out)
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
     rows = []
     for number, point in enumerate(experiment.points):
-        config, name, k = point.config, f"point-{number:03d}", point.config.threshold.k
+        config = point.config
+        name = f"point-{number:03d}"
+        k = point.config.threshold.k
         assert isinstance(config.source, CaptureSource)
         assert k is not None  # the checks of experiments refuse to calibrate on a capture
-        recording, frames = recording_of(config.source), config.capture.frames
+        recording = recording_of(config.source)
+        frames = config.capture.frames
         cloud = prefix_averages(recording, [frames], config.capture.average)[frames]
         detector = load_detector(config.detector.name, dict(config.detector.settings))
         choice = choice_by(getattr(detector, "settings", None), cloud)

@@ -1,6 +1,8 @@
-"""Chooses the engine that runs the jobs of a run: this process, processes of this machine, or a cluster.
+"""Chooses the engine that runs the jobs of a run: this process, processes of this machine, or a
+cluster.
 
-Engines are named here and imported when they are chosen, so that only a run on a cluster imports Dask."""
+Engines are named here and imported when they are chosen, so that only a run on a cluster imports
+Dask."""
 
 from collections.abc import Iterable
 from importlib import import_module
@@ -10,13 +12,15 @@ from harness.runs.jobs import Code, JobEngine, Stage
 from harness.runs.options import EngineOptions
 
 CLUSTER = "harness.programs.cluster.engine:ClusterEngine"
-"""The engine behind ``--scheduler``, as module:class. It is named and not imported, because it has a room of its own."""
+"""The engine behind ``--scheduler``, as module:class. It is named and not imported, because it has
+a room of its own."""
 
 
 def engine_of(
     options: EngineOptions, detectors: Iterable[str] = (), folder: Path = Path()
 ) -> JobEngine:
-    """Return the engine, not yet started, for trials of ``detectors``. ``folder``: of renders. Raises UserError."""
+    """Return the engine, not yet started, for trials of ``detectors``. ``folder``: of renders.
+    Raises UserError."""
     from harness.runs.processes import LocalEngine, SerialEngine
 
     if options.serial:
@@ -32,7 +36,8 @@ def engine_of(
 
 
 def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
-    """Return the code that determines the results of each stage, for trials of these ``detectors``."""
+    """Return the code that determines the results of each stage, for trials of these
+    ``detectors``."""
     from harness.runs.plan import PACKAGES, trial_code
     from scenes.render import cache
 

@@ -26,7 +26,8 @@ WINDOW_S = 60.0  # rates are those of the last minute, because set-ups differ in
 def progress_display(
     stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[Outcome], None]]:
-    """Yield a function that shows the progress of a run on ``stream`` (None: stderr). Rates exclude work found done."""
+    """Yield a function that shows the progress of a run on ``stream`` (None: stderr). Rates
+    exclude work found done."""
     stream = sys.stderr if stream is None else stream
     names = ("counts", "rate", "failed", "left")
     columns = [
@@ -47,13 +48,15 @@ def progress_display(
         name: bars.add_task(name, counts="", rate="", failed="", left="")
         for name in ("renders", "trials")
     }
-    last, said_at = "", float("-inf")
+    last = ""
+    said_at = float("-inf")
 
     def show(outcome: Outcome | None) -> None:
         nonlocal last, said_at
         if outcome is not None:
             for name, task in stages.items():
-                counts, state = getattr(outcome, name), bars.tasks[task]
+                counts = getattr(outcome, name)
+                state = bars.tasks[task]
                 total = counts.total - counts.found - counts.failed
                 bars.update(task, completed=counts.done, total=total)
                 speed = state.speed if state.speed and total > counts.done else None
@@ -77,7 +80,8 @@ def progress_display(
             )
             text = ", ".join(lines)
             if text != last:
-                last, said_at = text, clock()
+                last = text
+                said_at = clock()
                 print(text, file=stream, flush=True)
 
     with bars:
@@ -89,11 +93,9 @@ def progress_display(
 
 def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     """Print the amount of work of a sweep or of one shard, without writing anything."""
-    name, folder, points = (
-        experiment.config.name,
-        experiment.folder(out),
-        many(len(experiment.points), "point"),
-    )
+    name = experiment.config.name
+    folder = experiment.folder(out)
+    points = many(len(experiment.points), "point")
     if isinstance(experiment.config.source, CaptureSource):
         print(f"{name}: valid; {points} of a real capture; results: {folder}")
         return 0
@@ -101,7 +103,8 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     first, then = parts_of(plan, options.shard)
     parts = [part for group in (*first, *then) for part in group]
     renders = {path for part in parts for path in part.batch.paths}
-    trials, held = sum(len(part.repeats) for part in parts), len(Journal(folder / "journal"))
+    trials = sum(len(part.repeats) for part in parts)
+    held = len(Journal(folder / "journal"))
     print(f"{name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))
     print(f"  {points}, {many(len(plan.groups), 'set')} of frames")
     print(f"  renders: {len(renders)}, {sum(path.exists() for path in renders)} of them cached")

@@ -1,4 +1,5 @@
-"""The interface between plans and engines: every submitted job comes back exactly once, with how it ended."""
+"""The interface between plans and engines: every submitted job comes back exactly once, with how
+it ended."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
     from harness.report.clouds import ExampleCloud, MappedExample
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
-"""The ends of a job. Failed: it raised; crashed: its process died; skipped: something that it needs is missing."""
+"""The ends of a job. Failed: it raised; crashed: its process died; skipped: something that it
+needs is missing."""
 STATES: tuple[State, ...] = get_args(State)
 Stage = Literal[
     "renders", "trials"
@@ -31,7 +33,8 @@ TRACEBACK_CHARACTERS = 4000
 
 @dataclass(frozen=True)
 class Job:
-    """``function(*arguments)``, an importable function; arguments and result are plain data or frozen dataclasses."""
+    """``function(*arguments)``, an importable function; arguments and result are plain data or
+    frozen dataclasses."""
 
     name: str
     stage: Stage
@@ -41,8 +44,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a job. ``value``: its result; of a trial, its record as text. ``why``: a user's mistake, or the end of
-    a bug's traceback. ``peak_mb``: peak resident memory, 0 if unknown. ``ends_all``: the disk is full."""
+    """The end of a job. ``value``: its result; of a trial, its record as text. ``why``: a user's
+    mistake, or the end of a bug's traceback. ``peak_mb``: peak resident memory, 0 if unknown.
+    ``ends_all``: the disk is full."""
 
     state: State
     value: Any = None
@@ -60,19 +64,22 @@ class Ended:
 
 
 class JobEngine(Protocol):
-    """An engine that runs jobs. As a context manager, it drops its jobs within two seconds of an exception."""
+    """An engine that runs jobs. As a context manager, it drops its jobs within two seconds of an
+    exception."""
 
     def __enter__(self) -> JobEngine: ...
     def __exit__(self, *error: object) -> None: ...
 
     def room(self, stage: Stage) -> int:
-        """Return how many more jobs of a stage the engine can use; its queue stays short, whatever the plan's size."""
+        """Return how many more jobs of a stage the engine can use; its queue stays short, whatever
+        the plan's size."""
 
     def submit(self, job: Job) -> None:
         """Take a job."""
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait until at least one job has ended; return those that have. Raises UserError if the engine is gone."""
+        """Wait until at least one job has ended; return those that have. Raises UserError if the
+        engine is gone."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,8 @@ class Failure:
 
 @dataclass
 class StageCounts:
-    """Numbers of renders or trials: ``done`` in this run, ``found`` finished earlier, ``failed``, and in ``total``."""
+    """Numbers of renders or trials: ``done`` in this run, ``found`` finished earlier, ``failed``,
+    and in ``total``."""
 
     done: int = 0
     found: int = 0
@@ -109,7 +117,8 @@ class StageCounts:
 
 @dataclass
 class Outcome:
-    """The result of a run. ``finished``: journal keys of the finished trials; ``failures``: all others, by name."""
+    """The result of a run. ``finished``: journal keys of the finished trials; ``failures``: all
+    others, by name."""
 
     finished: list[str] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
@@ -129,23 +138,30 @@ class Limits:
 
 
 def attempt(job: Job, worker: str) -> Ended:
-    """Run a job in this process; an exception becomes its end. If the process dies, the engine has to notice."""
+    """Run a job in this process; an exception becomes its end. If the process dies, the engine has
+    to notice."""
     with contextlib.suppress(OSError):  # reset the peak of memory (Linux)
         Path("/proc/self/clear_refs").write_text("5")
     began = time.monotonic()
     state: State = "failed"
-    value, why, is_bug, ends_all = None, "", False, False
+    value = None
+    why = ""
+    is_bug = False
+    ends_all = False
     try:
         value = job.function(*job.arguments)
         state = "done"
     except UserError as mistake:
-        why, ends_all = str(mistake), isinstance(mistake, DiskFull)
+        why = str(mistake)
+        ends_all = isinstance(mistake, DiskFull)
     except MemoryError as error:
         where = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
         why = f"out of memory ({str(error) or 'no more'}): its process has a limit (--memory-limit)\n{where}"
     except Exception as error:
-        why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
-    seconds, peak_mb = time.monotonic() - began, 0.0
+        why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
+        is_bug = True
+    seconds = time.monotonic() - began
+    peak_mb = 0.0
     with contextlib.suppress(OSError, ValueError):
         (high,) = (
             line

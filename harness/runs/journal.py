@@ -1,7 +1,9 @@
-"""The journal of a sweep: how each trial ended, appended to segment files, from which the same command resumes.
+"""The journal of a sweep: how each trial ended, appended to segment files, from which the same
+command resumes.
 
-Each process that writes has its own segment, so that shards may share a folder and journals merge by appending. A
-segment begins with its version; further lines are entries with a checksum. Torn or altered lines are ignored."""
+Each process that writes has its own segment, so that shards may share a folder and journals merge
+by appending. A segment begins with its version; further lines are entries with a checksum. Torn or
+altered lines are ignored."""
 
 import errno
 import hashlib
@@ -19,7 +21,8 @@ from harness.vocabulary.files import RECORD_BYTES, explained, open_plain, strict
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
 
-JOURNAL_VERSION = 6  # raised with every change to records or to what a trial computes: older trials then run again
+# raised with every change to records or to what a trial computes: older trials then run again
+JOURNAL_VERSION = 6
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
 THRESHOLDS = "thresholds-"  # prefix of the keys of entries that hold thresholds
 NOTHING = "null"  # replaces the record of a trial that is not done
@@ -27,7 +30,8 @@ KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 
 
 class _Location(NamedTuple):
-    """The location of an entry: segment, offset and length of its line in bytes; and the entry's state."""
+    """The location of an entry: segment, offset and length of its line in bytes; and the entry's
+    state."""
 
     segment: str
     start: int
@@ -36,8 +40,9 @@ class _Location(NamedTuple):
 
 
 class Journal:
-    """Entries in a folder, by key: how a trial ended, and its record as text. Raises UserError for links, for a segment
-    that cannot be written or is of a newer tofpod. ``damaged``: torn or altered lines, segments of other versions."""
+    """Entries in a folder, by key: how a trial ended, and its record as text. Raises UserError for
+    links, for a segment that cannot be written or is of a newer tofpod. ``damaged``: torn or
+    altered lines, segments of other versions."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -79,7 +84,8 @@ class Journal:
                 yield key, entry
 
     def write(self, key: str, entry: Ended) -> None:
-        """Append how a trial ended. Raises UserError if the folder cannot be written or the disk is full."""
+        """Append how a trial ended. Raises UserError if the folder cannot be written or the disk
+        is full."""
         self._known()
         fields = {name: getattr(entry, name) for name in KEPT} | {
             "key": key,
@@ -175,7 +181,8 @@ class Journal:
         return version == JOURNAL_VERSION
 
     def _remember(self, key: str, place: _Location) -> None:
-        """Store an entry's location. A later entry replaces an earlier one, unless only the earlier one is done."""
+        """Store an entry's location. A later entry replaces an earlier one, unless only the
+        earlier one is done."""
         before = self._places.get(key)
         if before is None or before.state != "done" or place.state == "done":
             self._places[key] = place
@@ -189,7 +196,8 @@ def _parsed(line: bytes) -> tuple[str, Ended] | None:
     try:
         head, _, record = text.decode().partition("\t")
         fields = strict_json(head)
-        key, entry = fields.pop("key"), Ended(value=None if record == NOTHING else record, **fields)
+        key = fields.pop("key")
+        entry = Ended(value=None if record == NOTHING else record, **fields)
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
     is_whole = entry.state in STATES and (entry.value is not None) == (entry.state == "done")

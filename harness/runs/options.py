@@ -1,4 +1,5 @@
-"""The options of all programs that run experiments: how many processes, where, and within which limits."""
+"""The options of all programs that run experiments: how many processes, where, and within which
+limits."""
 
 import argparse
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ LEAST_MEMORY_GB = 0.5  # a process that has loaded the code of trials needs 0.2 
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """``jobs``: processes, or a cluster's workers. ``scheduler`` None: this machine. ``serial``: in this process."""
+    """``jobs``: processes, or a cluster's workers. ``scheduler`` None: this machine. ``serial``:
+    in this process."""
 
     jobs: int = 2
     limits: Limits = DEFAULT_LIMITS

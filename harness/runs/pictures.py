@@ -1,4 +1,5 @@
-"""Draws a report's pictures again from their seeds: the first damaged repeat or, in a study, damages near the limit."""
+"""Draws a report's pictures again from their seeds: the first damaged repeat or, in a study,
+damages near the limit."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -59,13 +60,16 @@ def _detected(judged: JudgedCloud) -> np.ndarray:
 
 
 def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
-    """Return the clouds of repeat 0 of each variant of a group, at its smallest and largest number of frames."""
-    batch, by_variant = group.damaged, dict[str, list[PointTask]]()
+    """Return the clouds of repeat 0 of each variant of a group, at its smallest and largest number
+    of frames."""
+    batch = group.damaged
+    by_variant = dict[str, list[PointTask]]()
     _, task = next(group.trials(batch, thresholds))
     for point in sorted(task.points, key=lambda point: point.frames):
         by_variant.setdefault(point.variant, []).append(point)
     set_up = load_set_up(batch.set_ups[0])
-    region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
+    region = set_up.unit.region
+    lens = set_up.unit.camera.nominal_lens
     marks = []
     for damage in set_up.truth:
         u, v = lens.project(damage.centre_camera_m[None])[0]
@@ -93,8 +97,10 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
 
 
 def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
-    """Return columns and rows (n, 2) of a damage's rim on the cloud's grid; a circle for a hole or dent."""
-    region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
+    """Return columns and rows (n, 2) of a damage's rim on the cloud's grid; a circle for a hole or
+    dent."""
+    region = set_up.unit.region
+    lens = set_up.unit.camera.nominal_lens
     across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     along = np.cross(damage.axis_camera, across)
@@ -109,7 +115,8 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
 
 
 def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedExample]:
-    """Return maps of the fewest and of all views, one per merge, with the most frames and the last registration."""
+    """Return maps of the fewest and of all views, one per merge, with the most frames and the last
+    registration."""
     batch = group.damaged
     points = [
         point
@@ -151,13 +158,12 @@ def _mapping(point: Point) -> MappingConfig:
 def _map_example(
     maps: MapMaker, point: Point, threshold: float, learned: str | None
 ) -> MappedExample:
-    mapping, frames = _mapping(point), point.config.capture.frames
+    mapping = _mapping(point)
+    frames = point.config.capture.frames
     known = maps.known(mapping, frames, hole_free=False)
     cloud = known.cloud
-    settings, radius_m = (
-        canonical_json(point.config.detector.settings),
-        point.config.matching.radius_mm * MM,
-    )
+    settings = canonical_json(point.config.detector.settings)
+    radius_m = point.config.matching.radius_mm * MM
     named = (point.config.detector.name, settings, threshold, radius_m)
     judged = judge(known, *named, hole_free=False, learned=learned)
     shown = np.flatnonzero(cloud.valid.ravel())
@@ -178,7 +184,8 @@ def _map_example(
         add(place_m, diameter_m, f"{diameter_m / MM:.1f}", kind)
     merged = maps.merged(mapping, frames)
     mapped = Mapped(maps.prepared(mapping, frames), maps.registrations(mapping, frames), merged)
-    count, way = maps.count(mapping), (mapping.registration.method, mapping.merge.kind)
+    count = maps.count(mapping)
+    way = (mapping.registration.method, mapping.merge.kind)
     names = tuple(view.view.name for view in mapped.views)
     number_of = np.array(
         [*map(names.index, merged.views_used), SEVERAL]
@@ -216,7 +223,8 @@ class ShownDamage(NamedTuple):
 
 
 def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[list[ShownDamage]]:
-    """Yield, for the first set-ups with single views, the damages closest to 0.75, 1 and 1.25 of the limit."""
+    """Yield, for the first set-ups with single views, the damages closest to 0.75, 1 and 1.25 of
+    the limit."""
     places = [(group, point) for group in plan.groups for point in group.points]
     by_place = {
         (point.variant, point.config.capture.frames): (group, point) for group, point in places
@@ -259,7 +267,8 @@ def _example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExampl
         task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row])
     )
     of_point = next(found for found in task.points if found.digest == point.digest)
-    set_up, judged = load_set_up(task.set_ups[0]), _judged(task, of_point, of_point.frames)
+    set_up = load_set_up(task.set_ups[0])
+    judged = _judged(task, of_point, of_point.frames)
     damage = next(found for found in set_up.truth if str(found.id) == str(seen.hole[row]))
     rim = _outline_px(set_up, damage)
     pitch_mm = float(np.mean(set_up.pitch_mm))
@@ -267,7 +276,8 @@ def _example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExampl
     middle = np.round(rim.mean(axis=0)).astype(int)
 
     def window(image: np.ndarray, beyond: float | bool) -> np.ndarray:
-        """Return a square of 2 half + 1 pixels around the rim's centre; ``beyond``: value outside the image."""
+        """Return a square of 2 half + 1 pixels around the rim's centre; ``beyond``: value outside
+        the image."""
         padded = np.pad(image, half, constant_values=beyond)
         return np.asarray(
             padded[middle[1] : middle[1] + 2 * half + 1, middle[0] : middle[0] + 2 * half + 1]

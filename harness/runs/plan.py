@@ -1,4 +1,5 @@
-"""The plan of a sweep: views to render, trials to run, points that share their frames, and the parts of a shard."""
+"""The plan of a sweep: views to render, trials to run, points that share their frames, and the
+parts of a shard."""
 
 from __future__ import annotations
 
@@ -34,12 +35,14 @@ CODE = "harness.trials.learning"
 PACKAGES = (
     "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
 )  # fmt: skip
-"""A trial runs again after a change of its task, of sources that it reaches, or of a version of these packages."""
+"""A trial runs again after a change of its task, of sources that it reaches, or of a version of
+these packages."""
 MOST_REPEATS = 256  # repeats in one part of a plan; a part is looked up and queued as a whole
 
 
 def trial_code(detector: str) -> tuple[str, ...]:
-    """Return the modules whose sources determine a trial with a detector, including those of a plug-in."""
+    """Return the modules whose sources determine a trial with a detector, including those of a
+    plug-in."""
     return (CODE, DETECTORS.offer(detector).target.partition(":")[0])
 
 
@@ -63,9 +66,10 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials of one role with one target, which share its renders. ``renders`` and ``set_ups`` have an entry for each
-    view (in the role "learning": the views of all targets in sequence). ``board``: the board's number in a study; None
-    for other experiments. ``units``: cameras that take turns over the repeats; empty: the camera of the set-ups."""
+    """Trials of one role with one target, which share its renders. ``renders`` and ``set_ups``
+    have an entry for each view (in the role "learning": the views of all targets in sequence).
+    ``board``: the board's number in a study; None for other experiments. ``units``: cameras that
+    take turns over the repeats; empty: the camera of the set-ups."""
 
     role: Role
     renders: tuple[RenderJob, ...]
@@ -89,11 +93,12 @@ class Batch:
 
 @dataclass(frozen=True)
 class Group:
-    """Points that share their frames: one set-up, one seed. Detectors learn on the batch ``learning``; the batches
-    ``first`` are hole-free and set thresholds; the batches ``then`` are judged at them. ``poses`` declares several
-    views. ``folder`` is for files of what detectors learn. Groups of a study that differ only in the damage have the
-    same trials before thresholds. The first such group is the ``leader`` of the others and also runs these trials for
-    their points, ``also``, in the same order as its own."""
+    """Points that share their frames: one set-up, one seed. Detectors learn on the batch
+    ``learning``; the batches ``first`` are hole-free and set thresholds; the batches ``then`` are
+    judged at them. ``poses`` declares several views. ``folder`` is for files of what detectors
+    learn. Groups of a study that differ only in the damage have the same trials before thresholds.
+    The first such group is the ``leader`` of the others and also runs these trials for their
+    points, ``also``, in the same order as its own."""
 
     points: tuple[Point, ...]
     learning: tuple[Batch, ...]
@@ -122,7 +127,8 @@ class Group:
 
     @cached_property
     def learned(self) -> dict[str, str]:
-        """The files that hold what detectors learn, by point digest; each is named after its trial in the journal."""
+        """The files that hold what detectors learn, by point digest; each is named after its trial
+        in the journal."""
         if self.leader is not None:
             return self.leader.learned
         trials = (trial for batch in self.learning for trial in self.trials(batch, None))
@@ -138,8 +144,9 @@ class Group:
         return next(batch for batch in self.then if batch.role == "damaged")
 
     def repeats(self, batch: Batch, point: Point) -> int:
-        """Return a point's number of trials of a batch: 1 of a calibration board; ``repeats`` per unit of a damaged
-        board; of hole-free boards as many as calibrate or, with a given threshold, as of damaged boards."""
+        """Return a point's number of trials of a batch: 1 of a calibration board; ``repeats`` per
+        unit of a damaged board; of hole-free boards as many as calibrate or, with a given
+        threshold, as of damaged boards."""
         calibrate = point.config.threshold.calibrate
         if batch.role == "calibration":
             return 0 if calibrate is None else 1
@@ -148,7 +155,8 @@ class Group:
         return point.config.repeats * max(len(batch.units), 1)
 
     def most_repeats(self, batch: Batch) -> int:
-        """Return the number of trials of a batch; when learning, one for each detector that learns."""
+        """Return the number of trials of a batch; when learning, one for each detector that
+        learns."""
         if batch.role == "learning":
             return len(self.learners)
         return max(self.repeats(batch, point) for point in self.points)
@@ -160,8 +168,9 @@ class Group:
         repeats: Iterable[int] | None = None,
         without: Collection[str] = (),
     ) -> Iterator[tuple[str, TrialTask]]:
-        """Yield (journal key, task) of the trials of a batch, or of some ``repeats``. ``thresholds``: by point digest,
-        empty in calibration; None: list all trials. Points without a threshold, or in ``without``, are not judged."""
+        """Yield (journal key, task) of the trials of a batch, or of some ``repeats``.
+        ``thresholds``: by point digest, empty in calibration; None: list all trials. Points
+        without a threshold, or in ``without``, are not judged."""
         if batch.role == "learning":
             for number in range(len(self.learners)) if repeats is None else repeats:
                 learner = (point_task(self.learners[number], None, None),)
@@ -169,10 +178,8 @@ class Group:
                 yield self._key(batch, task), task
             return
         sets_threshold = batch in self.first
-        every, unjudged = (
-            (*self.points, *(self.also if sets_threshold else ())),
-            thresholds is None or sets_threshold,
-        )
+        every = (*self.points, *(self.also if sets_threshold else ()))
+        unjudged = thresholds is None or sets_threshold
         given = {
             point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k)
             for point in every
@@ -224,8 +231,11 @@ class Group:
 
 
 def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
-    """Return a point's part of a trial. ``threshold`` is None during calibration; ``learned`` as in `PointTask`."""
-    capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
+    """Return a point's part of a trial. ``threshold`` is None during calibration; ``learned`` as
+    in `PointTask`."""
+    capture = point.config.capture
+    detector = point.config.detector
+    matching = point.config.matching
     first = (
         detector.name,
         canonical_json(detector.settings),
@@ -256,7 +266,8 @@ class SweepPlan:
 
 
 def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> SweepPlan:
-    """Group the points of an experiment that share their frames. ``folder``: its results; None: the cache."""
+    """Group the points of an experiment that share their frames. ``folder``: its results; None:
+    the cache."""
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
@@ -275,7 +286,8 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
 
 
 def _before_thresholds(group: Group) -> str:
-    """Return a text that is the same for groups of a study whose trials before thresholds are the same."""
+    """Return a text that is the same for groups of a study whose trials before thresholds are the
+    same."""
     batches = (*group.learning, *group.first)
     if not batches or batches[-1].board is None:
         return group.points[0].frames_key
@@ -289,14 +301,17 @@ def _before_thresholds(group: Group) -> str:
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
-    source, study = points[0].config.simulated, points[0].config.study
-    target, seed = source.target, points[0].config.seed
+    source = points[0].config.simulated
+    study = points[0].config.study
+    target = source.target
+    seed = points[0].config.seed
     if study is not None and isinstance(target, DrawnTargetConfig):
         calibrate = points[0].config.threshold.calibrate
         boards = 0 if calibrate is None else calibrate.boards or 0
 
         def batches(role: Role, count: int) -> tuple[Batch, ...]:
-            """Return a role's batches: all units inspect each damaged board; every other board has its own unit."""
+            """Return a role's batches: all units inspect each damaged board; every other board has
+            its own unit."""
             made = []
             for board in range(count):
                 numbers = (
@@ -308,7 +323,8 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
                 )
             return tuple(made)
 
-        learning, first = batches("learning", LEARNING_BOARDS), batches("calibration", boards)
+        learning = batches("learning", LEARNING_BOARDS)
+        first = batches("calibration", boards)
         then = (*batches("damaged", study.boards), *batches("hole_free", study.hole_free_boards))
     else:
         declared = target.declare()
@@ -318,9 +334,8 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
                 what, fix="declare source.target.holes, source.target.dents or source.target.flaws"
             )
         learning = (batch_of(declared, "learning", source, cache),) * LEARNING_BOARDS
-        first, then = (
-            (batch_of(declared, role, source, cache),) for role in ("hole_free", "damaged")
-        )
+        first = (batch_of(declared, "hole_free", source, cache),)
+        then = (batch_of(declared, "damaged", source, cache),)
     group = Group(points, (), first, then, seed, folder, source.views)
     if not group.learners:
         return group
@@ -348,10 +363,13 @@ def batch_of(
     board: int | None = None,
     units: tuple[CameraConfig, ...] = (),
 ) -> Batch:
-    """Return the trials of a role with one declared target, which shows its damage only in the role "damaged"."""
+    """Return the trials of a role with one declared target, which shows its damage only in the
+    role "damaged"."""
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
-    renders, set_ups, damaged = [], [], role == "damaged"
+    renders = []
+    set_ups = []
+    damaged = role == "damaged"
     for pose in poses:
         placed = target.model_copy(update={"pose": pose})
         renders.append(
@@ -364,7 +382,8 @@ def batch_of(
 
 
 class PlanPart(NamedTuple):
-    """Some repeats of one batch of group number ``group``. ``sets_threshold``: whether they set its thresholds."""
+    """Some repeats of one batch of group number ``group``. ``sets_threshold``: whether they set
+    its thresholds."""
 
     group: int
     batch: Batch
@@ -373,17 +392,18 @@ class PlanPart(NamedTuple):
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
-    """Cut a plan, by group, into parts that set thresholds (learning first), and the judged parts of a shard."""
+    """Cut a plan, by group, into parts that set thresholds (learning first), and the judged parts
+    of a shard."""
 
     def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
         starts = range(repeats.start, repeats.stop, MOST_REPEATS)
         slices = (range(start, min(start + MOST_REPEATS, repeats.stop)) for start in starts)
         return [PlanPart(number, batch, sets_threshold, each) for each in slices]
 
-    mine, before = (
-        shard.part(sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)),
-        0,
+    mine = shard.part(
+        sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)
     )
+    before = 0
     then: list[list[PlanPart]] = []
     for number, group in enumerate(plan.groups):
         judged = []

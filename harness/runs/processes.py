@@ -1,6 +1,8 @@
-"""Runs jobs in processes of this machine. A process that dies, hangs or needs too much memory fails only its own job.
+"""Runs jobs in processes of this machine. A process that dies, hangs or needs too much memory
+fails only its own job.
 
-The standard library's executors fail all jobs if a process dies; here, a thread serves each process through a pipe."""
+The standard library's executors fail all jobs if a process dies; here, a thread serves each
+process through a pipe."""
 
 from __future__ import annotations
 
@@ -29,15 +31,18 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import source_digest
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
-"""Each process uses one thread, so that sums are taken in the same order on every machine and processes do not compete
-for cores. Libraries read these variables when they are loaded."""
+"""Each process uses one thread, so that sums are taken in the same order on every machine and
+processes do not compete for cores. Libraries read these variables when they are loaded."""
 MOST_RENDERERS = 2  # processes that render; each needs 2 GB
 LOOKS_S = 1.0  # interval at which the driver checks the clock
-START_S = 300.0  # time for a process to load its modules: normally seconds, but longer from a network's disk
+# time for a process to load its modules: normally seconds, but longer from a network's disk
+START_S = 300.0
 DUMP_S = (
-    0.3  # time for a hanging process to write its traceback; the signal handler needs a millisecond
+    # time for a hanging process to write its traceback; the signal handler needs a millisecond
+    0.3
 )
-STOPPED_S = 2.0  # if a wait takes longer than `LOOKS_S` by this time, the machine or process was suspended (Ctrl-Z)
+# if a wait takes longer than `LOOKS_S` by this time, the machine or process was suspended (Ctrl-Z)
+STOPPED_S = 2.0
 IDLE_S: dict[Stage, float] = {
     "trials": 300.0,
     "renders": 10.0,
@@ -46,7 +51,8 @@ FALSE_STARTS = 3  # give up after this many processes in a row died before they 
 _STARTING = threading.Lock()
 CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
-"""Processes fork from a small server process that has imported what each of them would need a second to import."""
+"""Processes fork from a small server process that has imported what each of them would need a
+second to import."""
 if CAN_FORK:
     PROCESSES.set_forkserver_preload(["harness.runs.run", "scenes.render.view"])
 
@@ -62,7 +68,8 @@ def start_server() -> None:
 
 @dataclass(eq=False)
 class Answers:
-    """Queue for the ends of jobs, or for an error that ends all of them. ``is_dropped``: it is no longer read."""
+    """Queue for the ends of jobs, or for an error that ends all of them. ``is_dropped``: it is no
+    longer read."""
 
     ended: queue.SimpleQueue[tuple[Job, Ended] | UserError] = field(
         default_factory=queue.SimpleQueue
@@ -71,9 +78,10 @@ class Answers:
 
 
 class LocalEngine:
-    """Runs jobs in ``jobs`` processes for trials and up to two for renders, which load Mitsuba. ``limits`` hold for
-    trials; renders have no memory limit, because Dr.Jit reserves more than it uses. ``code``: modules that determine a
-    stage's results. A process that starts after an edit of their sources is refused: its results would differ."""
+    """Runs jobs in ``jobs`` processes for trials and up to two for renders, which load Mitsuba.
+    ``limits`` hold for trials; renders have no memory limit, because Dr.Jit reserves more than it
+    uses. ``code``: modules that determine a stage's results. A process that starts after an edit
+    of their sources is refused: its results would differ."""
 
     def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
         self.code = dict(code or {})
@@ -107,7 +115,8 @@ class LocalEngine:
         self.trace_files.cleanup()
 
     def room(self, stage: Stage) -> int:
-        """Return the room for two jobs per process, so that none waits while the driver stores a result."""
+        """Return the room for two jobs per process, so that none waits while the driver stores a
+        result."""
         return 2 * self._most[stage] - self._out[stage]
 
     def submit(self, job: Job) -> None:
@@ -151,7 +160,8 @@ class LocalEngine:
         answers.ended.put(UserError("these jobs are no longer awaited"))
 
     def next_job(self, worker: _Worker) -> tuple[Job, Limits, Answers] | None:
-        """Wait for a worker's next job; end its process if idle for long. Return None if there are no more jobs."""
+        """Wait for a worker's next job; end its process if idle for long. Return None if there are
+        no more jobs."""
         waiting = self._waiting[worker.stage]
         with self._state:
             worker.holds = None
@@ -166,11 +176,13 @@ class LocalEngine:
 
 
 class _Worker(threading.Thread):
-    """A thread that serves one process after another through a pipe. ``holds``: the queue for its job's end."""
+    """A thread that serves one process after another through a pipe. ``holds``: the queue for its
+    job's end."""
 
     def __init__(self, engine: LocalEngine, stage: Stage, number: int) -> None:
         super().__init__(daemon=True)
-        self.stage, self._engine = stage, engine
+        self.stage = stage
+        self._engine = engine
         self.holds: Answers | None = None
         self._label = f"{stage} process {number}"
         self._process: Any = None
@@ -208,7 +220,8 @@ class _Worker(threading.Thread):
         return ended
 
     def _start(self) -> None:
-        """Start a process that can take jobs. Raises UserError if it runs other sources or no process can start."""
+        """Start a process that can take jobs. Raises UserError if it runs other sources or no
+        process can start."""
         engine = self._engine
         self._pipe, child = PROCESSES.Pipe()
         arguments = (
@@ -249,10 +262,13 @@ class _Worker(threading.Thread):
             )
 
     def _answer(self, limit_s: float | None) -> Any:
-        """Return the next message, or an `Ended` if none comes. Time while the machine is suspended does not count."""
-        began, left_s = time.monotonic(), float("inf") if limit_s is None else limit_s
+        """Return the next message, or an `Ended` if none comes. Time while the machine is
+        suspended does not count."""
+        began = time.monotonic()
+        left_s = float("inf") if limit_s is None else limit_s
         while left_s > 0:
-            waiting_since, waits_s = time.monotonic(), min(left_s, LOOKS_S)
+            waiting_since = time.monotonic()
+            waits_s = min(left_s, LOOKS_S)
             try:
                 if self._pipe.poll(waits_s):
                     return self._pipe.recv()
@@ -265,7 +281,8 @@ class _Worker(threading.Thread):
                 )
             spent_s = time.monotonic() - waiting_since
             if spent_s > waits_s + STOPPED_S:
-                began, spent_s = began + spent_s - waits_s, waits_s
+                began = began + spent_s - waits_s
+                spent_s = waits_s
             left_s -= spent_s
         where = "a place that is not known"
         with contextlib.suppress(OSError, AttributeError):
@@ -309,7 +326,8 @@ class _Worker(threading.Thread):
 
 @contextlib.contextmanager
 def _environment(stated: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for a while: processes inherit them at their start, libraries read them when loaded."""
+    """Set environment variables for a while: processes inherit them at their start, libraries read
+    them when loaded."""
     before = {name: os.environ.get(name) for name in stated}
     os.environ.update(stated)
     try:
@@ -322,13 +340,14 @@ def _environment(stated: Mapping[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, even from a dask worker, which is a daemon. The server process finds modules
-    where this process does, not first in the folder in which it starts."""
+    """Start processes that ignore Ctrl-C, even from a dask worker, which is a daemon. The server
+    process finds modules where this process does, not first in the folder in which it starts."""
     config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
     started_in = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
     own = os.pathsep.join(path or started_in for path in sys.path)
     with _STARTING, _environment(ONE_THREAD | {"PYTHONPATH": own, "PYTHONSAFEPATH": "1"}):
-        daemon, config["daemon"] = config.get("daemon"), False
+        daemon = config.get("daemon")
+        config["daemon"] = False
         has_masks = hasattr(signal, "pthread_sigmask")
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else set()
         try:
@@ -350,7 +369,8 @@ def serve(
     code: Code | None,
     environment: dict[str, str],
 ) -> None:
-    """Run jobs until the driver closes the pipe. ``trace``: path of a file for the reason if it is killed."""
+    """Run jobs until the driver closes the pipe. ``trace``: path of a file for the reason if it is
+    killed."""
     os.environ.clear()
     os.environ.update(environment | ONE_THREAD)
     file = _prepare(trace)
@@ -388,9 +408,10 @@ def serve(
 
 
 def _prepare(trace: str) -> IO[str]:
-    """Ignore Ctrl-C, end together with the driver, and write where a crash or hang occurs to the file ``trace``."""
-    # On POSIX this process ends with its driver, whatever it does, because a pipe without a writer sends SIGIO. On
-    # Windows it ends when it next reads from or writes to the pipe.
+    """Ignore Ctrl-C, end together with the driver, and write where a crash or hang occurs to the
+    file ``trace``."""
+    # On POSIX this process ends with its driver, whatever it does, because a pipe without a writer
+    # sends SIGIO. On Windows it ends when it next reads from or writes to the pipe.
     with contextlib.suppress(ImportError, AttributeError, OSError):
         import fcntl
 
@@ -423,16 +444,15 @@ def render_into_cache(
     render_data: dict[str, Any],
     folder: str,
 ) -> tuple[bool, float]:
-    """Render a view unless it is cached; only this loads Mitsuba. Return whether it was cached, and the seconds."""
+    """Render a view unless it is cached; only this loads Mitsuba. Return whether it was cached,
+    and the seconds."""
     from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import CameraConfig, camera_of
     from scenes.target.custom import TargetConfig
 
-    target, optics = (
-        TargetConfig.from_data(target_data),
-        camera_of(CameraConfig.from_data(camera_data)).optics,
-    )
+    target = TargetConfig.from_data(target_data)
+    optics = camera_of(CameraConfig.from_data(camera_data)).optics
     view, found = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
     if (
         "drjit" in sys.modules
@@ -442,7 +462,8 @@ def render_into_cache(
 
 
 class SerialEngine:
-    """Runs one job at a time in this process, for debuggers and tests, without limits or protection against hangs."""
+    """Runs one job at a time in this process, for debuggers and tests, without limits or
+    protection against hangs."""
 
     def __init__(self) -> None:
         self._jobs: deque[Job] = deque()

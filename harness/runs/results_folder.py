@@ -26,14 +26,16 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def latest_run(parent: Path) -> str | None:
-    """Return the name of the run to which ``parent/latest`` points; None without a link that tofpod made."""
+    """Return the name of the run to which ``parent/latest`` points; None without a link that
+    tofpod made."""
     path = Path(parent) / LATEST
     target = os.readlink(path) if path.is_symlink() else ""
     return target if DIGEST_NAME.fullmatch(target) else None
 
 
 def point_to(run: Path) -> None:
-    """Point the link ``latest`` beside a run to it, unless somebody else made the link; print failures to stderr."""
+    """Point the link ``latest`` beside a run to it, unless somebody else made the link; print
+    failures to stderr."""
     path = Path(run).parent / LATEST
     if os.path.lexists(path) and latest_run(path.parent) is None:
         print(

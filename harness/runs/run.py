@@ -1,8 +1,10 @@
-"""Runs a plan. Renders feed trials; detectors learn on hole-free boards, other hole-free trials set thresholds, and
-judged trials use both. Trials in the journal are not run again, nor are views rendered that only they need.
+"""Runs a plan. Renders feed trials; detectors learn on hole-free boards, other hole-free trials
+set thresholds, and judged trials use both. Trials in the journal are not run again, nor are views
+rendered that only they need.
 
-Each shard calibrates its own thresholds, and different processors give slightly different last digits. So the journal
-stores the thresholds in use; after a merge, trials judged within `AGREES` of them count as judged at them."""
+Each shard calibrates its own thresholds, and different processors give slightly different last
+digits. So the journal stores the thresholds in use; after a merge, trials judged within `AGREES`
+of them count as judged at them."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -30,20 +32,26 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.render.cache import read_view
 
-NOTHING = 0.1  # a camera that allows no threshold sees nothing if at most this share of a board's face is judged
+# a camera that allows no threshold sees nothing if at most this share of a board's face is judged
+NOTHING = 0.1
 Quiet = dict[
     str, dict[str, tuple[float, float]]
 ]  # (quiet threshold, judged area in m2) by point, then by trial
-AGREES = 1e-3  # relative difference of equal thresholds: below a tenth of the standard error of one from twenty boards
+# relative difference of equal thresholds: below a tenth of the standard error of one from twenty
+# boards
+AGREES = 1e-3
 
 
 class Calibration:
-    """Derives thresholds from hole-free trials, which are added in any order. ``quiet``: shared by all groups."""
+    """Derives thresholds from hole-free trials, which are added in any order. ``quiet``: shared by
+    all groups."""
 
     def __init__(self, group: Group, quiet: Quiet) -> None:
-        self._group, self._quiet = group, quiet
+        self._group = group
+        self._quiet = quiet
         self.unlearned: set[str] = set()
-        """Digests of points whose detector failed to learn: they get no threshold, not even a given one."""
+        """Digests of points whose detector failed to learn: they get no threshold, not even a
+        given one."""
 
     def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
         """Add the ``runs`` rows of one trial."""
@@ -57,7 +65,8 @@ class Calibration:
         found: dict[str, float] = {}
         failures: list[Failure] = []
         for point in self._group.points:
-            quiet, threshold = self._quiet.get(point.digest, {}), None
+            quiet = self._quiet.get(point.digest, {})
+            threshold = None
             why = "no hole-free run ended"
             try:
                 if point.digest in self.unlearned:
@@ -72,8 +81,10 @@ class Calibration:
         return found, failures
 
     def sets(self, own: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
-        """Return sets of thresholds that agree with ``own``, the set to use first: ``own``, or one from the journal."""
-        prefix, stored = self._prefix(), []
+        """Return sets of thresholds that agree with ``own``, the set to use first: ``own``, or one
+        from the journal."""
+        prefix = self._prefix()
+        stored = []
         for key in journal.thresholds():
             entry = journal.read(key) if prefix and key.startswith(prefix) else None
             thresholds = entry.record if entry is not None else None
@@ -92,7 +103,8 @@ class Calibration:
             journal.write(key, Ended("done", canonical_json(dict(thresholds))))
 
     def _prefix(self) -> str:
-        """Return the prefix of the keys of thresholds that are based on the added trials; empty without such trials."""
+        """Return the prefix of the keys of thresholds that are based on the added trials; empty
+        without such trials."""
         keys = sorted(
             {key for point in self._group.points for key in self._quiet.get(point.digest, ())}
         )
@@ -100,7 +112,8 @@ class Calibration:
 
 
 def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
-    """Return a trial's entry with the thresholds of ``task``, which agree with those at which it was judged."""
+    """Return a trial's entry with the thresholds of ``task``, which agree with those at which it
+    was judged."""
     new = {(point.variant, point.frames): point.threshold for point in task.points}
     old = {(point.variant, point.frames): point.threshold for point in judged.points}
     octaves = {"operating": FINDING_OCTAVES, "pixels": PIXEL_OCTAVES}
@@ -121,13 +134,12 @@ def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
 
 
 def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | None:
-    """Return a point's threshold: given, or from its hole-free runs (quiet threshold, judged area in m2): the highest
-    or, in a study, the one for the wanted rate of false calls. None without runs. Raises UserError."""
-    given, calibrate, quiet = (
-        point.config.threshold.k,
-        point.config.threshold.calibrate,
-        list(quiet),
-    )
+    """Return a point's threshold: given, or from its hole-free runs (quiet threshold, judged area
+    in m2): the highest or, in a study, the one for the wanted rate of false calls. None without
+    runs. Raises UserError."""
+    given = point.config.threshold.k
+    calibrate = point.config.threshold.calibrate
+    quiet = list(quiet)
     if given is not None or not quiet:
         return given
     thresholds, areas_m2 = np.array(quiet).T
@@ -151,7 +163,8 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
 
 Report = Callable[[Outcome], None]
 AHEAD = 4096  # most trials that wait to be run: enough for a thousand workers, and a few megabytes
-TRIES = 2  # attempts at a render (two at once may need too much memory) or at a trial that sets a threshold
+# attempts at a render (two at once may need too much memory) or at a trial that sets a threshold
+TRIES = 2
 PARTS_AT_ONCE = 200  # parts looked up in the journal between two calls of the engine: about 0.1 s
 MOST_TRACEBACKS = 200  # failures whose traceback stays in memory; the journal has those of all
 
@@ -165,9 +178,10 @@ def run_plan(
     shard: Shard = WHOLE,
     retry_failed: bool = False,
 ) -> Outcome:
-    """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and draw a whole sweep's
-    pictures. A job that fails becomes a `Failure`; trials that need it are skipped. Raises UserError if nothing can be
-    written or the engine is gone. KeyboardInterrupt passes through; the journal has all finished trials."""
+    """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and
+    draw a whole sweep's pictures. A job that fails becomes a `Failure`; trials that need it are
+    skipped. Raises UserError if nothing can be written or the engine is gone. KeyboardInterrupt
+    passes through; the journal has all finished trials."""
     first, then = parts_of(plan, shard)
     run = _Run(plan, journal, engine, report, shard, retry_failed)
     outcome = run.outcome
@@ -202,7 +216,8 @@ def run_plan(
 
 
 def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, stored: set[Path]) -> None:
-    """Add the pictures of all judged groups, except in studies, whose limits determine which boards are shown."""
+    """Add the pictures of all judged groups, except in studies, whose limits determine which
+    boards are shown."""
     groups = [group for group in plan.groups if group.damaged.board is None]
     groups = [
         group
@@ -222,8 +237,8 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, stored: set[Path
 
 
 def pictures_from(jobs: Sequence[Job], engine: JobEngine, outcome: Outcome) -> Iterator[Any]:
-    """Start jobs that draw pictures again; return an iterator over all pictures in the order of the jobs. While it is
-    used, jobs that failed are added to the outcome."""
+    """Start jobs that draw pictures again; return an iterator over all pictures in the order of
+    the jobs. While it is used, jobs that failed are added to the outcome."""
     ends = carried_out(jobs, engine)
 
     def pictures() -> Iterator[Any]:
@@ -238,7 +253,8 @@ def pictures_from(jobs: Sequence[Job], engine: JobEngine, outcome: Outcome) -> I
 
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
-    """Render views that the cache lacks or holds damaged. Return a failure for each that could not be rendered."""
+    """Render views that the cache lacks or holds damaged. Return a failure for each that could not
+    be rendered."""
     missing = [
         _render_job(job)
         for job in {job.path: job for job in jobs}.values()
@@ -253,7 +269,8 @@ def _lost_view(name: str) -> str:
 
 
 def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, Ended]]:
-    """Run jobs; yield each with its end, in the order in which they end. The first jobs start with this call."""
+    """Run jobs; yield each with its end, in the order in which they end. The first jobs start with
+    this call."""
     waiting = deque(jobs)
 
     def started() -> int:
@@ -276,7 +293,8 @@ def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, E
 def values_of(
     function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], engine: JobEngine
 ) -> list[Any]:
-    """Return the values of a function of each of several arguments, None for a user's mistake. A bug is raised."""
+    """Return the values of a function of each of several arguments, None for a user's mistake. A
+    bug is raised."""
     jobs = [Job(str(number), "trials", function, each) for number, each in enumerate(arguments)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     if bug := next((end.why for end in ends.values() if end.is_bug), None):
@@ -300,7 +318,8 @@ class _Trial(NamedTuple):
 
 
 class _Run:
-    """The state of a run: jobs that are running, views in the cache, views wanted after calibration."""
+    """The state of a run: jobs that are running, views in the cache, views wanted after
+    calibration."""
 
     def __init__(
         self,
@@ -315,13 +334,12 @@ class _Run:
         self.under_way: dict[str, _Trial | RenderJob] = {}
         self.there: set[Path] = set()
         self.judged_paths: dict[int, list[Path]] = {}
-        self._groups, self._journal, self._engine, self._report = (
-            plan.groups,
-            journal,
-            engine,
-            report,
-        )
-        self._shard, self._retry_failed = shard, retry
+        self._groups = plan.groups
+        self._journal = journal
+        self._engine = engine
+        self._report = report
+        self._shard = shard
+        self._retry_failed = retry
         self._renders = {job.path: job for job in plan.renders}
         quiet: Quiet = {}
         self._calibrations = [Calibration(group, quiet) for group in plan.groups]
@@ -424,7 +442,8 @@ class _Run:
             self.outcome.renders.total += 1
 
     def _open(self, part: PlanPart) -> None:
-        """Take the finished trials of a part from the journal, and queue the others once their views are rendered."""
+        """Take the finished trials of a part from the journal, and queue the others once their
+        views are rendered."""
         missing = [trial for trial in self._trials(part) if not self._found(trial)]
         if not missing:
             return
@@ -455,7 +474,8 @@ class _Run:
         self._engine.submit(Job(trial.key, "trials", trial_as_text, (trial.task,)))
 
     def _trials(self, part: PlanPart) -> list[_Trial]:
-        """Return a part's trials. Those that others judged at agreeing thresholds are filed under this run's keys."""
+        """Return a part's trials. Those that others judged at agreeing thresholds are filed under
+        this run's keys."""
         group = self._groups[part.group]
         made = group.trials(
             part.batch,
@@ -503,7 +523,8 @@ class _Run:
         self.outcome.failures.append(failure if whole else replace(failure, why=failure.in_short))
 
     def _render_over(self, path: Path, ended: Ended) -> None:
-        counts, waiting = self.outcome.renders, self._waiting.pop(path, ())
+        counts = self.outcome.renders
+        waiting = self._waiting.pop(path, ())
         if ended.state == "done":
             was_there, seconds = ended.value
             counts.found += was_there
@@ -531,5 +552,6 @@ class _Run:
 
 
 def trial_as_text(task: TrialTask) -> str:
-    """Return a trial's record as JSON for the journal. The worker makes this text, because it takes a millisecond."""
+    """Return a trial's record as JSON for the journal. The worker makes this text, because it
+    takes a millisecond."""
     return record_text(learn(task) if task.role == "learning" else run_trial(task))

@@ -20,8 +20,9 @@ LOCK = ".lock"
 
 @dataclass(frozen=True)
 class Shard:
-    """Part ``number`` (from 1) of ``count``: a contiguous part of a plan's judged trials, and all hole-free trials that
-    set its thresholds. Each shard begins these at a different place, so that shards in one folder share them."""
+    """Part ``number`` (from 1) of ``count``: a contiguous part of a plan's judged trials, and all
+    hole-free trials that set its thresholds. Each shard begins these at a different place, so that
+    shards in one folder share them."""
 
     number: int = 1
     count: int = 1
@@ -46,7 +47,8 @@ class Shard:
         return f"{self.number}/{self.count}"
 
     def part(self, total: int) -> range:
-        """Return this shard's range of ``total`` items; the ranges of all shards cover each item exactly once."""
+        """Return this shard's range of ``total`` items; the ranges of all shards cover each item
+        exactly once."""
         return range((self.number - 1) * total // self.count, self.number * total // self.count)
 
     def rotated(self, items: Sequence[T]) -> list[T]:
@@ -60,8 +62,9 @@ WHOLE = Shard()
 
 @contextlib.contextmanager
 def locked(folder: Path, shard: Shard = WHOLE) -> Iterator[None]:
-    """Lock an existing folder: for a whole sweep exclusively, for shards together, but only once for each shard. Raises
-    UserError if another process holds it. Systems without locks continue, with a warning on stderr."""
+    """Lock an existing folder: for a whole sweep exclusively, for shards together, but only once
+    for each shard. Raises UserError if another process holds it. Systems without locks continue,
+    with a warning on stderr."""
     with _held(folder / LOCK, shared=not shard.is_whole):
         if shard.is_whole:
             yield

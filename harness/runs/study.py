@@ -55,20 +55,21 @@ from harness.vocabulary.text import Grid, show
 from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
 
-MOST_FAILURES, FAILURE = (
-    200,
-    ("what", "state", "why"),
-)  # failures to list; the journal has all of them
+# failures to list; the journal has all of them
+MOST_FAILURES = 200
+FAILURE = ("what", "state", "why")
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
-    """Run an experiment, write tables and report, print a summary; of a shard only the journal. Returns 0, 1, 130."""
+    """Run an experiment, write tables and report, print a summary; of a shard only the journal.
+    Returns 0, 1, 130."""
     began = time.monotonic()
     origin = record(
         command
     )  # recorded now: a commit during the sweep does not change the code that runs
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    folder, cache = experiment.folder(out), out / ".cache" / "renders"
+    folder = experiment.folder(out)
+    cache = out / ".cache" / "renders"
     _refuse_newer(folder)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
@@ -139,7 +140,8 @@ def _refuse_newer(folder: Path) -> None:
 
 
 def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
-    """Yield the records of all finished trials in the order of their keys; reading them one by one saves memory."""
+    """Yield the records of all finished trials in the order of their keys; reading them one by one
+    saves memory."""
     for key in outcome.finished:
         entry = journal.read(key)
         if entry is None or entry.record is None:
@@ -207,7 +209,8 @@ def _write_report(
     tables: ResultTables,
     provenance: dict[str, Any],
 ) -> list[str | Grid]:
-    """Write the summaries and the report of an experiment that is not a study. Return what the terminal shows."""
+    """Write the summaries and the report of an experiment that is not a study. Return what the
+    terminal shows."""
     facts = experiment.data
     found = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
     write_tables(folder, as_files(found), provenance)
@@ -217,8 +220,10 @@ def _write_report(
 
 
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
-    """End a run without results: raise the user's mistake, or print a bug's traceback once and return 1."""
-    name, detector = experiment.config.name, experiment.config.detector.name
+    """End a run without results: raise the user's mistake, or print a bug's traceback once and
+    return 1."""
+    name = experiment.config.name
+    detector = experiment.config.detector.name
     if bug := next((failure for failure in outcome.failures if failure.is_bug), None):
         count = outcome.trials.failed
         summary = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
@@ -268,7 +273,9 @@ def _provenance(
         ),
         None,
     )
-    runs, renders, trials = tables.runs, outcome.renders, outcome.trials
+    runs = tables.runs
+    renders = outcome.renders
+    trials = outcome.trials
     sources = {
         point.config.simulated.camera.name: point.config.simulated.camera
         for point in experiment.points
@@ -315,7 +322,8 @@ def record_of(
     failed: Mapping[str, Sequence[Failure]],
     provenance: Mapping[str, Any],
 ) -> StudyRecord:
-    """Return a study's record, without set-ups that have no judged damaged board. ``failed``: by point digest."""
+    """Return a study's record, without set-ups that have no judged damaged board. ``failed``: by
+    point digest."""
     calibrate = experiment.config.threshold.calibrate
     found = {point.digest: group for group in plan.groups for point in group.points}
     counts = {digest: len(failures) for digest, failures in failed.items()}
@@ -347,7 +355,8 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             else table[(table["variant"] == point.variant) & (table["frames"] == frames)]
         )
 
-    holes, runs = own(tables.holes), own(tables.runs)
+    holes = own(tables.holes)
+    runs = own(tables.runs)
     if holes.empty:
         return None
     calibrating = runs[runs["role"] == "calibration"]
@@ -395,10 +404,12 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
 
 
 def set_up_of(holes: pd.DataFrame, runs: pd.DataFrame, **named: Any) -> SetUpRecord:
-    """Return a set-up's record: threshold, hits and false calls from tables of its judged boards, and ``named``."""
+    """Return a set-up's record: threshold, hits and false calls from tables of its judged boards,
+    and ``named``."""
     judged = runs[runs["threshold"].notna()]
     threshold = float(judged["threshold"].iloc[0])
-    by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
+    by_depth = holes["detected"].to_numpy(bool)
+    by_no_return = holes["no_return"].to_numpy(bool)
 
     def false_calls(role: str) -> Unflawed:
         ran = judged[judged["role"] == role]
@@ -434,7 +445,8 @@ def failures_by_point(
     plan: SweepPlan, failures: Iterable[Failure], thresholds: Mapping[str, float]
 ) -> dict[str, list[Failure]]:
     """Return the failed trials of each point, by its digest."""
-    by_key, found = {failure.what: failure for failure in failures}, dict[str, list[Failure]]()
+    by_key = {failure.what: failure for failure in failures}
+    found = dict[str, list[Failure]]()
     every = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
     for group, batch in every:
         for key, task in group.trials(batch, thresholds if batch in group.then else {}):
@@ -449,8 +461,10 @@ def without_limit(
     failed: Mapping[str, list[Failure]],
     judged: Iterable[SetUpRecord],
 ) -> list[str]:
-    """Return sentences on the points that are not among the ``judged`` set-ups, each with its most common failure."""
-    known, by_cause = {(set_up.variant, set_up.frames) for set_up in judged}, dict[str, list[str]]()
+    """Return sentences on the points that are not among the ``judged`` set-ups, each with its most
+    common failure."""
+    known = {(set_up.variant, set_up.frames) for set_up in judged}
+    by_cause = dict[str, list[str]]()
     for point in (
         each for each in points if (each.variant, each.config.capture.frames) not in known
     ):

@@ -1,4 +1,5 @@
-"""Converts records of trials into tables: one row per trial and damage, per trial, per probe pixel, and per variant."""
+"""Converts records of trials into tables: one row per trial and damage, per trial, per probe
+pixel, and per variant."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,7 +24,8 @@ RECORDED = {
     "noise": trials.NOISE,
     "registrations": trials.REGISTRATIONS,
 }
-"""Tables by the names of their rows in records; probes are separate, because they are combined over repeats."""
+"""Tables by the names of their rows in records; probes are separate, because they are combined
+over repeats."""
 OF_STUDY = {table.name: table for table in trials.STUDY_ONLY}
 RECORDS_AT_ONCE = (
     100  # records held as mappings before they become columns, which need a tenth of the memory
@@ -32,7 +34,8 @@ UNKNOWN = np.iinfo(np.int32).min  # marks an unknown value among whole numbers
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
-    """Collect records into tables in a fixed order. Every axis but frames is a column, except in a study's tables."""
+    """Collect records into tables in a fixed order. Every axis but frames is a column, except in a
+    study's tables."""
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     grids: dict[tuple[float, ...], np.ndarray] = {}
     probes: list[
@@ -60,7 +63,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
     def ordered(name: str, declared: Table) -> pd.DataFrame:
-        """Join the parts of a table column by column, so that only one column at a time is held twice."""
+        """Join the parts of a table column by column, so that only one column at a time is held
+        twice."""
         own = parts.pop(name)
         sizes = [len(next(iter(part.values()))) for part in own]
         names = dict.fromkeys(column for part in own for column in part)
@@ -96,7 +100,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
 def columns_of(
     rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...], np.ndarray]
 ) -> dict[str, Any]:
-    """Convert rows to columns: numbers and None to floats with NaN, equal lists of thresholds to one of ``grids``."""
+    """Convert rows to columns: numbers and None to floats with NaN, equal lists of thresholds to
+    one of ``grids``."""
     found = {}
     for name, column in pd.DataFrame(rows).items():
         if isinstance(column.iloc[0], list):
@@ -119,7 +124,8 @@ def _in_mm(tenth_um: np.ndarray) -> np.ndarray:
 
 
 def _probes(rows: list[tuple[str, int, int, np.ndarray]]) -> pd.DataFrame:
-    """Return each probe's mean error and temporal deviation over hole-free repeats, without repeats' displacements."""
+    """Return each probe's mean error and temporal deviation over hole-free repeats, without
+    repeats' displacements."""
     grouped: dict[tuple[str, int], list[np.ndarray]] = {}
     for variant, frames, _, errors in sorted(rows, key=lambda row: row[:3]):
         grouped.setdefault((variant, frames), []).append(errors)
@@ -133,7 +139,8 @@ def _probes(rows: list[tuple[str, int, int, np.ndarray]]) -> pd.DataFrame:
         displacement = np.where(
             known, medians - (np.median(medians[known]) if known.any() else 0.0), 0.0
         )
-        several, centred = len(repeats) > 1, [*zip(repeats, displacement, strict=True)]
+        several = len(repeats) > 1
+        centred = [*zip(repeats, displacement, strict=True)]
         mean = sum(_in_mm(each) - moved for each, moved in centred) / len(repeats)
         squares = sum((_in_mm(each) - moved - mean) ** 2 for each, moved in centred)
         columns = {
@@ -151,7 +158,8 @@ def _probes(rows: list[tuple[str, int, int, np.ndarray]]) -> pd.DataFrame:
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
-    """Return the changes of each set-up and variation, their reasons, and their values on the axes."""
+    """Return the changes of each set-up and variation, their reasons, and their values on the
+    axes."""
     paths = list(experiment.points[0].axes)
     seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:

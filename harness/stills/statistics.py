@@ -1,8 +1,10 @@
-"""Statistics of stacks of frames of a static scene, real or simulated: planes, noise, fixed pattern, depth steps.
+"""Statistics of stacks of frames of a static scene, real or simulated: planes, noise, fixed
+pattern, depth steps.
 
-A plane z = d + sx x + sy y is exactly linear in 1/z over the rays' slopes: 1/z = (1 - sx X - sy Y) / d. A stack is
-``z_m`` (n, h, w) of a static scene, NaN where a frame has no range. ``where`` (h, w) bool selects pixels; of these, the
-pixels count that have a range in at least half of the frames and in at least two."""
+A plane z = d + sx x + sy y is exactly linear in 1/z over the rays' slopes: 1/z = (1 - sx X - sy Y)
+/ d. A stack is ``z_m`` (n, h, w) of a static scene, NaN where a frame has no range. ``where`` (h,
+w) bool selects pixels; of these, the pixels count that have a range in at least half of the frames
+and in at least two."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,9 +33,11 @@ NOTHING = Reading(float("nan"))
 
 
 def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float]) -> Reading:
-    """Return ``statistic`` of ``frames`` (n, ...), which must be independent, with Student's interval from the
-    delete-a-group jackknife over frames; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
-    value, g = float(statistic(frames)), min(GROUPS, len(frames) // 2)
+    """Return ``statistic`` of ``frames`` (n, ...), which must be independent, with Student's
+    interval from the delete-a-group jackknife over frames; unknown below 4 frames. Source: Efron
+    and Tibshirani 1993, chapter 11."""
+    value = float(statistic(frames))
+    g = min(GROUPS, len(frames) // 2)
     if g < 2 or not np.isfinite(value):
         return Reading(value)
     number = np.arange(len(frames)) % g
@@ -53,21 +57,26 @@ def mean_of(values: ArrayLike) -> Reading:
 
 
 def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
-    """Return the share of true ``hits`` with Wilson's interval; ``pixels_each`` neighbours count as a single pixel."""
+    """Return the share of true ``hits`` with Wilson's interval; ``pixels_each`` neighbours count
+    as a single pixel."""
     trials = hits.size / pixels_each
     low, high = wilson(hits.mean() * trials, trials)
     return Reading(float(hits.mean()), Interval(float(low), float(high)))
 
 
 BISQUARE = 4.685  # Tukey's constant, which gives an efficiency of 95 % for normal errors
-CANDIDATES, TRIPLE_PX, SCREENED = 400, 40, 4000
-"""Number of planes tried in each round, distance between the three points of each, and pixels that judge it."""
+CANDIDATES = 400
+TRIPLE_PX = 40
+SCREENED = 4000
+"""Number of planes tried in each round, distance between the three points of each, and pixels that
+judge it."""
 GROWN = 2.0
 MOST_PLANES = 6
 
 
 def robust_inverse_fit(basis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients c of 1/z = basis c, and which points count, by Tukey's bisquare on residuals of z."""
+    """Return coefficients c of 1/z = basis c, and which points count, by Tukey's bisquare on
+    residuals of z."""
     weight = np.ones_like(z)
     for _ in range(15):
         # an error of z is z^2 times an error of 1/z
@@ -87,7 +96,8 @@ def _with_ones(slopes: np.ndarray) -> np.ndarray:
 
 
 def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
-    """Return the plane through points of z (n,) on rays with ``slopes`` (n, 2), robust against a minority."""
+    """Return the plane through points of z (n,) on rays with ``slopes`` (n, 2), robust against a
+    minority."""
     (a, b, c), _ = robust_inverse_fit(_with_ones(slopes), z_m)
     return Plane(float(1 / a), float(-b / a), float(-c / a))
 
@@ -95,9 +105,10 @@ def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
 def find_planes(
     z_m: np.ndarray, slopes: np.ndarray, tolerance_m: float, least_px: int
 ) -> list[tuple[Plane, np.ndarray]]:
-    """Return the planes of a depth image with the connected pixels (h, w) bool of each, largest first, by RANSAC.
-    ``z_m`` (h, w) is NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up
-    to `GROWN` times as far. Planes with fewer than ``least_px`` pixels are left out. Equal images give equal planes."""
+    """Return the planes of a depth image with the connected pixels (h, w) bool of each, largest
+    first, by RANSAC. ``z_m`` (h, w) is NaN where unknown. Points within ``tolerance_m`` of a plane
+    belong to it, and connected points up to `GROWN` times as far. Planes with fewer than
+    ``least_px`` pixels are left out. Equal images give equal planes."""
     basis = _with_ones(slopes)
     left = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
     found: list[tuple[Plane, np.ndarray]] = []
@@ -121,7 +132,8 @@ def find_planes(
 def _best_candidate(
     z_m: np.ndarray, basis: np.ndarray, left: np.ndarray, tolerance_m: float, number: int
 ) -> np.ndarray:
-    """Return the coefficients (3,) of 1/z of the plane through three close points that has most screened pixels."""
+    """Return the coefficients (3,) of 1/z of the plane through three close points that has most
+    screened pixels."""
     rng = random_stream(0, "planes", number)
     points = np.argwhere(left)
     shift = rng.integers(-TRIPLE_PX, TRIPLE_PX + 1, (CANDIDATES, 3, 2))
@@ -131,7 +143,8 @@ def _best_candidate(
         0,
         np.array(left.shape) - 1,
     )
-    rays, z = basis[at[..., 0], at[..., 1]], z_m[at[..., 0], at[..., 1]]
+    rays = basis[at[..., 0], at[..., 1]]
+    z = z_m[at[..., 0], at[..., 1]]
     usable = left[at[..., 0], at[..., 1]].all(axis=1)
     usable[usable] = np.abs(np.linalg.det(rays[usable])) > 1e-8
     if not usable.any():
@@ -143,7 +156,8 @@ def _best_candidate(
 
 
 def _distance_m(inverse: np.ndarray, basis: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Return the distance of points from the plane with coefficients ``inverse`` (..., 3) of 1/z; infinite for NaN."""
+    """Return the distance of points from the plane with coefficients ``inverse`` (..., 3) of 1/z;
+    infinite for NaN."""
     with np.errstate(invalid="ignore"):
         distance = np.abs(z_m * (inverse * basis).sum(axis=-1) - 1) / np.linalg.norm(
             inverse, axis=-1
@@ -161,7 +175,8 @@ def often_valid(z_m: np.ndarray, where: np.ndarray | bool) -> np.ndarray:
 
 
 def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray | bool = True) -> float:
-    """Return the standard deviation over frames (n - 1), as an rms over the pixels that count; NaN if none does."""
+    """Return the standard deviation over frames (n - 1), as an rms over the pixels that count; NaN
+    if none does."""
     use = often_valid(z_m, where)
     return (
         float(np.sqrt(np.nanvar(z_m[:, use], axis=0, ddof=1).mean())) if use.any() else float("nan")
@@ -169,7 +184,8 @@ def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray | bool = True) -> float:
 
 
 def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> np.ndarray:
-    """Return deviations (n, h, w) from pixel means (minus each frame's mean unless kept), 0 for other pixels."""
+    """Return deviations (n, h, w) from pixel means (minus each frame's mean unless kept), 0 for
+    other pixels."""
     use = often_valid(z_m, where)
     d = np.zeros_like(z_m)
     d[:, use] = z_m[:, use] - np.nanmean(z_m[:, use], axis=0)
@@ -179,11 +195,14 @@ def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> 
 
 
 def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tuple[float, float]:
-    """Return (mean product, mean square) over pairs of pixels (lag_x, lag_y) apart in ``where``; NaN without pairs."""
+    """Return (mean product, mean square) over pairs of pixels (lag_x, lag_y) apart in ``where``;
+    NaN without pairs."""
     h, w = where.shape
-    first, second = (slice(h - lag_y), slice(w - lag_x)), (slice(lag_y, h), slice(lag_x, w))
+    first = (slice(h - lag_y), slice(w - lag_x))
+    second = (slice(lag_y, h), slice(lag_x, w))
     both = where[first] & where[second]
-    a, b = d[..., *first][..., both], d[..., *second][..., both]
+    a = d[..., *first][..., both]
+    b = d[..., *second][..., both]
     pair = np.isfinite(a) & np.isfinite(b)
     if not pair.any():
         return float("nan"), float("nan")
@@ -197,7 +216,8 @@ def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> flo
 
 
 def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y: int) -> float:
-    """Return the correlation of temporal noise of pixels (lag_x, lag_y) apart, including whole-frame displacement."""
+    """Return the correlation of temporal noise of pixels (lag_x, lag_y) apart, including
+    whole-frame displacement."""
     return correlation(
         deviations(z_m, where, keep_jitter=True), often_valid(z_m, where), lag_x, lag_y
     )
@@ -205,7 +225,8 @@ def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y:
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """The error of a wall's average beyond a smooth surface and noise: ``std_m``, ``covariance_m2`` at lags 0..20."""
+    """The error of a wall's average beyond a smooth surface and noise: ``std_m``,
+    ``covariance_m2`` at lags 0..20."""
 
     std_m: float
     covariance_m2: np.ndarray
@@ -214,11 +235,13 @@ class FixedPattern:
 def fixed_pattern(
     z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: int = 20
 ) -> FixedPattern:
-    """Return the fixed pattern of a wall: the average minus a robust surface of degree 5 in 1/z, without the remaining
-    temporal noise. ``z_m`` (n, h, w) must be valid in every frame at every pixel of ``where``; ``slopes`` (h, w, 2)."""
+    """Return the fixed pattern of a wall: the average minus a robust surface of degree 5 in 1/z,
+    without the remaining temporal noise. ``z_m`` (n, h, w) must be valid in every frame at every
+    pixel of ``where``; ``slopes`` (h, w, 2)."""
     average = z_m.mean(axis=0)[where]
     # Legendre products up to total degree 5 over the slopes, scaled to -1..1
-    middle, half = slopes[where].mean(axis=0), np.ptp(slopes[where], axis=0) / 2
+    middle = slopes[where].mean(axis=0)
+    half = np.ptp(slopes[where], axis=0) / 2
     x, y = ((slopes[where] - middle) / half).T
     basis = np.polynomial.legendre.legvander2d(x, y, (SURFACE_DEGREE, SURFACE_DEGREE))
     i, j = np.divmod(np.arange(basis.shape[1]), SURFACE_DEGREE + 1)
@@ -232,7 +255,8 @@ def fixed_pattern(
     noise = deviations(z_m, good, keep_jitter=False)
 
     def left_at(lag_x: int, lag_y: int) -> float:
-        # deviations from a mean of n frames have (n - 1)/n of the variance and the mean has 1/n: a ratio of 1/(n - 1)
+        # deviations from a mean of n frames have (n - 1)/n of the variance and the mean has 1/n: a
+        # ratio of 1/(n - 1)
         of_noise = covariance(noise, good, lag_x, lag_y)[0] / (len(z_m) - 1)
         return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
 
@@ -241,15 +265,16 @@ def fixed_pattern(
 
 
 TOLERANCE_SIGMAS = 4.0
-TOLERANCE_STEP = 0.1  # a point of a surface lies within four standard deviations of noise plus a tenth of the step
+# a point of a surface lies within four standard deviations of noise plus a tenth of the step
+TOLERANCE_STEP = 0.1
 LEAST_TOLERANCE_M = 0.5 * MM
 MOST_OF_STEP = 0.45
 FLAT_PX = 8.0  # distance from an edge beyond which the camera's filter sees a single surface
 
 
 def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
-    """Return the distance within which a range belongs to a surface; NaN if noise hides the step, since a tolerance of
-    more than `MOST_OF_STEP` of the step would join the surfaces."""
+    """Return the distance within which a range belongs to a surface; NaN if noise hides the step,
+    since a tolerance of more than `MOST_OF_STEP` of the step would join the surfaces."""
     noise = TOLERANCE_SIGMAS * sigma_m if np.isfinite(sigma_m) else 0.0
     tolerance_m = max(noise, TOLERANCE_STEP * step_m, LEAST_TOLERANCE_M)
     return tolerance_m if tolerance_m <= MOST_OF_STEP * step_m else float("nan")
@@ -264,10 +289,11 @@ def edge_widths(
     reach_px: float,
     across: int,
 ) -> dict[str, np.ndarray]:
-    """Return widths (n,) in pixels within ``reach_px`` of an edge that lines of pixels along the axis ``across`` cross,
-    for each of the frames (n, h, w): the ``gap`` without a range, the ``flying`` pixels with a range off both surfaces,
-    and the share of lines ``with_flying`` pixels. All but the gap are NaN if noise hides the step. ``front_z_m`` and
-    ``back_z_m`` (h, w) are z along each ray; ``from_edge_px`` (h, w) is negative in front, NaN for excluded pixels."""
+    """Return widths (n,) in pixels within ``reach_px`` of an edge that lines of pixels along the
+    axis ``across`` cross, for each of the frames (n, h, w): the ``gap`` without a range, the
+    ``flying`` pixels with a range off both surfaces, and the share of lines ``with_flying``
+    pixels. All but the gap are NaN if noise hides the step. ``front_z_m`` and ``back_z_m`` (h, w)
+    are z along each ray; ``from_edge_px`` (h, w) is negative in front, NaN for excluded pixels."""
     near = np.abs(from_edge_px) <= reach_px
     z = z_m[:, near]
     on_surface = np.any(

@@ -1,6 +1,8 @@
-"""The table of detection limits, and the limits in words: the answer, a sentence for each set-up, and notes.
+"""The table of detection limits, and the limits in words: the answer, a sentence for each set-up,
+and notes.
 
-A curve says nothing about sizes that were not inspected, so a size beyond the largest is written as ``> 15.9``."""
+A curve says nothing about sizes that were not inspected, so a size beyond the largest is written
+as ``> 15.9``."""
 
 import re
 from collections.abc import Sequence
@@ -20,7 +22,8 @@ MOST_ANSWERS = 3
 ONE_UNIT = "One unit of the camera"
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
-"""Words of a statement's note on an extrapolated bound, which `notes_of` replaces by a sentence of its own."""
+"""Words of a statement's note on an extrapolated bound, which `notes_of` replaces by a sentence of
+its own."""
 
 
 def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
@@ -45,15 +48,19 @@ def bound_text(bound: Estimate) -> str:
 
 
 def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown if not above 0."""
-    size_mm, ends = getattr(limit, f"{of}_mm"), getattr(limit, f"{of}_interval_mm")
+    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown
+    if not above 0."""
+    size_mm = getattr(limit, f"{of}_mm")
+    ends = getattr(limit, f"{of}_interval_mm")
     if size_mm <= 0:
         return Estimate(np.nan)
     return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
-a50_of, a90_of = (partial(size_estimate, of=name) for name in ("a50", "a90"))
-FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
+a50_of = partial(size_estimate, of="a50")
+a90_of = partial(size_estimate, of="a90")
+FOUND_50 = f"size found {50} % of the time"
+FOUND_90 = f"size found {90} % of the time"
 BRIEF: dict[str, Any] = {
     "interval": True,
     "brief": lambda estimate: estimate.text().partition(" ")[0],
@@ -88,14 +95,18 @@ CALLS = (
 
 
 def quoted(limit: SetUpLimit) -> Bound:
-    """Return the limit to quote: that of a new unit if the study has several units, else a90/95 of its single unit."""
+    """Return the limit to quote: that of a new unit if the study has several units, else a90/95 of
+    its single unit."""
     return limit.a90_95 if limit.over_units is None else limit.over_units.new_unit
 
 
 def _one_unit(limit: SetUpLimit) -> Estimate:
-    """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several units."""
+    """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several
+    units."""
     bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
-    middle, low, high = (float(statistic(bounds)) for statistic in (np.median, np.min, np.max))
+    middle = float(np.median(bounds))
+    low = float(np.min(bounds))
+    high = float(np.max(bounds))
     ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
     return Estimate(middle if np.isfinite(middle) else np.nan, *ends, limit.largest_mm)
 
@@ -106,7 +117,8 @@ def _verdict(limit: SetUpLimit, bound: Bound) -> str:
 
 
 def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
-    """Return the numbers of hits by depth and by missing returns; None if they were not counted separately."""
+    """Return the numbers of hits by depth and by missing returns; None if they were not counted
+    separately."""
     seen = limit.record.inspected
     if seen.by_depth is None or seen.by_no_return is None:
         return None
@@ -280,7 +292,8 @@ SCORES = Table(
 
 
 def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
-    """Return the table. It has columns on units if there are several; if there is only one, the title says so."""
+    """Return the table. It has columns on units if there are several; if there is only one, the
+    title says so."""
     if any(limit.over_units for limit in limits):
         return LIMITS.grid(
             limits,
@@ -297,7 +310,8 @@ def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
-    """Return a sentence for each set-up, or the range of many limits. An answer for a single unit says so first."""
+    """Return a sentence for each set-up, or the range of many limits. An answer for a single unit
+    says so first."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
     answer = _answer(limits)
@@ -322,9 +336,8 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
         own = [limit for limit in shown if limit.record.inspected.limit_of == kind]
-        best, worst = (
-            (text.size(quoted(limit).value), limit.record.label) for limit in (own[0], own[-1])
-        )
+        best = (text.size(quoted(own[0]).value), own[0].record.label)
+        worst = (text.size(quoted(own[-1]).value), own[-1].record.label)
         which = f" of {kind}" if len(kinds) > 1 else ""
         spans.append(
             "the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(
@@ -338,8 +351,10 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
 
 
 def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
-    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``, or only the size after such a sentence (``again``)."""
-    quote, new = quoted(limit), ""
+    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``, or only the size after such a
+    sentence (``again``)."""
+    quote = quoted(limit)
+    new = ""
     if limit.over_units is not None:
         new = f" by a new unit of the camera, judged from {limit.over_units.units},"
     if not quote.demonstrated:
@@ -358,7 +373,8 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
             f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
         )
         found = size.removeprefix("of ") if again else found
-    calls, rate = limit.false_calls, ""
+    calls = limit.false_calls
+    rate = ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
         if (

@@ -1,4 +1,5 @@
-"""Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and limits of depth."""
+"""Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and
+limits of depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,9 +35,12 @@ from harness.vocabulary.path_names import (
 )
 from harness.vocabulary.text import Grid
 
-BLOB_PX = 5.0  # distance on the sensor within which two highest scores are one blob: the width of a camera's filter
+# distance on the sensor within which two highest scores are one blob: the width of a camera's
+# filter
+BLOB_PX = 5.0
 HIGH_THRESHOLD = 10.0
-"""Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
+"""Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a
+fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
 BOUND = "upper bound of a90 at 95 % confidence; empty if not demonstrated"
@@ -69,7 +73,8 @@ CHANCE = Table(
         ),
     ),
 )
-GIVEN, UNSET = "number of calibration runs; 0 for a given threshold", "none: given"
+GIVEN = "number of calibration runs; 0 for a given threshold"
+UNSET = "none: given"
 THRESHOLDS = Table(
     "thresholds",
     "one row per set-up and number of frames: its threshold, and the false calls at that threshold on other boards",
@@ -98,7 +103,8 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run that set a threshold. ``same_pixels`` counts runs with the highest score on the same pixels."""
+    """The hole-free run that set a threshold. ``same_pixels`` counts runs with the highest score
+    on the same pixels."""
 
     limit: SetUpLimit
     board: int
@@ -136,9 +142,11 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
 
 
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return warnings about calibrated thresholds that are too high for noise or set by one place on the sensor."""
+    """Return warnings about calibrated thresholds that are too high for noise or set by one place
+    on the sensor."""
     rows = set_by(limits)
-    warnings, crowded = [], [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
+    warnings = []
+    crowded = [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
     if crowded:
         counts = sorted({row.same_pixels or 0 for row in crowded})
         where = (
@@ -213,7 +221,8 @@ def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class AxisGroup:
-    """An axis: its ``values``, ascending if they are numbers, and its ``lines`` by their values on the other axes."""
+    """An axis: its ``values``, ascending if they are numbers, and its ``lines`` by their values on
+    the other axes."""
 
     path: str
     name: str
@@ -237,7 +246,8 @@ class AxisGroup:
 
 
 def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
-    """Return the lines of each axis. A line's label gives its values on those other axes on which the lines differ."""
+    """Return the lines of each axis. A line's label gives its values on those other axes on which
+    the lines differ."""
     names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
@@ -247,7 +257,8 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
         varied = [axis for axis, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
         def held(line: AxisLine, axis: str, values: Sequence[Any]) -> str:
-            """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key (``albedo=0.2``)."""
+            """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key
+            (``albedo=0.2``)."""
             words = axis_value(axis, differing(line.held[axis], values))
             return (
                 words
@@ -417,7 +428,8 @@ STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
     """Return every table of a study with its rows."""
-    limits, set_ups = result.limits, result.set_ups
+    limits = result.limits
+    set_ups = result.set_ups
     return {
         LIMITS: list(limits),
         THRESHOLDS: list(limits),

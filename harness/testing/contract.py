@@ -34,15 +34,15 @@ def check_detector(
     settings: Mapping[str, Any] | None = None,
     clouds: Sequence[Cloud] | None = None,
 ) -> None:
-    """Run every check on every cloud. Raises AssertionError if the contract of `detectors.interface` is broken, and
-    passes on the detector's own exceptions, with a note that names the check. ``make`` is a detector's class, whose
-    ``settings_type`` validates ``settings`` (plain data as in YAML), or a function that makes a new detector at each
-    call. ``clouds`` are by default the three of `harness.testing.synthetic_clouds`, 0.7 m from the camera, each with damage of
-    centimetres, some of which must be found at some threshold. Use a study to measure how good a detector is."""
-    settings_type, build = (
-        getattr(make, "settings_type", None),
-        cast("Callable[..., Detector]", make),
-    )
+    """Run every check on every cloud. Raises AssertionError if the contract of
+    `detectors.interface` is broken, and passes on the detector's own exceptions, with a note that
+    names the check. ``make`` is a detector's class, whose ``settings_type`` validates ``settings``
+    (plain data as in YAML), or a function that makes a new detector at each call. ``clouds`` are
+    by default the three of `harness.testing.synthetic_clouds`, 0.7 m from the camera, each with
+    damage of centimetres, some of which must be found at some threshold. Use a study to measure
+    how good a detector is."""
+    settings_type = getattr(make, "settings_type", None)
+    build = cast("Callable[..., Detector]", make)
     if settings_type is None and settings is not None:
         raise TypeError(
             "`settings` belong to a detector's class with a `settings_type`, not to a function"
@@ -74,7 +74,8 @@ STRONGEST = 5  # findings of a cloud that are checked individually
 CENTRE_MARGIN_M = (
     0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
 )
-SCORE_TOLERANCE = 0.01  # share of the highest score: robust fits stop early, and the order of sums affects rounding
+# share of the highest score: robust fits stop early, and the order of sums affects rounding
+SCORE_TOLERANCE = 0.01
 CROP_TOLERANCE = 0.01  # share of the pixels: a crop may decide differently at the target's rim
 PLACE_TOLERANCE_M = 1e-4
 SHIFT_M = 0.037
@@ -86,7 +87,8 @@ T = TypeVar("T")
 
 
 def require(kept: bool | np.bool_, what: str) -> None:
-    """Raise AssertionError unless this part of the contract is kept; unlike assert, it also works with python -O."""
+    """Raise AssertionError unless this part of the contract is kept; unlike assert, it also works
+    with python -O."""
     if not kept:
         raise AssertionError(what)
 
@@ -114,8 +116,10 @@ class Look:
         return tuple(self.detector.find(self.cloud, self.evidence, threshold))
 
     def thresholds(self) -> tuple[float, ...]:
-        """Return ascending thresholds from 0 to the quiet threshold, at the scores of pixels, where findings change."""
-        scores, quiet = self.evidence.score[np.isfinite(self.evidence.score)], self.quiet
+        """Return ascending thresholds from 0 to the quiet threshold, at the scores of pixels,
+        where findings change."""
+        scores = self.evidence.score[np.isfinite(self.evidence.score)]
+        quiet = self.quiet
         high = np.quantile(scores, [0.5, 0.9, 0.99, 0.999]).tolist() if len(scores) else []
         steps = {0.0, *high, *(share * quiet for share in (0.25, 0.5, 0.75, 0.95))}
         return tuple(sorted(step for step in steps if 0.0 <= step < quiet))
@@ -123,7 +127,8 @@ class Look:
     def measured(self, finding: Detection) -> Measurement:
         """Measure a finding, and check that the numbers are valid."""
         found = self.detector.measure(self.cloud, self.evidence, finding)
-        diameter, centre = found.extent_diameter_m, np.asarray(found.extent_centre_m)
+        diameter = found.extent_diameter_m
+        centre = np.asarray(found.extent_centre_m)
         require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
         require(
             centre.shape == (3,) and np.isfinite(centre).all(),
@@ -149,7 +154,8 @@ class Look:
 
 
 def declares_itself(make: Make, cloud: Cloud) -> None:
-    """Check the name, the version (at least 1), and the settings: a Config with legal defaults that can be stored."""
+    """Check the name, the version (at least 1), and the settings: a Config with legal defaults
+    that can be stored."""
     detector = make()
     require(isinstance(detector.name, str) and detector.name != "", "`name` is not a text")
     version = detector.version
@@ -168,12 +174,14 @@ def declares_itself(make: Make, cloud: Cloud) -> None:
 
 
 def gives_sound_evidence(make: Make, cloud: Cloud) -> None:
-    """Check that images have the cloud's size, that only points have scores, some finite, and that the scale is > 0."""
+    """Check that images have the cloud's size, that only points have scores, some finite, and that
+    the scale is > 0."""
     _sound(Look.at(make(), cloud))
 
 
 def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
-    """Check that the same cloud gives the same bits: again, after another cloud, and with a new detector."""
+    """Check that the same cloud gives the same bits: again, after another cloud, and with a new
+    detector."""
     detector = make()
     first = Look.at(detector, cloud).everything()
     require(
@@ -202,7 +210,8 @@ def keeps_its_input(make: Make, cloud: Cloud) -> None:
 
 
 def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
-    """Check that findings are sorted by score, exceed the threshold, and vanish at a threshold equal to their score."""
+    """Check that findings are sorted by score, exceed the threshold, and vanish at a threshold
+    equal to their score."""
     look = Look.at(make(), cloud)
     for threshold in look.thresholds():
         found = look.find(threshold)
@@ -221,9 +230,8 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
             f"at a threshold of {threshold:g} the strongest finding is not first",
         )
         for finding in found[:STRONGEST]:
-            gone, kept = (
-                look.find(at) for at in (finding.score, float(np.nextafter(finding.score, 0.0)))
-            )
+            gone = look.find(finding.score)
+            kept = look.find(float(np.nextafter(finding.score, 0.0)))
             require(
                 not np.isin(finding.pixels, _pixels_of(gone)).any()
                 and np.isin(finding.pixels, _pixels_of(kept)).any(),
@@ -232,7 +240,8 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
 
 
 def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
-    """Check that the quiet threshold is the strongest finding's score (0 for none): silent there, but not below it."""
+    """Check that the quiet threshold is the strongest finding's score (0 for none): silent there,
+    but not below it."""
     look = Look.at(make(), cloud)
     quiet = look.quiet
     require(
@@ -256,7 +265,8 @@ def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
 def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
     """Check that a higher threshold only removes pixels from the findings."""
     look = Look.at(make(), cloud)
-    lower, thresholds = _pixels_of(look.find(0.0)), (*look.thresholds(), look.quiet)
+    lower = _pixels_of(look.find(0.0))
+    thresholds = (*look.thresholds(), look.quiet)
     for before, threshold in pairwise(thresholds):
         pixels = _pixels_of(look.find(threshold))
         added = int((~np.isin(pixels, lower)).sum())
@@ -268,7 +278,8 @@ def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
 
 
 def finds_valid_pixels(make: Make, cloud: Cloud) -> None:
-    """Check that pixels are ascending flat indices of valid points, and that centres lie within the cloud."""
+    """Check that pixels are ascending flat indices of valid points, and that centres lie within
+    the cloud."""
     look = Look.at(make(), cloud)
     _sound_findings(look, *look.thresholds())
 
@@ -282,8 +293,10 @@ def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
 
 
 def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
-    """Check that a cloud without points raises a UserError, and that a cloud with a single point causes no crash."""
-    detector, gone = make(), np.ones_like(cloud.valid)
+    """Check that a cloud without points raises a UserError, and that a cloud with a single point
+    causes no crash."""
+    detector = make()
+    gone = np.ones_like(cloud.valid)
     for points in (0, 1):
         gone.reshape(-1)[np.flatnonzero(cloud.valid)[:points]] = False
         few = without(cloud, gone)
@@ -305,7 +318,8 @@ def survives_pickling(make: Make, cloud: Cloud) -> None:
     def sent(value: Any) -> Any:
         return pickle.loads(pickle.dumps(value))
 
-    unused, detector = sent(make()), make()
+    unused = sent(make())
+    detector = make()
     result = Look.at(detector, cloud).everything()
     require(_same(sent(result), result), "a result that was pickled is not the same")
     for arrived in (unused, sent(detector)):
@@ -316,14 +330,13 @@ def survives_pickling(make: Make, cloud: Cloud) -> None:
 
 
 def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
-    """Check that learning returns reproducible arrays that can be stored, and that the detector works with them."""
+    """Check that learning returns reproducible arrays that can be stored, and that the detector
+    works with them."""
     detector = make()
     if not isinstance(detector, Calibratable):
         return
-    before, clouds = (
-        Look.at(make(), cloud).everything(),
-        [plane(seed=seed, damage=()) for seed in range(8)],
-    )
+    before = Look.at(make(), cloud).everything()
+    clouds = [plane(seed=seed, damage=()) for seed in range(8)]
     learned, again = (
         dict(detector.calibrate([_with_arrays(clean, _read_only) for clean in clouds]))
         for _ in range(2)
@@ -351,14 +364,16 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
 
 
 def turns_with_the_cloud(make: Make, cloud: Cloud) -> None:
-    """Check the results for a camera that is turned by 90 degrees about its optical axis, with its grid and lens."""
+    """Check the results for a camera that is turned by 90 degrees about its optical axis, with its
+    grid and lens."""
     pixels = _grid_turned(cloud, np.arange(cloud.valid.size).reshape(cloud.valid.shape))
     turned = Look.at(make(), turned_once(cloud))
     _compare(Look.at(make(), cloud), turned, pixels, QUARTER_TURN, "turned by 90 degrees")
 
 
 def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
-    """Check the results for a map (a cloud with parallel samples) that is moved away by 37 mm along its axis."""
+    """Check the results for a map (a cloud with parallel samples) that is moved away by 37 mm
+    along its axis."""
     base = replace(cloud, projection="parallel", lens=None, map_views=None)
     step = cloud.z_step_m
     shift = np.eye(4)
@@ -382,7 +397,8 @@ CHECKS = (
 
 
 def _sound(look: Look) -> None:
-    shape, evidence = look.cloud.valid.shape, look.evidence
+    shape = look.cloud.valid.shape
+    evidence = look.evidence
     for name in ("score", "residual_m", "surface_z_m"):
         image = np.asarray(getattr(evidence, name))
         require(
@@ -390,7 +406,8 @@ def _sound(look: Look) -> None:
             f"`{name}` has the shape {image.shape}; the cloud's grid is {shape}",
         )
         require(image.dtype.kind == "f", f"`{name}` holds {image.dtype}, which cannot hold NaN")
-    score, scale = evidence.score, float(evidence.scale_m)
+    score = evidence.score
+    scale = float(evidence.scale_m)
     count = int(np.isfinite(score[~look.cloud.valid]).sum())
     require(count == 0, f"{count} pixels without a point have a score; it must be NaN")
     require(not np.isinf(score).any(), "a score is infinite")
@@ -406,9 +423,11 @@ def _sound(look: Look) -> None:
 def _sound_findings(look: Look, *thresholds: float) -> None:
     cloud = look.cloud
     points = cloud.points_m[cloud.valid]
-    low, high = points.min(axis=0) - CENTRE_MARGIN_M, points.max(axis=0) + CENTRE_MARGIN_M
+    low = points.min(axis=0) - CENTRE_MARGIN_M
+    high = points.max(axis=0) + CENTRE_MARGIN_M
     for finding in (each for threshold in thresholds for each in look.find(threshold)):
-        pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
+        pixels = np.asarray(finding.pixels)
+        centre = np.asarray(finding.centre_m)
         require(
             pixels.ndim == 1 and pixels.dtype.kind in "iu",
             "a finding's pixels are not a row of whole numbers",
@@ -441,9 +460,11 @@ def _pixels_of(found: tuple[Detection, ...]) -> np.ndarray:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Return whether two values hold the same bits: arrays, numbers, text, and dataclasses or mappings of them."""
+    """Return whether two values hold the same bits: arrays, numbers, text, and dataclasses or
+    mappings of them."""
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        a, b = np.asarray(a), np.asarray(b)
+        a = np.asarray(a)
+        b = np.asarray(b)
         return a.shape == b.shape and bool(
             np.array_equal(a, b, equal_nan=a.dtype.kind == b.dtype.kind == "f")
         )
@@ -474,7 +495,8 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def turned_once(cloud: Cloud) -> Cloud:
-    """Return the cloud that the same camera gives when it is turned by 90 degrees about its optical axis."""
+    """Return the cloud that the same camera gives when it is turned by 90 degrees about its
+    optical axis."""
     names = ("reason", "count", "variance_m2", "rgb", "amplitude", "mean_variance_m2")
     images = {name: getattr(cloud, name) for name in names}
     turned: dict[str, Any] = {
@@ -487,7 +509,8 @@ def turned_once(cloud: Cloud) -> Cloud:
         )
     if not cloud.organised:
         return replace(cloud, lens=None, **turned)
-    lens, region = cloud.lens, cloud.region
+    lens = cloud.lens
+    region = cloud.region
     width = lens.width if lens is not None else region.col1
     turned["region"] = Region(width - region.col1, width - region.col0, region.row0, region.row1)
     if lens is not None:
@@ -507,8 +530,10 @@ def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
 def _compare(
     before: Look, after: Look, pixels: np.ndarray, T_after_before: np.ndarray, how: str
 ) -> None:
-    """Compare scores and findings; ``pixels`` (h, w) holds the flat index before of each pixel afterwards."""
-    was, now = before.evidence.score.reshape(-1)[pixels], after.evidence.score
+    """Compare scores and findings; ``pixels`` (h, w) holds the flat index before of each pixel
+    afterwards."""
+    was = before.evidence.score.reshape(-1)[pixels]
+    now = after.evidence.score
     changed = int((np.isfinite(was) != np.isfinite(now)).sum())
     require(
         changed <= CROP_TOLERANCE * now.size,
@@ -525,14 +550,17 @@ def _compare(
             f"{how}, {what} changed by {difference:g} (allowed {tolerance:g})",
         )
 
-    # findings are compared in the middle of the widest gap between scores from a fifth of the quiet threshold to it; if
-    # no gap is wider than the tolerance on both sides, a tolerable change of a score can change findings
+    # findings are compared in the middle of the widest gap between scores from a fifth of the
+    # quiet threshold to it; if no gap is wider than the tolerance on both sides, a tolerable
+    # change of a score can change
+    # findings
     scores = np.unique(before.evidence.score[np.isfinite(before.evidence.score)])
     scores = scores[(scores >= 0.2 * before.quiet) & (scores <= before.quiet)]
     gaps = np.diff(scores)
     if not len(gaps) or gaps.max() <= 2 * tolerance:
         return
-    threshold, flat = float(scores[gaps.argmax()] + gaps.max() / 2), pixels.reshape(-1)
+    threshold = float(scores[gaps.argmax()] + gaps.max() / 2)
+    flat = pixels.reshape(-1)
     of_before = {frozenset(finding.pixels.tolist()): finding for finding in before.find(threshold)}
     of_after = {
         frozenset(flat[finding.pixels].tolist()): finding for finding in after.find(threshold)

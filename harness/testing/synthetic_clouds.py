@@ -8,14 +8,18 @@ import numpy as np
 from harness.vocabulary.geometry import Cloud, Lens, Reason, Region
 
 SHAPE = (90, 120)  # rows and columns: 126 by 168 mm at 0.7 m
-DISTANCE_M, NOISE_M, FRAMES = 0.7, 3e-4, 20
+DISTANCE_M = 0.7
+NOISE_M = 3e-4
+FRAMES = 20
 LENS = Lens(SHAPE[1], SHAPE[0], 500.0, 500.0, 59.5, 44.5)
 DAMAGE = ((-0.04, -0.02, 0.010, 0.012), (0.03, 0.02, 0.007, 0.008), (0.05, -0.03, 0.008, -0.006))
-"""Two holes and a bump: x, y and radius on the face, and depth behind it (negative: in front of it), metres."""
+"""Two holes and a bump: x, y and radius on the face, and depth behind it (negative: in front of
+it), metres."""
 
 
 def synthetic_clouds() -> tuple[Cloud, ...]:
-    """Return a tilted plane, a cylinder's face, and a tilted plane with missing pixels, each with `DAMAGE`."""
+    """Return a tilted plane, a cylinder's face, and a tilted plane with missing pixels, each with
+    `DAMAGE`."""
     return plane(seed=1), cylinder(seed=2), with_gaps(plane(seed=3), seed=4)
 
 
@@ -57,10 +61,12 @@ def _seen(
 ) -> Cloud:
     slopes = LENS.region_slopes(LENS.whole)
     z = np.full(SHAPE, DISTANCE_M)
-    # the ray meets the face where z = face(z * slopes); the iteration converges because the slopes are small
+    # the ray meets the face where z = face(z * slopes); the iteration converges because the slopes
+    # are small
     for _ in range(60):
         z = face(slopes[..., 0] * z, slopes[..., 1] * z)
-    x, y = slopes[..., 0] * z, slopes[..., 1] * z
+    x = slopes[..., 0] * z
+    y = slopes[..., 1] * z
     for centre_x, centre_y, radius, depth in damage:
         z = z + depth * (np.hypot(x - centre_x, y - centre_y) < radius)
     z = z + NOISE_M * np.random.default_rng(seed).standard_normal(SHAPE)

@@ -1,4 +1,5 @@
-"""Judges one detector on one cloud: rows for the run and for each damage, and further rows for a study's board."""
+"""Judges one detector on one cloud: rows for the run and for each damage, and further rows for a
+study's board."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -46,9 +47,10 @@ PIXEL_OCTAVES = (
 
 @dataclass(frozen=True)
 class JudgedCloud:
-    """The result of one detector on one cloud. ``run``: its row. ``holes``: a row per damage. ``places_m`` (m, 2): of
-    the detections on the face. ``pairs``: index into ``known.truth`` -> index into ``detections``; on a hole-free
-    board, at the places of left-out damage. ``overlap``: the rule of matching beside the hit radius."""
+    """The result of one detector on one cloud. ``run``: its row. ``holes``: a row per damage.
+    ``places_m`` (m, 2): of the detections on the face. ``pairs``: index into ``known.truth`` ->
+    index into ``detections``; on a hole-free board, at the places of left-out damage. ``overlap``:
+    the rule of matching beside the hit radius."""
 
     run: dict[str, Any]
     holes: list[dict[str, Any]]
@@ -71,7 +73,8 @@ def judge(
     hole_free: bool,
     learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge a detector on a cloud; without a threshold, only find the quiet threshold. ``learned``: path of a file."""
+    """Judge a detector on a cloud; without a threshold, only find the quiet threshold.
+    ``learned``: path of a file."""
     cloud = known.cloud
     detector = detector_for(
         known, detector_name, settings_json, hole_free=hole_free, learned=learned
@@ -121,10 +124,11 @@ def judge(
 def matched(
     known: KnownCloud, detections: Sequence[Detection], radius_m: float, overlap: float | None
 ) -> tuple[dict[int, int], int]:
-    """Match detections to damages one to one, nearest first. Return the hits, {index of damage: index of detection},
-    and the number of other detections that are parts of a damage and so not false calls. A hit's centre lies within the
-    radius of the damage's centre (or centre line, if long), or, with an ``overlap``, at least this share of its pixels
-    lies on the damage, grown by `SMEARED_PX`. Other detections with this overlap are parts."""
+    """Match detections to damages one to one, nearest first. Return the hits, {index of damage:
+    index of detection}, and the number of other detections that are parts of a damage and so not
+    false calls. A hit's centre lies within the radius of the damage's centre (or centre line, if
+    long), or, with an ``overlap``, at least this share of its pixels lies on the damage, grown by
+    `SMEARED_PX`. Other detections with this overlap are parts."""
     (found,) = _matched(known, [Findings.of(detections)], radius_m, overlap)
     return found
 
@@ -133,7 +137,8 @@ def _matched(
     known: KnownCloud, levels: Sequence[Findings], radius_m: float, overlap: float | None
 ) -> list[tuple[dict[int, int], int]]:
     """Apply `matched` to the detections at each of several thresholds."""
-    lines, areas = [damage.line_m for damage in known.truth], []
+    lines = [damage.line_m for damage in known.truth]
+    areas = []
     if overlap is not None:
         outlines = [known.outlines[damage.id] for damage in known.truth]
         areas = smeared(outlines, known.cloud.valid.shape, grid=known.cloud.organised)
@@ -143,7 +148,8 @@ def _matched(
 def smeared(
     outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: bool = True
 ) -> list[np.ndarray]:
-    """Return a mask (n,) of pixels for each outline of flat indices, grown by `SMEARED_PX` on a ``grid``."""
+    """Return a mask (n,) of pixels for each outline of flat indices, grown by `SMEARED_PX` on a
+    ``grid``."""
     masks = []
     for outline in outlines:
         on = np.zeros(shape, bool)
@@ -160,16 +166,19 @@ def matched_places(
     radius_m: float,
     overlap: float | None,
 ) -> list[tuple[dict[int, int], int]]:
-    """Match as `matched` does. ``lines_m``: centre lines of the damages. ``areas``: their masks (none without an
-    ``overlap``). ``placed``: maps centres onto the face. ``levels``: the detections at each of several thresholds."""
+    """Match as `matched` does. ``lines_m``: centre lines of the damages. ``areas``: their masks
+    (none without an ``overlap``). ``placed``: maps centres onto the face. ``levels``: the
+    detections at each of several thresholds."""
     places_m = placed(np.concatenate([found.centres_m for found in levels]))
     apart = np.array([from_line_m(line, places_m) for line in lines_m]).reshape(
         len(lines_m), len(places_m)
     )
-    matches, start = [], 0
+    matches = []
+    start = 0
     for found in levels:
         count = len(found.scores)
-        near, start = apart[:, start : start + count], start + count
+        near = apart[:, start : start + count]
+        start = start + count
         if overlap is None:
             matches.append((closest_pairs(near, radius_m), 0))
             continue
@@ -198,7 +207,8 @@ def detector_of(name: str, settings_json: str, learned: str | None = None) -> De
 def detector_for(
     known: KnownCloud, name: str, settings_json: str, *, hole_free: bool, learned: str | None = None
 ) -> Detector:
-    """Return the detector for a cloud. A built-in detector that needs the truth gets it; no plug-in does."""
+    """Return the detector for a cloud. A built-in detector that needs the truth gets it; no
+    plug-in does."""
     detector = detector_of(name, settings_json, learned)
     if not (isinstance(detector, NeedsTruth) and DETECTORS.offer(name).built_in):
         return detector
@@ -228,7 +238,8 @@ def _hole_row(
     found: Measurement | None,
     largest: Measurement | None,
 ) -> dict[str, Any]:
-    """Return the row of one damage, mm. As in the thesis, positions are relative to the largest cluster."""
+    """Return the row of one damage, mm. As in the thesis, positions are relative to the largest
+    cluster."""
     inside = known.outlines[damage.id]
     # only a pixel of a grid can lack a range
     seen_z = known.cloud.points_m.reshape(-1, 3)[inside, 2]
@@ -276,7 +287,8 @@ def _hole_row(
     row |= {"angle_deg": float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90)}
     row |= {f"{name}_mm": float(getattr(found, f"{name}_m")) / MM for name in names}
     for kind in kinds:
-        centre, reference = (getattr(measured, f"{kind}_centre_m") for measured in (found, largest))
+        centre = getattr(found, f"{kind}_centre_m")
+        reference = getattr(largest, f"{kind}_centre_m")
         row[f"{kind}_offset_mm"] = float(np.linalg.norm(centre - reference)) / MM
         row[f"{kind}_error_mm"] = (
             float(np.linalg.norm(centre - known.centre_in_cloud_m(damage))) / MM
@@ -289,15 +301,18 @@ def _hole_row(
 
 
 def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool) -> Rows:
-    """Return the rows of one board by table (`STUDY_TABLES`, "runs", "holes"); a board that only sets a threshold has
-    its area and its highest score. Detections without return count in ``no_return`` and ``no_return_calls``."""
-    score, threshold = judged.evidence.score, judged.run["threshold"]
+    """Return the rows of one board by table (`STUDY_TABLES`, "runs", "holes"); a board that only
+    sets a threshold has its area and its highest score. Detections without return count in
+    ``no_return`` and ``no_return_calls``."""
+    score = judged.evidence.score
+    threshold = judged.run["threshold"]
     run = {**judged.run, "inspected_m2": known.area_m2(np.isfinite(score))}
     if np.isnan(threshold):
         # the place of the highest score on the board and on the sensor; NaN if it is not there
         x_m = y_m = u_px = v_px = np.nan
         if np.isfinite(score).any():
-            loudest, cloud = int(np.nanargmax(score)), known.cloud
+            loudest = int(np.nanargmax(score))
+            cloud = known.cloud
             x_m, y_m = known.places_m.reshape(-1, 2)[loudest]
             if cloud.organised and cloud.projection == "central":
                 v_px, u_px = np.add(
@@ -329,7 +344,8 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     for number, (detection, place) in enumerate(
         zip(judged.detections, judged.places_m, strict=True)
     ):
-        x_mm, y_mm = float(place[0]) / MM, float(place[1]) / MM
+        x_mm = float(place[0]) / MM
+        y_mm = float(place[1]) / MM
         facts = {"score": float(detection.score), "hole": counts_for.get(number, "")}
         tables["findings"].append({"x_mm": x_mm, "y_mm": y_mm, **facts})
     if hole_free:  # the places where the damage was left out
@@ -340,8 +356,10 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
         return tables
     for i, (row, signal) in enumerate(zip(judged.holes, signals, strict=True)):
         tables["holes"].append({**row, "signal": signal, "no_return": i in without_return})
-    # the number of judged pixels of each damage and of the undamaged face, and how many exceed each threshold
-    thresholds, flat = grid(threshold, PIXEL_OCTAVES), score.ravel()
+    # the number of judged pixels of each damage and of the undamaged face, and how many exceed
+    # each threshold
+    thresholds = grid(threshold, PIXEL_OCTAVES)
+    flat = score.ravel()
     parts = [(str(damage.id), known.outlines[damage.id]) for damage in known.truth]
     for name, pixels in (*parts, ("", np.flatnonzero(known.undamaged.ravel()))):
         valid = np.sort(flat[pixels][np.isfinite(flat[pixels])])
@@ -363,8 +381,9 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
 def _without_return(
     known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool
 ) -> tuple[frozenset[int], int]:
-    """Return the indices of the damages that detections without return hit, and the number of false calls among these
-    detections: they hit no damage and are not part of a detection by depth."""
+    """Return the indices of the damages that detections without return hit, and the number of
+    false calls among these detections: they hit no damage and are not part of a detection by
+    depth."""
     tests = getattr(judged.detector, "tests_the_harness", False)
     missing = None if tests else missing_returns(known.cloud, judged.evidence)
     if missing is None or not missing.detections:

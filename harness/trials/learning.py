@@ -1,6 +1,8 @@
-"""Lets a detector (`detectors.interface.Calibratable`) learn from hole-free boards before its threshold is set.
+"""Lets a detector (`detectors.interface.Calibratable`) learn from hole-free boards before its
+threshold is set.
 
-The journal stores the learned state, for resuming and shards; a file named after its key holds it for trials."""
+The journal stores the learned state, for resuming and shards; a file named after its key holds it
+for trials."""
 
 import base64
 import io
@@ -19,7 +21,8 @@ LEARNING_BOARDS = (
 
 
 def learn(task: TrialTask) -> Rows:
-    """Return the record of what a task's detector learns from its `LEARNING_BOARDS` boards: an ``.npz`` in base 64."""
+    """Return the record of what a task's detector learns from its `LEARNING_BOARDS` boards: an
+    ``.npz`` in base 64."""
     (point,), views = task.points, len(task.set_ups) // LEARNING_BOARDS
     boards = (
         replace(task, set_ups=task.set_ups[number * views : (number + 1) * views], repeat=number)

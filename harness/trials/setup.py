@@ -1,4 +1,5 @@
-"""A simulated set-up with what a trial needs, and clouds with the truth on their grid. Detectors get only the cloud."""
+"""A simulated set-up with what a trial needs, and clouds with the truth on their grid. Detectors
+get only the cloud."""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -25,14 +26,16 @@ INTACT_MARGIN_PX = (
     8  # pixels closer to damage or rim do not count as undamaged; twice the engine's window
 )
 FEWEST_PROBES = 100
-PROBES = 500  # pixels followed over repeats for noise and systematic error: 0.5 % accuracy with 50 repeats
+# pixels followed over repeats for noise and systematic error: 0.5 % accuracy with 50 repeats
+PROBES = 500
 FACE_STEPS = 8  # fixed-point steps to a curved face; each reduces the error by the face's slope
 FACE_ONLY_M = 50 * MM  # points farther behind the face are ignored by `face_errors_m`
 
 
 @dataclass(frozen=True)
 class SetUpRef:
-    """A small reference to a set-up, for workers. ``target`` has its damage; ``damaged``: whether the view shows it."""
+    """A small reference to a set-up, for workers. ``target`` has its damage; ``damaged``: whether
+    the view shows it."""
 
     view_path: str
     camera: CameraConfig
@@ -42,8 +45,9 @@ class SetUpRef:
 
 @dataclass(frozen=True)
 class SetUp:
-    """One target in front of one unit. ``truth`` is the target's damage with its centre in view; if the view was
-    rendered without damage (``damaged`` False), these places have no holes. Arrays cover ``unit.region``, (h, w)."""
+    """One target in front of one unit. ``truth`` is the target's damage with its centre in view;
+    if the view was rendered without damage (``damaged`` False), these places have no holes. Arrays
+    cover ``unit.region``, (h, w)."""
 
     unit: SimulatedUnit
     damaged: bool
@@ -53,7 +57,8 @@ class SetUp:
 
     @cached_property
     def on_face_m(self) -> np.ndarray:
-        """Points (h, w, 3) where each pixel's central ray meets the undamaged face, board frame; NaN off the board."""
+        """Points (h, w, 3) where each pixel's central ray meets the undamaged face, board frame;
+        NaN off the board."""
         slopes = self.unit.view.slopes[self.unit.cut]
         T_board_camera = invert(self.T_camera_board)
         rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
@@ -72,22 +77,27 @@ class SetUp:
 
     @cached_property
     def seen_z_m(self) -> np.ndarray:
-        """Depth z (h, w) of what each pixel's central ray meets in the rendered view, including the floors of holes."""
-        view, cut = self.unit.view, self.unit.cut
+        """Depth z (h, w) of what each pixel's central ray meets in the rendered view, including
+        the floors of holes."""
+        view = self.unit.view
+        cut = self.unit.cut
         return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
-        """Flat indices of the pixels whose central ray enters each damage, or of the nearest pixel."""
+        """Flat indices of the pixels whose central ray enters each damage, or of the nearest
+        pixel."""
         return outlined(self.truth, self.board_xy_m)
 
     @cached_property
     def seen_depth_m(self) -> dict[int, float]:
-        """Depth of each damage along the optical axis at which the central rays through it end behind the face: the
-        median of those within 1 mm of the deepest (others hit walls). For raised damage, the same for the highest,
-        negative; behind a through-hole, the backing's. Strips of tape count as face."""
+        """Depth of each damage along the optical axis at which the central rays through it end
+        behind the face: the median of those within 1 mm of the deepest (others hit walls). For
+        raised damage, the same for the highest, negative; behind a through-hole, the backing's.
+        Strips of tape count as face."""
         face_z_m = transform_points(self.T_camera_board, self.on_face_m)[..., 2]
-        depth_m, found = (self.seen_z_m - face_z_m).ravel(), {}
+        depth_m = (self.seen_z_m - face_z_m).ravel()
+        found = {}
         for damage in self.truth:
             inside = depth_m[self.outlines[damage.id]]
             sign = -1.0 if damage.raised else 1.0
@@ -112,27 +122,32 @@ class SetUp:
 
     @cached_property
     def bare(self) -> np.ndarray:
-        """Pixels (h, w) bool of the face well away from the rim, which a hole-free board shows undamaged."""
+        """Pixels (h, w) bool of the face well away from the rim, which a hole-free board shows
+        undamaged."""
         return _eroded(self.on_board)
 
     @cached_property
     def pitch_mm(self) -> tuple[float, float]:
-        """Median distance on the face between neighbouring columns and between neighbouring rows of pixels."""
+        """Median distance on the face between neighbouring columns and between neighbouring rows
+        of pixels."""
         steps = (np.linalg.norm(np.diff(self.board_xy_m, axis=axis), axis=-1) for axis in (1, 0))
         u, v = (float(np.nanmedian(step)) / MM for step in steps)
         return u, v
 
     @cached_property
     def probes(self) -> np.ndarray:
-        """Flat indices (p,) of evenly spread undamaged pixels, or of pixels on damage too if those are too few."""
+        """Flat indices (p,) of evenly spread undamaged pixels, or of pixels on damage too if those
+        are too few."""
         intact = np.flatnonzero(self.intact)
         intact = intact if len(intact) >= FEWEST_PROBES else np.flatnonzero(self.bare)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
 
 
 def outlined(truth: Sequence[Damage], places_m: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the flat indices of the places (h, w, 2) inside each damage, by id; the nearest place if none is."""
-    x, y = (np.ascontiguousarray(places_m[..., axis]).ravel() for axis in (0, 1))
+    """Return the flat indices of the places (h, w, 2) inside each damage, by id; the nearest place
+    if none is."""
+    x = np.ascontiguousarray(places_m[..., 0]).ravel()
+    y = np.ascontiguousarray(places_m[..., 1]).ravel()
     found = {damage.id: np.flatnonzero(damage.within(x, y)) for damage in truth}
     for damage in truth:
         if not found[damage.id].size:
@@ -150,8 +165,10 @@ def _eroded(mask: np.ndarray) -> np.ndarray:
 
 
 def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
-    """Return the points (..., 3) where lines through points along directions (..., 3), board frame, meet a face."""
-    place, before = points_m, None
+    """Return the points (..., 3) where lines through points along directions (..., 3), board
+    frame, meet a face."""
+    place = points_m
+    before = None
     for _ in range(FACE_STEPS):
         height = np.nan_to_num(face.height_m(place[..., 0], place[..., 1]))
         if before is not None and np.array_equal(height, before):
@@ -163,24 +180,23 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
     return np.asarray(place)
 
 
-KEPT, KEPT_BYTES = (
-    32,
-    200_000_000,
-)  # set-ups kept, and bytes of their views: three of a lidar with 31 frequencies
+# set-ups kept, and bytes of their views: three of a lidar with 31 frequencies
+KEPT = 32
+KEPT_BYTES = 200_000_000
 _kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
 
 
 def load_set_up(ref: SetUpRef) -> SetUp:
-    """Return the set-up of a reference. Workers keep set-ups for later trials, within ``KEPT`` and ``KEPT_BYTES``."""
+    """Return the set-up of a reference. Workers keep set-ups for later trials, within ``KEPT`` and
+    ``KEPT_BYTES``."""
     if ref not in _kept:
-        T_camera_board, view = ref.target.pose.T_camera_board, read_view(Path(ref.view_path))
+        T_camera_board = ref.target.pose.T_camera_board
+        view = read_view(Path(ref.view_path))
         if view is None:
             what = f"{ref.view_path}: the stored render is missing or damaged"
             raise UserError(what, fix="run the same command again")
-        unit, truth = (
-            SimulatedUnit(camera_of(ref.camera), ref.camera, view),
-            truth_of(ref.target, T_camera_board),
-        )
+        unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)
+        truth = truth_of(ref.target, T_camera_board)
         in_view = unit.camera.images(
             np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3)
         )
@@ -195,10 +211,11 @@ def load_set_up(ref: SetUpRef) -> SetUp:
 
 @dataclass(frozen=True)
 class KnownCloud:
-    """A cloud with the truth. ``T_board_cloud`` (4, 4): the true pose, cloud's frame to board's. ``outlines``: by
-    damage, the flat indices of the pixels (cells, points) that see into it, at least one. ``places_m`` (h, w, 2):
-    position of each on the face in plan, NaN off the board. ``undamaged`` (h, w) bool: face well away from damage and
-    rim. ``seen_depth_m``: by damage, the depth behind the face of what is seen in it."""
+    """A cloud with the truth. ``T_board_cloud`` (4, 4): the true pose, cloud's frame to board's.
+    ``outlines``: by damage, the flat indices of the pixels (cells, points) that see into it, at
+    least one. ``places_m`` (h, w, 2): position of each on the face in plan, NaN off the board.
+    ``undamaged`` (h, w) bool: face well away from damage and rim. ``seen_depth_m``: by damage, the
+    depth behind the face of what is seen in it."""
 
     cloud: Cloud
     T_board_cloud: np.ndarray
@@ -210,7 +227,8 @@ class KnownCloud:
     seen_depth_m: Mapping[int, float]
 
     def on_board(self, centres_m: np.ndarray) -> np.ndarray:
-        """Return the places (m, 2) on the face that lines of sight through centres (m, 3) of the cloud's frame meet."""
+        """Return the places (m, 2) on the face that lines of sight through centres (m, 3) of the
+        cloud's frame meet."""
         board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
         if self.cloud.projection == "parallel":
             direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
@@ -223,7 +241,8 @@ class KnownCloud:
         return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
 
     def area_m2(self, pixels: np.ndarray) -> float:
-        """Return the area in plan of the face under pixels (h, w) bool; without a grid, by their share of points."""
+        """Return the area in plan of the face under pixels (h, w) bool; without a grid, by their
+        share of points."""
         valid = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
             board = self.target.board
@@ -239,7 +258,8 @@ class KnownCloud:
 
 def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
     """Return the average of one view, with the truth along each pixel's central ray."""
-    # if the camera is so far away that nothing undamaged is left between damage, use a hole-free board without its rim
+    # if the camera is so far away that nothing undamaged is left between damage, use a hole-free
+    # board without its rim
     undamaged = set_up.bare if hole_free and not set_up.intact.any() else set_up.intact
     of_truth = (
         set_up.target,
@@ -255,7 +275,8 @@ def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
 def known_map(
     first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool
 ) -> KnownCloud:
-    """Return a map with the truth at the place of each point. ``first``: the set-up of the reference view."""
+    """Return a map with the truth at the place of each point. ``first``: the set-up of the
+    reference view."""
     T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
     place = board_places_m(cloud, T_board_cloud)
     margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM
@@ -270,17 +291,20 @@ def known_map(
 
 def far_from(truth: Sequence[Damage], places_m: np.ndarray, margin_m: float) -> np.ndarray:
     """Return (h, w) bool: whether places (h, w, 2) are farther than a margin from all damage."""
-    x, y = (np.ascontiguousarray(places_m[..., axis]) for axis in (0, 1))
+    x = np.ascontiguousarray(places_m[..., 0])
+    y = np.ascontiguousarray(places_m[..., 1])
     return ~np.any(
         [np.zeros(x.shape, bool), *(damage.within(x, y, margin_m) for damage in truth)], axis=0
     )
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
-    """Return the place (h, w, 2) on the board of each point; of a map's empty cells too, from its grid."""
+    """Return the place (h, w, 2) on the board of each point; of a map's empty cells too, from its
+    grid."""
     points = cloud.points_m
     if cloud.projection == "parallel":
-        x, y = _ticks(points[..., 0]), _ticks(points[..., 1].T)
+        x = _ticks(points[..., 0])
+        y = _ticks(points[..., 1].T)
         z = float(np.nanmedian(points[..., 2]))
         grid = np.stack([*np.meshgrid(x, y), np.full(cloud.valid.shape, z)], axis=-1)
         points = np.where(cloud.valid[..., None], points, grid)
@@ -288,7 +312,8 @@ def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
 
 
 def _ticks(places: np.ndarray) -> np.ndarray:
-    """Return the equally spaced co-ordinates (w,) of the columns of places (h, w), including empty columns."""
+    """Return the equally spaced co-ordinates (w,) of the columns of places (h, w), including empty
+    columns."""
     known = np.flatnonzero(np.isfinite(places).any(axis=0))
     ticks = np.nanmedian(places[:, known], axis=0)
     step, first = np.polyfit(known, ticks, 1) if len(known) > 1 else (0.0, float(ticks[0]))
@@ -298,8 +323,9 @@ def _ticks(places: np.ndarray) -> np.ndarray:
 
 
 def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
-    """Return how far (p,) behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along
-    the board's normal; NaN if that point is more than three of the cloud's mean spacings away."""
+    """Return how far (p,) behind the true face the cloud's point nearest to each place (p, 2) of
+    the board lies, along the board's normal; NaN if that point is more than three of the cloud's
+    mean spacings away."""
     points = transform_points(known.T_board_cloud, known.cloud.points_m[known.cloud.valid])
     points = points[np.abs(points[:, 2]) < FACE_ONLY_M]
     if not len(points):
@@ -321,9 +347,12 @@ def highest_within(
     lines_m: Sequence[np.ndarray] | np.ndarray,
     radius_m: float,
 ) -> np.ndarray:
-    """Return the highest (n,) of the finite scores (h, w) within a radius of each centre (2,) or line (k, 2); NaN if
-    there is none. ``places_m`` (h, w, 2): the place of each pixel, NaN if it has none."""
-    flat, scores, found = places_m.reshape(-1, 2), score.ravel(), []
+    """Return the highest (n,) of the finite scores (h, w) within a radius of each centre (2,) or
+    line (k, 2); NaN if there is none. ``places_m`` (h, w, 2): the place of each pixel, NaN if it
+    has none."""
+    flat = places_m.reshape(-1, 2)
+    scores = score.ravel()
+    found = []
     x, y = np.ascontiguousarray(flat.T)
     for line in map(np.atleast_2d, lines_m):
         (west, north), (east, south) = line.min(axis=0) - radius_m, line.max(axis=0) + radius_m
@@ -335,21 +364,20 @@ def highest_within(
 
 @numba.njit(**PLAIN)
 def pixel_areas(places_m: np.ndarray) -> np.ndarray:
-    """Return the areas (h, w) that pixels at ``places_m`` (h, w, 2) cover in plan: parallelograms of central
-    differences, one-sided at the edge. NaN beside a pixel without a place. h and w are at least 2."""
+    """Return the areas (h, w) that pixels at ``places_m`` (h, w, 2) cover in plan: parallelograms
+    of central differences, one-sided at the edge. NaN beside a pixel without a place. h and w are
+    at least 2."""
     h, w, _ = places_m.shape
     areas = np.empty((h, w))
     for v in range(h):
-        up, down = max(v - 1, 0), min(v + 1, h - 1)
+        up = max(v - 1, 0)
+        down = min(v + 1, h - 1)
         for u in range(w):
-            left, right = max(u - 1, 0), min(u + 1, w - 1)
-            ax, ay = (
-                places_m[v, right, 0] - places_m[v, left, 0],
-                places_m[v, right, 1] - places_m[v, left, 1],
-            )
-            bx, by = (
-                places_m[down, u, 0] - places_m[up, u, 0],
-                places_m[down, u, 1] - places_m[up, u, 1],
-            )
+            left = max(u - 1, 0)
+            right = min(u + 1, w - 1)
+            ax = places_m[v, right, 0] - places_m[v, left, 0]
+            ay = places_m[v, right, 1] - places_m[v, left, 1]
+            bx = places_m[down, u, 0] - places_m[up, u, 0]
+            by = places_m[down, u, 1] - places_m[up, u, 1]
             areas[v, u] = abs(ax * by - ay * bx) / ((right - left) * (down - up))
     return areas

@@ -1,7 +1,9 @@
-"""One trial: simulate the frames of a set-up, average them, merge views into maps, and run the detectors on the result.
+"""One trial: simulate the frames of a set-up, average them, merge views into maps, and run the
+detectors on the result.
 
-Averages are drawn at once if that gives the same distribution (plain means of `FEWEST_FRAMES` frames or more, if the
-camera's model supports it). Frames that jump are then left out by their displacement, which is known exactly."""
+Averages are drawn at once if that gives the same distribution (plain means of `FEWEST_FRAMES`
+frames or more, if the camera's model supports it). Frames that jump are then left out by their
+displacement, which is known exactly."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -48,12 +50,15 @@ from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
 FEWEST_FRAMES = 10
-"""Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only, not on the cost."""
+"""Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only,
+not on the cost."""
 FLAT_ALBEDO = (
-    0.6  # albedo of a flat field's plane: painted wood or paper, like the boards of the experiments
+    # albedo of a flat field's plane: painted wood or paper, like the boards of the experiments
+    0.6
 )
 MOST_DISTURBED = 0.5
-"""Share of `AverageConfig.disturbed_fraction` that the pixels' own noise may disturb; it varies by a thousandth."""
+"""Share of `AverageConfig.disturbed_fraction` that the pixels' own noise may disturb; it varies by
+a thousandth."""
 
 
 def averages_of(
@@ -63,9 +68,10 @@ def averages_of(
     exact: bool,
     flat_field: FlatFieldConfig | None = None,
 ) -> dict[int, Cloud]:
-    """Return the averages of the first n frames of a capture for each n in ``counts``. Their distribution is that of
-    `detectors.averages.average.prefix_averages`, which is used (and may raise) if ``exact`` or if averages cannot be drawn at
-    once. Larger averages contain the frames of smaller ones drawn in the same way. A ``flat_field`` is subtracted."""
+    """Return the averages of the first n frames of a capture for each n in ``counts``. Their
+    distribution is that of `detectors.averages.average.prefix_averages`, which is used (and may
+    raise) if ``exact`` or if averages cannot be drawn at once. Larger averages contain the frames
+    of smaller ones drawn in the same way. A ``flat_field`` is subtracted."""
     many = sorted({n for n in counts if n >= FEWEST_FRAMES})
     clouds = (
         _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
@@ -80,7 +86,8 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no pixel has a range."""
+    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no
+    pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -120,7 +127,8 @@ def _at_once(
 def _left_out(
     capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, noise_m: float
 ) -> dict[int, LeftOut]:
-    """Return the frames, by number, that jump. The estimate's error, a sixth of the limit, is not simulated."""
+    """Return the frames, by number, that jump. The estimate's error, a sixth of the limit, is not
+    simulated."""
     sampled = summer.sure_pixels / -(-summer.sure_pixels // SAMPLED_PIXELS)
     error_m = 1.2533 * noise_m * np.sqrt(2.0 * CORRELATED_PIXELS / max(sampled, CORRELATED_PIXELS))
     limit_m = max(config.jump_sigmas * error_m, config.jump_mm * MM)
@@ -150,7 +158,8 @@ def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
 def _cloud(
     capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftOut, ...]
 ) -> Cloud | None:
-    """Return the average from sums over frames, as `detectors.averages.average` computes it; None if no pixel has a range."""
+    """Return the average from sums over frames, as `detectors.averages.average` computes it; None
+    if no pixel has a range."""
     count = totals.count
     if not count.any():
         return None
@@ -159,7 +168,8 @@ def _cloud(
         z_m = (totals.base + mean) * totals.step_m
         variance = (totals.squares - totals.total * mean) / (count - 1)
         amplitude = totals.amplitude / count
-    reason, lost = np.zeros(count.shape, np.uint8), count == 0
+    reason = np.zeros(count.shape, np.uint8)
+    lost = count == 0
     reason[lost] = totals.reasons[:, lost].argmax(axis=0)
     return Cloud(
         points_m=np.concatenate([capture.slopes * z_m[..., None], z_m[..., None]], axis=-1),
@@ -182,8 +192,9 @@ BOARD_STEPS = 9  # points along each side of the board where a registration's er
 
 
 class MapMaker:
-    """Makes the maps of one trial. ``clouds``: by view, then by number of frames. ``poses``: declaration of the views.
-    ``labels``: of the random stream of the poses' errors. ``truth``, ``guesses``: T_reference_view of each view."""
+    """Makes the maps of one trial. ``clouds``: by view, then by number of frames. ``poses``:
+    declaration of the views. ``labels``: of the random stream of the poses' errors. ``truth``,
+    ``guesses``: T_reference_view of each view."""
 
     def __init__(
         self,
@@ -192,10 +203,12 @@ class MapMaker:
         poses: AnyViews,
         labels: Sequence[str | int],
     ) -> None:
-        self._set_ups, self._clouds = set_ups, clouds
+        self._set_ups = set_ups
+        self._clouds = clouds
         self._made: dict[str, Any] = {}
         self._reported: set[str] = set()
-        stands, numbers = tuple(set_up.target.pose for set_up in set_ups), range(len(set_ups))
+        stands = tuple(set_up.target.pose for set_up in set_ups)
+        numbers = range(len(set_ups))
         self.truth = tuple(T_reference_view_of(stands, number) for number in numbers)
         self.guesses = tuple(
             guessed_T_reference_view(poses, stands, number, *labels) for number in numbers
@@ -240,7 +253,8 @@ class MapMaker:
 
     def registrations(self, mapping: MappingConfig, frames: int) -> tuple[Registration, ...]:
         """Return the registration of each view."""
-        count, key = self.count(mapping), self._registration_key(mapping, frames)
+        count = self.count(mapping)
+        key = self._registration_key(mapping, frames)
         if mapping.registration.method in PAIRWISE:
             most = sum(frames in clouds for clouds in self._clouds)
             parts = [
@@ -249,13 +263,15 @@ class MapMaker:
                 mapping.marks.to_data(),
                 mapping.registration.to_data(),
             ]
-            key, count = canonical_json(parts), max(most, count)
+            key = canonical_json(parts)
+            count = max(most, count)
         if key not in self._made:
             self._made[key] = register(self.prepared(mapping, frames, count), mapping.registration)
         return tuple(self._made[key][: self.count(mapping)])
 
     def registration_rows(self, mapping: MappingConfig, frames: int) -> list[dict[str, Any]]:
-        """Return a row for each view but the first (columns: `REGISTRATIONS`), once for each registration."""
+        """Return a row for each view but the first (columns: `REGISTRATIONS`), once for each
+        registration."""
         key = self._registration_key(mapping, frames)
         if key in self._reported or self.count(mapping) == 1:
             return []
@@ -270,7 +286,8 @@ class MapMaker:
         ]
 
     def seconds(self, mapping: MappingConfig, frames: int) -> float:
-        """Return the seconds that registration and merging took, even if another point shares them."""
+        """Return the seconds that registration and merging took, even if another point shares
+        them."""
         spent = sum(registration.seconds for registration in self.registrations(mapping, frames))
         return float(spent + self.merged(mapping, frames).seconds)
 
@@ -283,15 +300,15 @@ class MapMaker:
 
     def _row(self, number: int, view: PreparedView, registration: Registration) -> dict[str, Any]:
         first = self._set_ups[0]
-        board, T_camera_board = first.target.board, first.T_camera_board
-        x, y = (
-            np.linspace(-0.5, 0.5, BOARD_STEPS) * side * MM
-            for side in (board.width_mm, board.height_mm)
-        )
+        board = first.target.board
+        T_camera_board = first.T_camera_board
+        x = np.linspace(-0.5, 0.5, BOARD_STEPS) * board.width_mm * MM
+        y = np.linspace(-0.5, 0.5, BOARD_STEPS) * board.height_mm * MM
         grid = np.stack(
             [*np.meshgrid(x, y), np.zeros((BOARD_STEPS, BOARD_STEPS))], axis=-1
         ).reshape(-1, 3)
-        places_m, normal = transform_points(T_camera_board, grid), T_camera_board[:3, 2]
+        places_m = transform_points(T_camera_board, grid)
+        normal = T_camera_board[:3, 2]
         both = (registration.T_reference_view, self.guesses[number])
         (in_plane, across), guessed = (
             registration_error_m(T, self.truth[number], places_m, normal) for T in both
@@ -318,9 +335,10 @@ def registration_error_m(
     points_m: np.ndarray,
     normal: np.ndarray,
 ) -> tuple[float, float]:
-    """Return the root mean square target registration error over points (n, 3) of the reference frame, in metres: in
-    the plane perpendicular to ``normal`` (3,), and along ``normal`` (Fitzpatrick, West and Maurer 1998). An error that
-    a whole view shares counts too: a camera that ranges d too far at an angle a adds d sin(a) in the plane."""
+    """Return the root mean square target registration error over points (n, 3) of the reference
+    frame, in metres: in the plane perpendicular to ``normal`` (3,), and along ``normal``
+    (Fitzpatrick, West and Maurer 1998). An error that a whole view shares counts too: a camera
+    that ranges d too far at an angle a adds d sin(a) in the plane."""
     moved = transform_points(T_reference_view @ invert(true_T_reference_view), points_m) - points_m
     across = moved @ normal
     in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
@@ -328,17 +346,20 @@ def registration_error_m(
 
 
 Role = Literal["learning", "calibration", "hole_free", "damaged"]
-"""Purpose of a board: to learn from, to set a threshold (only in a study), to count false calls, or to be inspected."""
+"""Purpose of a board: to learn from, to set a threshold (only in a study), to count false calls,
+or to be inspected."""
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
 LAGS = (1, 2, 3)  # distances in pixels for the correlation of noise
 FEWEST_PAIRS = (
-    50  # fewest pairs of pixels for a correlation; with fewer, its standard error would exceed 0.14
+    # fewest pairs of pixels for a correlation; with fewer, its standard error would exceed 0.14
+    50
 )
 
 
 @dataclass(frozen=True)
 class PointTask:
-    """A point's part of a trial. ``threshold``: None in calibration. ``learned``: file of what its detector learned."""
+    """A point's part of a trial. ``threshold``: None in calibration. ``learned``: file of what its
+    detector learned."""
 
     digest: str
     variant: str
@@ -357,7 +378,8 @@ class PointTask:
 
 @dataclass(frozen=True)
 class TrialTask:
-    """Frames of one set-up, drawn once and judged by all points that share them. ``board``: its number in a study."""
+    """Frames of one set-up, drawn once and judged by all points that share them. ``board``: its
+    number in a study."""
 
     set_ups: tuple[SetUpRef, ...]
     seed: int
@@ -432,12 +454,14 @@ def _clouds(
     )
     if not counts:
         return {}
-    first, capture = points[0], capture_of(set_up, number, task, counts[-1])
+    first = points[0]
+    capture = capture_of(set_up, number, task, counts[-1])
     return averages_of(capture, counts, first.average, first.exact, first.flat_field)
 
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:
-    """Return the frames of one view in one trial. Those of the first view are the same without other views."""
+    """Return the frames of one view in one trial. Those of the first view are the same without
+    other views."""
     return set_up.unit.capture(
         frames, task.seed, *task.labels, *(("view", number) if number else ())
     )
@@ -452,7 +476,8 @@ def _point_rows(
     done: dict[str, Rows],
     seconds: dict[str, float],
 ) -> Rows:
-    """Return the rows of one point, by table. ``done``: rows of earlier points, reused if their inputs are the same."""
+    """Return the rows of one point, by table. ``done``: rows of earlier points, reused if their
+    inputs are the same."""
     common: dict[str, Any] = {
         "variant": point.variant,
         "frames": point.frames,
@@ -460,17 +485,16 @@ def _point_rows(
     }
     if task.board is not None:
         common["board"] = task.board
-    named, role = {"point": point.digest, **common}, {"role": task.role}
+    named = {"point": point.digest, **common}
+    role = {"role": task.role}
     mapping = point.mapping
     source: Any = point.frames
     of_map: dict[str, float] = {}
     registrations: list[dict[str, Any]] = []
     probes: list[dict[str, Any]] = []
     if maps is not None and mapping is not None:
-        merged, registrations = (
-            maps.merged(mapping, point.frames),
-            maps.registration_rows(mapping, point.frames),
-        )
+        merged = maps.merged(mapping, point.frames)
+        registrations = maps.registration_rows(mapping, point.frames)
         used = len(merged.views_used)
         of_map = {"views_used": used, "views_left_out": maps.count(mapping) - used}
         of_map["seconds_map"] = maps.seconds(mapping, point.frames)
@@ -506,7 +530,8 @@ def _point_rows(
 def _board_rows(
     task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points: Sequence[PointTask]
 ) -> Rows:
-    """Return rows by variant and number of frames: "probes", errors of z; "noise", as in `tables.trials.NOISE`."""
+    """Return rows by variant and number of frames: "probes", errors of z; "noise", as in
+    `tables.trials.NOISE`."""
     pair = [frame.z_m for frame in islice(capture_of(set_up, 0, task, 2).frames(), 2)]
     noise = pair_noise(pair[0], pair[-1], set_up.bare)
     rows: Rows = {"probes": [], "noise": []}
@@ -531,8 +556,9 @@ def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
 def pair_noise(
     first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray
 ) -> dict[str, float]:
-    """Return the standard deviation of one frame's temporal noise and its correlations, from two frames' z (h, w) in
-    metres without their median difference. Only valid pixels in ``where`` (h, w) count; NaN if there are too few."""
+    """Return the standard deviation of one frame's temporal noise and its correlations, from two
+    frames' z (h, w) in metres without their median difference. Only valid pixels in ``where`` (h,
+    w) count; NaN if there are too few."""
     difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
     valid = where & np.isfinite(difference)
     if valid.sum() < FEWEST_PAIRS:
@@ -544,7 +570,8 @@ def pair_noise(
     for way, turned, mask in (("u", noise, valid), ("v", noise.T, valid.T)):
         for lag in LAGS:
             both = mask[:, :-lag] & mask[:, lag:]
-            a, b = turned[:, :-lag][both], turned[:, lag:][both]
+            a = turned[:, :-lag][both]
+            b = turned[:, lag:][both]
             power = np.sqrt((a @ a) * (b @ b))
             enough = len(a) >= FEWEST_PAIRS and power > 0
             found[f"correlation_{way}{lag}"] = float(a @ b / power) if enough else float("nan")

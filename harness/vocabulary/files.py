@@ -1,6 +1,7 @@
 """Reading files within size limits and as strict JSON, writing them atomically, and locking them.
 
-A hostile file may try to fill the memory. Most such files are refused unread; libraries run in `limited_memory`."""
+A hostile file may try to fill the memory. Most such files are refused unread; libraries run in
+`limited_memory`."""
 
 import errno
 import hashlib
@@ -62,15 +63,14 @@ def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: st
 def refuse_pixels(name: str, width: int, height: int) -> None:
     """Raise UserError if an image has no pixels, or more than `FRAME_PIXELS`."""
     if min(width, height) < 1 or width * height > FRAME_PIXELS:
-        legal, fix = (
-            f"1 to {FRAME_PIXELS // 10**6} million pixels",
-            RAISE if min(width, height) > 0 else None,
-        )
+        legal = f"1 to {FRAME_PIXELS // 10**6} million pixels"
+        fix = RAISE if min(width, height) > 0 else None
         raise UserError(f"{name}: {width} x {height} pixels", legal=legal, fix=fix)
 
 
 def bounded_bytes(path: Path, at_most: int) -> bytes:
-    """Return the content of a file, device or pipe. Raises UserError if it exceeds ``at_most``, OSError as `open`."""
+    """Return the content of a file, device or pipe. Raises UserError if it exceeds ``at_most``,
+    OSError as `open`."""
     with Path(path).open("rb") as stream:
         content = stream.read(at_most + 1)
     if len(content) > at_most:
@@ -83,7 +83,8 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
 
 
 def shipped(kind: str) -> Path:
-    """Return the folder ``experiments`` or ``baselines``: of tofpod's checkout, or else of the environment."""
+    """Return the folder ``experiments`` or ``baselines``: of tofpod's checkout, or else of the
+    environment."""
     folder = Path(__file__).resolve().parents[2] / (
         "results/baselines" if kind == "baselines" else kind
     )
@@ -92,14 +93,18 @@ def shipped(kind: str) -> Path:
     )
 
 
-_LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()
-"""The limits that active `limited_memory` contexts request, and the process's own limit before the first of them."""
+_LOCK = threading.Lock()
+_WANTED = list[int]()
+_BEFORE = list[tuple[int, int]]()
+"""The limits that active `limited_memory` contexts request, and the process's own limit before the
+first of them."""
 
 
 @contextmanager
 def limited_memory() -> Iterator[None]:
-    """Limit the additional memory of the process to `READING_BYTES`; an excess raises MemoryError. The limit
-    (RLIMIT_AS) holds for all threads; the lowest of several counts. Systems without it or /proc set no limit."""
+    """Limit the additional memory of the process to `READING_BYTES`; an excess raises MemoryError.
+    The limit (RLIMIT_AS) holds for all threads; the lowest of several counts. Systems without it
+    or /proc set no limit."""
     try:
         import resource
 
@@ -128,8 +133,9 @@ def limited_memory() -> Iterator[None]:
 
 
 def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value of a JSON text (UTF-8). Raises ValueError with the reason if the text is not JSON, repeats a key
-    in an object, holds NaN or Infinity (unless ``nan``), is nested too deeply, or holds too long an integer."""
+    """Return the value of a JSON text (UTF-8). Raises ValueError with the reason if the text is
+    not JSON, repeats a key in an object, holds NaN or Infinity (unless ``nan``), is nested too
+    deeply, or holds too long an integer."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -164,8 +170,9 @@ NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
 
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``
-    flushes the file to disk before the rename. Raises UserError if the folder is not writable or the disk is full."""
+    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on
+    failure. ``durable`` flushes the file to disk before the rename. Raises UserError if the folder
+    is not writable or the disk is full."""
     path = Path(path)
 
     def make() -> str:
@@ -184,7 +191,8 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder, which is renamed to ``path`` on success. Raises UserError if it cannot be created."""
+    """Yield a temporary folder, which is renamed to ``path`` on success. Raises UserError if it
+    cannot be created."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
         raise UserError(
@@ -203,7 +211,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
-    """Create a temporary file or folder and rename it, with the user's umask: tempfile makes everything private."""
+    """Create a temporary file or folder and rename it, with the user's umask: tempfile makes
+    everything private."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -223,8 +232,9 @@ def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
 
 
 def inside(folder: Path, *parts: str) -> Path:
-    """Return ``folder`` joined with ``parts``, names that may come from an untrusted file. Raises UserError if a part
-    is not a plain name, or if a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
+    """Return ``folder`` joined with ``parts``, names that may come from an untrusted file. Raises
+    UserError if a part is not a plain name, or if a link in ``folder`` leads out of it. ``folder``
+    itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
             raise UserError(
@@ -251,8 +261,9 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 
 def open_plain(path: Path, flags: int) -> IO[bytes]:
-    """Open a regular file, never through a link; a file opened for writing is unbuffered. ``flags`` are those of
-    `os.open`. Raises UserError if the path is a link, a pipe or a folder; OSError as `os.open` does."""
+    """Open a regular file, never through a link; a file opened for writing is unbuffered.
+    ``flags`` are those of `os.open`. Raises UserError if the path is a link, a pipe or a folder;
+    OSError as `os.open` does."""
     irregular = UserError(
         f"{path}: is not a regular file, so it is neither read nor written", fix="remove it"
     )
@@ -270,7 +281,8 @@ def open_plain(path: Path, flags: int) -> IO[bytes]:
 
 
 def explained(error: OSError, path: Path) -> Exception:
-    """Return the user's mistake that caused an OSError during writing, or the error itself if the cause is unknown."""
+    """Return the user's mistake that caused an OSError during writing, or the error itself if the
+    cause is unknown."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         fix = "free some space and run the same command again; finished work is kept"
         return DiskFull(f"{path}: the disk is full", fix=fix)
@@ -289,7 +301,8 @@ Answer = Literal[
 
 
 def opened_lock(path: Path) -> IO[bytes]:
-    """Open a lock file; create it if it is missing. Raises OSError, or UserError if it is not a regular file."""
+    """Open a lock file; create it if it is missing. Raises OSError, or UserError if it is not a
+    regular file."""
     return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
@@ -327,7 +340,8 @@ def one_at_a_time(path: Path, number: int) -> Iterator[None]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the digest of a file's content; the file is read again if its size or modification time has changed."""
+    """Return the digest of a file's content; the file is read again if its size or modification
+    time has changed."""
     found = path.stat()
     return _digest_of(path, found.st_size, found.st_mtime_ns)
 
@@ -349,7 +363,8 @@ def plain_json(data: Mapping[str, Any]) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """Convert plain data, tuples, arrays and NumPy numbers to JSON types; numbers that are not finite become None."""
+    """Convert plain data, tuples, arrays and NumPy numbers to JSON types; numbers that are not
+    finite become None."""
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):

@@ -1,4 +1,5 @@
-"""Dotted paths and their values as tables show them: ``source.target.distance_m`` becomes "distance", in m."""
+"""Dotted paths and their values as tables show them: ``source.target.distance_m`` becomes
+"distance", in m."""
 
 import contextlib
 import json
@@ -29,7 +30,8 @@ LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """Return a name without unit for each path: its last meaningful key, or the whole path if that is not unique."""
+    """Return a name without unit for each path: its last meaningful key, or the whole path if that
+    is not unique."""
     short = {path: _split(path)[0] for path in paths}
     return {
         path: name if list(short.values()).count(name) == 1 else path
@@ -43,7 +45,8 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """Return a value with its unit on one short line; a mapping as its kind, then its keys and values."""
+    """Return a value with its unit on one short line; a mapping as its kind, then its keys and
+    values."""
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
         rest = (
@@ -64,7 +67,8 @@ def value_text(path: str, value: Any) -> str:
 
 @cache
 def camera_title(name: str) -> str:
-    """Return the title of one of tofpod's cameras without commas; for any other name or path, its words."""
+    """Return the title of one of tofpod's cameras without commas; for any other name or path, its
+    words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
         found = (
@@ -78,7 +82,8 @@ def camera_title(name: str) -> str:
 
 
 def in_words(variant: str) -> str:
-    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m`` becomes "Kinect v2, distance 0.5 m"."""
+    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m`` becomes "Kinect v2,
+    distance 0.5 m"."""
     return ", ".join(_setting_in_words(part) for part in re.split(r", (?=[^=,]+=)", variant))
 
 
@@ -96,7 +101,8 @@ def _setting_in_words(part: str) -> str:
 
 
 def differing(value: Any, others: Iterable[Any]) -> Any:
-    """Return a mapping without the entries that all ``others`` share; return any other value unchanged."""
+    """Return a mapping without the entries that all ``others`` share; return any other value
+    unchanged."""
     held = list(others)
     if not all(isinstance(item, dict) for item in (value, *held)):
         return value
@@ -108,7 +114,8 @@ def _is_number(value: Any) -> bool:
 
 
 def on_one_line(value: Any) -> str:
-    """Return a value as text of at most `LONGEST` characters; a mapping starts with its kind, as in ``flat {...}``."""
+    """Return a value as text of at most `LONGEST` characters; a mapping starts with its kind, as
+    in ``flat {...}``."""
     choice = next((key for key in CHOICES if key in value), "") if isinstance(value, dict) else ""
     if choice:
         rest = {key: part for key, part in value.items() if key != choice}

@@ -15,7 +15,8 @@ OWN = "tofpod"  # name of the package with the built-in parts
 
 @dataclass(frozen=True)
 class Offer:
-    """A name, its ``target`` (``module:attribute``, or a file for some built-in parts), and the package it is from."""
+    """A name, its ``target`` (``module:attribute``, or a file for some built-in parts), and the
+    package it is from."""
 
     name: str
     target: str
@@ -35,7 +36,8 @@ class Offer:
 
 @dataclass(frozen=True)
 class PlugIns:
-    """The names of an entry point group. ``noun`` is used in messages, ``fix`` is advice; ``built_in`` maps names."""
+    """The names of an entry point group. ``noun`` is used in messages, ``fix`` is advice;
+    ``built_in`` maps names."""
 
     group: str
     noun: str
@@ -51,7 +53,8 @@ class PlugIns:
         return tuple(sorted({offer.name for offer in self.offers()}))
 
     def offer(self, name: str) -> Offer:
-        """Find the offer of a name. Raises UserError if the name is unknown (with the nearest name) or taken twice."""
+        """Find the offer of a name. Raises UserError if the name is unknown (with the nearest
+        name) or taken twice."""
         found = [offer for offer in self.offers() if offer.name == name]
         if not found:
             from harness.vocabulary.declaration.diagnose import nearest
@@ -72,14 +75,16 @@ class PlugIns:
         return found[0]
 
     def load(self, offer: Offer) -> Any:
-        """Import and return an offer's attribute. Raises UserError if a plug-in fails; built-in parts must not fail."""
+        """Import and return an offer's attribute. Raises UserError if a plug-in fails; built-in
+        parts must not fail."""
         module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
         try:
             found: Any = importlib.import_module(module)
             for part in filter(None, attribute.split(".")):
                 found = getattr(found, part)
             return found
-        # whatever a foreign module does on import, even sys.exit(), the user must repair or uninstall it
+        # whatever a foreign module does on import, even sys.exit(), the user must repair or
+        # uninstall it
         except (Exception, SystemExit) as error:
             if offer.built_in:
                 raise
@@ -88,7 +93,8 @@ class PlugIns:
             ) from error
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
-        """Return the error for a plug-in that does not fit its group. ``command`` shows the user more."""
+        """Return the error for a plug-in that does not fit its group. ``command`` shows the user
+        more."""
         fix = f"repair or uninstall the package {offer.package}" + (
             f"; `{command}` shows more" if command else ""
         )
@@ -100,7 +106,8 @@ class PlugIns:
 def _offers(
     group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]
 ) -> tuple[Offer, ...]:
-    """Return tofpod's own offers and the group's. Cached, since reading every installed package takes 7 ms."""
+    """Return tofpod's own offers and the group's. Cached, since reading every installed package
+    takes 7 ms."""
     from harness import __version__
 
     found = [Offer(name, target, OWN, __version__) for name, target in built_in]

@@ -1,4 +1,5 @@
-"""The frame of all programs: the parser, one message for a user's mistake, exit codes, and types of arguments."""
+"""The frame of all programs: the parser, one message for a user's mistake, exit codes, and types
+of arguments."""
 
 import argparse
 import re
@@ -17,7 +18,8 @@ Run = Callable[[argparse.Namespace, str], int]
 
 @dataclass(frozen=True)
 class Program:
-    """A program, ``tofpod <name>``. A call parses the arguments (None: those of the command line) and runs it."""
+    """A program, ``tofpod <name>``. A call parses the arguments (None: those of the command line)
+    and runs it."""
 
     name: str
     options: Options
@@ -27,7 +29,8 @@ class Program:
 
     @property
     def command(self) -> str:
-        """The words that call it: ``tofpod sweep``, or ``python -m harness.sweep`` where it was called so."""
+        """The words that call it: ``tofpod sweep``, or ``python -m harness.sweep`` where it was
+        called so."""
         called_as_module = Path(sys.argv[0]).stem == self.name
         return f"python -m harness.{self.name}" if called_as_module else f"tofpod {self.name}"
 
@@ -40,11 +43,13 @@ class Program:
         return parser
 
     def __call__(self, arguments: list[str] | None = None) -> int:
-        """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after Ctrl-C."""
+        """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after
+        Ctrl-C."""
         given = sys.argv[1:] if arguments is None else arguments
         parsed = self.parser().parse_args(given)
         if arguments is None:
-            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C does
+            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C
+            # does
             signal.signal(signal.SIGTERM, signal.default_int_handler)
         return exit_code_of(
             lambda: self.run(parsed, f"{self.command} {shlex.join(given)}".rstrip())
@@ -54,7 +59,8 @@ class Program:
 def program(
     options: Options, description: str, epilog: str | None = None
 ) -> Callable[[Run], Program]:
-    """Return a decorator that turns a function into a program, which is named after the function's module."""
+    """Return a decorator that turns a function into a program, which is named after the function's
+    module."""
     return lambda run: Program(
         Path(run.__code__.co_filename).stem, options, run, description, epilog
     )

@@ -20,7 +20,8 @@ INCHES = {n: str(Fraction(n, 16)) for n in (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)}
 
 
 def plain(value: Any) -> str:
-    """Return text and counts unchanged, other numbers with three digits, and a dash for unknown values."""
+    """Return text and counts unchanged, other numbers with three digits, and a dash for unknown
+    values."""
     if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
         return UNKNOWN_TEXT
     if isinstance(value, bool | np.bool_):
@@ -42,7 +43,8 @@ def plus_minus(mean: float, std: float, sign: str = "") -> str:
 
 
 def size(value: float, most: float = np.inf) -> str:
-    """Return a limit in mm with two digits; ``> 15.9`` beyond the largest inspected, ``most``; ``none`` for NaN."""
+    """Return a limit in mm with two digits; ``> 15.9`` beyond the largest inspected, ``most``;
+    ``none`` for NaN."""
     if np.isnan(value) or value > most:
         return "none" if np.isnan(value) else f">\u00a0{most:.3g}"
     return (
@@ -55,7 +57,8 @@ def size(value: float, most: float = np.inf) -> str:
 
 
 def percent(share: float) -> str:
-    """Return ``93`` for 0.93. Shares near 0 and 1 get a decimal, since 0 and 100 would mean impossible and certain."""
+    """Return ``93`` for 0.93. Shares near 0 and 1 get a decimal, since 0 and 100 would mean
+    impossible and certain."""
     value = 100 * share
     if np.isnan(value) or 1 <= value <= 99:
         return UNKNOWN_TEXT if np.isnan(value) else f"{value:.0f}"
@@ -68,7 +71,8 @@ def p_value(p: float) -> str:
 
 
 def interval(low: float, high: float, digits: int = 2, most: float = np.inf) -> str:
-    """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` if an end lies beyond ``most``; ``unknown`` without interval."""
+    """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` if an end lies beyond ``most``; ``unknown``
+    without interval."""
     if np.isnan(low) or np.isnan(high):
         return "unknown"
     return " to ".join(_number(end, digits, most) for end in (low, high))
@@ -77,9 +81,9 @@ def interval(low: float, high: float, digits: int = 2, most: float = np.inf) -> 
 def with_interval(
     value: float, low: float, high: float, digits: int = 2, most: float = np.inf
 ) -> str:
-    """Return ``5.1 (4.8 to 5.6)``, or only the estimate if its interval is unknown or beyond ``most``. Numbers have at
-    most ``digits`` decimals. They have two significant digits if the interval is wider than `ROUGH` times the value
-    (or times its upper end if the value is 0)."""
+    """Return ``5.1 (4.8 to 5.6)``, or only the estimate if its interval is unknown or beyond
+    ``most``. Numbers have at most ``digits`` decimals. They have two significant digits if the
+    interval is wider than `ROUGH` times the value (or times its upper end if the value is 0)."""
     if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > most:
         return _number(value, digits, most)
     scale = abs(value or high)
@@ -94,12 +98,14 @@ def many(count: int, what: str) -> str:
 
 
 def unbroken(text: str) -> str:
-    """Return ``text`` with no-break spaces between numbers and the words after them: ``0.7 m``, ``50 frames``."""
+    """Return ``text`` with no-break spaces between numbers and the words after them: ``0.7 m``,
+    ``50 frames``."""
     return re.sub(r"(?<=\d) (?=[^\W\d])", "\u00a0", text)
 
 
 def inches(diameter_mm: float) -> str:
-    """Return the size of a common inch drill as a fraction, such as ``1/4 in``; an empty text for other sizes."""
+    """Return the size of a common inch drill as a fraction, such as ``1/4 in``; an empty text for
+    other sizes."""
     sixteenths = diameter_mm / 25.4 * 16
     known = INCHES.get(round(sixteenths)) if abs(sixteenths - round(sixteenths)) < 1e-3 else None
     return f"{known} in" if known else ""
@@ -118,8 +124,8 @@ CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell's text and tone. On a page, ``share`` (0 to 1) shades the cell, and text after a line break or, in columns
-    of numbers, after `` (`` stands below in small letters."""
+    """A cell's text and tone. On a page, ``share`` (0 to 1) shades the cell, and text after a line
+    break or, in columns of numbers, after `` (`` stands below in small letters."""
 
     text: str
     tone: Tone = ""
@@ -128,7 +134,8 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """Rows of cells below their ``heads``; the first ``left`` columns are flush left. ``kind`` is a class on pages."""
+    """Rows of cells below their ``heads``; the first ``left`` columns are flush left. ``kind`` is
+    a class on pages."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
@@ -165,7 +172,8 @@ class Grid:
         ]
 
     def rich(self) -> RichTable:
-        """Return the table for a terminal; it has no box, so that many columns fit into 80 characters."""
+        """Return the table for a terminal; it has no box, so that many columns fit into 80
+        characters."""
         from rich.table import Table
         from rich.text import Text
 
@@ -178,7 +186,8 @@ class Grid:
         return table
 
     def html(self) -> Markup:
-        """Return the table for a page. The first cell of a row is its head; an interval stands below its estimate."""
+        """Return the table for a page. The first cell of a row is its head; an interval stands
+        below its estimate."""
         from markupsafe import Markup
 
         number = [
@@ -205,7 +214,9 @@ def _data_cell(cell: Cell, is_number: bool) -> Markup:
     style = Markup("")
     if cell.share is not None:
         weight = 0.06 + 0.94 * cell.share
-        red, green, blue = (round(255 + (channel - 255) * weight) for channel in (0, 94, 156))
+        red = round(255 + (0 - 255) * weight)
+        green = round(255 + (94 - 255) * weight)
+        blue = round(255 + (156 - 255) * weight)
         ink = "#fff" if cell.share > 0.72 else "#1d2530"
         style = Markup(' style="background:rgb({},{},{});color:{}"').format(red, green, blue, ink)
     kinds = (
@@ -226,7 +237,8 @@ def text_of(parts: Iterable[str | Grid]) -> str:
 
 
 def show(parts: Sequence[str | Grid]) -> None:
-    """Print tables and sentences: in colour at a terminal that is wide enough, else as plain lines."""
+    """Print tables and sentences: in colour at a terminal that is wide enough, else as plain
+    lines."""
     if not sys.stdout.isatty():
         print(text_of(parts))
         return

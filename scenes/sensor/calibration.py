@@ -1,8 +1,10 @@
-"""Fits numbers of a camera: the gain that gives the published noise, and a lidar's confidence threshold.
+"""Fits numbers of a camera: the gain that gives the published noise, and a lidar's confidence
+threshold.
 
-After a change of the sensor model, run ``python -m scenes.sensor.calibration NAME`` and write the numbers into the
-camera's file; a test compares both. The gain gives the published temporal deviation of single pixels, without the
-jitter of whole frames (subtracted in squares) and without jumps. Ambient light is the default of `CameraConfig`."""
+After a change of the sensor model, run ``python -m scenes.sensor.calibration NAME`` and write the
+numbers into the camera's file; a test compares both. The gain gives the published temporal
+deviation of single pixels, without the jitter of whole frames (subtracted in squares) and without
+jumps. Ambient light is the default of `CameraConfig`."""
 
 import argparse
 import sys
@@ -45,9 +47,11 @@ def with_number(camera: Camera, section: str, key: str, value: float) -> Camera:
 
 
 def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> SimulatedUnit:
-    """Return a unit with noise only, without jitter, before a plane that is tilted to cover all phases of rounding."""
+    """Return a unit with noise only, without jitter, before a plane that is tilted to cover all
+    phases of rounding."""
     lens, (half_h, half_w) = camera.nominal_lens, HALF_PX[camera.kind]
-    row, col = int(lens.cy), int(lens.cx)
+    row = int(lens.cy)
+    col = int(lens.cx)
     region = Region(row - half_h, row + half_h, col - half_w, col + half_w)
     view = plane_view(camera, region, distance_m, albedo, 0.05, 0.02)
     return SimulatedUnit(camera, ONLY_NOISE.model_copy(update={"name": camera.name}), view)
@@ -56,8 +60,8 @@ def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> Si
 def temporal_sigma_m(
     camera: AnyCamera, distance_m: float, albedo: float, frames: int, seed: int
 ) -> float:
-    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres. NaN if a pixel of an imager is
-    invalid in any frame; invalid samples of a lidar are left out."""
+    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres. NaN if a
+    pixel of an imager is invalid in any frame; invalid samples of a lidar are left out."""
     unit = unit_before_plane(camera, distance_m, albedo)
     z = np.stack(
         [frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]
@@ -72,9 +76,11 @@ def calibrated_signal_electrons(
     camera: PhotonCamera, frames: int | None = None, seed: int = 1
 ) -> float:
     """Return the gain that reproduces the camera's calibration point to 0.5 %."""
-    photons, count = camera.photons, frames or FRAMES[camera.kind]
+    photons = camera.photons
+    count = frames or FRAMES[camera.kind]
     wanted = photons.calibration_sigma_mm.value * MM
-    distance_m, albedo = photons.calibration_distance_m.value, photons.calibration_albedo.value
+    distance_m = photons.calibration_distance_m.value
+    albedo = photons.calibration_albedo.value
 
     def excess(log_electrons: float) -> float:
         trial: PhotonCamera = with_number(
@@ -91,16 +97,15 @@ def calibrated_signal_electrons(
 
 
 def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
-    """Return the gain and a lidar's threshold at which half of the pixels are valid at the published reach, by key."""
+    """Return the gain and a lidar's threshold at which half of the pixels are valid at the
+    published reach, by key."""
     numbers = {"photons.signal_electrons": calibrated_signal_electrons(camera)}
     if isinstance(camera, ScannedLidar):
         fitted = with_number(
             camera, "photons", "signal_electrons", numbers["photons.signal_electrons"]
         )
-        open_gate, photons = (
-            with_number(fitted, "engine", "confidence_electrons", 0.0),
-            camera.photons,
-        )
+        open_gate = with_number(fitted, "engine", "confidence_electrons", 0.0)
+        photons = camera.photons
         unit = unit_before_plane(
             open_gate, photons.calibration_reach_m.value, photons.calibration_reach_albedo.value
         )

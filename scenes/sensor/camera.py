@@ -1,4 +1,5 @@
-"""Cameras as data: a YAML file in which every number has a tag and a source, of tofpod or of an installed package."""
+"""Cameras as data: a YAML file in which every number has a tag and a source, of tofpod or of an
+installed package."""
 
 import difflib
 import json
@@ -30,7 +31,8 @@ from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 DEEPEST = 5  # most cameras in a chain of ``like``
-GROUP = "tofpod.cameras"  # its entry points give the path of a camera's file, which has the entry point's name
+# its entry points give the path of a camera's file, which has the entry point's name
+GROUP = "tofpod.cameras"
 CAMERAS = PlugIns(
     GROUP,
     "camera",
@@ -39,13 +41,15 @@ CAMERAS = PlugIns(
 )
 
 AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
-"""All kinds of camera, distinguished by ``kind``. Each has name, title, nominal_lens, optics, unit, z_step_m."""
+"""All kinds of camera, distinguished by ``kind``. Each has name, title, nominal_lens, optics,
+unit, z_step_m."""
 KINDS: dict[str, type[AnyCamera]]
 KINDS = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar, "empirical": EmpiricalCamera}
 
 
 class EffectsConfig(Config):
-    """Switches for the effects of a real unit. With all off, the camera is noise-free and sees direct light only."""
+    """Switches for the effects of a real unit. With all off, the camera is noise-free and sees
+    direct light only."""
 
     noise: bool = Field(True, description="shot and read noise of the samples")
     multipath: bool = Field(True, description="light that was reflected by more than one surface")
@@ -71,7 +75,8 @@ NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))  
 
 
 class CameraConfig(Config):
-    """The camera of an experiment: its name, the unit, the effects that are on, and the ambient light."""
+    """The camera of an experiment: its name, the unit, the effects that are on, and the ambient
+    light."""
 
     name: str = Field(
         "azure_kinect_nfov",
@@ -100,7 +105,8 @@ class CameraConfig(Config):
     )
 
     def __hash__(self) -> int:
-        # a mapping has no hash, and workers keep what they derived from a camera by its declaration
+        # a mapping has no hash, and workers keep what they derived from a camera by its
+        # declaration
         return hash(canonical_json(self.to_data()))
 
 
@@ -110,7 +116,8 @@ def camera_names() -> tuple[str, ...]:
 
 
 def camera_file(name: str) -> Path:
-    """Return the path of a camera's file. Raises UserError for a name that is unknown, ambiguous or without a file."""
+    """Return the path of a camera's file. Raises UserError for a name that is unknown, ambiguous
+    or without a file."""
     if is_camera_path(name):
         return Path(name)
     offer = CAMERAS.offer(name)
@@ -136,12 +143,14 @@ def is_camera_path(name: str) -> bool:
 
 
 def load_camera(name: str) -> AnyCamera:
-    """Return the camera of that name. Raises UserError as `camera_file` does, and for a file that is not a camera."""
+    """Return the camera of that name. Raises UserError as `camera_file` does, and for a file that
+    is not a camera."""
     return _camera_at(camera_file(name))
 
 
 def lens_names() -> dict[str, str]:
-    """Return the names that `lens_named` knows (cameras, and further depth modes), each with its camera."""
+    """Return the names that `lens_named` knows (cameras, and further depth modes), each with its
+    camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
         # a mode with its own file stays with the camera whose mode it is
@@ -150,11 +159,13 @@ def lens_names() -> dict[str, str]:
 
 
 def lens_named(name: str) -> OtherLens:
-    """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError for other names."""
+    """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError
+    for other names."""
     camera_name = lens_names().get(name, name)
     lenses = {}
     for mode in (camera_name, *load_camera(camera_name).modes):
-        camera, note = load_camera(mode), f"the lens is the nominal one of {mode}"
+        camera = load_camera(mode)
+        note = f"the lens is the nominal one of {mode}"
         lenses[mode] = OtherLens(
             **vars(camera.nominal_lens), note=note, mode=mode, unit_m=camera.z_step_m
         )
@@ -162,7 +173,8 @@ def lens_named(name: str) -> OtherLens:
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
-    """Return the camera that an experiment declares. Raises UserError if a replaced number is impossible."""
+    """Return the camera that an experiment declares. Raises UserError if a replaced number is
+    impossible."""
     return (
         _with_numbers(config.name, canonical_json(config.numbers))
         if config.numbers
@@ -171,7 +183,8 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 
 
 def guessed_precision(camera: AnyCamera) -> str:
-    """Return a warning for a camera whose precision is not published (shot noise by its gain); empty for others."""
+    """Return a warning for a camera whose precision is not published (shot noise by its gain);
+    empty for others."""
     if (
         isinstance(camera, EmpiricalCamera)
         or (gain := camera.photons.signal_electrons).range is None
@@ -220,7 +233,8 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def read_camera(path: Path) -> AnyCamera:
-    """Read a camera file. Raises UserError that names the file and each key that is missing, unknown or impossible."""
+    """Read a camera file. Raises UserError that names the file and each key that is missing,
+    unknown or impossible."""
     source = _completed(read_yaml(path))
     camera = read_as(KINDS, "kind", source)
     if camera.name != path.stem:
@@ -232,8 +246,8 @@ def read_camera(path: Path) -> AnyCamera:
 
 
 def _completed(source: Source, depth: int = 0) -> Source:
-    """Return a file's content, completed from the camera that its key ``like`` names: by whole facts and lists, never
-    by parts of them. Other modes of the lens are not inherited."""
+    """Return a file's content, completed from the camera that its key ``like`` names: by whole
+    facts and lists, never by parts of them. Other modes of the lens are not inherited."""
     name = source.data.get("like")
     if name is None:
         return source
@@ -268,7 +282,8 @@ def _named(name: str, depth: int) -> Source:
 
 
 def _stated(data: Mapping[str, Any], prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield the path and value of each fact, and of everything else that is not a mapping of facts."""
+    """Yield the path and value of each fact, and of everything else that is not a mapping of
+    facts."""
     for key, value in data.items():
         if isinstance(value, dict) and "value" not in value:
             yield from _stated(value, (*prefix, key))

@@ -1,17 +1,20 @@
-"""The noise of a depth camera from a small table, for any simulator. It needs only NumPy (or torch) and the table.
+"""The noise of a depth camera from a small table, for any simulator. It needs only NumPy (or
+torch) and the table.
 
-`tofpod export_noise` measures the table of a camera and copies this file beside it. For each pixel and frame, the
-noise's deviation and the probability of no return depend on the light that comes back, intensity / range^2. A separable
-filter correlates neighbours; each unit has a fixed pattern, the same in all frames. Not modelled: errors at steps of
-depth (mixing of neighbours, flying pixels), light over several surfaces, ambient light, warm-up and displacements of
-whole frames. `harness.sweep` simulates all of them."""
+`tofpod export_noise` measures the table of a camera and copies this file beside it. For each pixel
+and frame, the noise's deviation and the probability of no return depend on the light that comes
+back, intensity / range^2. A separable filter correlates neighbours; each unit has a fixed pattern,
+the same in all frames. Not modelled: errors at steps of depth (mixing of neighbours, flying
+pixels), light over several surfaces, ambient light, warm-up and displacements of whole frames.
+`harness.sweep` simulates all of them."""
 
 import numpy as np
 
 
 class DepthNoise:
-    """Noise of one unit of a camera with images (h, w). ``table``: the arrays of the camera's file, or its path.
-    ``slopes`` (h, w, 2): x/z and y/z of each pixel; None: the camera's nominal lens. ``seed``: chooses the unit."""
+    """Noise of one unit of a camera with images (h, w). ``table``: the arrays of the camera's
+    file, or its path. ``slopes`` (h, w, 2): x/z and y/z of each pixel; None: the camera's nominal
+    lens. ``seed``: chooses the unit."""
 
     def __init__(self, table, slopes=None, seed=1):  # type: ignore[no-untyped-def]
         self.table = table = _loaded(table)
@@ -27,9 +30,11 @@ class DepthNoise:
         )
 
     def __call__(self, z_m, intensity, rng):  # type: ignore[no-untyped-def]
-        """Return a frame (h, w) float32, NaN without a return, from the ideal distance along the axis ``z_m`` (h, w)
-        metres and ``intensity`` (h, w): albedo times the cosine of the incidence. ``rng``: a NumPy Generator."""
-        table, range_m = self.table, np.asarray(z_m, np.float32) * self.stretch
+        """Return a frame (h, w) float32, NaN without a return, from the ideal distance along the
+        axis ``z_m`` (h, w) metres and ``intensity`` (h, w): albedo times the cosine of the
+        incidence. ``rng``: a NumPy Generator."""
+        table = self.table
+        range_m = np.asarray(z_m, np.float32) * self.stretch
         with np.errstate(divide="ignore", invalid="ignore"):
             level = np.log2(self.falloff * np.asarray(intensity, np.float32) / (range_m * range_m))
         level *= table["per_octave"]
@@ -58,7 +63,8 @@ class DepthNoise:
 def filtered(image, rows, columns):  # type: ignore[no-untyped-def]
     """Return the image (h, w) after two causal filters, down and across; edges wrap around."""
     for axis, taps in ((0, rows), (1, columns)):
-        reach, side = len(taps) - 1, image.shape[axis]
+        reach = len(taps) - 1
+        side = image.shape[axis]
         longer = np.concatenate([image.take(range(side - reach, side), axis), image], axis)
         parts = (
             longer[k : k + side] if axis == 0 else longer[:, k : k + side] for k in range(reach + 1)
@@ -99,9 +105,11 @@ class TorchDepthNoise:
         )
 
     def __call__(self, z_m, intensity, generator=None):  # type: ignore[no-untyped-def]
-        """Return frames (.., h, w), NaN without a return, from ideal distances along the axis in metres and
-        intensities (albedo times the cosine of the angle of incidence) of the same shape."""
-        torch, table = self.torch, self.table
+        """Return frames (.., h, w), NaN without a return, from ideal distances along the axis in
+        metres and intensities (albedo times the cosine of the angle of incidence) of the same
+        shape."""
+        torch = self.torch
+        table = self.table
         range_m = z_m * self.stretch
         level = (torch.log2(table["falloff"] * intensity / range_m**2) - table["first"]) * table[
             "per_octave"
@@ -114,7 +122,8 @@ class TorchDepthNoise:
         chance = torch.where(level < 0.0, torch.zeros_like(level), table["seen"][place])
         seen = torch.rand(z_m.shape, generator=generator, device=z_m.device) < chance
         seen &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
-        z, step = moved / self.stretch, table["step_m"]
+        z = moved / self.stretch
+        step = table["step_m"]
         z = torch.round(z / step) * step if step > 0 else z
         return torch.where(seen, z, torch.full_like(z, float("nan")))
 

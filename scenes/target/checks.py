@@ -1,4 +1,5 @@
-"""Checks of a declaration as a whole: all parts that do not fit are found and named; nothing is built."""
+"""Checks of a declaration as a whole: all parts that do not fit are found and named; nothing is
+built."""
 
 from itertools import combinations
 
@@ -23,13 +24,16 @@ STEEPEST_SLOPE = (
     4 / 3
 )  # dz/dx and dz/dy of a face, 53 degrees: a round face reaches 0.8 of its radius
 THICKEST_BEND = 0.5  # thickness over the smallest radius of curvature; the back face folds up at 1
-WIDEST_BEND = 0.25  # a damage's radius over the radius of curvature there: the truth's volumes are good to its square
+# a damage's radius over the radius of curvature there: the truth's volumes are good to its square
+WIDEST_BEND = 0.25
 SHALLOWEST_BEND = (
     0.5  # the radius of a dent's ball over the same: at 1 a face that bends away has no rim
 )
-MOST_TURN = 0.8  # cosine between the face's normals at a flaw's centre, along which depth counts, and at its rim
+# cosine between the face's normals at a flaw's centre, along which depth counts, and at its rim
+MOST_TURN = 0.8
 LEAST_WEB_MM = (
-    0.01  # between two damages, or damage and edge: a circle's polygon sticks out by 2.5 um at 1 in
+    # between two damages, or damage and edge: a circle's polygon sticks out by 2.5 um at 1 in
+    0.01
 )
 NEAREST_M = 0.05  # least distance of the board from the lens plane
 _TURN = np.linspace(0, 2 * np.pi, 64, endpoint=False)
@@ -37,7 +41,8 @@ _CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 
 
 def check_target(config: custom.TargetConfig) -> None:
-    """Raise UserError that names every part that does not fit, with the numbers; return if all parts fit."""
+    """Raise UserError that names every part that does not fit, with the numbers; return if all
+    parts fit."""
     board = config.board
     problems = _board_problems(board)
     if not problems:
@@ -70,7 +75,9 @@ def _size(board: custom.BoardConfig) -> str:
 
 def _board_problems(board: custom.BoardConfig) -> list[str]:
     """Find a face too steep or too tightly bent for its size."""
-    shape, half_x, half_y = board.shape, board.width_mm / 2, board.height_mm / 2
+    shape = board.shape
+    half_x = board.width_mm / 2
+    half_y = board.height_mm / 2
     if isinstance(shape, custom.MeshConfig):
         vertices = part_of(shape)[0]
         sizes = (vertices.max(axis=0) - vertices.min(axis=0)) / MM
@@ -94,9 +101,8 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
             return [f"board: {small}, which reaches {reach:g} mm from its middle: {needed}"]
     face = face_of(board)
     x, y = np.meshgrid(np.linspace(-half_x, half_x, 65) * MM, np.linspace(-half_y, half_y, 65) * MM)
-    steepest, tightest = (
-        float(np.abs(function(x, y)).max()) for function in (face.slope, face.curvatures)
-    )
+    steepest = float(np.abs(face.slope(x, y)).max())
+    tightest = float(np.abs(face.curvatures(x, y)).max())
     # A sphere at 0.8 of its radius has this slope exactly, hence the allowance for rounding.
     if steepest > STEEPEST_SLOPE * (1 + 1e-9):
         return [
@@ -117,7 +123,9 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
 def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: Face) -> list[str]:
     """Find damage that is too deep, off the board, or on a face too bent for it."""
     name, (x, y), depth_mm, problems = _name(damage), damage.centre_m, damage.depth_mm, []
-    half_x, half_y, outward = board.width_mm * MM / 2, board.height_mm * MM / 2, np.zeros(2)
+    half_x = board.width_mm * MM / 2
+    half_y = board.height_mm * MM / 2
+    outward = np.zeros(2)
     if isinstance(damage, ChipConfig):
         outward = np.round([-np.sin(damage.turn_rad), np.cos(damage.turn_rad)])
         off_mm = float(np.abs(outward @ ((x, y) - outward * (half_x, half_y)))) / MM
@@ -168,9 +176,12 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
         problems.append(
             f"{name}: depth {depth_mm:g} mm is more than {radius}, the limit of a spherical cap"
         )
-    # compare the rim of the damage, at the face and at its bottom, with the board's edge in plan; the side walls follow
-    # the edge's normals, so that below the face the limits move by the depth times the normal there
-    centre, axis = face.point(x, y), face.normal(x, y)
+    # compare the rim of the damage, at the face and at its bottom, with the board's edge in plan;
+    # the side walls follow the edge's normals, so that below the face the limits move by the depth
+    # times the normal
+    # there
+    centre = face.point(x, y)
+    axis = face.normal(x, y)
     if not isinstance(damage, FlawConfig):
         across = np.cross(axis, [0.0, 1.0, 0.0])
         across /= np.linalg.norm(across)
@@ -192,7 +203,8 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
 
 
 def _reach_m(damage: custom.AnyDamage, board: custom.BoardConfig) -> float:
-    """Return the depth to which a damage keeps its full width: holes and slots alone do not narrow from the face on."""
+    """Return the depth to which a damage keeps its full width: holes and slots alone do not narrow
+    from the face on."""
     upright = damage.kind in ("through", "blind", "slot")
     return (
         (board.thickness_mm if damage.depth_mm is None else damage.depth_mm) * MM
@@ -204,14 +216,17 @@ def _reach_m(damage: custom.AnyDamage, board: custom.BoardConfig) -> float:
 def _overlap_problems(
     damages: list[custom.AnyDamage], board: custom.BoardConfig, face: Face
 ) -> list[str]:
-    """Find pairs without a web between them: at the face or at the depth that both reach; other outlines in plan."""
+    """Find pairs without a web between them: at the face or at the depth that both reach; other
+    outlines in plan."""
     x, y = np.array([damage.centre_m for damage in damages]).reshape(-1, 2).T
-    centres, axes = face.point(x, y), face.normal(x, y)
+    centres = face.point(x, y)
+    axes = face.normal(x, y)
     rims_m = np.array([widest_rim_m(damage, face) for damage in damages])
     reach_m = np.array([_reach_m(damage, board) for damage in damages])
     first, second = np.triu_indices(len(damages), k=1)
     shared_m = np.minimum(reach_m[first], reach_m[second])[:, None]
-    at_face, turn = centres[first] - centres[second], axes[first] - axes[second]
+    at_face = centres[first] - centres[second]
+    turn = axes[first] - axes[second]
     apart_m = np.minimum(
         np.linalg.norm(at_face, axis=-1), np.linalg.norm(at_face - shared_m * turn, axis=-1)
     )
@@ -245,7 +260,8 @@ def off_tape_mm(tape: custom.TapeConfig, places_mm: np.ndarray) -> np.ndarray:
 
 
 def _tape_problems(config: custom.TargetConfig) -> list[str]:
-    """Find strips off the board, over a damage, or over one another (their upper sides would coincide); in plan."""
+    """Find strips off the board, over a damage, or over one another (their upper sides would
+    coincide); in plan."""
     problems = []
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y) = tape.size_mm, tape.centre_mm
@@ -262,7 +278,8 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
             if gap <= 0:
                 problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
     for (first, tape_1), (second, tape_2) in combinations(enumerate(config.tapes, start=1), 2):
-        box_1, box_2 = ((tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in (tape_1, tape_2))
+        box_1 = (tape_1.centre_mm, tape_1.size_mm, tape_1.angle_deg)
+        box_2 = (tape_2.centre_mm, tape_2.size_mm, tape_2.angle_deg)
         _, shared = cv2.rotatedRectangleIntersection(box_1, box_2)
         shared_mm2 = 0.0 if shared is None else cv2.contourArea(cv2.convexHull(shared))
         if shared_mm2 > 1e-3:
@@ -273,14 +290,19 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
 
 
 def _pose_problems(config: custom.TargetConfig) -> list[str]:
-    """Find a board that reaches behind the lens, through the floor or, with its backing, into the wall."""
-    T_camera_board, room, problems = config.pose.T_camera_board, config.room, []
+    """Find a board that reaches behind the lens, through the floor or, with its backing, into the
+    wall."""
+    T_camera_board = config.pose.T_camera_board
+    room = config.room
+    problems = []
     solid = [
         face_grid_m(config.board, depth_m).reshape(-1, 3)
         for depth_m in (0.0, config.board.thickness_mm * MM)
     ]
     points = transform_points(T_camera_board, np.concatenate(solid))
-    nearest_m, lowest_m, farthest_m = points[:, 2].min(), points[:, 1].max(), points[:, 2].max()
+    nearest_m = points[:, 2].min()
+    lowest_m = points[:, 1].max()
+    farthest_m = points[:, 2].max()
     if config.backing is not None:
         backing = transform_points(T_camera_board, backing_corners_board_m(config, config.backing))
         farthest_m = max(farthest_m, backing[:, 2].max())

@@ -1,9 +1,10 @@
 """Declaration of a target: board, damage, tape, material, backing, room and pose.
 
-Frames. ``board``: x across the face, y up, z out of the face towards the camera, origin on the face's centre.
-``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
-+x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at 850 nm and for red, green and blue. Ranges of single
-fields are checked here; rules on several fields (a hole that leaves the board) by `scenes.target.checks`."""
+Frames. ``board``: x across the face, y up, z out of the face towards the camera, origin on the
+face's centre. ``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero
+tilt board +x, +y, +z are camera +x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at
+850 nm and for red, green and blue. Ranges of single fields are checked here; rules on several
+fields (a hole that leaves the board) by `scenes.target.checks`."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ from harness.vocabulary.geometry import MM, rotation_xyz_deg
 from harness.vocabulary.meshes import FileUnit, FrontAxis
 from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
-NEAR_NM = 20.0  # range of wavelengths for which an albedo holds: wood and paint change by a per cent or two (a guess)
+# range of wavelengths for which an albedo holds: wood and paint change by a per cent or two (a
+# guess)
+NEAR_NM = 20.0
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
@@ -44,7 +47,8 @@ class _CurvedConfig(Config):
 
 
 class CylinderConfig(_CurvedConfig):
-    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), where s runs across the straight direction."""
+    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), where s runs across the straight
+    direction."""
 
     kind: Literal["cylinder"]
     straight_along: Literal["x", "y"] = "y"
@@ -57,7 +61,8 @@ class SphereConfig(_CurvedConfig):
 
 
 class TermConfig(Config):
-    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y / height)^power_y."""
+    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y /
+    height)^power_y."""
 
     power_x: Annotated[int, Field(ge=0, le=8)]
     power_y: Annotated[int, Field(ge=0, le=8)]
@@ -78,7 +83,8 @@ class PolynomialConfig(Config):
 
 
 class CorrugatedConfig(Config):
-    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), where s runs across the straight direction."""
+    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), where s runs across the
+    straight direction."""
 
     kind: Literal["corrugated"]
     period_mm: Annotated[float, Field(ge=5.0, le=1e3)] = 76.0
@@ -89,8 +95,9 @@ class CorrugatedConfig(Config):
 
 
 class PanelConfig(Config):
-    """A panel like that of a car door. It is bent in both directions, and the face steps at a swage line along x:
-    z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 / w)). The default values are guesses."""
+    """A panel like that of a car door. It is bent in both directions, and the face steps at a
+    swage line along x: z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 /
+    w)). The default values are guesses."""
 
     kind: Literal["panel"]
     radius_x_mm: Annotated[float, Field(ge=50.0, le=1e6)] = 4000.0
@@ -101,10 +108,10 @@ class PanelConfig(Config):
 
 
 class RoughConfig(Config):
-    """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their power spectrum in
-    two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi / ``outer_mm``, and ends at 2 pi / ``inner_mm``;
-    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Not modelled:
-    pores, gravel."""
+    """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their
+    power spectrum in two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi /
+    ``outer_mm``, and ends at 2 pi / ``inner_mm``; between both, the surface is self-affine
+    (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Not modelled: pores, gravel."""
 
     kind: Literal["rough"]
     deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(
@@ -134,7 +141,8 @@ class _FileConfig(Config):
 
 
 class MeshConfig(_FileConfig):
-    """The front of a part from a mesh file (`scenes.target.part`). Its bounds give the board's sizes."""
+    """The front of a part from a mesh file (`scenes.target.part`). Its bounds give the board's
+    sizes."""
 
     kind: Literal["mesh"]
     unit: FileUnit = "mm"
@@ -155,7 +163,8 @@ ShapeConfig = Annotated[
 
 
 class BoardConfig(Config):
-    """A board. Its outline, seen along z, is a rectangle; its thickness along the face's normal is constant."""
+    """A board. Its outline, seen along z, is a rectangle; its thickness along the face's normal is
+    constant."""
 
     width_mm: Annotated[float, Field(ge=5.0, le=5e3)]
     height_mm: Annotated[float, Field(ge=5.0, le=5e3)]
@@ -185,7 +194,8 @@ class DamageConfig(PlacedConfig):
 
 
 class DrillConfig(Config):
-    """The drill of all holes of a board. It replaces the diameter, kind, depth and chamfer of each hole."""
+    """The drill of all holes of a board. It replaces the diameter, kind, depth and chamfer of each
+    hole."""
 
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     kind: Literal["through", "blind"] = "through"
@@ -196,7 +206,8 @@ class DrillConfig(Config):
 
 
 class HoleConfig(DrillConfig, DamageConfig):
-    """A drilled cylinder whose axis is the face's normal at its centre. A blind hole has a flat bottom."""
+    """A drilled cylinder whose axis is the face's normal at its centre. A blind hole has a flat
+    bottom."""
 
     @model_validator(mode="after")
     def _depth_where_blind(self) -> Self:
@@ -223,7 +234,8 @@ AnyDamage = HoleConfig | DentConfig | FlawConfig
 
 
 class TapeConfig(Config):
-    """A strip of tape on the face. Its size and place are those in plan; its angle counts from board +x towards +y."""
+    """A strip of tape on the face. Its size and place are those in plan; its angle counts from
+    board +x towards +y."""
 
     centre_mm: PlaceMm
     size_mm: SizeMm
@@ -234,9 +246,10 @@ class TapeConfig(Config):
 
 
 class GlossConfig(Config):
-    """A Phong lobe beside diffuse reflection: the part ``share`` of the reflected light goes into a lobe about the
-    mirror direction, (exponent + 2) / (2 pi) cos^exponent of the angle from it (Lafortune and Willems 1994). The model
-    is reciprocal and never reflects more than the albedo. It lacks the growth at grazing angles (Fresnel)."""
+    """A Phong lobe beside diffuse reflection: the part ``share`` of the reflected light goes into
+    a lobe about the mirror direction, (exponent + 2) / (2 pi) cos^exponent of the angle from it
+    (Lafortune and Willems 1994). The model is reciprocal and never reflects more than the albedo.
+    It lacks the growth at grazing angles (Fresnel)."""
 
     share: Albedo
     exponent: float = Field(
@@ -245,14 +258,16 @@ class GlossConfig(Config):
 
 
 class TextureConfig(_FileConfig):
-    """An image on the face in place of the grain. It is stretched over the board's width and height, its first row at
-    the top. Its brightness in linear light (decoded from sRGB) scales the albedo at 850 nm and all colours alike, so
-    that their means are those declared. A pattern that looks different at 850 nm is not modelled."""
+    """An image on the face in place of the grain. It is stretched over the board's width and
+    height, its first row at the top. Its brightness in linear light (decoded from sRGB) scales the
+    albedo at 850 nm and all colours alike, so that their means are those declared. A pattern that
+    looks different at 850 nm is not modelled."""
 
 
 class ReflectanceConfig(Config):
-    """Reflectance of a board: diffuse, with a grain along x or a ``texture``, which scale 850 nm and all colours alike.
-    ``gloss`` acts at the camera's wavelength, on the face and in holes, but not on tape."""
+    """Reflectance of a board: diffuse, with a grain along x or a ``texture``, which scale 850 nm
+    and all colours alike. ``gloss`` acts at the camera's wavelength, on the face and in holes, but
+    not on tape."""
 
     albedo_850: Albedo = Field(
         0.6, description="pale wood has 0.5 to 0.7; no published value for plywood was found"
@@ -288,8 +303,9 @@ class BackingConfig(Config):
 
 
 class RoomConfig(Config):
-    """Floor and back wall, from which light reaches the board (multipath). In the camera's frame, the floor is parallel
-    to the optical axis and the wall is perpendicular to it. A key that is null leaves that surface out."""
+    """Floor and back wall, from which light reaches the board (multipath). In the camera's frame,
+    the floor is parallel to the optical axis and the wall is perpendicular to it. A key that is
+    null leaves that surface out."""
 
     floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = None
     floor_albedo_850: Albedo = 0.3
@@ -304,8 +320,8 @@ class RoomConfig(Config):
 
 
 class WavelengthConfig(Config):
-    """Albedos at a wavelength other than 850 nm: one for each kind of surface that the target has. ``as_at_850`` gives
-    the ``board`` the albedo that its material has at 850 nm."""
+    """Albedos at a wavelength other than 850 nm: one for each kind of surface that the target has.
+    ``as_at_850`` gives the ``board`` the albedo that its material has at 850 nm."""
 
     wavelength_nm: Annotated[float, Field(ge=300.0, le=2000.0)]
     board: Albedo | Literal["as_at_850"]
@@ -320,7 +336,8 @@ OtherWavelengths = Annotated[tuple[WavelengthConfig, ...], _OTHER]
 
 
 class PoseConfig(Config):
-    """Pose of the board: the face's centre in the camera's axes, and rotations about the board's own x, then y, z."""
+    """Pose of the board: the face's centre in the camera's axes, and rotations about the board's
+    own x, then y, z."""
 
     distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(
         0.7, description="depth of the face's centre"
@@ -333,8 +350,9 @@ class PoseConfig(Config):
 
     @property
     def T_camera_board(self) -> np.ndarray:
-        """The 4x4 matrix that maps board to camera. Positive ``tilt_x_deg`` brings the upper edge nearer, positive
-        ``tilt_y_deg`` the -x edge, and positive ``roll_deg`` lifts the +x edge."""
+        """The 4x4 matrix that maps board to camera. Positive ``tilt_x_deg`` brings the upper edge
+        nearer, positive ``tilt_y_deg`` the -x edge, and positive ``roll_deg`` lifts the +x edge.
+        """
         T_camera_board = np.eye(4)
         turned = rotation_xyz_deg(self.tilt_x_deg, self.tilt_y_deg, self.roll_deg)
         T_camera_board[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turned
@@ -406,8 +424,9 @@ class TargetConfig(SetUpConfig):
         return self.model_copy(update={"holes": (), "dents": (), "flaws": ()})
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
-        """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
-        Raises UserError if the declaration has none for it, or lacks the albedo of one of its surfaces."""
+        """Return the declaration with the nearest albedos to that wavelength as its
+        ``albedo_850``, and no others. Raises UserError if the declaration has none for it, or
+        lacks the albedo of one of its surfaces."""
         near = [
             albedos
             for albedos in self.other_wavelengths

@@ -1,9 +1,10 @@
 """A family of boards, drawn at random, on which a detection limit is measured.
 
-Each board has a number of damages of random size, depth and place, its own grain, and a random pose in front of the
-camera. Every quantity of every board has its own random stream, named by the family's seed, the board's purpose and its
-number. So a board does not depend on the number of other boards, and at another distance, albedo, kind of hole or
-depth the boards keep their places, sizes and tilts: their results are paired.
+Each board has a number of damages of random size, depth and place, its own grain, and a random
+pose in front of the camera. Every quantity of every board has its own random stream, named by the
+family's seed, the board's purpose and its number. So a board does not depend on the number of
+other boards, and at another distance, albedo, kind of hole or depth the boards keep their places,
+sizes and tilts: their results are paired.
 
 Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
 
@@ -33,11 +34,15 @@ from scenes.target.truth import (
 Purpose = Literal[
     "learning", "calibration", "hole_free", "damaged"
 ]  # purposes of boards; no two share boards
-NEAREST_M, FARTHEST_M = 0.1, 10.0  # limits of a pose's distance, jitter included
+# limits of a pose's distance, jitter included
+NEAREST_M = 0.1
+FARTHEST_M = 10.0
 WIDEST_BACKING_MM = 1e4  # largest backing in a declaration
-ATTEMPTS, TRIES = 50, 400
-"""Attempts to fill a board, and places tried for each damage: if discs ``apart_mm`` wide are to cover 40 % of the free
-area (random placement reaches 54.7 % at most), one attempt in three or more fills a board."""
+ATTEMPTS = 50
+TRIES = 400
+"""Attempts to fill a board, and places tried for each damage: if discs ``apart_mm`` wide are to
+cover 40 % of the free area (random placement reaches 54.7 % at most), one attempt in three or more
+fills a board."""
 
 
 def _ascending(limits: tuple[float, float]) -> tuple[float, float]:
@@ -53,7 +58,8 @@ Jitter = Annotated[float, Field(ge=0.0, le=1e3)]
 
 
 class _Drawn(Config):
-    """Number and sizes of drawn damage. Each board has one size from each of ``per_board`` equal parts of the range."""
+    """Number and sizes of drawn damage. Each board has one size from each of ``per_board`` equal
+    parts of the range."""
 
     per_board: Annotated[int, Field(ge=1, le=100)]
     sizes: Literal["uniform", "log"] = Field(
@@ -80,7 +86,8 @@ class _Drawn(Config):
 
 
 class DrawnThrough(_Drawn):
-    """Drilled through-holes. Each board has one diameter from each of ``per_board`` equal parts of the range."""
+    """Drilled through-holes. Each board has one diameter from each of ``per_board`` equal parts of
+    the range."""
 
     kind: Literal["through"]
     diameter_mm: Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
@@ -93,9 +100,10 @@ class DrawnThrough(_Drawn):
 
 
 class DrawnDeep(DrawnThrough):
-    """Blind holes with a flat bottom, or dents (spherical caps). Depths are uniform: one from each of ``per_board``
-    equal parts of their range, in random order. A dent's range is cut to the depths that its size allows: at most its
-    radius, and on a bent face at least what its ball needs (`scenes.target.checks`)."""
+    """Blind holes with a flat bottom, or dents (spherical caps). Depths are uniform: one from each
+    of ``per_board`` equal parts of their range, in random order. A dent's range is cut to the
+    depths that its size allows: at most its radius, and on a bent face at least what its ball
+    needs (`scenes.target.checks`)."""
 
     kind: Literal["blind", "dent"]  # type: ignore[assignment]
     depth_mm: Depths
@@ -112,8 +120,9 @@ RANGES["angle_deg"] = (
 
 
 class DrawnFlaws(_Drawn):
-    """A kind of damage of `scenes.target.flaws`. Each pair is a range. The size that ``size_of`` names and the depth
-    are drawn as those of holes, all other quantities uniformly and independently; a single number is not drawn."""
+    """A kind of damage of `scenes.target.flaws`. Each pair is a range. The size that ``size_of``
+    names and the depth are drawn as those of holes, all other quantities uniformly and
+    independently; a single number is not drawn."""
 
     kind: Any
 
@@ -128,7 +137,8 @@ class DrawnFlaws(_Drawn):
     def declare(
         self, facts: dict[str, Any], stream: Callable[[str], np.random.Generator]
     ) -> dict[str, Any]:
-        """Return the declaration of a flaw: ``facts`` (id, place, size and depth) and what else is drawn for it."""
+        """Return the declaration of a flaw: ``facts`` (id, place, size and depth) and what else is
+        drawn for it."""
         own = {name for name in type(self).model_fields if name not in _Drawn.model_fields}
         held = {name: value for name in own if (value := getattr(self, name)) is not None} | facts
         number = facts["id"]
@@ -142,7 +152,8 @@ class DrawnFlaws(_Drawn):
 
 
 def _drawn_of(flaw: type[flaws.FlawConfig]) -> type[DrawnFlaws]:
-    """Return the declaration of a family of a kind of flaw: that of a single flaw, with ranges in place of numbers."""
+    """Return the declaration of a family of a kind of flaw: that of a single flaw, with ranges in
+    place of numbers."""
     fields: dict[str, Any] = {}
     for name, field in flaw.model_fields.items():
         # places and seeds are drawn; a chip's place determines the edge, and so its angle
@@ -167,8 +178,9 @@ else:
 
 
 class DrawnTargetConfig(Config):
-    """A family of random boards. Offsets, tilts, roll and jitter of the pose are drawn uniformly between plus and minus
-    the given value. ``drawn`` returns the full declaration of a board, ``declare`` that of the first damaged one."""
+    """A family of random boards. Offsets, tilts, roll and jitter of the pose are drawn uniformly
+    between plus and minus the given value. ``drawn`` returns the full declaration of a board,
+    ``declare`` that of the first damaged one."""
 
     name: Literal["drawn"] = "drawn"
     seed: flaws.Seed = Field(
@@ -219,13 +231,13 @@ class DrawnTargetConfig(Config):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        damage, board, bend_per_mm, problems = (
-            self.damage,
-            self.board,
-            _tightest_per_mm(self.board),
-            [],
-        )
-        thick, widest_mm, jitter_mm = board.thickness_mm, damage.size_mm[1], self.distance_jitter_mm
+        damage = self.damage
+        board = self.board
+        bend_per_mm = _tightest_per_mm(self.board)
+        problems = []
+        thick = board.thickness_mm
+        widest_mm = damage.size_mm[1]
+        jitter_mm = self.distance_jitter_mm
         declared = damage.depths_mm or (0.0, 0.0)
         if declared[1] >= thick and damage.kind not in (
             "pressed_dent",
@@ -234,7 +246,8 @@ class DrawnTargetConfig(Config):
         ):
             deep = f"{declared[1]:g} mm is not less than the board's thickness, {thick:g} mm"
             problems.append(f"damage.depth_mm: {deep}")
-        # Both limits of a dent's depth grow with the diameter, so checking the smallest and largest size suffices.
+        # Both limits of a dent's depth grow with the diameter, so checking the smallest and
+        # largest size suffices.
         dents = isinstance(damage, DrawnDeep) and damage.kind == "dent"
         for diameter_mm in sorted(set(damage.size_mm)) if dents else []:
             least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)
@@ -272,11 +285,11 @@ class DrawnTargetConfig(Config):
         return self
 
     def _room_mm(self) -> tuple[float, float, float]:
-        """Return the largest radius of a rim; the factor by which axes along a bent face's normals start farther apart
-        in plan, so that they do not meet within the board (parallel surfaces at a depth t shrink by 1 - t / radius of
-        curvature); and the least distance of centres from the edge, the same for all sizes. A dent's rim on a face that
-        bends away is up to sqrt 2 larger than on a flat one; holes get the same room, so that they have the dents'
-        places."""
+        """Return the largest radius of a rim; the factor by which axes along a bent face's normals
+        start farther apart in plan, so that they do not meet within the board (parallel surfaces
+        at a depth t shrink by 1 - t / radius of curvature); and the least distance of centres from
+        the edge, the same for all sizes. A dent's rim on a face that bends away is up to sqrt 2
+        larger than on a flat one; holes get the same room, so that they have the dents' places."""
         bend_per_mm = _tightest_per_mm(self.board)
         round_on_bent = bend_per_mm > 0 and not isinstance(self.damage, DrawnFlaws)
         rim_mm = self.damage.widest_mm / 2 * (math.sqrt(2) if round_on_bent else 1.0)
@@ -288,8 +301,9 @@ class DrawnTargetConfig(Config):
         return self.drawn("damaged", 0)
 
     def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
-        """Return a board of the family with its damage, ids from 1 in the order of size; of a hole-free one call
-        ``hole_free()``: the damages left out are unflawed sites. Raises UserError if the board is too full."""
+        """Return a board of the family with its damage, ids from 1 in the order of size; of a
+        hole-free one call ``hole_free()``: the damages left out are unflawed sites. Raises
+        UserError if the board is too full."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
@@ -297,7 +311,9 @@ class DrawnTargetConfig(Config):
         def within(quantity: str, limit: float, count: int) -> list[Any]:
             return (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
 
-        damage, count, depths = self.damage, self.damage.per_board, stream("depths")
+        damage = self.damage
+        count = self.damage.per_board
+        depths = stream("depths")
         made: list[custom.AnyDamage] = []
         (low, high), parts = (
             damage.size_mm,
@@ -320,7 +336,8 @@ class DrawnTargetConfig(Config):
                 least, most = damage.depths_mm
                 if damage.kind == "dent":
                     legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
-                    least, most = max(least, legal[0]), min(most, legal[1])
+                    least = max(least, legal[0])
+                    most = min(most, legal[1])
                 facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
             if isinstance(damage, DrawnFlaws):
                 facts |= {"angle_deg": round(edge[0])} if edge else {}
@@ -354,15 +371,16 @@ class DrawnTargetConfig(Config):
         config = custom.TargetConfig(board=board, material=material, pose=placed, **common)
         if self.backing is None or self.backing.size_mm is not None:
             return config
-        # a backing that fills every hole: the face's shadow on it from the lens, in the extreme poses
+        # a backing that fills every hole: the face's shadow on it from the lens, in the extreme
+        # poses
         size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, self.backing)[0, 2]))
         return config.model_copy(
             update={"backing": self.backing.model_copy(update={"size_mm": size_mm})}
         )
 
     def extreme_poses(self) -> tuple[custom.PoseConfig, ...]:
-        """Return the corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways
-        and upwards: a point in view in all of these is in view in every pose."""
+        """Return the corners of what poses can be drawn, with the rolls at which the board reaches
+        farthest sideways and upwards: a point in view in all of these is in view in every pose."""
         diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
         rolls = [
             self.roll_deg,
@@ -380,7 +398,8 @@ class DrawnTargetConfig(Config):
         return tuple(self._posed(*corner) for corner in product(*signed, both_rolls))
 
     def _places_mm(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is free."""
+        """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is
+        free."""
         board, count, best, (rim_mm, _, margin_mm) = (
             self.board,
             self.damage.per_board,
@@ -395,7 +414,8 @@ class DrawnTargetConfig(Config):
                 free = np.all([off_tape_mm(tape, tried) > rim_mm for tape in self.tapes], axis=0)
                 if isinstance(board.shape, custom.MeshConfig):  # what is not in front has no place
                     ring = np.exp(2j * np.pi * np.arange(16) / 16) * rim_mm
-                    x, y = (tried[:, :1] + ring.real, tried[:, 1:] + ring.imag)
+                    x = tried[:, :1] + ring.real
+                    y = tried[:, 1:] + ring.imag
                     free = free & np.isfinite(face_of(board).height_m(x * MM, y * MM)).all(axis=1)
                 free = free & (
                     np.linalg.norm(tried[:, None] - places, axis=-1) >= self.apart_mm
@@ -415,9 +435,11 @@ class DrawnTargetConfig(Config):
         )
 
     def _edge_places_mm(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw (per_board, 3): points on the board's edges in plan, apart and off corners, with the edge's angle."""
+        """Draw (per_board, 3): points on the board's edges in plan, apart and off corners, with
+        the edge's angle."""
         half = np.array([self.board.width_mm, self.board.height_mm]) / 2
-        corner_mm, places = self.damage.widest_mm / 2 + LEAST_WEB_MM, np.empty((0, 3))
+        corner_mm = self.damage.widest_mm / 2 + LEAST_WEB_MM
+        places = np.empty((0, 3))
         for _ in range(ATTEMPTS * TRIES):
             if len(places) == self.damage.per_board:
                 return places
@@ -436,7 +458,8 @@ class DrawnTargetConfig(Config):
         )
 
     def _posed(self, jitter_mm: float, *others: float) -> custom.PoseConfig:
-        """Return the pose at a jitter of the distance, with offsets x and y, tilts x and y and a roll."""
+        """Return the pose at a jitter of the distance, with offsets x and y, tilts x and y and a
+        roll."""
         names = ("offset_x_mm", "offset_y_mm", "tilt_x_deg", "tilt_y_deg", "roll_deg")
         return custom.PoseConfig(
             distance_m=self.distance_m + jitter_mm * MM, **dict(zip(names, others, strict=True))
@@ -444,7 +467,8 @@ class DrawnTargetConfig(Config):
 
 
 def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
-    """Return the ends of a dent's depth: of a ball of `SHALLOWEST_BEND` radii of curvature, and the dent's radius."""
+    """Return the ends of a dent's depth: of a ball of `SHALLOWEST_BEND` radii of curvature, and
+    the dent's radius."""
     reach = diameter_mm / 2 * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
     least = 1.0 if reach >= 1 else reach / (1 + math.sqrt(1 - reach**2))
     return diameter_mm / 2 * least, diameter_mm / 2
@@ -452,7 +476,8 @@ def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, floa
 
 @lru_cache(maxsize=256)
 def _tightest_per_mm(board: custom.BoardConfig) -> float:
-    """Return a face's largest curvature; 0 for a rough face or a mesh, and where its shape does not reach."""
+    """Return a face's largest curvature; 0 for a rough face or a mesh, and where its shape does
+    not reach."""
     if face_of(board).rough or isinstance(board.shape, custom.MeshConfig):
         return 0.0
     x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T
@@ -462,8 +487,10 @@ def _tightest_per_mm(board: custom.BoardConfig) -> float:
 
 @lru_cache(maxsize=256)
 def _backing_size_mm(family: DrawnTargetConfig, z_m: float) -> tuple[float, float]:
-    """Return width and height of the face's shadows from the lens, in all extreme poses, on a plane at this board z."""
-    outline, half_m = outline_board_m(family.board), np.zeros(2)
+    """Return width and height of the face's shadows from the lens, in all extreme poses, on a
+    plane at this board z."""
+    outline = outline_board_m(family.board)
+    half_m = np.zeros(2)
     for pose in family.extreme_poses():
         lens = invert(pose.T_camera_board)[:3, 3]
         steps = (z_m - lens[2]) / (outline[:, 2] - lens[2])

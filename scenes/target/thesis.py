@@ -1,9 +1,11 @@
-"""The target named ``thesis``, with a field for every fact that its source leaves open; and all kinds of targets.
+"""The target named ``thesis``, with a field for every fact that its source leaves open; and all
+kinds of targets.
 
-Source: "Damage Detection and Location Using Time of Flight Depth Cameras" (Rutgers), Table I and the ruler readings of
-its error script. They state eleven holes of 1/16 to 1 in, drilled in one row of a half-inch plywood sheet and about
-2 in apart from the 1/4 in hole on, strips of coloured tape, and an Azure Kinect. Every other value is a choice with a
-reason, made before any claim was scored; `experiments/averaging.yaml` tries other plausible values."""
+Source: "Damage Detection and Location Using Time of Flight Depth Cameras" (Rutgers), Table I and
+the ruler readings of its error script. They state eleven holes of 1/16 to 1 in, drilled in one row
+of a half-inch plywood sheet and about 2 in apart from the 1/4 in hole on, strips of coloured tape,
+and an Azure Kinect. Every other value is a choice with a reason, made before any claim was scored;
+`experiments/averaging.yaml` tries other plausible values."""
 
 from typing import Annotated, Any, Literal, get_args
 
@@ -38,8 +40,9 @@ def _open(default: Any, reason: str) -> Any:
 
 
 class ThesisTargetConfig(Config):
-    """The thesis' target. The thesis states the holes' diameters and the board's thickness; each key is a fact that it
-    leaves open, and the meaning gives the reason for the default. ``declare()`` returns the full declaration."""
+    """The thesis' target. The thesis states the holes' diameters and the board's thickness; each
+    key is a fact that it leaves open, and the meaning gives the reason for the default.
+    ``declare()`` returns the full declaration."""
 
     name: Literal["thesis"] = "thesis"
     hole_kind: Literal["through", "blind"] = _open(

@@ -1,11 +1,14 @@
-"""Renders on a GPU beside the processor: ``python tests/benchmarks/gpu.py [--boards N] [--variants NAME ..]``.
+"""Renders on a GPU beside the processor: ``python tests/benchmarks/gpu.py [--boards N] [--variants
+NAME ..]``.
 
-Boards of `experiments/detection_limit.yaml` are rendered by each variant in a process of its own, once with the study's
-settings and once as a reference with many paths. Prints wall-clock seconds a board when kernels are warm, the seconds
-of the first board, which compiles them, and how far the views are apart in range: the median, and the share of pixels
-that differ by more than four deviations of the noise that both state. Exit code 1 where that share is above 1 %.
+Boards of `experiments/detection_limit.yaml` are rendered by each variant in a process of its own,
+once with the study's settings and once as a reference with many paths. Prints wall-clock seconds a
+board when kernels are warm, the seconds of the first board, which compiles them, and how far the
+views are apart in range: the median, and the share of pixels that differ by more than four
+deviations of the noise that both state. Exit code 1 where that share is above 1 %.
 
-Needs an NVIDIA GPU with OptiX for ``cuda``; ``llvm`` is the processor with all its cores, ``llvm-1`` with one.
+Needs an NVIDIA GPU with OptiX for ``cuda``; ``llvm`` is the processor with all its cores,
+``llvm-1`` with one.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ WORKS: dict[str, dict[str, float]] = {
         "rest_samples": 64,
     },
 }
-"""Settings of the render that replace the study's; a reference is rendered of one board of each kind."""
+"""Settings of the render that replace the study's; a reference is rendered of one board of each
+kind."""
 OVERRIDES = (
     "study.hole_free_boards=1",
     "threshold={k: 5.0}",
@@ -64,7 +68,8 @@ def boards_of(count: int) -> list[Any]:
 
 
 def render(name: str, boards: int, folder: Path) -> None:
-    """Render all boards in this process; prints {work: seconds of each board} as JSON. Views go into ``folder``."""
+    """Render all boards in this process; prints {work: seconds of each board} as JSON. Views go
+    into ``folder``."""
     from scenes.render.scene import _point_to_llvm
 
     _point_to_llvm()
@@ -92,12 +97,14 @@ def render(name: str, boards: int, folder: Path) -> None:
 
 
 def apart(first: Path, second: Path) -> np.ndarray:
-    """Return (2, n): the difference of range in mm of two stored views of a board, and the deviation of what their
-    noise makes of it; pixels with less light than 0.03 of a white plane at 1 m are left out."""
+    """Return (2, n): the difference of range in mm of two stored views of a board, and the
+    deviation of what their noise makes of it; pixels with less light than 0.03 of a white plane at
+    1 m are left out."""
     from scenes.render.cache import read_view
     from scenes.render.view import range_change_m
 
-    one, two = read_view(first), read_view(second)
+    one = read_view(first)
+    two = read_view(second)
     assert one is not None and two is not None
     lit = np.abs(two.phasor).mean(axis=0) > 0.03
     change = (one.phasor[:, lit] - two.phasor[:, lit]).astype(complex)
@@ -147,7 +154,8 @@ def main() -> int:
             warm = {name: float(np.median(spent[name][work][1:])) for name in options.variants}
             print(f"\n{work}: {len(spent[last][work])} boards")
             for name, seconds in warm.items():
-                first, ratio = spent[name][work][0], warm[last] / seconds
+                first = spent[name][work][0]
+                ratio = warm[last] / seconds
                 print(
                     f"  {name:8} {seconds:8.3f} s a board, first {first:6.2f} s, {ratio:7.2f} times as fast as {last}"
                 )

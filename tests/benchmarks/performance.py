@@ -1,9 +1,11 @@
-"""Speed beside other libraries, and how the cost grows: ``python tests/benchmarks/performance.py [--quick] [PART ..]``.
+"""Speed beside other libraries, and how the cost grows: ``python tests/benchmarks/performance.py
+[--quick] [PART ..]``.
 
-Rivals do the same work in turns in one process, so that their ratios hold on any machine; what they find is compared
-too. Times are this process' processor time on one thread, which others' work on the machine lengthens less than the
-wall clock. No time is asserted. A study's trials see a board of 30,000 pixels with direct light only: the time of a
-trial does not depend on how its view was rendered.
+Rivals do the same work in turns in one process, so that their ratios hold on any machine; what
+they find is compared too. Times are this process' processor time on one thread, which others' work
+on the machine lengthens less than the wall clock. No time is asserted. A study's trials see a
+board of 30,000 pixels with direct light only: the time of a trial does not depend on how its view
+was rendered.
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ def once(work: Work) -> float:
 def told(
     title: str, rivals: Mapping[str, Work], runs: int, agree: Callable[[Any, Any], str]
 ) -> None:
-    """Print the rivals' times, ours first, their ratios to it, and how far their results agree with ours."""
+    """Print the rivals' times, ours first, their ratios to it, and how far their results agree
+    with ours."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         results = [work() for work in rivals.values()]
@@ -79,7 +82,8 @@ def exponent(title: str, works: Mapping[float, Work], runs: int) -> None:
 
 def noisy_board(pixels: int) -> np.ndarray:
     """Return points (h, w, 3) of a bent board with damage, 0.5 mm of noise and a pitch of 1.4 mm."""
-    random, h = np.random.default_rng(0), round((pixels / 1.5) ** 0.5)
+    random = np.random.default_rng(0)
+    h = round((pixels / 1.5) ** 0.5)
     v, u = np.mgrid[:h, : round(1.5 * h)] * 1.4e-3
     z = 0.75 + 0.1 * u + 0.2 * u * v - v**3 + 5e-4 * random.standard_normal(u.shape)
     z[np.hypot(u % 0.06 - 0.03, v % 0.06 - 0.03) < 0.005] += 0.0127
@@ -118,7 +122,8 @@ def peers_of_frames(runs: int) -> None:
 
 
 def peers_of_surfaces(runs: int) -> None:
-    """Fit a robust cubic. The others get the basis ready made; tolerances end within some micrometres of ours."""
+    """Fit a robust cubic. The others get the basis ready made; tolerances end within some
+    micrometres of ours."""
     import statsmodels.api as sm
     from scipy.optimize import least_squares
     from sklearn.linear_model import HuberRegressor
@@ -129,8 +134,10 @@ def peers_of_surfaces(runs: int) -> None:
     basis = np.ascontiguousarray(
         Chebyshev.over(np.stack([x, y], axis=1), 3).basis(np.stack([x, y], axis=1)).T
     )
-    middle, sigma = float(np.median(z)), 5e-4
-    scaled, columns = (z - middle) / sigma, basis / sigma
+    middle = float(np.median(z))
+    sigma = 5e-4
+    scaled = (z - middle) / sigma
+    columns = basis / sigma
     soft = {"loss": "soft_l1", "f_scale": 1.345, "xtol": 1e-4, "jac": lambda _: columns}
 
     def ours(method: str) -> np.ndarray:
@@ -254,7 +261,8 @@ def peers_of_registration(runs: int) -> None:
         fixed, moving = (
             o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points_m)) for view in views
         )
-        point, T = o3d.pipelines.registration.TransformationEstimationPointToPoint(), guess
+        point = o3d.pipelines.registration.TransformationEstimationPointToPoint()
+        T = guess
         for limit in (0.03, 0.015, 0.012):
             T = o3d.pipelines.registration.registration_icp(
                 moving, fixed, limit, T, point
@@ -273,7 +281,8 @@ def peers_of_registration(runs: int) -> None:
 
 
 def peers_of_renders(runs: int) -> None:
-    """Render a blind hole: ours against mitransient's path tracer, by time times variance of the pixels inside."""
+    """Render a blind hole: ours against mitransient's path tracer, by time times variance of the
+    pixels inside."""
     from scenes.optics import RenderConfig
     from scenes.render.scene import lit_scene, load_mitsuba
     from scenes.render.view import render_view
@@ -283,10 +292,8 @@ def peers_of_renders(runs: int) -> None:
     from tests.validation.transport_oracle import oracle
 
     hole = {"id": 1, "kind": "blind", "diameter_mm": 24, "depth_mm": 30, "centre_mm": [0, 0]}
-    board, at = (
-        {"width_mm": 60, "height_mm": 60, "thickness_mm": 40},
-        {"distance_m": 0.5, "tilt_x_deg": 8},
-    )
+    board = {"width_mm": 60, "height_mm": 60, "thickness_mm": 40}
+    at = {"distance_m": 0.5, "tilt_x_deg": 8}
     facts = {
         "name": "custom",
         "board": board,
@@ -295,11 +302,10 @@ def peers_of_renders(runs: int) -> None:
         "backing": None,
         "room": None,
     }
-    target, optics = build_target(TargetConfig.from_data(facts)), optics_of(56, 56, 420.0)
-    lit, view = (
-        lit_scene(load_mitsuba(), target.parts, optics),
-        render_view(target, optics, RenderConfig(bounces=6)),
-    )
+    target = build_target(TargetConfig.from_data(facts))
+    optics = optics_of(56, 56, 420.0)
+    lit = lit_scene(load_mitsuba(), target.parts, optics)
+    view = render_view(target, optics, RenderConfig(bounces=6))
     cut = (slice(view.region.row0, view.region.row1), slice(view.region.col0, view.region.col1))
     tracer = oracle(lit, optics, FREQUENCIES)
     inside = view.range_m > 0.515
@@ -366,8 +372,9 @@ WAYS = {"drawn at once": "false", "frame by frame": "true"}
 
 
 def trials(runs: int) -> None:
-    """Print whole trials a second: frames, average, crop, fit, findings, sizes, matching and a study's rows; of
-    detectors that learn nothing, as what `matched` has learned comes from boards of its own."""
+    """Print whole trials a second: frames, average, crop, fit, findings, sizes, matching and a
+    study's rows; of detectors that learn nothing, as what `matched` has learned comes from boards
+    of its own."""
     print(
         "\nwhole trials of 50 frames, damaged board of 30,000 pixels with eight holes, a second and core"
     )
@@ -433,7 +440,8 @@ def growth(runs: int) -> None:
             max(3, runs // 3),
         )
         tasks = trials_of(folder, 20 * runs)
-        context, rates = multiprocessing.get_context("spawn"), []
+        context = multiprocessing.get_context("spawn")
+        rates = []
         for workers in (1, 2):
             with ProcessPoolExecutor(workers, mp_context=context) as pool:
                 rates.append(sum(pool.map(rate_of, [tasks] * workers)))
@@ -453,7 +461,8 @@ def boards(runs: int) -> None:
     from scenes.target.mesh import build_target
 
     print("\nrender of a board of detection_limit.yaml, a second and core")
-    plan, by_kind = plan_of(load_experiment(STUDY, []), Path()), dict[str, list[Any]]()
+    plan = plan_of(load_experiment(STUDY, []), Path())
+    by_kind = dict[str, list[Any]]()
     for group in plan.groups:
         for batch in group.batches:
             holes = batch.renders[0].target.holes
@@ -475,7 +484,8 @@ def boards(runs: int) -> None:
 
 
 def programs(runs: int) -> None:
-    """Print the wall-clock time of imports and of whole sweeps that find nothing stored, with two processes."""
+    """Print the wall-clock time of imports and of whole sweeps that find nothing stored, with two
+    processes."""
 
     def seconds_of(*arguments: str) -> float:
         began = time.perf_counter()

@@ -27,7 +27,8 @@ def cloud_of(z_m: np.ndarray, region: Region | None = None, z_step_m: float = 0.
 
 
 def board_before_wall(noise_m: float = 5e-4) -> tuple[Cloud, np.ndarray]:
-    """A board at 0.7 m, tilted, with a 30 mm deep hole, 0.5 m before a wall; and where the board is."""
+    """A board at 0.7 m, tilted, with a 30 mm deep hole, 0.5 m before a wall; and where the board
+    is."""
     z = np.full((150, 200), 1.2)
     board = np.zeros(z.shape, dtype=bool)
     board[30:120, 40:170] = True
@@ -118,8 +119,9 @@ def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
 def judged(kind: str, seed: int, camera: str, flat: bool = False) -> tuple[bool, bool, Scene]:
     """Whether the crop of a random scene is its target, and whether it warned.
 
-    Right: at most 3 % of the crop lie more than two pixels outside of the target's outline, and 80 % of the target's
-    inside, without a rim of twice the inset, are kept. Noise of 0.3 to 3 mm, up to 30 % dropouts.
+    Right: at most 3 % of the crop lie more than two pixels outside of the target's outline, and 80
+    % of the target's inside, without a rim of twice the inset, are kept. Noise of 0.3 to 3 mm, up
+    to 30 % dropouts.
     """
     random = np.random.default_rng(seed)
     scene = Scene(camera)
@@ -133,7 +135,8 @@ def judged(kind: str, seed: int, camera: str, flat: bool = False) -> tuple[bool,
     mask = np.zeros(cloud.valid.shape, dtype=bool)
     mask[cloud.valid] = choice.mask[0] if flat else choice.mask[cloud.valid]
     target = scene.name == 1
-    whole, kernel = holes_filled(target).astype(np.uint8), np.ones((3, 3), np.uint8)
+    whole = holes_filled(target).astype(np.uint8)
+    kernel = np.ones((3, 3), np.uint8)
     outside = cv2.dilate(whole, kernel, iterations=2) == 0
     inside = target & (cv2.erode(whole, kernel, iterations=10 if flat else 6) > 0) & cloud.valid
     right = (mask & outside).sum() <= 0.03 * mask.sum() and (
@@ -178,7 +181,8 @@ def test_two_boards_side_by_side_are_a_doubt() -> None:
 
 @pytest.mark.parametrize(("squares", "is_told"), [(4, False), (5, True)])
 def test_a_crowd_of_like_surfaces_may_hold_no_target(squares: int, is_told: bool) -> None:
-    """Squares side by side, each 20 cm farther than the one before, so that the first is preferred to all others."""
+    """Squares side by side, each 20 cm farther than the one before, so that the first is preferred
+    to all others."""
     z_m = np.full((150, 200), np.nan)
     for number in range(squares):
         z_m[60:92, 4 + 40 * number : 36 + 40 * number] = 0.5 + 0.2 * number
@@ -279,12 +283,13 @@ def test_inset_takes_the_rim_but_leaves_holes_and_the_image_edge() -> None:
 def drilled_board_before_a_wall(
     noise_m: float = 5e-4, seed: int = 5
 ) -> tuple[Cloud, np.ndarray, np.ndarray]:
-    """A frontal board at 0.7 m, half an inch thick, right of the axis, with through-holes of 14 and 25 mm to a backing
-    33 mm behind its face, and a wall 0.2 m behind; which pixels see the board or into its holes, and which hole
-    (1, 2; else 0) each sees into.
+    """A frontal board at 0.7 m, half an inch thick, right of the axis, with through-holes of 14
+    and 25 mm to a backing 33 mm behind its face, and a wall 0.2 m behind; which pixels see the
+    board or into its holes, and which hole (1, 2; else 0) each sees into.
 
-    A ray that leaves a hole's cylinder within the thickness ends on its wall; the camera's own blur is left out. Only
-    30 mm of the wall are seen around the board: a wall that fills more of the picture would be the largest surface.
+    A ray that leaves a hole's cylinder within the thickness ends on its wall; the camera's own
+    blur is left out. Only 30 mm of the wall are seen around the board: a wall that fills more of
+    the picture would be the largest surface.
     """
     slopes = LENS.region_slopes(LENS.whole)
     x, y = np.moveaxis(0.7 * slopes, -1, 0)
@@ -293,7 +298,8 @@ def drilled_board_before_a_wall(
     hole = np.zeros(z.shape, dtype=int)
     for number, centre_x, diameter in ((1, 0.1, 0.014), (2, 0.19, 0.025)):
         apart = np.stack([x - centre_x, y - 0.02], axis=-1)
-        a, b = (slopes**2).sum(-1), (apart * slopes).sum(-1)
+        a = (slopes**2).sum(-1)
+        b = (apart * slopes).sum(-1)
         c = (apart**2).sum(-1) - diameter**2 / 4
         inside = c < 0
         wall = (np.sqrt(np.where(inside, b * b - a * c, 0.0)) - b) / a
@@ -308,7 +314,8 @@ def without_grid(points: np.ndarray) -> Cloud:
     """The points of (n, 3) that are none NaN, as a cloud without a grid."""
     points = points[np.isfinite(points[:, 2])]
     n = len(points)
-    none, zeros = np.full((1, n), np.nan), np.zeros((1, n), dtype=np.uint8)
+    none = np.full((1, n), np.nan)
+    zeros = np.zeros((1, n), dtype=np.uint8)
     return Cloud(
         points[None],
         zeros,
@@ -327,11 +334,9 @@ def test_without_a_grid_holes_with_a_backing_are_found_and_the_wall_past_the_rim
 ) -> None:
     cloud, target, hole = drilled_board_before_a_wall()
     order = np.random.default_rng(6).permutation(np.flatnonzero(cloud.valid))
-    points, target, hole = (
-        cloud.points_m.reshape(-1, 3)[order],
-        target.ravel()[order],
-        hole.ravel()[order],
-    )
+    points = cloud.points_m.reshape(-1, 3)[order]
+    target = target.ravel()[order]
+    hole = hole.ravel()[order]
     if not recorded_from_origin:
         points = points - [0.15, 0.02, 0.7]
     flat = without_grid(points)
@@ -373,7 +378,8 @@ def test_points_in_no_order_at_all_still_make_a_surface() -> None:
 
 
 def test_the_pixel_grids_of_several_views_over_one_another_make_a_surface() -> None:
-    """Grids of nearly one pitch beat: their points gather in bands, and the gaps between these part nothing."""
+    """Grids of nearly one pitch beat: their points gather in bands, and the gaps between these
+    part nothing."""
     random = np.random.default_rng(7)
     clouds = []
     for number in range(9):

@@ -23,9 +23,11 @@ def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
 
 
 def by_graph(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Number the components by scipy's search of the graph whose edges are the links; -1 off the nodes."""
+    """Number the components by scipy's search of the graph whose edges are the links; -1 off the
+    nodes."""
     places = np.arange(nodes.size).reshape(nodes.shape)
-    across, below = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:], down[:-1] & nodes[:-1] & nodes[1:]
+    across = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
+    below = down[:-1] & nodes[:-1] & nodes[1:]
     starts = np.concatenate([places[:, :-1][across], places[:-1][below]])
     ends = np.concatenate([places[:, 1:][across], places[1:][below]])
     graph = coo_array((np.ones(len(starts)), (starts, ends)), shape=(nodes.size, nodes.size))
@@ -91,7 +93,8 @@ def test_no_node_has_no_component() -> None:
 @pytest.mark.parametrize("half", [1, 4])
 def test_normals_and_their_turns_equal_plain_ones(half: int) -> None:
     surface = np.nan_to_num(rough_points(3), nan=0.7)
-    du, dv = (np.gradient(surface, axis=axis) for axis in (1, 0))
+    du = np.gradient(surface, axis=1)
+    dv = np.gradient(surface, axis=0)
     normals = np.cross(du, dv)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-15)
     np.testing.assert_allclose(unit_normals(surface), normals, atol=1e-13)

@@ -53,7 +53,8 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-# ---- which surface is the target -------------------------------------------------------------------------------------
+# ---- which surface is the target
+# -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,8 @@ def test_a_target_that_is_not_there_is_refused_with_those_that_are(
     assert "another crop" in failed(capsys, before_wall, "--target", "1", "--crop", "none")
 
 
-# ---- what it finds ---------------------------------------------------------------------------------------------------
+# ---- what it finds
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_it_finds_the_hole_and_writes_everything(
@@ -159,10 +161,8 @@ def test_long_damage_is_told_with_length_width_and_angle(
     measured = Measurement(
         3.0, 4.0, 4, 9.0, 0.02, np.zeros(3), length_m=0.024, width_m=0.004, along=-turned
     )
-    scratch, hole = (
-        finding_of(n, evidence, found, replace(measured, width_m=w))
-        for n, w in ((1, 0.004), (2, 0.02))
-    )
+    scratch = finding_of(1, evidence, found, replace(measured, width_m=0.004))
+    hole = finding_of(2, evidence, found, replace(measured, width_m=0.02))
     assert (scratch.length_mm, scratch.width_mm) == pytest.approx(
         (24, 4)
     ) and scratch.angle_deg == pytest.approx(30)
@@ -242,14 +242,16 @@ def test_a_cloud_without_a_grid_works_too(
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
     row, *others = rows_of(tmp_path / "out" / "findings.csv")
-    # rounding is all the noise: too few peaks stand out to set the threshold, as the first line says
+    # rounding is all the noise: too few peaks stand out to set the threshold, as the first line
+    # says
     assert (
         float(row["score"]) > 100
         and all(float(other["score"]) < 10 for other in others)
         and len(others) < 5
     )
     assert row["u_px"] == "" and row["volume_mm3"] == ""
-    # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to a part of the hole.
+    # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to
+    # a part of the hole.
     offset = np.array([float(row[f"{a}_mm"]) for a in "xy"]) - TRUE_CENTRE_MM[:2]
     assert np.hypot(*offset) < TRUE_DIAMETER_MM / 3
     assert float(row["depth_mm"]) == pytest.approx(plane.HOLE_DEPTH_MM, abs=1.0)
@@ -371,7 +373,8 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "no findings" in capsys.readouterr().out
 
 
-# ---- what it refuses -------------------------------------------------------------------------------------------------
+# ---- what it refuses
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -472,7 +475,8 @@ def test_help_is_there_without_the_heavy_libraries() -> None:
     assert "--quiet-capture" in said and said.strip().endswith("[]")
 
 
-# ---- parts -----------------------------------------------------------------------------------------------------------
+# ---- parts
+# -----------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=50, deadline=None)
@@ -484,7 +488,8 @@ def test_a_crop_is_read_or_refused(text: str) -> None:
         assert "auto" in (mistake.legal or "")
 
 
-# ---- real captures ---------------------------------------------------------------------------------------------------
+# ---- real captures
+# ---------------------------------------------------------------------------------------------------
 
 
 # Mouths that are seen in the mean depth and that nothing lies beside, in pixels.
@@ -515,8 +520,8 @@ MOUTHS = np.array(UPPER + LOWER + LOWEST)
 
 
 def missed_and_false(findings: list[dict[str, str]], mouths: np.ndarray) -> tuple[int, int]:
-    """How many mouths no hole was found at; and how many findings of the rows of mouths between the tags, where nothing
-    else is, are no mouth."""
+    """How many mouths no hole was found at; and how many findings of the rows of mouths between
+    the tags, where nothing else is, are no mouth."""
     every = np.array(
         [(row["kind"] == "bump", float(row["u_px"]), float(row["v_px"])) for row in findings]
     )

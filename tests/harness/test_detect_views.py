@@ -1,4 +1,5 @@
-"""``python -m harness.detect A B C --register ..``: from several captures to one cloud, its findings, and refusals."""
+"""``python -m harness.detect A B C --register ..``: from several captures to one cloud, its
+findings, and refusals."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ FILES = [
     "view3d.html",
 ]
 SHARP = ("--set", "hole_model.blur_px=1", "--threshold", "6.5")  # noise of this map reaches 5.8
-"""The board's hole is drawn without a camera's blur; the threshold is so high that no false call is expected."""
+"""The board's hole is drawn without a camera's blur; the threshold is so high that no false call
+is expected."""
 
 
 @pytest.fixture(scope="module")
@@ -71,13 +73,15 @@ def findings_of(out: Path) -> list[dict[str, float]]:
 
 
 def error_m(T_reference_view: object, number: int) -> np.ndarray:
-    """(4, 3): how far a registration puts the board's corners from where they are, in the first view's frame."""
+    """(4, 3): how far a registration puts the board's corners from where they are, in the first
+    view's frame."""
     moved = np.array(T_reference_view) @ invert(T_FIRST_VIEW[number])
     wrong: np.ndarray = transform_points(moved, CORNERS_M) - CORNERS_M
     return wrong
 
 
-# ---- what it finds ---------------------------------------------------------------------------------------------------
+# ---- what it finds
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
@@ -97,7 +101,8 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     assert told["results_version"] == RESULTS_VERSION
     for number, row in enumerate(told["views"][1:], start=1):
         wrong_mm = 1e3 * np.sqrt((error_m(row["T_reference_view"], number) ** 2).sum(axis=1).mean())
-        # corners lie farther out than the target's mean point: four times the prediction is beyond any chance
+        # corners lie farther out than the target's mean point: four times the prediction is beyond
+        # any chance
         assert (
             wrong_mm < 4 * np.hypot(row["predicted_in_plane_mm"], row["predicted_across_mm"]) < 1.0
         )
@@ -113,7 +118,8 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     assert facts["settings"]["mapping"]["registration"]["method"] == "marks"
     assert facts["settings"]["detector"]["settings"]["crop"]["kind"] == "none"
     assert len(facts["provenance"]["files"]) == 3 * (3 + 3 + 1)
-    # the fused map states each cell's deviation, and the text says so; the ring is named like its row, in the page too
+    # the fused map states each cell's deviation, and the text says so; the ring is named like its
+    # row, in the page too
     (cell_mm,) = re.findall(r"cells of ([0-9.]+) mm", said)
     assert facts["merged"]["cell_mm"] == pytest.approx(float(cell_mm), rel=0.01)
     assert "one unit of score is the deviation of matched filters" in said and " u cell " in said
@@ -138,7 +144,8 @@ def test_every_merge_finds_the_hole(
     assert points == judged
     rows = findings_of(tmp_path / "out")
     place_mm = np.array([rows[0][f"{axis}_mm"] for axis in "xyz"])
-    # the mean of four extreme points, of two views of one floor from two sides: good to a quarter of the hole
+    # the mean of four extreme points, of two views of one floor from two sides: good to a quarter
+    # of the hole
     np.testing.assert_allclose(place_mm[:2], 1e3 * HOLE_M[:2], atol=5e2 * board.HOLE_RADIUS_M)
     assert "<canvas" in (tmp_path / "out" / "view3d.html").read_text()
 
@@ -256,7 +263,8 @@ def _cloud(points: np.ndarray) -> Cloud:
     )
 
 
-# ---- what it refuses -------------------------------------------------------------------------------------------------
+# ---- what it refuses
+# -------------------------------------------------------------------------------------------------
 
 
 def test_a_view_with_hidden_marks_is_named_with_what_is_missing(
@@ -367,7 +375,8 @@ def test_a_full_disk_leaves_nothing(
     assert "the disk is full" in said and not (tmp_path / "out").exists()
 
 
-# ---- poses -----------------------------------------------------------------------------------------------------------
+# ---- poses
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
@@ -439,7 +448,8 @@ def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, told: str) -
         assert part in said
 
 
-# ---- a real capture --------------------------------------------------------------------------------------------------
+# ---- a real capture
+# --------------------------------------------------------------------------------------------------
 
 
 def _halves(source: Path, folder: Path) -> list[str]:
@@ -465,8 +475,9 @@ def _halves(source: Path, folder: Path) -> list[str]:
 def test_two_halves_of_a_static_capture_stand_where_they_stood(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """The camera did not move, so the truth is the identity. The one colour picture serves both halves, so that only
-    the marks' ranges differ: the error within the plane is not tested by it."""
+    """The camera did not move, so the truth is the identity. The one colour picture serves both
+    halves, so that only the marks' ranges differ: the error within the plane is not tested by it.
+    """
     paths = _halves(shared_data / "azure_drilled_board", tmp_path)
     out = tmp_path / "out"
     # coarse: what is found on the plate is not the question

@@ -26,7 +26,8 @@ def thesis() -> Target:
 
 
 def test_thesis_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mesh, truth = tmp_path / "new" / "board.glb", tmp_path / "new" / "truth.json"
+    mesh = tmp_path / "new" / "board.glb"
+    truth = tmp_path / "new" / "truth.json"
     assert main(["thesis", "--out", str(mesh), "--truth", str(truth)]) == 0
     printed = capsys.readouterr().out
     assert "25.400" in printed
@@ -55,7 +56,8 @@ def test_glb_holds_each_part_upright(thesis: Target, tmp_path: Path) -> None:
 def test_glb_grain_lies_where_the_renderer_sees_it(thesis: Target, tmp_path: Path) -> None:
     """The image of the GLB at the file's own co-ordinates is the texture at the part's."""
     write_mesh(thesis, tmp_path / "board.glb")
-    board, part = trimesh.load_scene(tmp_path / "board.glb").geometry["board"], thesis.parts[0]
+    board = trimesh.load_scene(tmp_path / "board.glb").geometry["board"]
+    part = thesis.parts[0]
     image = np.asarray(board.visual.material.baseColorTexture.convert("RGB"))
     assert part.texture_rgb is not None
     assert part.uv is not None

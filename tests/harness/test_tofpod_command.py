@@ -1,4 +1,5 @@
-"""The command `tofpod`: its programs, their names as words, completion; experiments by name; the wheel's contents."""
+"""The command `tofpod`: its programs, their names as words, completion; experiments by name; the
+wheel's contents."""
 
 from __future__ import annotations
 

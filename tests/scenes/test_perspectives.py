@@ -1,4 +1,5 @@
-"""Poses of several views, the guesses of where they stand, and what an experiment may say about them."""
+"""Poses of several views, the guesses of where they stand, and what an experiment may say about
+them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Make recordings of all kinds, answer them with the default command, and print right, warned and wrong by kind."""
+"""Make recordings of all kinds, answer them with the default command, and print right, warned and
+wrong by kind."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from tests.strangers.score import Score, answered, scored
 
 
 def made(kind: str, seed: int, folder: Path) -> Score:
-    """Make one recording in ``folder``, answer it and score the answer; what was printed goes to answer.txt there."""
+    """Make one recording in ``folder``, answer it and score the answer; what was printed goes to
+    answer.txt there."""
     rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
     stranger = KINDS[kind](rng)
     stack, view, truths = recorded(stranger, rng)

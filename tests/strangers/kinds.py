@@ -30,24 +30,25 @@ def kind(make: Callable[[Rng], Stranger]) -> Callable[[Rng], Stranger]:
     return make
 
 
-# ---- parts -----------------------------------------------------------------------------------------------------------
+# ---- parts
+# -----------------------------------------------------------------------------------------------------------
 
 
 def camera(rng: Rng, *among: tuple[int, int, float]) -> Camera:
     """A camera with its centre a few pixels off the image's."""
     width, height, f = (among or CAMERAS)[int(rng.integers(len(among or CAMERAS)))]
-    cx, cy = (
-        (width - 1) / 2 + rng.uniform(-0.02, 0.02) * width,
-        (height - 1) / 2 + rng.uniform(-0.04, 0.04) * height,
-    )
+    cx = (width - 1) / 2 + rng.uniform(-0.02, 0.02) * width
+    cy = (height - 1) / 2 + rng.uniform(-0.04, 0.04) * height
     return Camera(width, height, f, float(cx), float(cy))
 
 
 def turned(tilt_deg: float, towards_deg: float, spin_deg: float = 0.0) -> np.ndarray:
-    """Axes of a surface whose normal leaves the line of sight by ``tilt_deg`` towards a direction in the image."""
+    """Axes of a surface whose normal leaves the line of sight by ``tilt_deg`` towards a direction
+    in the image."""
     tilt, to, spin = np.radians([tilt_deg, towards_deg, spin_deg])
     axis = np.array([-np.sin(to), np.cos(to), 0.0]) * tilt
-    turn, about_z = cv2.Rodrigues(axis)[0], cv2.Rodrigues(np.array([0.0, 0.0, spin]))[0]
+    turn = cv2.Rodrigues(axis)[0]
+    about_z = cv2.Rodrigues(np.array([0.0, 0.0, spin]))[0]
     return turn @ about_z
 
 
@@ -80,8 +81,10 @@ def filling(
 def wall(
     surface: Surface, gap_m: float, tilt_deg: float = 0.0, towards_deg: float = 0.0
 ) -> Surface:
-    """An endless plane behind a surface's farthest corner, parallel to the image but for its own tilt."""
-    x, y = (0.999 * half if half < 5 else 0.0 for half in (surface.half_x_m, surface.half_y_m))
+    """An endless plane behind a surface's farthest corner, parallel to the image but for its own
+    tilt."""
+    x = 0.999 * surface.half_x_m if surface.half_x_m < 5 else 0.0
+    y = 0.999 * surface.half_y_m if surface.half_y_m < 5 else 0.0
     corners = [surface.point_m(i * x, j * y)[2] for i in (-1, 0, 1) for j in (-1, 0, 1)]
     at = np.array([*surface.origin_m[:2], np.nanmax(corners) + gap_m])
     return Surface(at, turned(tilt_deg, towards_deg), 9.0, 9.0)
@@ -92,9 +95,11 @@ def damaged(
     radius_mm: tuple[float, float] = (3, 20), depth_mm: tuple[float, float] = (4, 40), sign: float = 1.0,
     reach: tuple[float, float] | None = None,
 ) -> Surface:  # fmt: skip
-    """``n`` damages (fewer where they do not fit) at least 12 mm apart and 12 mm from the rim and the view's edge.
+    """``n`` damages (fewer where they do not fit) at least 12 mm apart and 12 mm from the rim and
+    the view's edge.
 
-    Sizes are uniform in their logarithm; a tapered one is at most 0.4 of its radius deep, as pressed dents are.
+    Sizes are uniform in their logarithm; a tapered one is at most 0.4 of its radius deep, as
+    pressed dents are.
     """
     d = surface.origin_m[2]
     view = np.array([cam.width, cam.height]) / cam.f_px * d / 2 * 0.85
@@ -161,7 +166,8 @@ def blotch(rng: Rng, cam: Camera, share: float, n: int = 1) -> np.ndarray:
     return image > 0
 
 
-# ---- boards ----------------------------------------------------------------------------------------------------------
+# ---- boards
+# ----------------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -198,7 +204,8 @@ def on_floor(rng: Rng) -> Stranger:
 
 @kind
 def corner(rng: Rng) -> Stranger:
-    """A board that stands on a floor before a wall; the floor runs from below the camera to the wall."""
+    """A board that stands on a floor before a wall; the floor runs from below the camera to the
+    wall."""
     cam = camera(rng)
     target = damaged(rng, cam, board(rng, cam, (0.6, 0.9), tilt=(0, 12), spin=(0, 0)), 3)
     floor = Surface(
@@ -236,7 +243,8 @@ def round_board(rng: Rng) -> Stranger:
     )
 
 
-# ---- curved targets --------------------------------------------------------------------------------------------------
+# ---- curved targets
+# --------------------------------------------------------------------------------------------------
 
 
 def _pipe(rng: Rng, cam: Camera, radius_m: float, **more: object) -> Surface:
@@ -291,7 +299,8 @@ def pipe_inside(rng: Rng) -> Stranger:
 @kind
 def sphere(rng: Rng) -> Stranger:
     cam = camera(rng)
-    radius, d = rng.uniform(0.08, 0.3), rng.uniform(0.5, 0.9)
+    radius = rng.uniform(0.08, 0.3)
+    d = rng.uniform(0.5, 0.9)
     ball = Surface(
         np.array([0, 0, d]),
         np.eye(3),
@@ -337,7 +346,8 @@ def corrugated(rng: Rng) -> Stranger:
     return _shaped(rng, "waves", pitch * rng.uniform(0.02, 0.06), pitch, n=2)
 
 
-# ---- things on and before the target ---------------------------------------------------------------------------------
+# ---- things on and before the target
+# ---------------------------------------------------------------------------------
 
 
 def _objects(target: Surface, rng: Rng) -> list[Surface]:
@@ -353,7 +363,8 @@ def _objects(target: Surface, rng: Rng) -> list[Surface]:
         half = halves[what]
         high = {"box": rng.uniform(0.01, 0.06), "tape": 0.0003, "cable": 0.008}[what]
         reach = float(np.hypot(*half))
-        x, y = rng.uniform(-0.8, 0.8) * target.half_x_m, rng.uniform(-0.8, 0.8) * target.half_y_m
+        x = rng.uniform(-0.8, 0.8) * target.half_x_m
+        y = rng.uniform(-0.8, 0.8) * target.half_y_m
         if any(
             np.hypot(x - d.x_m, y - d.y_m) < reach + d.radius_m + d.length_m + 0.02
             for d in target.damages
@@ -378,13 +389,16 @@ def object_on_plate(rng: Rng) -> Stranger:
 
 @kind
 def tags(rng: Rng) -> Stranger:
-    """Printed tags with black squares that a measures 1 to 3 mm off; findings there are not judged."""
+    """Printed tags with black squares that a measures 1 to 3 mm off; findings there are not
+    judged."""
     made = plate(rng)
-    cam, target = made.camera, made.surfaces[0]
+    cam = made.camera
+    target = made.surfaces[0]
     offset = np.zeros((cam.height, cam.width))
     for sx, sy in ((-0.8, -0.8), (0.8, -0.8), (-0.8, 0.8), (0.8, 0.8)):
         at = target.point_m(sx * target.half_x_m, sy * target.half_y_m)
-        u, v = (int(cam.f_px * at[i] / at[2] + c) for i, c in ((0, cam.cx_px), (1, cam.cy_px)))
+        u = int(cam.f_px * at[0] / at[2] + cam.cx_px)
+        v = int(cam.f_px * at[1] / at[2] + cam.cy_px)
         pattern = rng.integers(0, 2, (4, 4)).repeat(3, 0).repeat(3, 1) * rng.uniform(1e-3, 3e-3)
         window = offset[max(v, 0) : v + 12, max(u, 0) : u + 12]
         window[:] = pattern[: window.shape[0], : window.shape[1]]
@@ -412,8 +426,8 @@ def foreground(rng: Rng) -> Stranger:
 
 @kind
 def white_millimetre(rng: Rng) -> Stranger:
-    """Another kind's scene before the simplest camera: 1 mm of white noise, nothing mixed at edges, some pixels lost;
-    stored in millimetres or finer, with 0 or 65535 for no return."""
+    """Another kind's scene before the simplest camera: 1 mm of white noise, nothing mixed at
+    edges, some pixels lost; stored in millimetres or finer, with 0 or 65535 for no return."""
     named = "before_wall on_floor corner tilted fills_view pipe_outside pipe_inside sphere dome bent_sheet drilled"
     made = KINDS[str(rng.choice([*named.split(), "dents", "no_return", "object_on_plate"]))](rng)
     form = Format(
@@ -437,7 +451,8 @@ def camera_model(rng: Rng) -> Stranger:
     return replace(made, camera=cam, noise=noise, model=model, frames=int(rng.integers(1, 9)))
 
 
-# ---- damage ----------------------------------------------------------------------------------------------------------
+# ---- damage
+# ----------------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -488,7 +503,8 @@ def no_return(rng: Rng) -> Stranger:
     )
 
 
-# ---- what the camera loses -------------------------------------------------------------------------------------------
+# ---- what the camera loses
+# -------------------------------------------------------------------------------------------
 
 
 @kind
@@ -518,7 +534,8 @@ def dark_patch(rng: Rng) -> Stranger:
 
 @kind
 def specular(rng: Rng) -> Stranger:
-    """A highlight that saturates: nothing returns from a patch; calling it is right, calling it not too."""
+    """A highlight that saturates: nothing returns from a patch; calling it is right, calling it
+    not too."""
     made = plate(rng)
     patch = blotch(rng, made.camera, rng.uniform(0.001, 0.01))
     return replace(
@@ -532,7 +549,8 @@ def flying_pixels(rng: Rng) -> Stranger:
     return replace(made, noise=replace(made.noise, mixing_px=rng.uniform(0.8, 1.5)))
 
 
-# ---- noise -----------------------------------------------------------------------------------------------------------
+# ---- noise
+# -----------------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -574,13 +592,15 @@ def fifty_frames(rng: Rng) -> Stranger:
     return replace(plate(rng, cam=camera(rng, CAMERAS[1], CAMERAS[3], CAMERAS[4])), frames=50)
 
 
-# ---- what moves ------------------------------------------------------------------------------------------------------
+# ---- what moves
+# ------------------------------------------------------------------------------------------------------
 
 
 @kind
 def frame_jump(rng: Rng) -> Stranger:
     """One frame reads 5 to 30 mm off, as after an interrupted exposure."""
-    at, off = int(rng.integers(8)), float(rng.choice([-1, 1])) * rng.uniform(5e-3, 30e-3)
+    at = int(rng.integers(8))
+    off = float(rng.choice([-1, 1])) * rng.uniform(5e-3, 30e-3)
     return replace(plate(rng), frames=8, per_frame=lambda k, depth: depth + off * (k == at))
 
 
@@ -598,7 +618,8 @@ def moved_camera(rng: Rng) -> Stranger:
 def passer_by(rng: Rng) -> Stranger:
     """Somebody walks through the view in two of ten frames."""
     made = plate(rng)
-    h, w = made.camera.height, made.camera.width
+    h = made.camera.height
+    w = made.camera.width
     near = 0.6 * made.surfaces[0].origin_m[2]
 
     def walks(k: int, depth: np.ndarray) -> np.ndarray:
@@ -611,7 +632,8 @@ def passer_by(rng: Rng) -> Stranger:
     return replace(made, frames=10, per_frame=walks)
 
 
-# ---- cameras and files -----------------------------------------------------------------------------------------------
+# ---- cameras and files
+# -----------------------------------------------------------------------------------------------
 
 
 @kind
@@ -693,7 +715,8 @@ def clouds_mm(rng: Rng) -> Stranger:
     )
 
 
-# ---- nothing to find -------------------------------------------------------------------------------------------------
+# ---- nothing to find
+# -------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -709,7 +732,8 @@ def rubble(rng: Rng) -> Stranger:
     cam = camera(rng, CAMERAS[1], CAMERAS[3], CAMERAS[4])
     stones = []
     for _ in range(60):
-        d, radius = rng.uniform(0.5, 0.9), rng.uniform(0.02, 0.07)
+        d = rng.uniform(0.5, 0.9)
+        radius = rng.uniform(0.02, 0.07)
         at = np.array(
             [*(rng.uniform(-0.6, 0.6, 2) * d * np.array([cam.width, cam.height]) / cam.f_px), d]
         )

@@ -1,4 +1,5 @@
-"""A stranger's recording: a view with a camera's faults, its true damage, and the files that a stranger would keep."""
+"""A stranger's recording: a view with a camera's faults, its true damage, and the files that a
+stranger would keep."""
 
 from __future__ import annotations
 
@@ -15,19 +16,23 @@ import scipy.io
 from tests.strangers.world import Camera, Damage, Surface, View, cast
 
 CLEAR_D = 3 * 5.5
-"""A damage is clearly visible from three times the d' that an ideal observer needs (90 % found at about one false
-call a view: d' 5.5) ..."""
-CLEAR_PIXELS, CLEAR_PEAK, CLEAR_SHARE = 9, 3.0, 0.15
+"""A damage is clearly visible from three times the d' that an ideal observer needs (90 % found at
+about one false call a view: d' 5.5) ..."""
+CLEAR_PIXELS = 9
+CLEAR_PEAK = 3.0
+CLEAR_SHARE = 0.15
 """... where it has that many pixels, stands out of an averaged pixel's noise by that factor, and its radius is at most
 that share of the target's half width (wider is shape of the target, not damage)."""
 CLEAR_LOG_ODDS = 36.0
-"""A hole without return is clearly visible where chance alone would leave such a gap with odds of e^-36 or less."""
+"""A hole without return is clearly visible where chance alone would leave such a gap with odds of
+e^-36 or less."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """A camera's faults. ``white_m`` of one pixel in one frame; ``blur_px`` > 0 correlates it over neighbours and keeps
-    its size; ``tail``: Student's t with 3 degrees in place of a Gaussian; ``fixed_m`` the same in every frame."""
+    """A camera's faults. ``white_m`` of one pixel in one frame; ``blur_px`` > 0 correlates it over
+    neighbours and keeps its size; ``tail``: Student's t with 3 degrees in place of a Gaussian;
+    ``fixed_m`` the same in every frame."""
 
     white_m: float = 1e-3
     blur_px: float = 0.0
@@ -41,8 +46,9 @@ class Noise:
 
 @dataclass(frozen=True)
 class Format:
-    """The files: ``kind`` png, npy, npz, mat, ply, pcd or xyz; one stored unit in metres (floats store ``unit_m`` too);
-    what stands for no return; more arguments that the stranger would know to give."""
+    """The files: ``kind`` png, npy, npz, mat, ply, pcd or xyz; one stored unit in metres (floats
+    store ``unit_m`` too); what stands for no return; more arguments that the stranger would know
+    to give."""
 
     kind: str = "png"
     unit_m: float = 1e-3
@@ -52,8 +58,9 @@ class Format:
 
 @dataclass(frozen=True)
 class Truth:
-    """One true damage. Lengths in metres, camera frame; ``depth_m`` ranges over what may rightly be called its depth
-    (along the normal, along z), ``diameter_m`` likewise (at half depth, at the rim)."""
+    """One true damage. Lengths in metres, camera frame; ``depth_m`` ranges over what may rightly
+    be called its depth (along the normal, along z), ``diameter_m`` likewise (at half depth, at the
+    rim)."""
 
     centre_m: tuple[float, float, float]
     radius_m: float
@@ -66,11 +73,12 @@ class Truth:
 
 @dataclass(frozen=True)
 class Stranger:
-    """A scene and how it was recorded. ``ignored`` (h, w): pixels where a finding is neither right nor false, because
-    something real is there; ``doubtful``: no answer is right without a warning; ``per_frame(k, depth)`` changes the
-    noise-free depth of frame k; ``louder`` (h, w) multiplies the noise; from ``gone`` (h, w) nothing returns;
-    ``offset_m`` (h, w) is added to the depth. ``model``: the project's own camera that takes the frames, from phasors
-    without interreflection; ``noise`` then says only what is clearly visible in them."""
+    """A scene and how it was recorded. ``ignored`` (h, w): pixels where a finding is neither right
+    nor false, because something real is there; ``doubtful``: no answer is right without a warning;
+    ``per_frame(k, depth)`` changes the noise-free depth of frame k; ``louder`` (h, w) multiplies
+    the noise; from ``gone`` (h, w) nothing returns; ``offset_m`` (h, w) is added to the depth.
+    ``model``: the project's own camera that takes the frames, from phasors without
+    interreflection; ``noise`` then says only what is clearly visible in them."""
 
     surfaces: list[Surface]
     camera: Camera
@@ -93,7 +101,8 @@ def recorded(
     view = cast(stranger.surfaces, stranger.camera)
     if stranger.model:
         return _simulated(stranger, int(rng.integers(1000))), view, _truths(stranger, view)
-    noise, shape = stranger.noise, view.depth_m.shape
+    noise = stranger.noise
+    shape = view.depth_m.shape
     clean = view.depth_m if stranger.offset_m is None else view.depth_m + stranger.offset_m
     if noise.mixing_px:
         clean = _mixed(clean, noise.mixing_px)
@@ -111,7 +120,8 @@ def recorded(
 
 
 def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
-    """Frames of the project's own camera model: phasors of ``finer`` x ``finer`` rays a pixel, light by r^-2."""
+    """Frames of the project's own camera model: phasors of ``finer`` x ``finer`` rays a pixel,
+    light by r^-2."""
     from harness.vocabulary.geometry import Region
     from scenes.optics import NoiseFreeView
     from scenes.sensor.camera import CameraConfig, load_camera
@@ -166,12 +176,14 @@ def _field(
 
 
 def _gain(blur_px: float) -> float:
-    """How many times more a correlated field of deviation 1 holds at the lowest frequencies than a white one."""
+    """How many times more a correlated field of deviation 1 holds at the lowest frequencies than a
+    white one."""
     return max(1.0, 2 * np.sqrt(np.pi) * blur_px)
 
 
 def _mixed(depth: np.ndarray, blur_px: float) -> np.ndarray:
-    """Depth averaged over the pixel's footprint: flying pixels at every edge. Beyond the image it goes on straight."""
+    """Depth averaged over the pixel's footprint: flying pixels at every edge. Beyond the image it
+    goes on straight."""
     beyond = 4
     depth = np.pad(depth, beyond, mode="reflect", reflect_type="odd")
     known = np.isfinite(depth)
@@ -182,7 +194,8 @@ def _mixed(depth: np.ndarray, blur_px: float) -> np.ndarray:
 
 
 def _clusters(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
-    """Ragged patches of 2 to 6 pixels' radius from which nothing returns: a frame's bad spots, not holes."""
+    """Ragged patches of 2 to 6 pixels' radius from which nothing returns: a frame's bad spots, not
+    holes."""
     seeds = np.zeros(shape)
     for _ in range(count):
         cv2.circle(
@@ -197,16 +210,19 @@ def _clusters(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> n
 
 def _truths(stranger: Stranger, view: View) -> tuple[Truth, ...]:
     """Every damage, and whether it is clearly visible in this recording."""
-    noise, n = stranger.noise, stranger.frames
+    noise = stranger.noise
+    n = stranger.frames
     step = stranger.format.unit_m if stranger.format.kind == "png" else 0.0
     rounding = step**2 / 12 / (n if noise.white_m > step / 2 else 1)
     pixel = float(np.sqrt(noise.white_m**2 / n / (1 - noise.dropout) + noise.fixed_m**2 + rounding))
-    white, fixed = noise.white_m * _gain(noise.blur_px), noise.fixed_m * _gain(noise.fixed_px)
+    white = noise.white_m * _gain(noise.blur_px)
+    fixed = noise.fixed_m * _gain(noise.fixed_px)
     broad = float(np.sqrt(white**2 / n / (1 - noise.dropout) + fixed**2 + rounding))
     louder = np.ones(view.depth_m.shape) if stranger.louder is None else stranger.louder
     rate = min(max(noise.dropout**n, 1e-3), 1.0)
     gone = np.zeros(view.depth_m.shape, bool) if stranger.gone is None else stranger.gone
-    truths, i = [], 0
+    truths = []
+    i = 0
     for surface in stranger.surfaces:
         half = min(surface.half_x_m, surface.half_y_m)
         half = min(half, _seen_half_m(surface, stranger.camera))
@@ -271,13 +287,16 @@ def _truth(
     )
 
 
-# ---- files -----------------------------------------------------------------------------------------------------------
+# ---- files
+# -----------------------------------------------------------------------------------------------------------
 
 
 def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
-    """Write the frames as the stranger keeps them; returns the path that `harness.detect` is given."""
+    """Write the frames as the stranger keeps them; returns the path that `harness.detect` is
+    given."""
     folder.mkdir(parents=True, exist_ok=True)
-    camera, form = stranger.camera, stranger.format
+    camera = stranger.camera
+    form = stranger.format
     lens: dict[str, object] = {
         "fx": camera.f_px,
         "fy": camera.f_px,
@@ -311,7 +330,8 @@ def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
 
 
 def _clouds(stranger: Stranger, stored: np.ndarray, folder: Path) -> Path:
-    """Each frame as a cloud: binary PLY without a grid, organised binary PCD, or one text file of points."""
+    """Each frame as a cloud: binary PLY without a grid, organised binary PCD, or one text file of
+    points."""
     slopes = stranger.camera.slopes().astype(np.float32)
     kind, (h, w) = stranger.format.kind, stored.shape[1:]
     for k, z in enumerate(stored):

@@ -21,7 +21,8 @@ FALSE_CALLS = 1
 """False findings that a right answer may hold; none of them on another surface than the target."""
 FACTOR = 1.5
 """A size is right within this factor of what may rightly be called the size ..."""
-PIXELS, SIGMAS = 2.0, 3.0
+PIXELS = 2.0
+SIGMAS = 3.0
 """... and two pixels, or three deviations of an averaged pixel."""
 RIM_PX = 4
 
@@ -47,7 +48,8 @@ class Score:
 def answered(
     path: Path, out: Path, arguments: tuple[str, ...] = ()
 ) -> tuple[int, str, list[dict[str, str]]]:
-    """(exit code, all that was printed, rows of findings.csv) of the default command; a traceback is code 1."""
+    """(exit code, all that was printed, rows of findings.csv) of the default command; a traceback
+    is code 1."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
@@ -116,9 +118,11 @@ def _place(row: dict[str, str]) -> np.ndarray:
 
 
 def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
-    """The nearest damage whose centre is within its radius, at least 12 mm, across the line of sight."""
+    """The nearest damage whose centre is within its radius, at least 12 mm, across the line of
+    sight."""
     place = _place(row)
-    best, least = None, math.inf
+    best = None
+    least = math.inf
     for truth in truths:
         centre = 1e3 * np.array(truth.centre_m)
         # an error of the camera's range moves a place along its line of sight
@@ -129,7 +133,8 @@ def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
             and abs(place[2] - centre[2]) < 50 + deep
             and apart < least
         ):
-            best, least = truth, apart
+            best = truth
+            least = apart
     return best
 
 
@@ -141,9 +146,11 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
     for row in rows:
         x, y, z = _place(row) / 1e3
         if any(cam.distortion):
-            at_u, at_v = float(row["u_px"]), float(row["v_px"])
+            at_u = float(row["u_px"])
+            at_v = float(row["v_px"])
         else:
-            at_u, at_v = cam.f_px * x / z + cam.cx_px, cam.f_px * y / z + cam.cy_px
+            at_u = cam.f_px * x / z + cam.cx_px
+            at_v = cam.f_px * y / z + cam.cy_px
         near = np.hypot(u - at_u, v - at_v) <= RIM_PX
         if stranger.ignored is not None and (near & stranger.ignored).any():
             continue
@@ -159,8 +166,10 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
 def _misjudged(
     stranger: Stranger, rows: list[dict[str, str]], matched: list[Truth | None]
 ) -> list[str]:
-    """Wrong signs and sizes of the clearly visible damages, each by the strongest finding at its place."""
-    why, done = [], set()
+    """Wrong signs and sizes of the clearly visible damages, each by the strongest finding at its
+    place."""
+    why = []
+    done = set()
     for row, truth in zip(rows, matched, strict=True):
         if truth is None or not truth.clear or id(truth) in done:
             continue

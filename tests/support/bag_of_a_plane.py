@@ -1,4 +1,5 @@
-"""ROS bags of the recorded plane, in whatever layout a test asks for, written without the project's own writer."""
+"""ROS bags of the recorded plane, in whatever layout a test asks for, written without the
+project's own writer."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from tests.support import recorded_plane as plane
 
 @cache
 def types_of(store: Stores = Stores.ROS2_HUMBLE) -> Typestore:
-    """Return the message types. To read them takes over a second, which no import of this module should cost."""
+    """Return the message types. To read them takes over a second, which no import of this module
+    should cost."""
     return get_typestore(store)
 
 
@@ -50,10 +52,13 @@ def cloud(
     packed_as: str = "f4",
     cut: int = 0,
 ) -> Any:
-    """PointCloud2 of points (h, w, 3): ``lead`` bytes before x, ``row_padding`` after each row; ``cut`` bytes lack."""
+    """PointCloud2 of points (h, w, 3): ``lead`` bytes before x, ``row_padding`` after each row;
+    ``cut`` bytes lack."""
     order = ">" if big else "<"
     size = int(number[1])
-    names, offsets, types = ["x", "y", "z"], [lead, lead + size, lead + 2 * size], [number] * 3
+    names = ["x", "y", "z"]
+    offsets = [lead, lead + size, lead + 2 * size]
+    types = [number] * 3
     if rgb is not None:
         names.append("rgb")
         offsets.append(lead + 3 * size + 4)
@@ -160,7 +165,8 @@ def depth_image(
 
 
 def packed_depth(stored_mm: np.ndarray, encoding: str = "16UC1", form: str = "png") -> Any:
-    """The same as compressedDepth, with image_transport's quantisation of 32FC1 (100 at most 10 m away)."""
+    """The same as compressedDepth, with image_transport's quantisation of 32FC1 (100 at most 10 m
+    away)."""
     a = b = 0.0
     values = stored_mm
     if encoding == "32FC1":
@@ -182,12 +188,15 @@ def rvl(values: np.ndarray) -> bytes:
 
     def put(number: int) -> None:
         while True:
-            nibble, number = number & 7, number >> 3
+            nibble = number & 7
+            number = number >> 3
             nibbles.append(nibble | (8 if number else 0))
             if not number:
                 return
 
-    flat, at, previous = values.ravel().tolist(), 0, 0
+    flat = values.ravel().tolist()
+    at = 0
+    previous = 0
     while at < len(flat):
         start = at
         while at < len(flat) and flat[at] == 0:
@@ -198,7 +207,8 @@ def rvl(values: np.ndarray) -> bytes:
             at += 1
         put(at - start)
         for value in flat[start:at]:
-            delta, previous = value - previous, value
+            delta = value - previous
+            previous = value
             put((delta << 1) ^ (delta >> 31))
     nibbles += [0] * (-len(nibbles) % 8)
     words = [

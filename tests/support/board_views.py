@@ -1,4 +1,5 @@
-"""Views of a small board with four marks, ray-cast by a pinhole camera: what registrations are tested on."""
+"""Views of a small board with four marks, ray-cast by a pinhole camera: what registrations are
+tested on."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from detectors.views.view import PreparedView, View
 from harness.vocabulary.geometry import Cloud, Lens, invert, rotation_xyz_deg, transform_points
 
 LENS = Lens(220, 160, 300.0, 300.0, 109.5, 79.5)
-HALF_X_M, HALF_Y_M = 0.15, 0.09
+HALF_X_M = 0.15
+HALF_Y_M = 0.09
 DISTANCE_M = 0.5
 TAPE_M = (0.036, 0.014)
 TAPES_M = ((-0.11, 0.06), (0.10, 0.065), (-0.105, -0.06), (0.115, -0.05))
@@ -34,7 +36,8 @@ def pose(
     roll_deg: float = 0.0,
     shift_m: object = (0, 0, 0),
 ) -> np.ndarray:
-    """``T_camera_board``: the board's x and y along the camera's x and -y, then turned, at `DISTANCE_M`."""
+    """``T_camera_board``: the board's x and y along the camera's x and -y, then turned, at
+    `DISTANCE_M`."""
     T = np.eye(4)
     T[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_xyz_deg(tilt_x_deg, tilt_y_deg, roll_deg)
     T[:3, 3] = np.array([0.0, 0.0, DISTANCE_M]) + np.asarray(shift_m, dtype=float)
@@ -52,17 +55,19 @@ def board_view(
     textured: bool = False,
     smooth_m: np.ndarray | None = None,
 ) -> BoardView:
-    """One view. ``smooth_m`` (4, 4): coefficients T_i(x) T_j(y) of Chebyshev polynomials, x and y from -1 to 1 on the
-    board, that are added to z as an error of the whole view."""
+    """One view. ``smooth_m`` (4, 4): coefficients T_i(x) T_j(y) of Chebyshev polynomials, x and y
+    from -1 to 1 on the board, that are added to z as an error of the whole view."""
     slopes = lens.region_slopes(lens.whole)
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    normal, point = T_camera_board[:3, 2], T_camera_board[:3, 3]
+    normal = T_camera_board[:3, 2]
+    point = T_camera_board[:3, 3]
     points = rays * (normal @ point / (rays @ normal))[..., None]
     on_board = transform_points(invert(T_camera_board), points)
     inside = (np.abs(on_board[..., 0]) <= HALF_X_M) & (np.abs(on_board[..., 1]) <= HALF_Y_M)
     z = points[..., 2] + np.random.default_rng(seed).standard_normal(inside.shape) * noise_m
     if smooth_m is not None:
-        u, v = on_board[..., 0] / HALF_X_M, on_board[..., 1] / HALF_Y_M
+        u = on_board[..., 0] / HALF_X_M
+        v = on_board[..., 1] / HALF_Y_M
         z = z + np.polynomial.chebyshev.chebval2d(u, v, smooth_m)
     z = np.where(inside, z, np.nan)
     points = rays * z[..., None]
@@ -74,7 +79,8 @@ def board_view(
         labels[close & inside] = k
     reason = np.where(inside, 0, 1).astype(np.uint8)
     count = inside.astype(int)
-    rgb, unknown = _colour(on_board, labels, textured), np.full(inside.shape, np.nan)
+    rgb = _colour(on_board, labels, textured)
+    unknown = np.full(inside.shape, np.nan)
     cloud = Cloud(points, reason, count, unknown, lens.whole, 0.0, 1, lens=lens, rgb=rgb)
     marks = tuple(
         _mark(points, labels, k, noise_m) for k in range(len(tapes_m)) if (labels == k).sum() >= 10
@@ -95,7 +101,8 @@ def views(
     seed: int = 0,
     **more: Any,
 ) -> list[BoardView]:
-    """Views of one board, named view 0, 1, ...; guesses are the truth, times ``guess_error`` (4, 4) after the first."""
+    """Views of one board, named view 0, 1, ...; guesses are the truth, times ``guess_error`` (4,
+    4) after the first."""
     made = []
     for i, T_camera_board in enumerate(poses):
         guess = poses[0] @ invert(T_camera_board) if i else np.eye(4)
@@ -136,7 +143,8 @@ def target_error_m(
 def _mark(points_m: np.ndarray, labels: np.ndarray, label: int, noise_m: float) -> Mark:
     picked = np.flatnonzero(labels == label)
     own = points_m.reshape(-1, 3)[picked]
-    # the rim lies anywhere within a pixel: the centroid of n pixels with about 4 sqrt(n) at the rim
+    # the rim lies anywhere within a pixel: the centroid of n pixels with about 4 sqrt(n) at the
+    # rim
     pitch = DISTANCE_M / LENS.fx
     rim = 4 * np.sqrt(len(picked)) * pitch**2 / 12 * (TAPE_M[0] / 2 / (len(picked) * pitch)) ** 2
     covariance = np.diag([rim, rim, max(noise_m, 1e-6) ** 2 / len(picked)])
@@ -148,7 +156,8 @@ def _colour(on_board_m: np.ndarray, labels: np.ndarray, textured: bool) -> np.nd
     """Grey with red tapes; or with a pattern of bars of several widths, fixed to the board."""
     grey = np.full(labels.shape, 150.0)
     if textured:
-        x, y = on_board_m[..., 0], on_board_m[..., 1]
+        x = on_board_m[..., 0]
+        y = on_board_m[..., 1]
         grey += 45 * np.sin(2 * np.pi * (x / 0.031 + 0.3 * y / 0.02)) + 40 * np.sin(
             2 * np.pi * (y / 0.023 - 0.4 * x / 0.05)
         )

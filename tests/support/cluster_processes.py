@@ -1,4 +1,5 @@
-"""A scheduler and workers as processes of their own, as a user starts them; and jobs that misbehave."""
+"""A scheduler and workers as processes of their own, as a user starts them; and jobs that
+misbehave."""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ class Processes:
         return subprocess.Popen(command, cwd=self.folder, env=environment, stdout=log, stderr=log)
 
     def close(self) -> None:
-        # workers first: one that ends while its scheduler does may wait for it. Nothing is asserted of how they end
+        # workers first: one that ends while its scheduler does may wait for it. Nothing is
+        # asserted of how they end
         for group in (self.workers, [self.scheduler]):
             for process in group:
                 if process.poll() is None:
@@ -131,7 +133,8 @@ def hang() -> None:
 
 
 def hold_the_interpreter() -> None:
-    """Wait in C for what never comes, without giving the interpreter's lock back: no other thread runs again."""
+    """Wait in C for what never comes, without giving the interpreter's lock back: no other thread
+    runs again."""
     nothing, _ = os.pipe()
     ctypes.PyDLL(None).read(nothing, ctypes.create_string_buffer(1), 1)
 

@@ -1,4 +1,5 @@
-"""Two detectors that test the harness, not a target: the oracle is handed the truth, the blind detector guesses."""
+"""Two detectors that test the harness, not a target: the oracle is handed the truth, the blind
+detector guesses."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ UNIT_M = 1.0 * MM  # length of one unit of score: neither score is a length, and
 
 
 class Oracle:
-    """Handed the truth: finds every damage once, at any threshold below 1, and nothing else; has no settings."""
+    """Handed the truth: finds every damage once, at any threshold below 1, and nothing else; has
+    no settings."""
 
     settings_type: ClassVar[type[Config]] = Config
     name = "oracle"
@@ -38,7 +40,8 @@ class Oracle:
         return Oracle(self.settings, tuple(truth))
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score 1 on the pixels of true damage, 0 on others. Raises UserError if it has not received the truth."""
+        """Score 1 on the pixels of true damage, 0 on others. Raises UserError if it has not
+        received the truth."""
         truth = self._known()
         if not cloud.valid.any():
             raise UserError("the cloud has no valid point to judge", fix="check the capture")
@@ -81,7 +84,8 @@ class Oracle:
 
 
 class BlindConfig(Config):
-    """``guesses_per_m2``: mean number of guesses on a square metre; above a threshold t exp(-t) times as many."""
+    """``guesses_per_m2``: mean number of guesses on a square metre; above a threshold t exp(-t)
+    times as many."""
 
     crop: CropConfig = Field(default_factory=BoxCrop)
     guesses_per_m2: float = Field(default=400.0, gt=0, le=1e6)
@@ -89,8 +93,8 @@ class BlindConfig(Config):
 
 
 class BlindDetector:
-    """Random: guesses without looking, at a stated number per square metre, with exponential scores; the same cloud
-    gives the same guesses, another draw of noise independent ones."""
+    """Random: guesses without looking, at a stated number per square metre, with exponential
+    scores; the same cloud gives the same guesses, another draw of noise independent ones."""
 
     settings_type: ClassVar[type[BlindConfig]] = BlindConfig
     name = "blind"
@@ -101,7 +105,8 @@ class BlindDetector:
         self.settings = settings
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score exponentially where a guess falls, 0 elsewhere in the crop. Raises UserError on an empty crop."""
+        """Score exponentially where a guess falls, 0 elsewhere in the crop. Raises UserError on an
+        empty crop."""
         mask = crop(cloud, self.settings.crop)
         points = np.ascontiguousarray(cloud.points_m)
         content = hashlib.blake2b(
@@ -140,8 +145,9 @@ class BlindDetector:
 
 
 def judged_area_m2(cloud: Cloud, mask: np.ndarray) -> float:
-    """Return the area of the surface that a mask (h, w) of pixels covers: of its cells between four pixels across the
-    optical axis, over the cosine of the tilt of its plane. Of a cloud without a grid the area of the convex hull."""
+    """Return the area of the surface that a mask (h, w) of pixels covers: of its cells between
+    four pixels across the optical axis, over the cosine of the tilt of its plane. Of a cloud
+    without a grid the area of the convex hull."""
     from scipy.spatial import ConvexHull, QhullError
 
     x, y, z = cloud.points_m[mask].T
@@ -152,7 +158,8 @@ def judged_area_m2(cloud: Cloud, mask: np.ndarray) -> float:
     if cloud.organised:
         whole = mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
         xy = np.where(mask[..., None], cloud.points_m[..., :2], 0.0)
-        falling, rising = xy[1:, 1:] - xy[:-1, :-1], xy[1:, :-1] - xy[:-1, 1:]
+        falling = xy[1:, 1:] - xy[:-1, :-1]
+        rising = xy[1:, :-1] - xy[:-1, 1:]
         areas = 0.5 * (falling[..., 0] * rising[..., 1] - falling[..., 1] * rising[..., 0])
         across = float(abs(areas[whole].sum()))
     else:

@@ -60,8 +60,8 @@ FOLDER = "TOFPOD_TEST_FAULTS"
 
 
 def commit_a_fault(kind: str) -> None:
-    """Take one of the files of a kind that a test has put into the folder named by the environment, and do as its name
-    says; each is done once, by whoever is first."""
+    """Take one of the files of a kind that a test has put into the folder named by the
+    environment, and do as its name says; each is done once, by whoever is first."""
     folder = os.environ.get(FOLDER)
     for name, fault in FAULTS.items() if folder else ():
         for path in sorted(Path(str(folder)).glob(f"{kind}-{name}*")):

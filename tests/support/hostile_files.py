@@ -17,7 +17,8 @@ from tests.support import recorded_plane as plane
 
 SPARE_BYTES = 1 << 30
 SECONDS = 120.0
-"""Processor time that no refusal takes: some seconds are usual, and without the refusal it would be hours."""
+"""Processor time that no refusal takes: some seconds are usual, and without the refusal it would
+be hours."""
 BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 30)
 )

@@ -1,4 +1,5 @@
-"""A detector as somebody else would write it, which learns the noise of hole-free clouds and scores by it."""
+"""A detector as somebody else would write it, which learns the noise of hole-free clouds and
+scores by it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""How deep a small hole looks through the beam: closed form, for the sensitivity to the beam's width."""
+"""How deep a small hole looks through the beam: closed form, for the sensitivity to the beam's
+width."""
 
 from __future__ import annotations
 
@@ -13,10 +14,12 @@ from scenes.sensor.lidar.scanner import smear_weights
 
 
 def share_in_disc(camera: ScannedLidar, diameter_m: float, distance_m: float) -> float:
-    """Share of the light of a beam, aimed at the centre of a disc that faces it, that lands on the disc.
+    """Share of the light of a beam, aimed at the centre of a disc that faces it, that lands on the
+    disc.
 
-    A round Gaussian, smeared along the sweep by the integration. From an aim d deviations off centre a disc of radius
-    r deviations gets the non-central chi-square distribution of d^2 with two degrees of freedom at r^2.
+    A round Gaussian, smeared along the sweep by the integration. From an aim d deviations off
+    centre a disc of radius r deviations gets the non-central chi-square distribution of d^2 with
+    two degrees of freedom at r^2.
     """
     deviation_m = camera.beam.fwhm_mrad.value * MRAD / FWHM_PER_DEVIATION * distance_m
     weights = smear_weights(camera.integration_points)
@@ -28,10 +31,12 @@ def share_in_disc(camera: ScannedLidar, diameter_m: float, distance_m: float) ->
 def hole_depth_seen_m(
     camera: ScannedLidar, diameter_m: float, depth_m: float, distance_m: float
 ) -> float:
-    """Depth that the centre of a blind hole shows in a face at ``distance_m``, before the device's smoothing.
+    """Depth that the centre of a blind hole shows in a face at ``distance_m``, before the device's
+    smoothing.
 
-    The strongest peak of the correlation of both returns, which a beam's footprint mixes. Left out: the hole's wall,
-    the shadow that its rim throws on its floor for the receiver, and the light between wall and floor.
+    The strongest peak of the correlation of both returns, which a beam's footprint mixes. Left
+    out: the hole's wall, the shadow that its rim throws on its floor for the receiver, and the
+    light between wall and floor.
     """
     share = share_in_disc(camera, diameter_m, distance_m)
     wave = 2 * np.pi * np.array(camera.optics.frequencies_hz) / SPEED_OF_LIGHT_AIR

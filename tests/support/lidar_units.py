@@ -1,4 +1,5 @@
-"""What tests of the scanned lidar share: the camera with other numbers, units before planes, mixed views."""
+"""What tests of the scanned lidar share: the camera with other numbers, units before planes, mixed
+views."""
 
 from __future__ import annotations
 

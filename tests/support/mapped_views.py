@@ -1,4 +1,5 @@
-"""Views of a plane, with or without a drilled hole, from rays in space: what the tests of maps are made of."""
+"""Views of a plane, with or without a drilled hole, from rays in space: what the tests of maps are
+made of."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class Hole:
 
 @dataclass(frozen=True)
 class Plane:
-    """In the first view's frame: through (0, 0, ``DISTANCE_M``) with a unit normal away from the viewer."""
+    """In the first view's frame: through (0, 0, ``DISTANCE_M``) with a unit normal away from the
+    viewer."""
 
     tilt_x_deg: float = 0.0
     tilt_y_deg: float = 0.0
@@ -51,7 +53,8 @@ class Plane:
         return T
 
     def z_m(self, slopes: np.ndarray, T_reference_view: np.ndarray) -> np.ndarray:
-        """(h, w) where rays with ``slopes`` (h, w, 2) end: on the plane, on the hole's wall or on its floor."""
+        """(h, w) where rays with ``slopes`` (h, w, 2) end: on the plane, on the hole's wall or on
+        its floor."""
         T_plane_view = invert(self.T_reference_plane) @ T_reference_view
         rays = rotate_vectors(
             T_plane_view, np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
@@ -60,7 +63,8 @@ class Plane:
         part = -start[2] / rays[..., 2]
         if self.hole is None:
             return part
-        # in the hole's own frame, from the mouth on: leave the circle (the wall) or reach the floor
+        # in the hole's own frame, from the mouth on: leave the circle (the wall) or reach the
+        # floor
         mouth = (start + part[..., None] * rays)[..., :2] - np.array(self.hole.at)
         a = (rays[..., :2] ** 2).sum(axis=-1)
         b = (mouth * rays[..., :2]).sum(axis=-1)
@@ -75,7 +79,8 @@ class Plane:
 def turned(
     about_x_deg: float, about_y_deg: float, shift_m: tuple[float, float, float] = (0, 0, 0)
 ) -> np.ndarray:
-    """T_reference_view of a camera that has gone around the point (0, 0, ``DISTANCE_M``), and then aside."""
+    """T_reference_view of a camera that has gone around the point (0, 0, ``DISTANCE_M``), and then
+    aside."""
     T = np.eye(4)
     T[:3, :3] = rotation_xyz_deg(about_x_deg, about_y_deg, 0.0)
     middle = np.array([0.0, 0.0, DISTANCE_M])
@@ -84,7 +89,8 @@ def turned(
 
 
 def arc(count: int, half_deg: float) -> list[np.ndarray]:
-    """The reference and views to both sides, each shifted a little, so that pixels fall differently."""
+    """The reference and views to both sides, each shifted a little, so that pixels fall
+    differently."""
     angles = np.linspace(-half_deg, half_deg, count - 1) if count > 1 else []
     return [np.eye(4)] + [
         turned(0.3 * angle, angle, (0.0007 * i, -0.0004 * i, 0.003 * i))
@@ -107,7 +113,8 @@ def seen(
 ) -> PreparedView:
     """A view of a plane: average of frames with white noise, a pattern added, all pixels inside.
 
-    ``variance_m2`` is a sample variance as frames would give it. ``fields`` replace those of the cloud.
+    ``variance_m2`` is a sample variance as frames would give it. ``fields`` replace those of the
+    cloud.
     """
     slopes = lens.region_slopes(lens.whole)
     over = 4

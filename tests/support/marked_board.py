@@ -1,4 +1,5 @@
-"""A board with strips of tape and one blind hole before a pinhole camera, as Open3D's recorder would store it."""
+"""A board with strips of tape and one blind hole before a pinhole camera, as Open3D's recorder
+would store it."""
 
 from __future__ import annotations
 
@@ -11,8 +12,12 @@ import numpy as np
 from harness.vocabulary.geometry import Lens, invert, rotation_xyz_deg, transform_points
 
 LENS = Lens(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
-DISTANCE_M, HALF_WIDTH_M, HALF_HEIGHT_M = 0.5, 0.2, 0.1
-HOLE_M, HOLE_RADIUS_M, HOLE_DEPTH_M = np.array([0.03, 0.01]), 0.01, 0.008
+DISTANCE_M = 0.5
+HALF_WIDTH_M = 0.2
+HALF_HEIGHT_M = 0.1
+HOLE_M = np.array([0.03, 0.01])
+HOLE_RADIUS_M = 0.01
+HOLE_DEPTH_M = 0.008
 STRIPS_M = ((-0.15, 0.06), (0.14, 0.065), (0.12, -0.06), (-0.10, -0.055), (0.01, 0.075))
 """Centres; no turn of the board brings these strips to each other's places."""
 STRIP_HALF_M = (0.02, 0.006)
@@ -38,7 +43,8 @@ def write_view(
     hidden: tuple[int, ...] = (),
     noise_mm: float = 0.3,
 ) -> Path:
-    """Depth (whole millimetres) and colour pictures and the lens. ``hidden``: strips that a hand covers."""
+    """Depth (whole millimetres) and colour pictures and the lens. ``hidden``: strips that a hand
+    covers."""
     for name in ("depth", "color"):
         (folder / name).mkdir(parents=True)
     z_m, on_board = _depth_m(pose)
@@ -56,15 +62,18 @@ def write_view(
 
 
 def _depth_m(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) z of the face or of the hole's floor, and whether the ray meets the board; the hole's wall is left out."""
+    """(h, w) z of the face or of the hole's floor, and whether the ray meets the board; the hole's
+    wall is left out."""
     slopes = LENS.region_slopes(LENS.whole)
-    face, floor = (_meet(pose, slopes, height) for height in (0.0, -HOLE_DEPTH_M))
+    face = _meet(pose, slopes, 0.0)
+    floor = _meet(pose, slopes, -HOLE_DEPTH_M)
     in_hole = np.linalg.norm(face[1] - HOLE_M, axis=-1) < HOLE_RADIUS_M
     return np.where(in_hole, floor[0], face[0]), _on_board(face[1])
 
 
 def _colour(pose: np.ndarray, strips: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """(h, w, 3) uint8: grey board with red strips, each pixel the mean of its rays, black beyond the rim."""
+    """(h, w, 3) uint8: grey board with red strips, each pixel the mean of its rays, black beyond
+    the rim."""
     part = (np.arange(FINE) + 0.5) / FINE - 0.5
     v, u = (axis[..., None] for axis in np.mgrid[: LENS.height, : LENS.width])
     dv, du = (axis.ravel() for axis in np.meshgrid(part, part, indexing="ij"))
@@ -79,8 +88,10 @@ def _colour(pose: np.ndarray, strips: tuple[tuple[float, float], ...]) -> np.nda
 
 
 def _meet(pose: np.ndarray, slopes: np.ndarray, height_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """z (...) where rays meet the plane ``height_m`` above the face, and the place (..., 2) on the board."""
-    normal, rays = pose[:3, 2], np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
+    """z (...) where rays meet the plane ``height_m`` above the face, and the place (..., 2) on the
+    board."""
+    normal = pose[:3, 2]
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
     z_m = (pose[:3, 3] @ normal + height_m) / (rays @ normal)
     return z_m, transform_points(invert(pose), rays * z_m[..., None])[..., :2]
 

@@ -21,7 +21,8 @@ from harness.vocabulary.geometry import (
 LENS = Lens(width=400, height=140, fx=500.0, fy=500.0, cx=199.5, cy=69.5)
 TAPES = np.array([[-0.2, 0.038], [0.2, 0.038], [0.2, -0.038], [-0.2, -0.038]])
 """The thesis board's strips, 40 x 12 mm."""
-WOOD, RED = (140, 107, 71), (217, 20, 20)
+WOOD = (140, 107, 71)
+RED = (217, 20, 20)
 DEPTH_SIGMA_M = 0.5e-3
 
 Paint = Callable[[np.ndarray], np.ndarray]
@@ -69,8 +70,9 @@ def marked_cloud(
     lens: Lens = LENS,
     sigma_m: float = DEPTH_SIGMA_M,
 ) -> Cloud:
-    """A cloud of an endless board: colour of each pixel's centre, or the mean over ``samples`` squared points of it,
-    times ``light`` at (u, v) scaled to -1..1; depth with noise through a 5 x 5 window; ``behind_m`` the surface."""
+    """A cloud of an endless board: colour of each pixel's centre, or the mean over ``samples``
+    squared points of it, times ``light`` at (u, v) scaled to -1..1; depth with noise through a 5 x
+    5 window; ``behind_m`` the surface."""
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(float)
     colours = np.mean(
@@ -116,7 +118,8 @@ def prepared(name: str, marks: MarkSet, T_reference_view_guess: np.ndarray | Non
 def _board_places(T_camera_board: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """(..., 3) where rays (..., 2) meet the board, in its frame."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
-    normal, origin = T_camera_board[:3, 2], T_camera_board[:3, 3]
+    normal = T_camera_board[:3, 2]
+    origin = T_camera_board[:3, 3]
     points = rays * ((origin @ normal) / (rays @ normal))[..., None]
     places: np.ndarray = transform_points(invert(T_camera_board), points)
     return places

@@ -1,4 +1,5 @@
-"""Packages that offer plug-ins, as an installer leaves them: a folder on the search path with their metadata."""
+"""Packages that offer plug-ins, as an installer leaves them: a folder on the search path with
+their metadata."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A tilted plane with one blind hole, written in every format that is read; its true points are known."""
+"""A tilted plane with one blind hole, written in every format that is read; its true points are
+known."""
 
 from __future__ import annotations
 
@@ -13,7 +14,10 @@ import numpy as np
 from harness.vocabulary.geometry import Lens
 
 LENS = Lens(width=96, height=72, fx=150.0, fy=151.0, cx=47.0, cy=36.0)
-HOLE_U, HOLE_V, HOLE_RADIUS_PX, HOLE_DEPTH_MM = 60, 30, 6.0, 14.0
+HOLE_U = 60
+HOLE_V = 30
+HOLE_RADIUS_PX = 6.0
+HOLE_DEPTH_MM = 14.0
 DISTANCE_M = 0.5
 NO_RETURN = (3, 5)
 """(row, column) that every frame leaves out."""
@@ -125,8 +129,10 @@ def write_stray(folder: Path, frames: int, step_m: float = 0.0) -> Path:
     """Stray Scanner's folder: the lens of 1920 x 1440 pixels, poses ``step_m`` apart."""
     for name in ("depth", "confidence"):
         (folder / name).mkdir(parents=True)
-    across, down = 1920 / LENS.width, 1440 / LENS.height
-    cx, cy = (LENS.cx + 0.5) * across - 0.5, (LENS.cy + 0.5) * down - 0.5
+    across = 1920 / LENS.width
+    down = 1440 / LENS.height
+    cx = (LENS.cx + 0.5) * across - 0.5
+    cy = (LENS.cy + 0.5) * down - 0.5
     matrix = f"{LENS.fx * across}, 0, {cx}\n0, {LENS.fy * down}, {cy}\n0, 0, 1\n"
     (folder / "camera_matrix.csv").write_text(matrix)
     lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
@@ -160,7 +166,8 @@ def write_r3d(path: Path, frames: int, step_m: float = 0.0) -> Path:
 
 
 def write_opaque_mat(path: Path) -> Path:
-    """What ``save('x.mat', 'pc')`` leaves of a pointCloud: an MCOS object (MAT-file level 5, class 17)."""
+    """What ``save('x.mat', 'pc')`` leaves of a pointCloud: an MCOS object (MAT-file level 5, class
+    17)."""
 
     def element(kind: int, content: bytes) -> bytes:
         padded = content + bytes(-len(content) % 8)
@@ -180,7 +187,8 @@ def write_opaque_mat(path: Path) -> Path:
 
 
 def calibration(purposes: tuple[str, ...] = ("Depth", "PhotoVideo")) -> bytes:
-    """A factory calibration with round numbers; the colour camera 50 mm to the right, without distortion."""
+    """A factory calibration with round numbers; the colour camera 50 mm to the right, without
+    distortion."""
     depth = [0.51, 0.52, 0.49, 0.5, 0.55, -0.02, -0.003, 0.89, 0.086, -0.014, 0.0, 0.0, -7e-5, 2e-5]
     colour = [0.5, 0.5, 0.48, 0.64] + [0.0] * 10
     cameras = []
@@ -210,7 +218,8 @@ def write_mkv(
     mode: str = "NFOV_UNBINNED",
     attached: bytes | None = None,
 ) -> Path:
-    """Tracks titled as k4arecorder does, losslessly coded, one picture of each title a frame at 5 Hz."""
+    """Tracks titled as k4arecorder does, losslessly coded, one picture of each title a frame at 5
+    Hz."""
     import av
 
     with av.open(str(path), "w", format="matroska") as container:

@@ -27,10 +27,11 @@ MERGES = ("grid", "fusion", "volume")
 
 @dataclass(frozen=True)
 class MapWorld:
-    """The answers. ``first(views, method, merge, frames)``: the smallest hole found, with all larger ones, in every
-    repeat. ``size_bias_mm(diameter, views, method, merge)`` and ``size_std_mm``: of the thesis' measure.
-    ``surface_mm(views, method, merge, frames)``: noise of the fitted surface. ``tre_mm``: of each method the median
-    error in the plane and across it; ``spread``: standard deviation of its logarithm. ``failing``: share of failures.
+    """The answers. ``first(views, method, merge, frames)``: the smallest hole found, with all
+    larger ones, in every repeat. ``size_bias_mm(diameter, views, method, merge)`` and
+    ``size_std_mm``: of the thesis' measure. ``surface_mm(views, method, merge, frames)``: noise of
+    the fitted surface. ``tre_mm``: of each method the median error in the plane and across it;
+    ``spread``: standard deviation of its logarithm. ``failing``: share of failures.
     """
 
     first: Callable[[int, str, str, int], int] = lambda views, method, merge, frames: (
@@ -179,7 +180,8 @@ def registrations(
     """Each view registered once, under the first set-up that has it."""
     rng = np.random.default_rng(3 + sum(method.encode()))
     plane, across = world.tre_mm[method]
-    rows, known = [], 1
+    rows = []
+    known = 1
     for views in sorted(counts):
         for view in range(known, views):
             for n in frames:
@@ -233,14 +235,16 @@ def map_example(
 ) -> MappedExample:
     """A board with four marks as each view places it."""
     rng = np.random.default_rng(views)
-    x, y = rng.uniform(-300, 300, points), rng.uniform(-55, 55, points)
+    x = rng.uniform(-300, 300, points)
+    y = rng.uniform(-55, 55, points)
     holes = [
         circle(254.0 - offset, 0.0, diameter, str(number), "found" if number >= 4 else "missed")
         for number, (diameter, offset) in enumerate(
             zip(DIAMETERS_MM, OFFSETS_MM, strict=True), start=1
         )
     ]
-    z, detected = rng.normal(0, 0.3, points), np.zeros(points, bool)
+    z = rng.normal(0, 0.3, points)
+    detected = np.zeros(points, bool)
     for hole in holes:
         inside = np.hypot(x - hole.centre_mm[0], y - hole.centre_mm[1]) < hole.diameter_mm / 2
         z[inside] -= 10

@@ -1,7 +1,9 @@
-"""Studies with known answers: boards of damage whose chance of detection, false calls and board effects are as asked.
+"""Studies with known answers: boards of damage whose chance of detection, false calls and board
+effects are as asked.
 
-A damage of diameter a is found with probability logistic((a - a50 - shift of its board) / width); its signal crosses
-the threshold exactly when it is found. False calls are Poisson on the face, with exponential scores above `LOWEST`.
+A damage of diameter a is found with probability logistic((a - a50 - shift of its board) / width);
+its signal crosses the threshold exactly when it is found. False calls are Poisson on the face,
+with exponential scores above `LOWEST`.
 """
 
 from __future__ import annotations
@@ -46,10 +48,12 @@ CALIBRATED = Calibrated(
 
 @dataclass(frozen=True)
 class SetUp:
-    """One set-up's answers: POD is logistic((a - a50_mm) / width_mm), on boards whose a50 scatters by ``boards_mm``.
+    """One set-up's answers: POD is logistic((a - a50_mm) / width_mm), on boards whose a50 scatters
+    by ``boards_mm``.
 
-    ``own_noise``: share of the variance of luck that set-ups do not have in common (0: identical hits where a50 is
-    equal). ``pixel_d``: distance of the damaged pixels' scores from the face's, in standard deviations.
+    ``own_noise``: share of the variance of luck that set-ups do not have in common (0: identical
+    hits where a50 is equal). ``pixel_d``: distance of the damaged pixels' scores from the face's,
+    in standard deviations.
     """
 
     variant: str = "main"
@@ -75,8 +79,8 @@ class SetUp:
 
 @dataclass(frozen=True)
 class Study:
-    """The boards: each with ``holes`` of diameters spread evenly over ``sizes_mm``; depth 5 mm, or drawn evenly from
-    ``depths_mm``; every board inspected ``repeats`` times."""
+    """The boards: each with ``holes`` of diameters spread evenly over ``sizes_mm``; depth 5 mm, or
+    drawn evenly from ``depths_mm``; every board inspected ``repeats`` times."""
 
     set_ups: tuple[SetUp, ...] = (SetUp(),)
     boards: int = 60
@@ -188,7 +192,8 @@ def _signals(study: Study, one: SetUp) -> pd.DataFrame:
 def _inspected(study: Study, one: SetUp) -> Inspected:
     rows = _signals(study, one)
     truth = (rows[f"true_{name}_mm"].to_numpy(float) for name in ("diameter", "depth", "x", "y"))
-    hit, signal = (rows["signal"] > THRESHOLD).to_numpy(), rows["signal"].to_numpy(float)
+    hit = (rows["signal"] > THRESHOLD).to_numpy()
+    signal = rows["signal"].to_numpy(float)
     return Inspected(
         rows["board"].to_numpy(),
         rows["hole"].to_numpy(str),
@@ -278,7 +283,8 @@ def _sites(study: Study, calls: pd.DataFrame) -> pd.DataFrame:
     sites = sites[sites["board"] < 100_000 + study.hole_free_boards]
     sites = sites.merge(pd.DataFrame({"repeat": np.arange(study.repeats)}), how="cross")
     noise = np.random.default_rng([study.seed, 8]).normal(2.5, 0.4, len(sites))
-    highest, names = np.full(len(sites), -np.inf), ("board", "repeat", "x_mm", "y_mm", "score")
+    highest = np.full(len(sites), -np.inf)
+    names = ("board", "repeat", "x_mm", "y_mm", "score")
     boards, repeats, x_mm, y_mm, scores = (calls[name].to_numpy() for name in names)
     for row, (board, repeat, x, y) in enumerate(
         sites[["board", "repeat", "true_x_mm", "true_y_mm"]].to_numpy()
@@ -291,7 +297,8 @@ def _sites(study: Study, calls: pd.DataFrame) -> pd.DataFrame:
 def _of_runs(
     study: Study, findings: pd.DataFrame
 ) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
-    """Every run's role, board and repeat, and the scores and holes of its findings (as arrays, which is fast)."""
+    """Every run's role, board and repeat, and the scores and holes of its findings (as arrays,
+    which is fast)."""
     names = ("role", "board", "repeat", "score", "hole")
     roles, boards, repeats, scores, holes = (findings[name].to_numpy() for name in names)
     for role in ("hole_free", "damaged"):

@@ -1,4 +1,5 @@
-"""Result tables with known answers: what an experiment would leave if its statistics were exactly as asked for."""
+"""Result tables with known answers: what an experiment would leave if its statistics were exactly
+as asked for."""
 
 from __future__ import annotations
 
@@ -33,10 +34,11 @@ OFFSETS_MM = 50.8 * np.arange(10, -1, -1.0)
 
 @dataclass(frozen=True)
 class World:
-    """The answers. ``rate(hole, frames)`` is the exact share of repeats that detect; scatters are standard deviations.
+    """The answers. ``rate(hole, frames)`` is the exact share of repeats that detect; scatters are
+    standard deviations.
 
-    Sizes and positions are drawn and then rescaled, so that a hole detected in every repeat has exactly the mean and
-    standard deviation asked for.
+    Sizes and positions are drawn and then rescaled, so that a hole detected in every repeat has
+    exactly the mean and standard deviation asked for.
     """
 
     rate: Callable[[int, int], float] = lambda hole, frames: float(
@@ -106,7 +108,8 @@ CAMERA_AXES = pd.DataFrame(
 
 
 def placed(part: Tables, camera: str, distance_m: float, of: str = "") -> Tables:
-    """One variant's tables as a set-up of the camera comparison, or as a variation of the set-up called ``of``."""
+    """One variant's tables as a set-up of the camera comparison, or as a variation of the set-up
+    called ``of``."""
     place = {"source.camera.name": camera, "source.target.distance_m": distance_m}
     name = set_up_name(camera, distance_m)
     part = replace(
@@ -128,8 +131,8 @@ def cameras(
     distances_m: Sequence[float] = (0.5, 1.0),
     world: World | None = None,
 ) -> Tables:
-    """A comparison in which a camera finds, at each distance in turn, its ``smallest`` hole and all larger ones in
-    every repeat, with one frame one hole fewer."""
+    """A comparison in which a camera finds, at each distance in turn, its ``smallest`` hole and
+    all larger ones in every repeat, with one frame one hole fewer."""
     world = world or World(repeats=12)
     return joined(
         *(
@@ -153,11 +156,17 @@ def cameras(
 def example(
     frames: int = 50, shape: str = "bowl", variant: str = "main", noise_mm: float = 0.2
 ) -> ExampleCloud:
-    """A frontal board at 0.8 m whose holes (12.7 mm deep) look like a bowl or a cylinder; 1.6 mm a pixel, 60 x 380."""
-    height, width, pitch_mm, z_mm = 60, 380, 1.6, 800.0
+    """A frontal board at 0.8 m whose holes (12.7 mm deep) look like a bowl or a cylinder; 1.6 mm a
+    pixel, 60 x 380."""
+    height = 60
+    width = 380
+    pitch_mm = 1.6
+    z_mm = 800.0
     rng = np.random.default_rng(frames)
     v, u = np.indices((height, width), dtype=float)
-    truth, z_truth, depth = [], np.full((height, width), z_mm), np.zeros((height, width))
+    truth = []
+    z_truth = np.full((height, width), z_mm)
+    depth = np.zeros((height, width))
     detected = np.zeros((height, width), bool)
     for number, (diameter, offset) in enumerate(
         zip(DIAMETERS_MM, OFFSETS_MM, strict=True), start=1
@@ -208,7 +217,8 @@ def _exactly(rng: np.random.Generator, n: int, mean: float, std: float) -> np.nd
 
 
 def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) -> pd.DataFrame:
-    n, parts = world.repeats, []
+    n = world.repeats
+    parts = []
     of_all: dict[str, object] = {
         "point": f"{variant}-{frames}",
         "variant": variant,
@@ -260,7 +270,8 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
 
 
 def _runs(world: World, rng: np.random.Generator, variant: str, frames: int) -> pd.DataFrame:
-    n, scale = world.repeats, 0.25 + 0.65 / np.sqrt(frames)
+    n = world.repeats
+    scale = 0.25 + 0.65 / np.sqrt(frames)
     threshold = (world.threshold or {}).get(frames, 5.0)
     parts = []
     for role in ("damaged", "hole_free"):

@@ -1,4 +1,5 @@
-"""Random scenes with a known target, cast ray by ray: what a stranger may put before a depth camera."""
+"""Random scenes with a known target, cast ray by ray: what a stranger may put before a depth
+camera."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ CAMERAS = {
 
 @dataclass
 class Scene:
-    """Surfaces seen by a camera: ``z`` (h, w) the nearest depth in metres, inf where nothing is; ``name`` (h, w) index
-    of the surface. `add` puts a surface before what is there."""
+    """Surfaces seen by a camera: ``z`` (h, w) the nearest depth in metres, inf where nothing is;
+    ``name`` (h, w) index of the surface. `add` puts a surface before what is there."""
 
     camera: str = "azure nfov"
     z: np.ndarray = field(init=False)
@@ -43,7 +44,8 @@ class Scene:
     def plane(
         self, centre: np.ndarray, normal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth of the plane, and the places (h, w) along its own axes (a level one first) about the centre."""
+        """Depth of the plane, and the places (h, w) along its own axes (a level one first) about
+        the centre."""
         normal = np.asarray(normal, float) / np.linalg.norm(normal)
         rays = np.concatenate([self.slopes, np.ones((*self.z.shape, 1))], axis=-1)
         with np.errstate(divide="ignore"):
@@ -70,8 +72,8 @@ class Scene:
         holes: tuple = (),
         thick_m: float = 0.0,
     ) -> None:
-        """A rectangle; ``holes``: (a, b, radius) on it, through which one sees what is behind. With a thickness, faces
-        of the same number behind its edges close a box."""
+        """A rectangle; ``holes``: (a, b, radius) on it, through which one sees what is behind.
+        With a thickness, faces of the same number behind its edges close a box."""
         z, a, b = self.plane(np.asarray(centre, float), normal)
         turn = np.deg2rad(roll_deg)
         a, b = a * np.cos(turn) - b * np.sin(turn), a * np.sin(turn) + b * np.cos(turn)
@@ -99,10 +101,14 @@ class Scene:
         inner: bool = False,
     ) -> None:
         """The outside of a pipe (``inner``: the far half, a bent sheet seen from its hollow side)."""
-        centre, axis = np.asarray(centre, float), np.asarray(axis, float) / np.linalg.norm(axis)
+        centre = np.asarray(centre, float)
+        axis = np.asarray(axis, float) / np.linalg.norm(axis)
         rays = np.concatenate([self.slopes, np.ones((*self.z.shape, 1))], axis=-1)
-        flat, away = rays - (rays @ axis)[..., None] * axis, centre - (centre @ axis) * axis
-        qa, qb, qc = (flat**2).sum(-1), -2 * flat @ away, away @ away - radius**2
+        flat = rays - (rays @ axis)[..., None] * axis
+        away = centre - (centre @ axis) * axis
+        qa = (flat**2).sum(-1)
+        qb = -2 * flat @ away
+        qc = away @ away - radius**2
         under = qb**2 - 4 * qa * qc
         root = np.sqrt(np.maximum(under, 0))
         z = np.where(under > 0, (-qb + (root if inner else -root)) / (2 * qa), np.inf)
@@ -114,7 +120,9 @@ class Scene:
     def sphere(self, number: int, centre, radius: float) -> None:
         centre = np.asarray(centre, float)
         rays = np.concatenate([self.slopes, np.ones((*self.z.shape, 1))], axis=-1)
-        qa, qb, qc = (rays**2).sum(-1), -2 * rays @ centre, centre @ centre - radius**2
+        qa = (rays**2).sum(-1)
+        qb = -2 * rays @ centre
+        qc = centre @ centre - radius**2
         under = qb**2 - 4 * qa * qc
         self.add(
             number, np.where(under > 0, (-qb - np.sqrt(np.maximum(under, 0))) / (2 * qa), np.inf)
@@ -129,8 +137,8 @@ class Scene:
         mix_px: int = 3,
         silent: np.ndarray | None = None,
     ) -> Cloud:
-        """What the camera tells: pixels mix over a window (flying pixels), noise, dropouts, rounding; ``silent`` pixels
-        return nothing."""
+        """What the camera tells: pixels mix over a window (flying pixels), noise, dropouts,
+        rounding; ``silent`` pixels return nothing."""
         z = self.z.copy()
         nothing = ~np.isfinite(z)
         if mix_px > 1:
@@ -148,14 +156,16 @@ class Scene:
         if silent is not None:
             z[silent] = np.nan
         points = np.concatenate([self.slopes * z[..., None], z[..., None]], axis=-1)
-        none, zeros = np.full(z.shape, np.nan), np.zeros(z.shape, dtype=np.uint8)
+        none = np.full(z.shape, np.nan)
+        zeros = np.zeros(z.shape, dtype=np.uint8)
         region = Region(0, z.shape[0], 0, z.shape[1])
         return Cloud(points, zeros, zeros.astype(int) + 1, none, region, step_m, 1, lens=self.lens)
 
 
 def tilted(random: np.random.Generator, most_deg: float) -> np.ndarray:
     """A normal towards the camera, tilted by up to so much in any direction."""
-    tilt, turn = np.deg2rad(random.uniform(0, most_deg)), random.uniform(0, 2 * np.pi)
+    tilt = np.deg2rad(random.uniform(0, most_deg))
+    turn = random.uniform(0, 2 * np.pi)
     return np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
 
 
@@ -184,23 +194,23 @@ def board_before_wall(random, scene):
 
 
 def board_close_before_wall(random, scene):
-    normal, size = tilted(random, 15), (random.uniform(0.25, 0.45), random.uniform(0.2, 0.35))
+    normal = tilted(random, 15)
+    size = (random.uniform(0.25, 0.45), random.uniform(0.2, 0.35))
     centre = np.array([*_pair(random, -0.04, 0.04), random.uniform(0.5, 0.8)])
     scene.board(1, centre, normal, size, random.uniform(-10, 10))
     scene.add(0, scene.plane(centre - random.uniform(0.015, 0.04) * normal, normal)[0])
 
 
 def board_on_floor(random, scene):
-    below, height, away = (
-        random.uniform(0.2, 0.5),
-        random.uniform(0.2, 0.4),
-        random.uniform(0.5, 0.9),
-    )
+    below = random.uniform(0.2, 0.5)
+    height = random.uniform(0.2, 0.4)
+    away = random.uniform(0.5, 0.9)
     # the camera looks at the board's middle, roughly
     pitch = float(np.rad2deg(np.arctan2(below - height / 2, away))) + random.uniform(-4, 4)
     scene.floor(0, below, pitch)
     p = np.deg2rad(pitch)
-    up, ahead = np.array([0, -np.cos(p), -np.sin(p)]), np.array([0, -np.sin(p), np.cos(p)])
+    up = np.array([0, -np.cos(p), -np.sin(p)])
+    ahead = np.array([0, -np.sin(p), np.cos(p)])
     width = random.uniform(0.2, 0.45)
     lean = np.deg2rad(random.uniform(0, 20))
     foot = away * ahead - below * up + np.array([random.uniform(-0.08, 0.08), 0, 0])
@@ -212,9 +222,11 @@ def board_on_floor(random, scene):
 
 
 def object_on_plate(random, scene):
-    normal, centre = tilted(random, 20), np.array([0, 0, random.uniform(0.4, 0.9)])
+    normal = tilted(random, 20)
+    centre = np.array([0, 0, random.uniform(0.4, 0.9)])
     scene.add(1, scene.plane(centre, normal)[0])
-    side, height = random.uniform(0.02, 0.07), random.uniform(0.004, 0.05)
+    side = random.uniform(0.02, 0.07)
+    height = random.uniform(0.004, 0.05)
     place = centre + np.array([*_pair(random, -0.2, 0.2), 0]) * centre[2]
     # where the ray to that place meets the plate
     place *= (centre @ normal) / (place @ normal)
@@ -223,13 +235,15 @@ def object_on_plate(random, scene):
 
 def object_on_board_before_wall(random, scene):
     centre, normal, _ = _board(random, scene, holes=False)
-    side, height = random.uniform(0.02, 0.06), random.uniform(0.004, 0.04)
+    side = random.uniform(0.02, 0.06)
+    height = random.uniform(0.004, 0.04)
     scene.board(1, centre + height * normal, normal, (side, side), 10.0)
     scene.wall(0, centre[2] + random.uniform(0.25, 1.5))
 
 
 def plate_with_large_holes(random, scene):
-    normal, centre = tilted(random, 25), np.array([0, 0, random.uniform(0.5, 0.9)])
+    normal = tilted(random, 25)
+    centre = np.array([0, 0, random.uniform(0.5, 0.9)])
     holes = tuple((*_pair(random, -0.12, 0.12), random.uniform(0.02, 0.07)) for _ in range(3))
     whole = random.random() < 0.5
     scene.board(1, centre, normal, (3.0, 3.0) if whole else (0.5, 0.4), 0.0, holes)
@@ -256,7 +270,8 @@ def sphere(random, scene):
 
 
 def bent_sheet(random, scene):
-    radius, away = random.uniform(0.25, 0.8), random.uniform(0.5, 0.8)
+    radius = random.uniform(0.25, 0.8)
+    away = random.uniform(0.5, 0.8)
     inner = random.random() < 0.5
     centre = [0, 0, away - radius if inner else away + radius]
     scene.cylinder(1, centre, [random.uniform(-0.2, 0.2), 1, 0], radius, 0.2, inner)

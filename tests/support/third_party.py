@@ -1,4 +1,5 @@
-"""A package of somebody else's: a detector and a camera, with their entry points, as its author would publish it."""
+"""A package of somebody else's: a detector and a camera, with their entry points, as its author
+would publish it."""
 
 from __future__ import annotations
 
@@ -71,7 +72,8 @@ class MedianDetector(ScoreMapDetector[MedianConfig]):
 
 
 def write_package(folder: Path) -> Path:
-    """Write the package's sources; its camera is an Azure Kinect by another name, with a title of its own."""
+    """Write the package's sources; its camera is an Azure Kinect by another name, with a title of
+    its own."""
     code = folder / "acme_inspection"
     code.mkdir(parents=True)
     (folder / "pyproject.toml").write_text(PYPROJECT)

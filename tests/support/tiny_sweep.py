@@ -1,4 +1,5 @@
-"""Sweeps of seconds, run as a user runs them, and their results as text that can be compared byte by byte."""
+"""Sweeps of seconds, run as a user runs them, and their results as text that can be compared byte
+by byte."""
 
 from __future__ import annotations
 
@@ -66,7 +67,8 @@ class Done:
 
 def sweep(yaml: Path, out: Path, *arguments: str) -> Done:
     """Run the program to its end in this process, its workers in processes of their own."""
-    told, warned = io.StringIO(), io.StringIO()
+    told = io.StringIO()
+    warned = io.StringIO()
     with redirect_stdout(told), redirect_stderr(warned):
         code = main([str(yaml), "--out", str(out), *arguments])
     return Done(code, told.getvalue(), warned.getvalue())
@@ -88,8 +90,8 @@ def results(out: Path) -> Path:
 
 
 def content(folder: Path) -> dict[str, str]:
-    """Every table and record of a folder of results as text, every digit of every number in it; timings left out, and
-    of a study's record what names the run."""
+    """Every table and record of a folder of results as text, every digit of every number in it;
+    timings left out, and of a study's record what names the run."""
     found = {}
     for path in sorted(folder.glob("*.parquet")):
         table = pd.read_parquet(path)

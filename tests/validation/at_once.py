@@ -1,11 +1,13 @@
-"""Averages drawn at once against averages of frames on rendered thesis boards, a table of ratios: minutes.
+"""Averages drawn at once against averages of frames on rendered thesis boards, a table of ratios:
+minutes.
 
-Run ``python tests/validation/at_once.py --captures 400``. For each camera and board it renders
-the view, draws that many averages of 50 frames either way, and prints for even, uneven and listed pixels (see
-`scenes.sensor.amcw.at_once`) the ratios, at once over frame by frame, of the variance of z between captures, of the
-sample variance and of the share beyond three deviations; the correlation with neighbours both ways; and the mean's and
-the count's difference in standard errors, root mean square over pixels (1 where there is none) and largest.
-Whole-frame errors are off, as they are drawn the same way in both.
+Run ``python tests/validation/at_once.py --captures 400``. For each camera and board it renders the
+view, draws that many averages of 50 frames either way, and prints for even, uneven and listed
+pixels (see `scenes.sensor.amcw.at_once`) the ratios, at once over frame by frame, of the variance
+of z between captures, of the sample variance and of the share beyond three deviations; the
+correlation with neighbours both ways; and the mean's and the count's difference in standard
+errors, root mean square over pixels (1 where there is none) and largest. Whole-frame errors are
+off, as they are drawn the same way in both.
 """
 
 from __future__ import annotations
@@ -41,10 +43,8 @@ def unit_before(name: str, board: str) -> SimulatedUnit:
     """A unit before the thesis' board with holes of a kind."""
     chosen = BOARDS[board]
     target = ThesisTargetConfig.model_validate(chosen or {}).declare()
-    camera, config = (
-        camera_of(CameraConfig(name=name)),
-        CameraConfig(name=name, effects=EffectsConfig(frame_jumps=False)),
-    )
+    camera = camera_of(CameraConfig(name=name))
+    config = CameraConfig(name=name, effects=EffectsConfig(frame_jumps=False))
     view = render_view(
         build_target(target if chosen else target.hole_free()), camera.optics, RENDER
     )
@@ -61,10 +61,8 @@ def drawn(
         )[FRAMES]
         for number in range(captures)
     ]
-    z_m, count = (
-        np.stack([cloud.points_m[..., 2] for cloud in clouds]),
-        np.stack([cloud.count for cloud in clouds]),
-    )
+    z_m = np.stack([cloud.points_m[..., 2] for cloud in clouds])
+    count = np.stack([cloud.count for cloud in clouds])
     return z_m, count, np.stack([cloud.variance_m2 for cloud in clouds])
 
 
@@ -118,10 +116,8 @@ def main(arguments: list[str]) -> int:
             unit = unit_before(name, board)
             summer = unit.at_once
             assert isinstance(summer, AtOnce)
-            frames, at_once = (
-                drawn(unit, options.captures, True),
-                drawn(unit, options.captures, False),
-            )
+            frames = drawn(unit, options.captures, True)
+            at_once = drawn(unit, options.captures, False)
             kind = summer.linear.kind.reshape(unit.exposure.shape)[unit.cut]
             for group, pixels in (
                 ("even", kind == EVEN),

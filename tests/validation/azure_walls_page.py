@@ -26,9 +26,10 @@ WINDOW_PX = 5
 
 
 def white_before_m(pattern: FixedPattern) -> float:
-    """The part of a pattern that is white before the engine's window of 5, told by its triangle up to lag 5; below 0
-    where the estimate of its variance is."""
-    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth field the rest
+    """The part of a pattern that is white before the engine's window of 5, told by its triangle up
+    to lag 5; below 0 where the estimate of its variance is."""
+    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth
+    # field the rest
     k = np.arange(1.0, WINDOW_PX + 1)
     rows = np.column_stack([k / WINDOW_PX, k**2, k**4])
     falls = pattern.covariance_m2[0] - pattern.covariance_m2[1 : WINDOW_PX + 1]
@@ -38,7 +39,8 @@ def white_before_m(pattern: FixedPattern) -> float:
 
 def length_px(pattern: FixedPattern) -> float:
     """Length l of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12."""
-    lag, relative = np.arange(13), pattern.covariance_m2[:13] / pattern.covariance_m2[0]
+    lag = np.arange(13)
+    relative = pattern.covariance_m2[:13] / pattern.covariance_m2[0]
     found = optimize.least_squares(
         lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0]
     )
@@ -126,7 +128,8 @@ def _pattern_rows(check: WallCheck) -> list[list[str]]:
     ]
     rows = []
     for name, value, unit in kinds:
-        real, ours = value(check.pattern), [value(p) / unit for p in check.simulated_patterns]
+        real = value(check.pattern)
+        ours = [value(p) / unit for p in check.simulated_patterns]
         spread = " ".join(f"{v:.2f}" for v in ours)
         rows.append(
             [check.wall.name, name, f"{real / unit:.2f}", spread, f"{real / unit / _rms(ours):.2f}"]
@@ -182,7 +185,8 @@ def _draw_sigma(axes: Any, checks: Sequence[WallCheck]) -> None:
         ):
             bins: list[SigmaBin] = check.by_range_inner
             face = colour if name == "measured" else "white"
-            x, y = [b.at for b in bins], [getattr(b, value) / MM for b in bins]
+            x = [b.at for b in bins]
+            y = [getattr(b, value) / MM for b in bins]
             axes.plot(
                 x,
                 y,
@@ -203,7 +207,8 @@ def _draw_sigma(axes: Any, checks: Sequence[WallCheck]) -> None:
 
 def _draw_ratio(axes: Any, checks: Sequence[WallCheck]) -> None:
     for check, colour, marker in zip(checks, WALL_COLOURS, "os", strict=False):
-        x, y = [b.at for b in check.by_angle], [b.ratio for b in check.by_angle]
+        x = [b.at for b in check.by_angle]
+        y = [b.ratio for b in check.by_angle]
         axes.plot(x, y, "-", marker=marker, color=colour, label=f"{check.wall.name} wall")
     axes.set(
         title="Deviation, simulated by measured",
@@ -278,7 +283,8 @@ def _reflowed(block: str) -> str:
 
 
 def _set_up(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
-    lens, albedo = camera.nominal_lens, camera.photons.calibration_albedo.value
+    lens = camera.nominal_lens
+    albedo = camera.photons.calibration_albedo.value
     planes = _listed(
         f"the {c.wall.name} wall is {c.wall.z_m[:, c.wall.mask].mean(0).min():.2f} to "
         f"{c.wall.z_m[:, c.wall.mask].mean(0).max():.2f} m away and {_tilt_deg(c):.0f} degrees from frontal "

@@ -1,8 +1,10 @@
-"""What a trial costs beside its own work on a cluster: ``python tests/validation/cluster_run.py --trials 20000``.
+"""What a trial costs beside its own work on a cluster: ``python tests/validation/cluster_run.py
+--trials 20000``.
 
-A `dask scheduler` and `dask worker` processes are started separately; the plan is real and cheap: one frame of a board
-at 2.3 m, rendered once, and the blind detector. Printed: rate, shares of the workers' time, processor time of driver
-and scheduler, bytes over the network, and what the journal and the tables cost.
+A `dask scheduler` and `dask worker` processes are started separately; the plan is real and cheap:
+one frame of a board at 2.3 m, rendered once, and the blind detector. Printed: rate, shares of the
+workers' time, processor time of driver and scheduler, bytes over the network, and what the journal
+and the tables cost.
 """
 
 from __future__ import annotations
@@ -75,7 +77,8 @@ def main() -> int:
 def scaled(
     said: dict[str, float], cores: int, trials: float = 1e6, per_render: float = 1000.0
 ) -> dict[str, float]:
-    """Hours of each part of a large run: what workers share, and what one driver and one scheduler do alone."""
+    """Hours of each part of a large run: what workers share, and what one driver and one scheduler
+    do alone."""
     hours = {
         "renders": trials / per_render * said["render_s"] / cores,
         "trials": trials * said["trial_ms"] / 1e3 / cores,
@@ -103,7 +106,8 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
 
         def look(now: Outcome) -> None:
             if now.trials.done:
-                mine, theirs = processor_s(psutil.Process()), processor_s(scheduler)
+                mine = processor_s(psutil.Process())
+                theirs = processor_s(scheduler)
                 steady[1:] = [
                     Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)
                 ]
@@ -114,9 +118,9 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
         outcome.failures[:2],
     )
     first, last = steady
-    wall, count, work = (
-        getattr(last, name) - getattr(first, name) for name in ("at_s", "trials", "work_s")
-    )
+    wall = getattr(last, "at_s") - getattr(first, "at_s")
+    count = getattr(last, "trials") - getattr(first, "trials")
+    work = getattr(last, "work_s") - getattr(first, "work_s")
     return {
         "trials": trials,
         "workers": workers,
@@ -135,7 +139,8 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
 
 @dataclass(frozen=True)
 class Look:
-    """At one moment: trials done, work of all workers on them, processor time of driver and scheduler."""
+    """At one moment: trials done, work of all workers on them, processor time of driver and
+    scheduler."""
 
     at_s: float
     trials: int
@@ -146,7 +151,9 @@ class Look:
 
 def bare_rate(engine: ClusterEngine, count: int = 4000) -> float:
     """Jobs a second that do nothing; bundles have grown by the time that it counts."""
-    began, left, ended = 0.0, 2 * count, 0
+    began = 0.0
+    left = 2 * count
+    ended = 0
     while ended < 2 * count:
         while left > 0 and engine.room("trials") > 0:
             engine.submit(Job(f"empty {left}", "trials", square, (left,)))
@@ -163,7 +170,8 @@ def processor_s(process: psutil.Process) -> float:
 
 
 def sizes(plan: SweepPlan, journal: Journal, outcome: Outcome) -> dict[str, float]:
-    """Bytes of what is sent for a trial, alone and in a bundle of 32, of its answer, and of what is stored."""
+    """Bytes of what is sent for a trial, alone and in a bundle of 32, of its answer, and of what
+    is stored."""
     group = plan.groups[0]
     tasks = [task for _, task in group.trials(group.batches[0], {}, range(32))]
     entries = [journal.read(key) for key in outcome.finished[:100]]
@@ -183,7 +191,8 @@ def sizes(plan: SweepPlan, journal: Journal, outcome: Outcome) -> dict[str, floa
 
 
 def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[str, float]:
-    """Milliseconds a trial to write a record, to read it again, and to make tables; and the tables' memory."""
+    """Milliseconds a trial to write a record, to read it again, and to make tables; and the
+    tables' memory."""
     keys = outcome.finished
     began = time.monotonic()
     entries = [entry for key in keys[:2000] if (entry := journal.read(key)) is not None]
@@ -195,7 +204,8 @@ def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[
             copied.write(key, Ended(**vars(entry)))
         write = (time.monotonic() - began) / len(entries)
     process = psutil.Process()
-    before, began = process.memory_info().rss, time.monotonic()
+    before = process.memory_info().rss
+    began = time.monotonic()
     tables = tables_of((journal.read(key).record for key in keys), experiment)  # type: ignore[union-attr, misc, arg-type]
     spent = time.monotonic() - began
     with contextlib.suppress(AttributeError):

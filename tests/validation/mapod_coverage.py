@@ -1,12 +1,15 @@
-"""How often a study's corrected limit lies above the true a90: ``python tests/validation/mapod_coverage.py``.
+"""How often a study's corrected limit lies above the true a90: ``python
+tests/validation/mapod_coverage.py``.
 
-Studies of a simulated camera are drawn from a curve with a50 = 4 and a90 = 5 mm, at places of their sizes that differ.
-The real curve is ``k`` times as far to the right and its rise ``w`` times as wide. Each campaign draws hits of real
-holes spread evenly over the drills from it, and corrects a study of its own, of which nothing but hits is known:
-campaigns that share a study miss together, so that 100 of 10 studies would tell the share to 0.04, not to 0.02.
-``covered``: share of campaigns whose combined a90/95 is at or over the true a90, with its exact 95 % interval; the
-quoted one, of a contradicted study the larger of combined and measured, is never smaller. Nominal: 95 %. Beside it
-stand the combined limit as a multiple of the true a90, and that of the real hits alone.
+Studies of a simulated camera are drawn from a curve with a50 = 4 and a90 = 5 mm, at places of
+their sizes that differ. The real curve is ``k`` times as far to the right and its rise ``w`` times
+as wide. Each campaign draws hits of real holes spread evenly over the drills from it, and corrects
+a study of its own, of which nothing but hits is known: campaigns that share a study miss together,
+so that 100 of 10 studies would tell the share to 0.04, not to 0.02. ``covered``: share of
+campaigns whose combined a90/95 is at or over the true a90, with its exact 95 % interval; the
+quoted one, of a contradicted study the larger of combined and measured, is never smaller. Nominal:
+95 %. Beside it stand the combined limit as a multiple of the true a90, and that of the real hits
+alone.
 """
 
 from __future__ import annotations
@@ -38,9 +41,9 @@ MEASURED = 40
 
 @dataclass(frozen=True)
 class Coverage:
-    """A case: factors ``k`` and ``w``, real ``holes``; ``covered``: share of ``campaigns``. Limits as multiples of the
-    true a90: ``median`` and 90 % quantile ``high`` of the combined ones; median of the ``measured`` ones, infinite
-    where half of the campaigns demonstrate none."""
+    """A case: factors ``k`` and ``w``, real ``holes``; ``covered``: share of ``campaigns``. Limits
+    as multiples of the true a90: ``median`` and 90 % quantile ``high`` of the combined ones;
+    median of the ``measured`` ones, infinite where half of the campaigns demonstrate none."""
 
     k: float
     w: float
@@ -53,7 +56,8 @@ class Coverage:
 
 
 def wrong_by(curve: PodCurve, k: float, w: float) -> PodCurve:
-    """The true curve of a simulation that is wrong by factors k in size and w in the width of the rise."""
+    """The true curve of a simulation that is wrong by factors k in size and w in the width of the
+    rise."""
     half = curve.size_at(0.5)
     if curve.log_size:
         shift = np.log(half) - curve.mu
@@ -71,7 +75,8 @@ def of_hits(size: np.ndarray, hit: np.ndarray) -> Inspections:
 def drawn_studies(
     curve: PodCurve, number: int, targets: int, random: np.random.Generator
 ) -> list[PodStatement]:
-    """Statements of studies of ``targets`` simulated holes; those without a rising curve are drawn again."""
+    """Statements of studies of ``targets`` simulated holes; those without a rising curve are drawn
+    again."""
     studies: list[PodStatement] = []
     while len(studies) < number:
         size = random.uniform(*DRILLS_MM, targets)
@@ -114,9 +119,11 @@ def coverage(
     campaigns: int,
     targets: int = 64,
 ) -> list[Coverage]:
-    """Coverage of each case (k, w) with so many real ``holes``; each campaign corrects another study of ``targets``."""
+    """Coverage of each case (k, w) with so many real ``holes``; each campaign corrects another
+    study of ``targets``."""
     random = np.random.default_rng(1823)
-    size, truths = even_sizes(holes, DRILLS_MM), [wrong_by(curve, *case) for case in cases]
+    size = even_sizes(holes, DRILLS_MM)
+    truths = [wrong_by(curve, *case) for case in cases]
     chances = np.array([truth.pod(size) for truth in truths])
     hits = random.random((campaigns, len(cases), holes)) < chances
     studies = drawn_studies(curve, campaigns, targets, random)

@@ -1,13 +1,17 @@
-"""False calls counted against those expected by a capture's own null, a table: some 20 minutes on two free cores.
+"""False calls counted against those expected by a capture's own null, a table: some 20 minutes on
+two free cores.
 
-Run ``python tests/validation/own_null.py --cache FOLDER [--boards 50]``. Boards are drawn at random before three
-cameras, each before a unit of its own: hole-free, the same with flat objects lying on them, and drilled. On each, with
-1 and with 50 frames, `detectors.findings.null.own_threshold` sets the threshold at which 1 and 3 false calls are expected.
-Counted are the findings that are neither a hole (centres within 15 mm, as in the studies) nor an object or its edge.
-Expected is the number asked for, in the share of the judged area where a finding would be counted. ``asked``: over the
-boards whose own null was trusted; the rest is told as ``refused``.
+Run ``python tests/validation/own_null.py --cache FOLDER [--boards 50]``. Boards are drawn at
+random before three cameras, each before a unit of its own: hole-free, the same with flat objects
+lying on them, and drilled. On each, with 1 and with 50 frames,
+`detectors.findings.null.own_threshold` sets the threshold at which 1 and 3 false calls are
+expected. Counted are the findings that are neither a hole (centres within 15 mm, as in the
+studies) nor an object or its edge. Expected is the number asked for, in the share of the judged
+area where a finding would be counted. ``asked``: over the boards whose own null was trusted; the
+rest is told as ``refused``.
 
-Objects are put into the averaged cloud, with edges blurred over 1 pixel: their light is not rendered.
+Objects are put into the averaged cloud, with edges blurred over 1 pixel: their light is not
+rendered.
 """
 
 from __future__ import annotations
@@ -43,13 +47,15 @@ ASKED = (1.0, 3.0)
 DISTANCES_M = (0.55, 0.7, 0.9)
 HIT_M = 15 * MM
 FIRST_UNIT = 1000
-"""Units and noise of their own: the settings of `detectors.findings.null` were chosen on these boards before other units."""
+"""Units and noise of their own: the settings of `detectors.findings.null` were chosen on these
+boards before other units."""
 RENDER = RenderConfig(hole_noise_mm=0.3)
 
 
 @dataclass(frozen=True)
 class Board:
-    """An averaged view. ``excused`` (h, w) bool: where a finding is right, or near enough to be counted as such."""
+    """An averaged view. ``excused`` (h, w) bool: where a finding is right, or near enough to be
+    counted as such."""
 
     cloud: Cloud
     excused: np.ndarray
@@ -108,15 +114,18 @@ def holes_near(target: TargetConfig, cloud: Cloud) -> np.ndarray:
 
 
 def with_objects(cloud: Cloud, target: TargetConfig, number: int) -> Board:
-    """One to three rectangles of 12 to 40 mm, 4 to 30 mm thick, flat or tilted, on the target's face."""
+    """One to three rectangles of 12 to 40 mm, 4 to 30 mm thick, flat or tilted, on the target's
+    face."""
     random = random_stream(11, "objects", number)
     pixel_m = target.pose.distance_m / (cloud.lens.fx if cloud.lens else 500.0)
     height, width = cloud.valid.shape
-    rise_m, covered = np.zeros((height, width)), np.zeros((height, width), bool)
+    rise_m = np.zeros((height, width))
+    covered = np.zeros((height, width), bool)
     v, u = np.mgrid[:height, :width] * pixel_m
     for _ in range(int(random.integers(1, 4))):
         place = random.uniform(0.25, 0.75, 2) * (height * pixel_m, width * pixel_m)
-        half, turn = random.uniform(6 * MM, 20 * MM, 2), random.uniform(0, np.pi)
+        half = random.uniform(6 * MM, 20 * MM, 2)
+        turn = random.uniform(0, np.pi)
         along = (v - place[0]) * np.cos(turn) + (u - place[1]) * np.sin(turn)
         across = (u - place[1]) * np.cos(turn) - (v - place[0]) * np.sin(turn)
         inside = (np.abs(along) < half[0]) & (np.abs(across) < half[1])
@@ -136,7 +145,8 @@ def with_objects(cloud: Cloud, target: TargetConfig, number: int) -> Board:
 
 
 def counts(board: Board, detector: Detector) -> Iterator[tuple[float, int] | None]:
-    """For each of `ASKED` what is expected and what is counted; None where the own null is not trusted."""
+    """For each of `ASKED` what is expected and what is counted; None where the own null is not
+    trusted."""
     evidence = detector.analyse(board.cloud)
     for asked in ASKED:
         own = own_threshold(detector, board.cloud, evidence, asked)

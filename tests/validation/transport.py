@@ -1,10 +1,12 @@
-"""What is left of the light transport's error, and what it costs: ``python tests/validation/transport.py``.
+"""What is left of the light transport's error, and what it costs: ``python
+tests/validation/transport.py``.
 
-The thesis target at 0.7 m before the Azure Kinect, in a room with floor and back wall. Each view is rendered as an
-experiment would, and compared in range (frequencies fused by least squares) with a reference that knows neither nodes
-on the face nor a budget: paths of up to 24 reflections through 32 x 32 sub-rays of every compared pixel. Then
-mitransient's ``transient_path`` renders the hole-free board at a number of paths that it can afford; its variance is
-extrapolated by 1/n to our error. Prints Markdown tables.
+The thesis target at 0.7 m before the Azure Kinect, in a room with floor and back wall. Each view
+is rendered as an experiment would, and compared in range (frequencies fused by least squares) with
+a reference that knows neither nodes on the face nor a budget: paths of up to 24 reflections
+through 32 x 32 sub-rays of every compared pixel. Then mitransient's ``transient_path`` renders the
+hole-free board at a number of paths that it can afford; its variance is extrapolated by 1/n to our
+error. Prints Markdown tables.
 """
 
 from __future__ import annotations
@@ -44,17 +46,21 @@ SIDE = 32
 LONGEST = 24
 """Reflections of the reference's paths; those of experiments have RenderConfig's."""
 FACE_TIMES = 8
-"""Paths of the reference on the face for one in a hole: they leave the scene soon, and the error is small."""
+"""Paths of the reference on the face for one in a hole: they leave the scene soon, and the error
+is small."""
 AMPLITUDE_GATE = 0.03
-"""Of a plane of albedo 1 at 1 m: 35 electrons of the Azure Kinect's 1168, above the noise of one frame."""
+"""Of a plane of albedo 1 at 1 m: 35 electrons of the Azure Kinect's 1168, above the noise of one
+frame."""
 FILTER_PIXELS = 25
-"""Pixels under the camera's 5 x 5 window, if its weights were all equal: more than mitransient can be credited with."""
+"""Pixels under the camera's 5 x 5 window, if its weights were all equal: more than mitransient can
+be credited with."""
 
 
 @dataclass(frozen=True)
 class Error:
-    """Error of range over some pixels against the reference, mm: root mean square with the reference's own noise taken
-    off, mean with its standard error, and what the render itself told of its noise."""
+    """Error of range over some pixels against the reference, mm: root mean square with the
+    reference's own noise taken off, mean with its standard error, and what the render itself told
+    of its noise."""
 
     title: str
     pixels: int
@@ -88,7 +94,8 @@ def rendered(facts: dict[str, Any], *, holes: bool = True) -> Scene:
     """The thesis target rendered twice; the second, with warm kernels, counts."""
     declared = ThesisTargetConfig.from_data({"name": "thesis", **facts}).declare()
     target = build_target(declared if holes else declared.hole_free())
-    optics, config = load_camera("azure_kinect_nfov").optics, RenderConfig()
+    optics = load_camera("azure_kinect_nfov").optics
+    config = RenderConfig()
     render_view(target, optics, config)
     (view, cpu_s), wall_s = _timed(lambda: _cpu(lambda: render_view(target, optics, config)))
     return Scene(
@@ -97,10 +104,12 @@ def rendered(facts: dict[str, Any], *, holes: bool = True) -> Scene:
 
 
 def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) -> Error:
-    """The render against the reference over (at most so many, evenly picked) pixels of a mask (h, w)."""
+    """The render against the reference over (at most so many, evenly picked) pixels of a mask (h,
+    w)."""
     rows, cols = np.nonzero(here)
     picked = slice(None, None, max(len(rows) // most, 1))
-    rows, cols = rows[picked], cols[picked]
+    rows = rows[picked]
+    cols = cols[picked]
     frequencies = scene.optics.frequencies_hz
     footprint = Quadrilaterals(scene.optics.lens, scene.view.region)
     slopes = footprint.slopes(rows, cols, footprint.grid(SIDE))
@@ -132,7 +141,8 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
 def in_holes(scene: Scene) -> np.ndarray:
     """(h, w): pixels whose central ray goes through a hole's mouth."""
     rays = np.concatenate([scene.view.slopes, np.ones((*scene.view.slopes.shape[:2], 1))], axis=-1)
-    normal, middle = scene.target.T_camera_board[:3, 2], scene.target.T_camera_board[:3, 3]
+    normal = scene.target.T_camera_board[:3, 2]
+    middle = scene.target.T_camera_board[:3, 3]
     on_plane = rays * ((middle @ normal) / (rays @ normal))[..., None]
     apart = [
         np.linalg.norm(on_plane - hole.centre_camera_m, axis=-1) for hole in scene.target.truth
@@ -144,7 +154,8 @@ def in_holes(scene: Scene) -> np.ndarray:
 
 
 def face_parts(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Masks (h, w) of a hole-free board: whole pixels of one surface, pixels at edges of tape, pixels on its rim."""
+    """Masks (h, w) of a hole-free board: whole pixels of one surface, pixels at edges of tape,
+    pixels on its rim."""
     names = scene.view.surface_names
     board = np.isin(
         scene.view.surface, [k for k, name in enumerate(names) if name == "board" or "tape" in name]
@@ -156,7 +167,8 @@ def face_parts(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Rival:
-    """mitransient on the same board: noise of range of a pixel at ``paths`` each, and what that took."""
+    """mitransient on the same board: noise of range of a pixel at ``paths`` each, and what that
+    took."""
 
     paths: int
     noise_mm: float
@@ -165,10 +177,12 @@ class Rival:
 
 
 def rival(scene: Scene, paths: int, runs: int = 8) -> Rival:
-    """Spread of mitransient's range over seeds, on whole pixels of the board, by a lens as wide as the region."""
+    """Spread of mitransient's range over seeds, on whole pixels of the board, by a lens as wide as
+    the region."""
     from transport_oracle import oracle
 
-    view, lens = scene.view, scene.optics.lens
+    view = scene.view
+    lens = scene.optics.lens
     h, w = view.range_m.shape
     narrow = Lens(w, h, lens.fx, lens.fx, (w - 1) / 2, (h - 1) / 2)
     optics = replace(scene.optics, lens=narrow)
@@ -251,7 +265,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\n| view | seconds | processor seconds |\n|---|---|---|")
     for title, scene in {"hole-free": free, **holed}.items():
         print(f"| {title} | {scene.wall_s:.2f} | {scene.cpu_s:.2f} |")
-    other, ours_mm = rival(free, options.rival_paths), table[0].rms_mm
+    other = rival(free, options.rival_paths)
+    ours_mm = table[0].rms_mm
     needed = other.paths * (other.noise_mm / ours_mm) ** 2
     cpu_s = other.cpu_s * needed / other.paths
     print(

@@ -1,17 +1,21 @@
-"""Fusion in the target's frame: registered views to one 2.5-D map over the fitted surface, with its variance.
+"""Fusion in the target's frame: registered views to one 2.5-D map over the fitted surface, with
+its variance.
 
-Each pixel's depth counts as a height over the surface at the place where its *ray meets the surface*. On an intact
-surface that is the point itself; at a hole it is the mouth, which therefore has the same place in all views. In a
-slanted view, points at the bottom of a wide hole or in front of the surface are displaced.
+Each pixel's depth counts as a height over the surface at the place where its *ray meets the
+surface*. On an intact surface that is the point itself; at a hole it is the mouth, which therefore
+has the same place in all views. In a slanted view, points at the bottom of a wide hole or in front
+of the surface are displaced.
 
-View i measures a cell's height as h + e_i + f(p_i) + g_i. e_i: noise that the sensor's law and the registration's
-covariance explain. f: the camera's fixed pattern, a function of the *pixel* p_i that sees the cell. g_i: an error that
-is fixed for a view and cell. Half the mean square difference of two views is noise + var g + var f (1 - exp(-(|p_i -
-p_j| / length)^exponent)), a variogram with nugget and sill (Matheron 1963; Cressie 1993). It is fitted to medians,
-because views see different parts of damage. Views that look through the same pixels share f.
+View i measures a cell's height as h + e_i + f(p_i) + g_i. e_i: noise that the sensor's law and the
+registration's covariance explain. f: the camera's fixed pattern, a function of the *pixel* p_i
+that sees the cell. g_i: an error that is fixed for a view and cell. Half the mean square
+difference of two views is noise + var g + var f (1 - exp(-(|p_i - p_j| / length)^exponent)), a
+variogram with nugget and sill (Matheron 1963; Cressie 1993). It is fitted to medians, because
+views see different parts of damage. Views that look through the same pixels share f.
 
-Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that varies over
-the sensor; changes of the blur. If views are no farther apart than the pattern's length, its sill is extrapolated."""
+Not modelled: errors that all views share in all pixels, or registrations to one reference; a
+pattern that varies over the sensor; changes of the blur. If views are no farther apart than the
+pattern's length, its sill is extrapolated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,27 +32,29 @@ from detectors.views.mapping import placing
 from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert, transform_points
 
 CELLS = 2000
-CLASSES, PER_CLASS = (
-    12,
-    100,
-)  # distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median
+# distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median
+CLASSES = 12
+PER_CLASS = 100
 LENGTHS = (
     24  # number of trial lengths, geometric from a pixel to the largest distance between views
 )
 EXPONENTS = (1.0, 1.5, 2.0)
-"""A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2), not pointed (1)."""
+"""A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2),
+not pointed (1)."""
 MEDIAN_SQUARE = 0.45494  # median of the square of a standard normal deviate
 MEDIAN_ERROR = 2.33  # relative standard error of the median of n such squares, times the root of n
 GATE_SIGMAS = (
-    5.0  # an observation this many deviations from the median of at least three views is an outlier
+    # an observation this many deviations from the median of at least three views is an outlier
+    5.0
 )
 
 
 @dataclass(frozen=True)
 class BetweenViews:
-    """Differences between views. ``own_m2``: variance of the error of a view and cell. ``pattern_m2``: variance of the
-    fixed pattern, with covariance exp(-(distance / ``length_px``)^``exponent``) between pixels. ``noise_share``: share
-    of the sensor law's variance that is noise; below 1 only if the law is from a single frame."""
+    """Differences between views. ``own_m2``: variance of the error of a view and cell.
+    ``pattern_m2``: variance of the fixed pattern, with covariance exp(-(distance /
+    ``length_px``)^``exponent``) between pixels. ``noise_share``: share of the sensor law's
+    variance that is noise; below 1 only if the law is from a single frame."""
 
     own_m2: float = 0.0
     pattern_m2: float = 0.0
@@ -60,9 +66,10 @@ class BetweenViews:
 def between_views(
     heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
 ) -> BetweenViews:
-    """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances that the ``sensor`` and
-    ``other`` (lens, registration) explain; and the direction ``looks_px`` (k, h, w, 2), in pixels, in which each view
-    sees each cell. ``repeated``: the sensor's variances come from repeated frames. All zero with too little overlap."""
+    """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances
+    that the ``sensor`` and ``other`` (lens, registration) explain; and the direction ``looks_px``
+    (k, h, w, 2), in pixels, in which each view sees each cell. ``repeated``: the sensor's
+    variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
     chosen = several[:: max(1, len(several) // CELLS)]
     values = (heights, sensor, other, looks_px)
@@ -97,8 +104,9 @@ def between_views(
 def _law(
     first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
 ) -> tuple[float, float, float, float]:
-    """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the law with the least chi
-    square plus Schwarz's penalty: none (if it ``may_vanish``), ``first`` alone, or both terms."""
+    """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the
+    law with the least chi square plus Schwarz's penalty: none (if it ``may_vanish``), ``first``
+    alone, or both terms."""
     penalty = float(np.log(max(len(distance), 2)))
     (level,), misfit = nnls(first[:, None], known)
     best = (float(misfit) ** 2 + penalty, float(level), 0.0, 1.0, 1.0)
@@ -122,10 +130,11 @@ def _law(
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """Values of each cell (h, w). ``height_m``: mean deviation from the fitted surface along z, positive behind; NaN
-    where no view counts. ``variance_m2``: of an intact surface's height, from sensor, lens, registration and further
-    differences between views. ``temporal_m2``: the part of it that more frames would lower. ``seen_by`` (k, h, w) bool:
-    views that count. ``shares`` (k, h, w): their weights, with sum 1. ``rejected``: number of outliers."""
+    """Values of each cell (h, w). ``height_m``: mean deviation from the fitted surface along z,
+    positive behind; NaN where no view counts. ``variance_m2``: of an intact surface's height, from
+    sensor, lens, registration and further differences between views. ``temporal_m2``: the part of
+    it that more frames would lower. ``seen_by`` (k, h, w) bool: views that count. ``shares`` (k,
+    h, w): their weights, with sum 1. ``rejected``: number of outliers."""
 
     cell_m: float
     height_m: np.ndarray
@@ -145,9 +154,10 @@ def combine(
     repeated: bool,
     cell_m: float,
 ) -> SurfaceMap:
-    """Combine the views' heights (k, h, w); arguments as in `between_views`. The weight of a view is the inverse of its
-    own variance. (The best weights under the covariance can be negative, which fails at a hole seen by only some
-    views.) The variance of the mean includes the covariance of views."""
+    """Combine the views' heights (k, h, w); arguments as in `between_views`. The weight of a view
+    is the inverse of its own variance. (The best weights under the covariance can be negative,
+    which fails at a hole seen by only some views.) The variance of the mean includes the
+    covariance of views."""
     between = between_views(heights, sensor, other, looks_px, repeated)
     temporal = between.noise_share * sensor
     own = temporal + other + between.own_m2
@@ -169,19 +179,19 @@ def combine(
                 * shares[j]
                 * np.exp(-(apart**between.exponent))
             )
-    height, alone, by_frames = (
-        np.where(known, np.where(used, values, 0.0).sum(axis=0), np.nan)
-        for values in (shares * heights, squares * own, squares * temporal)
-    )
+    height = np.where(known, np.where(used, shares * heights, 0.0).sum(axis=0), np.nan)
+    alone = np.where(known, np.where(used, squares * own, 0.0).sum(axis=0), np.nan)
+    by_frames = np.where(known, np.where(used, squares * temporal, 0.0).sum(axis=0), np.nan)
     return SurfaceMap(
         cell_m, height, alone + shared, by_frames, used, shares, int(rejected.sum()), between
     )
 
 
 def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """Return (k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the
-    views if larger) from the median of at least three views that cannot be damage: in front of the fitted surface,
-    where damage would have hidden it from the others; or behind it, but alone among their neighbours."""
+    """Return (k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the
+    robust spread of the views if larger) from the median of at least three views that cannot be
+    damage: in front of the fitted surface, where damage would have hidden it from the others; or
+    behind it, but alone among their neighbours."""
     deviation = heights - pixel_medians(heights)
     limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
     several = np.isfinite(heights).sum(axis=0) >= 3
@@ -195,10 +205,13 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     return rejected
 
 
-LATERAL_PX = 0.1  # standard deviation of a pixel's direction: the reprojection error of a well calibrated lens
+# standard deviation of a pixel's direction: the reprojection error of a well calibrated lens
+LATERAL_PX = 0.1
 SMOOTH_POINTS = 8192
-BINS, PER_BIN = 16, 40
-SAMPLED = 16_384  # number of pixels for the law: the median of a class is then known to 7 % from three frames
+BINS = 16
+PER_BIN = 40
+# number of pixels for the law: the median of a class is then known to 7 % from three frames
+SAMPLED = 16_384
 LEAST_M2 = (
     1e-14  # least variance, so that no weight is infinite: no point is known better than to 0.1 um
 )
@@ -207,10 +220,11 @@ LEAST_M2 = (
 def fuse(
     views: Sequence[placing.ChosenView], cell_m: float | None
 ) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
-    """Return the map as an organised cloud, its frame in the first view's (4, 4), further results, and notes. The
-    cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` the whole with
-    rounding (None for a single view, which cannot know it). Raises UserError if the points do not determine a surface
-    or the map would have too many cells."""
+    """Return the map as an organised cloud, its frame in the first view's (4, 4), further results,
+    and notes. The cloud's ``variance_m2`` over ``count`` is the temporal part of the variance,
+    ``mean_variance_m2`` the whole with rounding (None for a single view, which cannot know it).
+    Raises UserError if the points do not determine a surface or the map would have too many cells.
+    """
     T_reference_map = placing.T_reference_map_of(views[0])
     surface = placing.common_surface(views, T_reference_map)
     placed = [placing.place(view, T_reference_map, surface) for view in views]
@@ -221,9 +235,11 @@ def fuse(
     gradient = surface.gradients(x, y, grid.step)
     points = np.stack([x, y, z], axis=-1)
 
-    observed, repeated = [], True
+    observed = []
+    repeated = True
     for view in placed:
-        cloud, inside = view.chosen.cloud, view.chosen.inside
+        cloud = view.chosen.cloud
+        inside = view.chosen.inside
         raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
         variance, by_frames = depth_noise(cloud, inside, _roughness(view))
         repeated &= by_frames
@@ -296,7 +312,8 @@ def _roughness(view: placing.PlacedView) -> np.ndarray:
 
 
 def _neighbour_correlation(view: placing.PlacedView) -> float:
-    """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a pixel grid."""
+    """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a
+    pixel grid."""
     if not view.chosen.cloud.organised:
         return 1.0
     d = view.deviation_m
@@ -316,8 +333,9 @@ def _median(values: np.ndarray) -> float:
 def _registration_variance(
     view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
 ) -> np.ndarray:
-    """Return the variance (h, w) that the registration gives to displacements w x (p - centre) + t of points (h, w, 3)
-    along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0 without a covariance."""
+    """Return the variance (h, w) that the registration gives to displacements w x (p - centre) + t
+    of points (h, w, 3) along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0
+    without a covariance."""
     if not view.known_covariance:
         return np.zeros(points_m.shape[:2])
     turn = np.kron(np.eye(2), T_reference_map[:3, :3])
@@ -352,12 +370,15 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
 def depth_noise(
     cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray
 ) -> tuple[np.ndarray, bool]:
-    """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if it comes from the
-    sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise:
-    Lange and Seitz 2001), or the range to the fourth if a tenth of the points has no amplitude; a pixel's own sample
-    variance would favour pixels that are quiet by chance. ``deviation_m`` (h, w): z minus the view's own smooth
-    surface, whose squares replace the variances for a single frame. Not modelled: shared noise, multipath, pattern."""
-    q, valid = (cloud.points_m**2).sum(axis=-1) ** 2, cloud.valid
+    """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if
+    it comes from the sample variances of repeated frames inside the target. The law is v = k q + c
+    with q = 1 / amplitude^2 (phase noise: Lange and Seitz 2001), or the range to the fourth if a
+    tenth of the points has no amplitude; a pixel's own sample variance would favour pixels that
+    are quiet by chance. ``deviation_m`` (h, w): z minus the view's own smooth surface, whose
+    squares replace the variances for a single frame. Not modelled: shared noise, multipath,
+    pattern."""
+    q = (cloud.points_m**2).sum(axis=-1) ** 2
+    valid = cloud.valid
     if cloud.amplitude is not None:
         known = valid & (np.nan_to_num(cloud.amplitude) > 0)
         if known.sum() >= 0.9 * valid.sum():
@@ -366,12 +387,16 @@ def depth_noise(
     used = inside & (cloud.count > 1) & np.isfinite(cloud.variance_m2)
     repeated = bool(used.sum() >= PER_BIN)
     if repeated:
-        samples, freedom = cloud.variance_m2[used], cloud.count[used] - 1.0
+        samples = cloud.variance_m2[used]
+        freedom = cloud.count[used] - 1.0
     else:
         used = inside & np.isfinite(deviation_m)
         # one sample has the variance of a single frame: it is divided by their number below
-        samples, freedom = deviation_m[used] ** 2 * cloud.count[used], np.ones(int(used.sum()))
-    slope, constant, typical = 0.0, LEAST_M2, 1.0
+        samples = deviation_m[used] ** 2 * cloud.count[used]
+        freedom = np.ones(int(used.sum()))
+    slope = 0.0
+    constant = LEAST_M2
+    typical = 1.0
     if used.any():
         thinned = slice(None, None, max(1, len(samples) // SAMPLED))
         numbers, where = np.unique(freedom[thinned], return_inverse=True)
@@ -389,7 +414,8 @@ def depth_noise(
     frame = slope * q / typical + constant
     left = 0.0
     if cloud.z_step_m > 0 and repeated:
-        # any average keeps an error of rounding that no scatter shows; if frames repeat exactly, it is the whole error
+        # any average keeps an error of rounding that no scatter shows; if frames repeat exactly,
+        # it is the whole error
         left = rounding_left_m2(
             cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0)
         )

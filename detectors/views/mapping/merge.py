@@ -1,9 +1,11 @@
-"""The steps from views to one cloud: prepare, register (`detectors.views.registration.register`), and merge.
+"""The steps from views to one cloud: prepare, register (`detectors.views.registration.register`),
+and merge.
 
-A volume is a truncated signed distance field over the views' depth images (Open3D's VoxelBlockGrid). Depth is resampled
-with the triangles of the map to an image without distortion, because the field's projection has no lens model. All
-views have equal weight, and depth counts along the view's own optical axis (Curless and Levoy 1996). Not modelled:
-noise and incidence in the weights; views through a hole, which remove part of its rim."""
+A volume is a truncated signed distance field over the views' depth images (Open3D's
+VoxelBlockGrid). Depth is resampled with the triangles of the map to an image without distortion,
+because the field's projection has no lens model. All views have equal weight, and depth counts
+along the view's own optical axis (Curless and Levoy 1996). Not modelled: noise and incidence in
+the weights; views through a hole, which remove part of its rim."""
 
 import time
 from collections.abc import Sequence
@@ -32,20 +34,29 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Region, invert, transform_points
 
 TRUNCATION_VOXELS = 4.0
-"""Distance at which the field is truncated: over 5 mm for pixels of 1.4 mm, ten times the noise of one frame."""
-OVERSAMPLING = 2  # pixels of the undistorted image along a side of an original pixel; the field takes the nearest depth
+"""Distance at which the field is truncated: over 5 mm for pixels of 1.4 mm, ten times the noise of
+one frame."""
+# pixels of the undistorted image along a side of an original pixel; the field takes the nearest
+# depth
+OVERSAMPLING = 2
 WALL_DEG = 60.0
-"""A crossing whose normal is farther from that of the smooth face lies on a wall. A dent as deep as its radius has
-flanks of 45 degrees; a drilled wall has 90, less the effect of the camera's blur."""
-LOOKED_UP_AT = 0.5  # added to the principal point, as Open3D truncates pixel positions: the first pixel's centre is 0.5
-BLOCK, BLOCKS_AT_FIRST = 8, 4096
-"""Voxels along a side of a block (larger ones lie mostly outside the truncated field), and blocks reserved at first."""
+"""A crossing whose normal is farther from that of the smooth face lies on a wall. A dent as deep
+as its radius has flanks of 45 degrees; a drilled wall has 90, less the effect of the camera's
+blur."""
+# added to the principal point, as Open3D truncates pixel positions: the first pixel's centre is
+# 0.5
+LOOKED_UP_AT = 0.5
+BLOCK = 8
+BLOCKS_AT_FIRST = 4096
+"""Voxels along a side of a block (larger ones lie mostly outside the truncated field), and blocks
+reserved at first."""
 
 
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
-    """Return the field's zero crossings as an unorganised cloud in the first view's frame, sorted by x, y, z; and
-    notes. ``count`` is 1; ``variance_m2`` of all points is the median variance of one frame's z over the views'
-    targets, for the floor that rounding sets. Raises UserError if the field or the targets have no smooth surface."""
+    """Return the field's zero crossings as an unorganised cloud in the first view's frame, sorted
+    by x, y, z; and notes. ``count`` is 1; ``variance_m2`` of all points is the median variance of
+    one frame's z over the views' targets, for the floor that rounding sets. Raises UserError if
+    the field or the targets have no smooth surface."""
     clouds = [view.cloud for view in views]
     pitch = float(np.median(clouds[0].points_m[views[0].inside][:, 2])) * views[0].slope_step
     voxel = voxel_m if voxel_m is not None else pitch
@@ -76,12 +87,15 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Return depth (h, w, 1) float32, 0 if none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
-    cloud, inside = view.cloud, view.inside
+    """Return depth (h, w, 1) float32, 0 if none, on a pinhole's grid; colour (h, w, 3) 0..1 if
+    any; camera matrix."""
+    cloud = view.cloud
+    inside = view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
     step = view.slope_step / OVERSAMPLING
-    low, high = slopes[inside].min(axis=0), slopes[inside].max(axis=0)
+    low = slopes[inside].min(axis=0)
+    high = slopes[inside].max(axis=0)
     columns, rows = np.floor((high - low) / step).astype(int) + 1
     grid = CellGrid(float(low[0]), float(low[1]), step, (int(rows), int(columns)))
     raster = raster_between(slopes, inside, cloud.organised, step, grid)
@@ -101,11 +115,14 @@ def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.nd
 def _crossings(
     views: Sequence[ChosenView], voxel: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return places and normals (n, 3) of zero crossings in the first view's frame; colours if all views have any."""
+    """Return places and normals (n, 3) of zero crossings in the first view's frame; colours if all
+    views have any."""
     coloured = all(view.cloud.rgb is not None for view in views)
-    names, channels = ["tsdf", "weight", "color"][: 2 + coloured], [[1], [1], [3]][: 2 + coloured]
+    names = ["tsdf", "weight", "color"][: 2 + coloured]
+    channels = [[1], [1], [3]][: 2 + coloured]
     with open3d_on_one_thread() as o3d:
-        core, geometry = o3d.core, o3d.t.geometry
+        core = o3d.core
+        geometry = o3d.t.geometry
 
         def image(values: np.ndarray) -> Any:
             return geometry.Image(core.Tensor(np.ascontiguousarray(values)))
@@ -129,16 +146,16 @@ def _crossings(
             raise UserError(
                 what, fix="choose smaller voxels, check the crop, or merge in another way"
             ) from error
-        points, normals = (
-            found.point[name].numpy().astype(np.float64) for name in ("positions", "normals")
-        )
+        points = found.point["positions"].numpy().astype(np.float64)
+        normals = found.point["normals"].numpy().astype(np.float64)
         return points, normals, found.point.colors.numpy().copy() if coloured else None
 
 
 def _facing(
     views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarray, pitch_m: float
 ) -> np.ndarray:
-    """Return (n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface of all targets."""
+    """Return (n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface
+    of all targets."""
     T_reference_map = T_reference_map_of(views[0])
     surface = common_surface(views, T_reference_map)
     x, y, _ = transform_points(invert(T_reference_map), points_m).T
@@ -157,8 +174,9 @@ MAX_BOXES = (
 
 @dataclass(frozen=True)
 class Merged:
-    """One cloud of several views. ``T_reference_cloud`` (4, 4): from its frame to the first view's camera frame.
-    ``views_used``: names of the merged views. ``surface_map``: further results of a fused map."""
+    """One cloud of several views. ``T_reference_cloud`` (4, 4): from its frame to the first view's
+    camera frame. ``views_used``: names of the merged views. ``surface_map``: further results of a
+    fused map."""
 
     cloud: Cloud
     T_reference_cloud: np.ndarray
@@ -177,8 +195,9 @@ class Mapped:
     merged: Merged
 
     def view_of_points(self) -> np.ndarray:
-        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`.
-        A map knows its views; else it is that of the nearest point, or several if another has one within twice that."""
+        """Return (n,) for each point of the merged cloud the index of its view in
+        ``merged.views_used``, or `SEVERAL`. A map knows its views; else it is that of the nearest
+        point, or several if another has one within twice that."""
         merged = self.merged
         count = merged.cloud.valid.size
         if merged.surface_map is not None:
@@ -200,7 +219,8 @@ class Mapped:
 
 
 def prepare(view: View, config: MappingConfig) -> PreparedView:
-    """Cut the target out of a view and find its marks. Raises UserError if the crop leaves nothing."""
+    """Cut the target out of a view and find its marks. Raises UserError if the crop leaves
+    nothing."""
     inside = crop(view.cloud, config.crop)
     return PreparedView(view, inside, find_marks(view.cloud, inside, config.marks))
 
@@ -208,12 +228,14 @@ def prepare(view: View, config: MappingConfig) -> PreparedView:
 def merge(
     views: Sequence[PreparedView], registrations: Sequence[Registration], config: AnyMerge
 ) -> Merged:
-    """Merge the views, or the single view, whose registration did not fail. Raises UserError if no view is left, or if
-    the settings ask for too many cells."""
+    """Merge the views, or the single view, whose registration did not fail. Raises UserError if no
+    view is left, or if the settings ask for too many cells."""
     began = time.perf_counter()
-    chosen, left_out = list[ChosenView](), tuple[str, ...]()
+    chosen = list[ChosenView]()
+    left_out = tuple[str, ...]()
     for prepared, registration in zip(views, registrations, strict=True):
-        cloud, name = prepared.view.cloud, prepared.view.name
+        cloud = prepared.view.cloud
+        name = prepared.view.name
         view = ChosenView(name, cloud, prepared.inside & cloud.valid, registration)
         if registration.failure:
             left_out += (f"{name} left out: {registration.failure}",)
@@ -225,7 +247,9 @@ def merge(
         legal = "at least one view that is registered and holds points of the target"
         fix = "correct the views or their crop, or choose another registration method"
         raise UserError(f"no view is left to merge: {'; '.join(left_out)}", legal=legal, fix=fix)
-    T_reference_cloud, surface_map, notes = np.eye(4), None, tuple[str, ...]()
+    T_reference_cloud = np.eye(4)
+    surface_map = None
+    notes = tuple[str, ...]()
     if isinstance(config, GridMerge):
         cloud = _on_grid(chosen, config.step_mm * MM)
     elif isinstance(config, FusedMerge):
@@ -240,12 +264,14 @@ def merge(
 
 
 def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
-    """The thesis' merge (MATLAB's pcmerge) as an unorganised cloud in the first view's frame: boxes in the order of x,
-    then y, then z; then the rest. Raises UserError if there are more boxes along an axis than can be numbered. The
-    overlap of the clouds' axis-parallel bounding boxes is divided into boxes from its lowest corner; each box with
-    points becomes their plain mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all
-    go into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would weight a late cloud
-    more. ``count``: samples of all points of a box; ``variance_m2``: their mean variance; ``n_frames``: the least."""
+    """The thesis' merge (MATLAB's pcmerge) as an unorganised cloud in the first view's frame:
+    boxes in the order of x, then y, then z; then the rest. Raises UserError if there are more
+    boxes along an axis than can be numbered. The overlap of the clouds' axis-parallel bounding
+    boxes is divided into boxes from its lowest corner; each box with points becomes their plain
+    mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all go
+    into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would
+    weight a late cloud more. ``count``: samples of all points of a box; ``variance_m2``: their
+    mean variance; ``n_frames``: the least."""
     limits = [
         (view.points_reference_m.min(axis=0), view.points_reference_m.max(axis=0)) for view in views
     ]
@@ -273,7 +299,8 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
         sums = np.concatenate([np.add.reduceat(columns[shared][order], starts, axis=0), sums])
     clouds = [view.cloud for view in views]
-    n, samples = sums[:, 9:], sums[:, 7]
+    n = sums[:, 9:]
+    samples = sums[:, 7]
     # MATLAB rounds mean colours
     colour = np.floor(sums[:, 3:6] / n + 0.5)
     return Cloud(
@@ -295,7 +322,8 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
 
 def _columns(view: ChosenView) -> np.ndarray:
     """Return (n, 10), NaN where unknown."""
-    cloud, inside = view.cloud, view.inside
+    cloud = view.cloud
+    inside = view.inside
     count = cloud.count[inside].astype(np.float64)
     unknown = np.full(len(count), np.nan)
     colour = [unknown] * 3 if cloud.rgb is None else list(cloud.rgb[inside].T)

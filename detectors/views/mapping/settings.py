@@ -11,14 +11,16 @@ from harness.vocabulary.config import Config
 
 
 class GridMerge(Config):
-    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid in the first view's frame."""
+    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid in the
+    first view's frame."""
 
     kind: Literal["grid"] = "grid"
     step_mm: float = Field(default=0.1, gt=0, le=50, description="side of a cube")
 
 
 class FusedMerge(Config):
-    """A map over the fitted surface. Each cell holds the views' inverse-variance mean, its variance and count."""
+    """A map over the fitted surface. Each cell holds the views' inverse-variance mean, its
+    variance and count."""
 
     kind: Literal["fusion"] = "fusion"
     cell_mm: float | None = Field(

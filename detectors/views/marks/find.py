@@ -1,9 +1,11 @@
-"""Finds and judges the marks of one view: coloured spots, or codes (OpenCV's); unreliable marks are in doubt.
+"""Finds and judges the marks of one view: coloured spots, or codes (OpenCV's); unreliable marks
+are in doubt.
 
-The slope of a mark's plane is fitted to the mark and its surroundings, but the offset only to the mark, because a mark
-may be thick or have a range error of its own. Its centroid is the mean of the points where the pixels' rays meet this
-plane, weighted by the surface that they cover and by their colour. Spots behind the surface are holes. Not modelled: a
-surface or tag that bends within the mark; a lens whose distortion is more than quadratic over one tag."""
+The slope of a mark's plane is fitted to the mark and its surroundings, but the offset only to the
+mark, because a mark may be thick or have a range error of its own. Its centroid is the mean of the
+points where the pixels' rays meet this plane, weighted by the surface that they cover and by their
+colour. Spots behind the surface are holes. Not modelled: a surface or tag that bends within the
+mark; a lens whose distortion is more than quadratic over one tag."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +42,8 @@ LEAST_SCALE_M = 1e-6
 
 @dataclass(frozen=True)
 class Patch:
-    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m``, and the deviation of one point's z about it."""
+    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m``, and the deviation of one point's
+    z about it."""
 
     slope_x: float
     slope_y: float
@@ -69,8 +72,9 @@ class Patch:
     def range_covariance_m2(
         self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray
     ) -> np.ndarray:
-        """Return the covariance (3, 3) of a centre (3,) on the plane from its pixels' mean z (n,): from the largest of
-        scatter about the plane, the frames' noise and a map's variance; `CORRELATED_PIXELS` share it."""
+        """Return the covariance (3, 3) of a centre (3,) on the plane from its pixels' mean z (n,):
+        from the largest of scatter about the plane, the frames' noise and a map's variance;
+        `CORRELATED_PIXELS` share it."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
         known = frames[np.isfinite(frames)]
         variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
@@ -89,9 +93,10 @@ class Patch:
 
 @dataclass(frozen=True)
 class Spot:
-    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``pitch_m`` between pixels,
-    and ``behind_m``: its distance behind its surroundings, with standard deviation. ``sizes_m`` (3,): sides of the
-    rectangle with its second moments, and the mean breadth over the length, which gaps reduce."""
+    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``,
+    ``pitch_m`` between pixels, and ``behind_m``: its distance behind its surroundings, with
+    standard deviation. ``sizes_m`` (3,): sides of the rectangle with its second moments, and the
+    mean breadth over the length, which gaps reduce."""
 
     blob: Blob
     centre_m: np.ndarray
@@ -110,7 +115,8 @@ class Spot:
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """Fit the plane of at least two thirds of points (n, 3); None if they are too few or lie on a line."""
+    """Fit the plane of at least two thirds of points (n, 3); None if they are too few or lie on a
+    line."""
     x, y, z = points_m[:: max(1, len(points_m) // PATCH_POINTS)].T
     try:
         plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
@@ -131,7 +137,8 @@ def fit_patch(points_m: np.ndarray) -> Patch | None:
 
 def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     """Return the place of a blob whose surroundings lie on a plane."""
-    pixels, weights = blob.pixels, blob.weights
+    pixels = blob.pixels
+    weights = blob.weights
     points = cloud.points_m.reshape(-1, 3)[pixels]
     own = weights > 0.5
     # the mean height of those points within four scales of the median
@@ -139,7 +146,8 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     middle = median_of(height)
     scale = max(sigma_of(height - middle), LEAST_SCALE_M)
     kept = height[np.abs(height - middle) <= 4.0 * scale]
-    behind, sigma = float(kept.mean()), float(max(kept.std(), scale))
+    behind = float(kept.mean())
+    sigma = float(max(kept.std(), scale))
     settled = replace(patch, offset_m=patch.offset_m + behind, sigma_m=sigma)
     on_plane = settled.cut(points, cloud.projection)
     covers = weights * (on_plane[:, 2] ** 3 if cloud.projection == "central" else 1.0)
@@ -156,20 +164,26 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
     # the scatter of a flat mark: the different depths in a hole must not hide that it is a hole
     behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
-    area, pitch = pixel_area * float(weights.sum()), float(np.sqrt(pixel_area))
-    covariance, sizes = (covariance + covariance.T) / 2, np.array([major, minor, area / major])
+    area = pixel_area * float(weights.sum())
+    pitch = float(np.sqrt(pixel_area))
+    covariance = (covariance + covariance.T) / 2
+    sizes = np.array([major, minor, area / major])
     return Spot(blob, centre, covariance, settled.normal, area, sizes, pitch, behind, behind_sigma)
 
 
 CORNER_PX = 0.25
-"""Standard deviation of a refined corner per axis: 0.18 on drawn sharp tags of 40 pixels, 0.34 with a blur of 1.5."""
-LEAST_SEEN, WHOLE = 0.5, 0.95
-"""Least share of a tag's pixels on the target for a tag of the target, and for a tag without doubt."""
+"""Standard deviation of a refined corner per axis: 0.18 on drawn sharp tags of 40 pixels, 0.34
+with a blur of 1.5."""
+LEAST_SEEN = 0.5
+WHOLE = 0.95
+"""Least share of a tag's pixels on the target for a tag of the target, and for a tag without
+doubt."""
 HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 
 
 def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
-    """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one code are in doubt."""
+    """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one
+    code are in doubt."""
     assert cloud.rgb is not None
     grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
@@ -204,21 +218,21 @@ def _coded_mark(
     if patch is None:
         return None
     grid = np.stack([pixels % inside.shape[1], pixels // inside.shape[1]], axis=1).astype(float)
-    middle, half = grid.mean(axis=0), max(float(np.ptp(grid, axis=0).max()) / 2, 1.0)
+    middle = grid.mean(axis=0)
+    half = max(float(np.ptp(grid, axis=0).max()) / 2, 1.0)
     rays = points[:, :2] / points[:, 2:] if cloud.projection == "central" else points[:, :2]
     coefficients = np.linalg.lstsq(_quadratic((grid - middle) / half), rays, rcond=1e-10)[0]
     wanted = np.concatenate([corners, corners.mean(axis=0) + HALF_STEPS])
     found = _quadratic((wanted - middle) / half) @ coefficients
     on_plane = patch.cut(np.column_stack([found, np.ones(len(found))]), cloud.projection)
-    places, steps = (
-        on_plane[:4],
-        np.stack([on_plane[4] - on_plane[5], on_plane[6] - on_plane[7]], axis=1),
-    )
+    places = on_plane[:4]
+    steps = np.stack([on_plane[4] - on_plane[5], on_plane[6] - on_plane[7]], axis=1)
     centre = places.mean(axis=0)
     covariance = steps @ steps.T * CORNER_PX**2 / 4 + patch.range_covariance_m2(
         centre, cloud, pixels
     )
-    seen, without = len(pixels) / int(area.sum()), 1.0 - cloud.valid[area > 0].mean()
+    seen = len(pixels) / int(area.sum())
+    without = 1.0 - cloud.valid[area > 0].mean()
     doubt = ""
     if twice:
         doubt = f"code {code} is seen more than once"
@@ -236,19 +250,26 @@ def _quadratic(uv: np.ndarray) -> np.ndarray:
 
 
 CLEAR_MARGIN = 2.0
-"""If the marks' pixels exceed the threshold by this factor, their outlines are whole; else lightness is tried."""
+"""If the marks' pixels exceed the threshold by this factor, their outlines are whole; else
+lightness is tried."""
 LEAST_TARGET = 100
 BEHIND_M = 2.0 * MM
-"""A mark may seem to lie this far behind its surroundings: cameras range dark and bright surfaces differently."""
+"""A mark may seem to lie this far behind its surroundings: cameras range dark and bright surfaces
+differently."""
 BEHIND_SIGMAS = 5.0
 RAISED_SHARE = 0.25
-"""Largest height of a mark above its surroundings, as a share of its breadth: allows a tag on board, no object."""
+"""Largest height of a mark above its surroundings, as a share of its breadth: allows a tag on
+board, no object."""
 SAME_COLOUR = 0.35
-"""Two spots have the same colour if their contrasts to their surroundings differ by less than this share of them."""
+"""Two spots have the same colour if their contrasts to their surroundings differ by less than this
+share of them."""
 WEAK_SHARE = 1 / 3
-"""Share of the strongest colour's contrast to its surroundings; beside such marks, weaker spots are stains."""
-UNLIKE_SHARE, UNLIKE_PIXELS = 0.3, 1.5
-"""A mark is unlike the others if its sizes differ from their median by more than this share and this many pixels."""
+"""Share of the strongest colour's contrast to its surroundings; beside such marks, weaker spots
+are stains."""
+UNLIKE_SHARE = 0.3
+UNLIKE_PIXELS = 1.5
+"""A mark is unlike the others if its sizes differ from their median by more than this share and
+this many pixels."""
 LARGEST_SHARE = (
     0.15  # share of the target; a larger spot is a part of the target with another colour
 )
@@ -257,8 +278,8 @@ LARGEST_SHARE = (
 def find_marks(
     cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks
 ) -> MarkSet:
-    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. It raises for no picture; a set
-    that cannot support a registration says so in its ``problem``."""
+    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. It raises for
+    no picture; a set that cannot support a registration says so in its ``problem``."""
     none = MarkSet((), np.zeros(0, dtype=np.int64))
     if cloud.rgb is None:
         return replace(none, problem="the capture has no colour, which is needed to find marks")
@@ -275,7 +296,8 @@ def find_marks(
     if isinstance(config, RedMarks):
         # the rule of the thesis, with MATLAB's standard deviation (n - 1)
         red = cloud.rgb[inside][:, 0].astype(np.float64)
-        mean, spread = red.mean(), red.std(ddof=1)
+        mean = red.mean()
+        spread = red.std(ddof=1)
         limit = mean + config.deviations * spread
         coloured = np.zeros(inside.shape, dtype=bool)
         coloured[inside] = red > limit
@@ -288,8 +310,8 @@ def find_marks(
                 "marks need a pixel grid, which this cloud does not have",
             )
         return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
-    # lightness is tried if chromaticity gives too few marks or hardly any contrast: black and white have the light's
-    # chromaticity, and black hardly any
+    # lightness is tried if chromaticity gives too few marks or hardly any contrast: black and
+    # white have the light's chromaticity, and black hardly any
     found, margin = _standing_out(cloud, inside, chromaticity)
     if len(found.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
         return found
@@ -304,9 +326,11 @@ def find_marks(
 def _standing_out(
     cloud: Cloud, inside: np.ndarray, feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> tuple[MarkSet, float]:
-    """Find the marks by one feature of the colours; return them and the median margin of the trusted marks' pixels."""
+    """Find the marks by one feature of the colours; return them and the median margin of the
+    trusted marks' pixels."""
     assert cloud.rgb is not None
-    contrast, margin = np.zeros(inside.shape), np.zeros(inside.shape)
+    contrast = np.zeros(inside.shape)
+    margin = np.zeros(inside.shape)
     contrast[inside], margin[inside] = stand_out(
         *feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2]
     )
@@ -323,8 +347,10 @@ def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
 
 
 def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
-    """Return the marks among coloured pixels, in the order of their pixels; ``missing`` says why there are not more."""
-    points_m, n_target = cloud.points_m.reshape(-1, 3), int(inside.sum())
+    """Return the marks among coloured pixels, in the order of their pixels; ``missing`` says why
+    there are not more."""
+    points_m = cloud.points_m.reshape(-1, 3)
+    n_target = int(inside.sum())
     blobs = find_blobs(cloud, inside, coloured)
     patches = [fit_patch(points_m[blob.surroundings]) for blob in blobs]
     spots = [
@@ -346,15 +372,18 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
             colours.append([spot])
     groups = []
     for colour in colours:
-        # if most of a colour's area lies behind, its flat-looking spots are holes too small to look deep
+        # if most of a colour's area lies behind, its flat-looking spots are holes too small to
+        # look deep
         flat = [s for s in colour if not s.is_hole]
         if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(
             s.area_m2 for s in colour
         ):
-            whole, usual_m = [s for s in flat if not s.blob.doubt], None
+            whole = [s for s in flat if not s.blob.doubt]
+            usual_m = None
             if len(whole) >= 3:
                 # half of the spots' area is in larger spots, so that chips count little
-                sizes, areas = np.array([s.sizes_m for s in whole]), [s.area_m2 for s in whole]
+                sizes = np.array([s.sizes_m for s in whole])
+                areas = [s.area_m2 for s in whole]
                 usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
             groups.append(
                 (
@@ -384,8 +413,10 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
 
 
 def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
-    """Return the spot as a mark, with its doubt. ``usual_m`` (3,): usual sizes. ``n_target``: the target's pixels."""
-    doubt, sizes_m = spot.blob.doubt, spot.sizes_m
+    """Return the spot as a mark, with its doubt. ``usual_m`` (3,): usual sizes. ``n_target``: the
+    target's pixels."""
+    doubt = spot.blob.doubt
+    sizes_m = spot.sizes_m
     pixels = spot.blob.pixels[spot.blob.weights > 0.5]
     if doubt:
         pass

@@ -1,4 +1,5 @@
-"""Fiducial marks for a registration: their data, settings of the rules that find them, conditions on a set of marks."""
+"""Fiducial marks for a registration: their data, settings of the rules that find them, conditions
+on a set of marks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,26 +12,31 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM
 
 LEAST_MARKS = 3
-OFF_LINE_SIGMAS, OFF_LINE_SHARE = 5.0, 0.02
-"""Marks count as lying on a line if their root mean square distance from it is below this many standard deviations of a
-mark's position, or below this share of their spread along it: there, a millimetre of error at a mark becomes 50 mm."""
+OFF_LINE_SIGMAS = 5.0
+OFF_LINE_SHARE = 0.02
+"""Marks count as lying on a line if their root mean square distance from it is below this many
+standard deviations of a mark's position, or below this share of their spread along it: there, a
+millimetre of error at a mark becomes 50 mm."""
 
 
 class RedMarks(Config):
-    """The thesis' rule: pixels whose red exceeds the cropped cloud's mean by this many standard ``deviations``."""
+    """The thesis' rule: pixels whose red exceeds the cropped cloud's mean by this many standard
+    ``deviations``."""
 
     kind: Literal["red"] = "red"
     deviations: float = Field(default=2.6, gt=0, le=20)
 
 
 class ColourMarks(Config):
-    """Pixels whose chromaticity, or, if that gives too few marks, whose lightness differs from the target's own."""
+    """Pixels whose chromaticity, or, if that gives too few marks, whose lightness differs from the
+    target's own."""
 
     kind: Literal["colour"] = "colour"
 
 
 class CodedMarks(Config):
-    """Printed codes (ArUco, AprilTag) in the cloud's colour image; ``dictionary`` is OpenCV's name of their set."""
+    """Printed codes (ArUco, AprilTag) in the cloud's colour image; ``dictionary`` is OpenCV's name
+    of their set."""
 
     kind: Literal["coded"] = "coded"
     dictionary: str = "DICT_6X6_50"
@@ -53,10 +59,11 @@ MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3,
-    3): of the centroid, without errors that all pixels of the mark share (a range offset, lens distortion). ``normal``
-    (3,): of the surface there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid. ``area_m2``: on
-    the surface. ``code``: None for a piece of tape. ``doubt``: why it is unreliable."""
+    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface.
+    ``covariance_m2`` (3, 3): of the centroid, without errors that all pixels of the mark share (a
+    range offset, lens distortion). ``normal`` (3,): of the surface there, towards the camera.
+    ``pixels`` (n,): flat indices into the cloud's grid. ``area_m2``: on the surface. ``code``:
+    None for a piece of tape. ``doubt``: why it is unreliable."""
 
     centre_m: np.ndarray
     covariance_m2: np.ndarray
@@ -69,8 +76,9 @@ class Mark:
 
 @dataclass(frozen=True)
 class MarkSet:
-    """All marks of one view. ``points`` (n,): flat indices of all pixels of the fiducial colour in the crop, the
-    thesis' fiducial cloud. ``problem``: why these marks do not suffice for a registration, with what is missing."""
+    """All marks of one view. ``points`` (n,): flat indices of all pixels of the fiducial colour in
+    the crop, the thesis' fiducial cloud. ``problem``: why these marks do not suffice for a
+    registration, with what is missing."""
 
     marks: tuple[Mark, ...]
     points: np.ndarray
@@ -84,7 +92,8 @@ class MarkSet:
 
 
 def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
-    """Return why these marks do not suffice for a registration, else "". ``missing``: why there are not more."""
+    """Return why these marks do not suffice for a registration, else "". ``missing``: why there
+    are not more."""
     trusted = [mark for mark in marks if not mark.doubt]
     if len(trusted) >= LEAST_MARKS:
         return off_line_problem(trusted)

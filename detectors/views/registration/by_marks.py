@@ -1,18 +1,22 @@
-"""Registration by marks, matched by code or by distances: weighted least squares for each view, or all views jointly.
+"""Registration by marks, matched by code or by distances: weighted least squares for each view, or
+all views jointly.
 
-To judge whether views belong together, `SHARED_M` allows for errors of range or lens in a single view. The covariance
-holds the noise, widened if the marks disagree by more than chance allows (Birge's ratio).
+To judge whether views belong together, `SHARED_M` allows for errors of range or lens in a single
+view. The covariance holds the noise, widened if the marks disagree by more than chance allows
+(Birge's ratio).
 
-The joint adjustment is a bundle adjustment (Triggs et al., 2000) with one smooth surface instead of many points. Its
-unknowns are the poses of all views but the first, the surface z(x, y) (a cubic), the marks' places on it, and each
-view's own smooth error across it:
+The joint adjustment is a bundle adjustment (Triggs et al., 2000) with one smooth surface instead
+of many points. Its unknowns are the poses of all views but the first, the surface z(x, y) (a
+cubic), the marks' places on it, and each view's own smooth error across it:
 
-z(T_v p) - S(x, y) - b_v(x, y) = noise for about 2000 target points p of each view v, and P (T_v c - M) = noise for each
-mark c of each view that is one of the reference's, in the surface's frame. Noise across the surface is that of the
-sampling, with one independent value in 25 pixels; Tukey's weights exclude holes. b_v is the smooth error that all
-pixels of a view share (wiggling, multipath): a cubic, whose level and tilts are indistinguishable from those of the
-pose. The scatter of its seven other terms between views gives their common deviation (by expectation maximisation),
-which also widens the level and tilts. Not modelled: errors within the plane; other surfaces; gross errors of marks."""
+z(T_v p) - S(x, y) - b_v(x, y) = noise for about 2000 target points p of each view v, and P (T_v c
+- M) = noise for each mark c of each view that is one of the reference's, in the surface's frame.
+Noise across the surface is that of the sampling, with one independent value in 25 pixels; Tukey's
+weights exclude holes. b_v is the smooth error that all pixels of a view share (wiggling,
+multipath): a cubic, whose level and tilts are indistinguishable from those of the pose. The
+scatter of its seven other terms between views gives their common deviation (by expectation
+maximisation), which also widens the level and tilts. Not modelled: errors within the plane; other
+surfaces; gross errors of marks."""
 
 from __future__ import annotations
 
@@ -31,15 +35,18 @@ from detectors.views.view import PreparedView
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 WIDEN_BELOW = 0.01
-"""Probability of so large a disagreement of marks by noise alone, below which the covariance is widened."""
+"""Probability of so large a disagreement of marks by noise alone, below which the covariance is
+widened."""
 REFUSE_BELOW = 1e-4
-"""The same probability, with `SHARED_M` for each mark and axis, below which the views do not fit together."""
+"""The same probability, with `SHARED_M` for each mark and axis, below which the views do not fit
+together."""
 
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> registered.Registration:
-    """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Its
-    ``failure`` reports too few marks, marks on a line, and marks that fit nowhere, badly or in several ways; the
-    transform is then the best known, or else the guess, or else the identity."""
+    """Return the pose of a view relative to the reference, from their trusted marks; ``overlap``
+    stays NaN. Its ``failure`` reports too few marks, marks on a line, and marks that fit nowhere,
+    badly or in several ways; the transform is then the best known, or else the guess, or else the
+    identity."""
     guess = registered.guess_of(reference, view)
     fixed, moved, problem, notes = _matched(reference, view)
     if len(fixed) < 3:
@@ -76,8 +83,9 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
-    """Return the root mean square distance (m) of each matched mark from its place by a registration with the others;
-    None if fewer than four marks match, or if leaving one out leaves the rest on a line."""
+    """Return the root mean square distance (m) of each matched mark from its place by a
+    registration with the others; None if fewer than four marks match, or if leaving one out leaves
+    the rest on a line."""
     fixed, moved, problem, _ = _matched(reference, view)
     if problem or len(fixed) < 4:
         return None
@@ -98,7 +106,8 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
 def _matched(
     reference: PreparedView, view: PreparedView
 ) -> tuple[tuple[Mark, ...], tuple[Mark, ...], str, tuple[str, ...]]:
-    """Return the pairs of trusted marks of both views, the reason why they must not be used (or ""), and notes."""
+    """Return the pairs of trusted marks of both views, the reason why they must not be used (or
+    ""), and notes."""
     problem = "; ".join(
         f"{each.view.name}: {each.marks.problem}"
         for each in (reference, view)
@@ -106,14 +115,16 @@ def _matched(
     )
     if problem:
         return (), (), problem, ()
-    fixed, moved = reference.marks.trusted, view.marks.trusted
+    fixed = reference.marks.trusted
+    moved = view.marks.trusted
     pairing = pair_marks(fixed, moved, registered.guess_of(reference, view))
     i, j = pairing.pairs.T
     return tuple(fixed[k] for k in i), tuple(moved[k] for k in j), pairing.problem, pairing.notes
 
 
 def _placed(fixed: Sequence[Mark], moved: Sequence[Mark], shared_m: float) -> Placement:
-    """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis of each mark."""
+    """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis
+    of each mark."""
     extra = shared_m**2 * np.eye(3)
     fixed_m, moved_m = (np.stack([mark.centre_m for mark in marks]) for marks in (fixed, moved))
     fixed_spread, moved_spread = (
@@ -123,19 +134,23 @@ def _placed(fixed: Sequence[Mark], moved: Sequence[Mark], shared_m: float) -> Pl
 
 
 MAX_STEPS = 40
-CONVERGED_M, CONVERGED_SHARED = 1e-6, 0.02
-"""Largest last move of an unknown, and largest last relative change of the deviation of the views' own errors."""
+CONVERGED_M = 1e-6
+CONVERGED_SHARED = 0.02
+"""Largest last move of an unknown, and largest last relative change of the deviation of the views'
+own errors."""
 LEAST_SHARED_M = 1e-6
 DEGREE = 3
 TERMS = tuple((k - j, j) for k in range(DEGREE + 1) for j in range(k + 1))
-"""Orders of the Chebyshev terms in x and y by total degree: a level, two tilts, then seven that no pose can imitate."""
+"""Orders of the Chebyshev terms in x and y by total degree: a level, two tilts, then seven that no
+pose can imitate."""
 POSE_TERMS = 3
 
 
 @dataclass(frozen=True)
 class ViewData:
-    """One view's part: thinned target points (n, 3), and marks in its camera frame, each with its index among the
-    reference's. ``noise_m``: of a point across the surface. ``sigma_m``: inflated to make points independent."""
+    """One view's part: thinned target points (n, 3), and marks in its camera frame, each with its
+    index among the reference's. ``noise_m``: of a point across the surface. ``sigma_m``: inflated
+    to make points independent."""
 
     points_m: np.ndarray
     marks: tuple[tuple[Mark, int], ...]
@@ -145,9 +160,10 @@ class ViewData:
 
 @dataclass(frozen=True)
 class JointState:
-    """Estimates. ``T`` (v, 4, 4): from the views to the surface's frame. ``surface`` (10,) and ``own`` (v, 10):
-    coefficients, metres. ``marks_m`` (m, 2): places in the plane. ``shared_m``: prior deviation of each term of
-    ``own``. ``half_m`` (2,): scales x, y to -1..1. Vectors of all unknowns hold poses 1.., surface, marks, own."""
+    """Estimates. ``T`` (v, 4, 4): from the views to the surface's frame. ``surface`` (10,) and
+    ``own`` (v, 10): coefficients, metres. ``marks_m`` (m, 2): places in the plane. ``shared_m``:
+    prior deviation of each term of ``own``. ``half_m`` (2,): scales x, y to -1..1. Vectors of all
+    unknowns hold poses 1.., surface, marks, own."""
 
     T: np.ndarray
     surface: np.ndarray
@@ -157,7 +173,8 @@ class JointState:
     half_m: np.ndarray
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or of their indices."""
+        """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or
+        of their indices."""
         poses, surface, marks, own = np.split(
             values, np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size])
         )
@@ -184,8 +201,8 @@ class JointState:
     def across(
         self, data: ViewData, v: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return a view's points against the surface: residuals (n,), basis (n, 10), derivatives (n, 6) by the pose's
-        motion, and robust weights (n,) in 1/m^2."""
+        """Return a view's points against the surface: residuals (n,), basis (n, 10), derivatives
+        (n, 6) by the pose's motion, and robust weights (n,) in 1/m^2."""
         points = transform_points(self.T[v], data.points_m)
         x, y, z = points.T
         basis = self.basis(x, y)
@@ -204,7 +221,8 @@ class JointState:
     def equations(self, data: Sequence[ViewData]) -> tuple[np.ndarray, np.ndarray]:
         """Return matrix and right side of the normal equations of one Gauss-Newton step."""
         size = 6 * (len(self.T) - 1) + len(TERMS) * (len(self.T) + 1) + self.marks_m.size
-        matrix, right = np.zeros((size, size)), np.zeros(size)
+        matrix = np.zeros((size, size))
+        right = np.zeros(size)
         poses, surface, marks, own = self.split(np.arange(size))
 
         def add(
@@ -237,8 +255,9 @@ class JointState:
 
 
 def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registration]:
-    """Register all views but the first to the first, jointly. ``covariance``: each view's marginal. ``residual_m``:
-    across the surface, of the points that count. A view whose marks fail keeps that failure."""
+    """Register all views but the first to the first, jointly. ``covariance``: each view's
+    marginal. ``residual_m``: across the surface, of the points that count. A view whose marks fail
+    keeps that failure."""
     found = [register_by_marks(views[0], view) for view in views[1:]]
     usable = [i for i, each in enumerate(found) if not each.failure]
     if usable:
@@ -255,7 +274,8 @@ def _adjust(
     T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera
-    sampling, T_surface_reference = registered.sampling_of(views[0]), np.eye(4)
+    sampling = registered.sampling_of(views[0])
+    T_surface_reference = np.eye(4)
     along = np.array([1.0, 0.0, 0.0]) - sampling.normal[0] * sampling.normal
     along /= np.linalg.norm(along)
     T_surface_reference[:3, :3] = np.stack(
@@ -276,13 +296,15 @@ def _adjust(
     )
     start = fit_surface(x, y, z, SurfaceConfig(degree=DEGREE)).evaluate(x, y)
     state = replace(state, surface=np.linalg.lstsq(state.basis(x, y), start, rcond=None)[0])
-    steps, converged = 0, False
+    steps = 0
+    converged = False
     while steps < MAX_STEPS and not converged:
         steps += 1
         matrix, right = state.equations(data)
         covariance = np.linalg.inv(matrix)
         motion = covariance @ right
-        # the maximisation step of EM: the squares of the terms that no pose can imitate, plus their variance
+        # the maximisation step of EM: the squares of the terms that no pose can imitate, plus
+        # their variance
         squares = (state.own + state.split(motion)[3]) ** 2 + state.split(np.diag(covariance))[3]
         shared = max(float(np.sqrt(squares[:, POSE_TERMS:].mean())), LEAST_SHARED_M)
         settled = abs(shared - state.shared_m) <= CONVERGED_SHARED * state.shared_m

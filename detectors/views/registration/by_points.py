@@ -1,16 +1,18 @@
 """Registration of clouds: iterative closest point, rigid coherent point drift, RGB-D odometry.
 
-ICP goes from coarse to fine, starting at the guess, point to point, as MATLAB's `pcregistericp` does by default. Unlike
-MATLAB's, its pairs are limited in distance.
+ICP goes from coarse to fine, starting at the guess, point to point, as MATLAB's `pcregistericp`
+does by default. Unlike MATLAB's, its pairs are limited in distance.
 
-Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the fixed cloud is drawn from
-Gaussians of one width about the moving cloud's points, and a uniform component for outliers. As in MATLAB's
-`pcregistercpd`, both clouds are set to zero mean and the initial width is that of all pairs; the clouds share one unit
-of length, and only the rotation of the guess matters.
+Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the fixed
+cloud is drawn from Gaussians of one width about the moving cloud's points, and a uniform component
+for outliers. As in MATLAB's `pcregistercpd`, both clouds are set to zero mean and the initial
+width is that of all pairs; the clouds share one unit of length, and only the rotation of the guess
+matters.
 
-Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) aligns each view with the one before it by colour and
-depth together, starting from no motion, so that errors add up. It uses only the target: on a turntable the room does
-not move with the target. No loop is closed, no map is kept."""
+Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) aligns each view with the one
+before it by colour and depth together, starting from no motion, so that errors add up. It uses
+only the target: on a turntable the room does not move with the target. No loop is closed, no map
+is kept."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,25 +30,34 @@ from detectors.views.registration.settings import CpdRegistration, IcpRegistrati
 from detectors.views.view import PreparedView
 from harness.vocabulary.geometry import MM, Lens, transform_points
 
-GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
-"""Usual error of a nominal pose; the first pairs may be twice as far apart as it moves the outermost point."""
+GUESS_ERROR_M = 10 * MM
+GUESS_ERROR_RAD = np.deg2rad(3.0)
+"""Usual error of a nominal pose; the first pairs may be twice as far apart as it moves the
+outermost point."""
 FINEST_PITCHES = 3.0
-"""Limit of the last stage: a mark's rim is known to a pixel in either view; noise and shared errors add a third."""
-STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
-"""A stage ends after this many steps, or once the paired points' share and their distance (m) change by less."""
+"""Limit of the last stage: a mark's rim is known to a pixel in either view; noise and shared
+errors add a third."""
+STAGE_ITERATIONS = 100
+LEAST_CHANGE = 1e-8
+"""A stage ends after this many steps, or once the paired points' share and their distance (m)
+change by less."""
 CONVERGED_PITCHES = 0.05
 
 
 def register_by_icp(
     reference: PreparedView, view: PreparedView, config: IcpRegistration
 ) -> registered.Registration:
-    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets."""
+    """Return the registration of a view to the reference by ICP of their fiducial clouds or
+    targets."""
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
         return registered.failed(view, "icp", start, few, *notes)
     sampling = registered.sampling_of(view)
     tree = cKDTree(fixed)
-    T, moved, iterations, step_m = np.eye(4) if start is None else start, moving, 0, np.inf
+    T = np.eye(4) if start is None else start
+    moved = moving
+    iterations = 0
+    step_m = np.inf
     for limit_m in stages_m(sampling.pitch_m, sampling.extent_m):
         last = np.full(2, np.inf)
         for _ in range(STAGE_ITERATIONS):
@@ -56,7 +67,8 @@ def register_by_icp(
                 failure = f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the reference's"
                 return registered.failed(view, "icp", start, failure, *notes)
             change = kabsch(moved[paired], (moved - apart)[paired], np.ones(paired.sum()))
-            T, step_m = change @ T, registered.moved_m(change, moved)
+            T = change @ T
+            step_m = registered.moved_m(change, moved)
             iterations += 1
             now = np.array([paired.mean(), np.sqrt(np.mean(apart[paired] ** 2))])
             if np.abs(now - last).max() < LEAST_CHANGE:
@@ -79,7 +91,8 @@ def register_by_icp(
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
-    """Return each stage's largest distance of a pair: twice a guess's usual error, halved down to three pitches."""
+    """Return each stage's largest distance of a pair: twice a guess's usual error, halved down to
+    three pitches."""
     finest = FINEST_PITCHES * pitch_m
     limits = [max(2 * (GUESS_ERROR_M + GUESS_ERROR_RAD * extent_m), finest)]
     while limits[-1] > finest:
@@ -88,18 +101,20 @@ def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
 
 
 def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return vectors (n, 3) to the partners, zero without one, and the mask (n,) of points that have a partner."""
+    """Return vectors (n, 3) to the partners, zero without one, and the mask (n,) of points that
+    have a partner."""
     distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
     paired = np.isfinite(distances)
     return np.where(paired[:, None], moved_m - tree.data[np.where(paired, nearest, 0)], 0.0), paired
 
 
 def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) -> np.ndarray:
-    """Return the covariance (6, 6) of the pose, as in `Registration`, about the moved points' centroid: H^-1 S H^-1. H
-    is the cost's curvature with new pairs, by differences over one pitch (Bengtsson & Baerveldt, Robotics and
-    Autonomous Systems 44:29, 2003); with fixed pairs, the inside of a flat mark would seem to resist sliding. S is the
-    scatter of the gradients, summed within cubes of 5 pixels whose errors are common. It ignores that the iteration may
-    stop at one of many near minima. NaN if a motion costs nothing."""
+    """Return the covariance (6, 6) of the pose, as in `Registration`, about the moved points'
+    centroid: H^-1 S H^-1. H is the cost's curvature with new pairs, by differences over one pitch
+    (Bengtsson & Baerveldt, Robotics and Autonomous Systems 44:29, 2003); with fixed pairs, the
+    inside of a flat mark would seem to resist sliding. S is the scatter of the gradients, summed
+    within cubes of 5 pixels whose errors are common. It ignores that the iteration may stop at one
+    of many near minima. NaN if a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
     jacobian = registered.displacement_jacobian(arm, np.zeros(3))
     scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
@@ -109,30 +124,34 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
         off, has = _pairs(tree, moved_m + jacobian @ motion, limit_m)
         return float(np.sum(off**2) + limit_m**2 * np.sum(~has)) / 2
 
-    # a step moves the points by a pitch, root mean square; a turn about an axis moves points by their distance from it
+    # a step moves the points by a pitch, root mean square; a turn about an axis moves points by
+    # their distance from it
     squares = np.mean(arm**2, axis=0)
     sizes = pitch_m / np.sqrt(np.maximum([*(squares.sum() - squares), 1.0, 1.0, 1.0], 1e-12))
     sizes = np.minimum(sizes, [0.1] * 3 + [pitch_m] * 3)
-    steps, curvature = np.diag(sizes), np.empty((6, 6))
+    steps = np.diag(sizes)
+    curvature = np.empty((6, 6))
     for i in range(6):
         for j in range(i + 1):
             part = 0.5 if i == j else 1.0
-            both, across = part * (steps[i] + steps[j]), part * (steps[i] - steps[j])
+            both = part * (steps[i] + steps[j])
+            across = part * (steps[i] - steps[j])
             mixed = half_cost(both) + half_cost(-both) - half_cost(across) - half_cost(-across)
             curvature[i, j] = curvature[j, i] = mixed / (4 * part**2 * sizes[i] * sizes[j])
     return registered.clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
 
 
 LEAST_VARIANCE = 10 * float(np.finfo(np.float64).eps)
-"""Variance in squared normalised units at which the clouds coincide (the authors' own criterion)."""
+"""Variance in squared normalised units at which the clouds coincide (the authors' own criterion).
+"""
 PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of coherent point drift. ``T_fixed_moving``: (4, 4). ``sigma_m``: the Gaussians' width. ``matched``:
-    expected number of fixed points that are not outliers. ``step_m``: how far the last iteration moved the points.
-    ``background``: a share, as in `posterior_moments`."""
+    """The result of coherent point drift. ``T_fixed_moving``: (4, 4). ``sigma_m``: the Gaussians'
+    width. ``matched``: expected number of fixed points that are not outliers. ``step_m``: how far
+    the last iteration moved the points. ``background``: a share, as in `posterior_moments`."""
 
     T_fixed_moving: np.ndarray
     sigma_m: float
@@ -149,18 +168,24 @@ def coherent_point_drift(
     config: CpdRegistration,
     T_start: np.ndarray | None = None,
 ) -> Drift:
-    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three, from ``T_start`` (4, 4)."""
+    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three, from
+    ``T_start`` (4, 4)."""
     start = np.eye(4) if T_start is None else T_start
     centre = fixed_m.mean(axis=0)
     scale = max(float(np.sqrt(np.sum(np.var(fixed_m, axis=0)))), 1e-12)
     fixed = (fixed_m - centre) / scale
     turned = transform_points(start, moving_m)
     moving = (turned - turned.mean(axis=0)) / scale
-    turn, shift = np.eye(3), np.zeros(3)
+    turn = np.eye(3)
+    shift = np.zeros(3)
     # a third of the mean squared distance of all pairs; both clouds have zero mean
     variance = float((np.sum(fixed**2) / len(fixed) + np.sum(moving**2) / len(moving)) / 3)
     outliers = config.outlier_ratio / (1 - config.outlier_ratio) * len(moving) / len(fixed)
-    last, change, step, matched, iterations = 0.0, np.inf, np.inf, 0.0, 0
+    last = 0.0
+    change = np.inf
+    step = np.inf
+    matched = 0.0
+    iterations = 0
     while (
         iterations < config.max_iterations
         and change > config.tolerance
@@ -171,11 +196,14 @@ def coherent_point_drift(
             fixed, moving, variance, outliers * (2 * np.pi * variance) ** 1.5
         )
         objective += 1.5 * len(fixed) * np.log(variance)
-        change, last = abs((objective - last) / objective), objective
+        change = abs((objective - last) / objective)
+        last = objective
         # the maximisation, with the scale held at 1
-        weight, total = moments[:, 3, 3], moments.sum(axis=0)
+        weight = moments[:, 3, 3]
+        total = moments.sum(axis=0)
         matched = float(total[3, 3])
-        mean_x, mean_y = weight @ fixed / matched, total[:3, 3] / matched
+        mean_x = weight @ fixed / matched
+        mean_y = total[:3, 3] / matched
         cross = fixed.T @ moments[:, :3, 3] - matched * np.outer(mean_x, mean_y)
         left, _, right = np.linalg.svd(cross)
         d_turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
@@ -186,7 +214,9 @@ def coherent_point_drift(
         variance = max(variance, LEAST_VARIANCE / 2)
         moved = moving @ d_turn.T + d_shift
         step = float(np.sqrt(np.mean(np.sum((moved - moving) ** 2, axis=1)))) * scale
-        moving, turn, shift = moved, d_turn @ turn, d_turn @ shift + d_shift
+        moving = moved
+        turn = d_turn @ turn
+        shift = d_turn @ shift + d_shift
     T = np.eye(4)
     T[:3, :3] = turn
     T[:3, 3] = centre + scale * shift - turn @ turned.mean(axis=0)
@@ -206,8 +236,9 @@ def coherent_point_drift(
 def register_by_cpd(
     reference: PreparedView, view: PreparedView, config: CpdRegistration
 ) -> registered.Registration:
-    """Return the registration of a view to the reference by coherent point drift of their fiducial clouds or targets.
-    At the limit of iterations it fails only if its last step still moved the points."""
+    """Return the registration of a view to the reference by coherent point drift of their fiducial
+    clouds or targets. At the limit of iterations it fails only if its last step still moved the
+    points."""
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
         return registered.failed(view, "cpd", start, few, *notes)
@@ -231,10 +262,11 @@ def register_by_cpd(
 def drift_covariance(
     fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float
 ) -> np.ndarray:
-    """Return the covariance (6, 6) of the pose, as in `Registration`, about the fixed cloud's centroid: H^-1 S H^-1. H
-    is the observed information (Louis, JRSS B 44:226, 1982); S is the scatter of the scores, summed within cubes of 5
-    pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud's noise is assumed equal.
-    The Gaussian width is at least a pitch, below which the likelihood shows the moire of two grids. NaN if H is not
+    """Return the covariance (6, 6) of the pose, as in `Registration`, about the fixed cloud's
+    centroid: H^-1 S H^-1. H is the observed information (Louis, JRSS B 44:226, 1982); S is the
+    scatter of the scores, summed within cubes of 5 pixels whose errors are common (Liang & Zeger,
+    Biometrika 73:13, 1986). The moving cloud's noise is assumed equal. The Gaussian width is at
+    least a pitch, below which the likelihood shows the moire of two grids. NaN if H is not
     positive definite."""
     centre = fixed_m.mean(axis=0)
     x = fixed_m - centre
@@ -262,13 +294,15 @@ def drift_covariance(
 def posterior_moments(
     fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
 ) -> tuple[np.ndarray, float]:
-    """Return posterior sums (n, 4, 4) of (y, 1)(y, 1)' over the moving points y (m, 3) for each fixed point (n, 3); and
-    the negative sum of the log likelihood over fixed points, up to the Gaussians' factor. ``background``: the uniform
-    component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's
-    weight is divided out, so that nothing underflows at w = 0."""
+    """Return posterior sums (n, 4, 4) of (y, 1)(y, 1)' over the moving points y (m, 3) for each
+    fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the
+    Gaussians' factor. ``background``: the uniform component as in equation 6 of Myronenko & Song:
+    (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's weight is divided out, so that
+    nothing underflows at w = 0."""
     places = np.column_stack([moving, np.ones(len(moving))])
     products = np.einsum("mi,mj->mij", places, places).reshape(-1, 16)
-    moments, objective = [], 0.0
+    moments = []
+    objective = 0.0
     for part in np.array_split(fixed, 1 + len(fixed) * len(moving) // PAIRS_AT_ONCE):
         exponents = cdist(part, moving, "sqeuclidean") / (-2.0 * variance)
         greatest = exponents.max(axis=1, keepdims=True)
@@ -285,11 +319,15 @@ DRIFTS = "no covariance: that of Open3D's odometry counts its pairs and ignores 
 
 
 def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Registration]:
-    """Register all views but the first to the first, in the order given, which is that of the walk. A view that
-    odometry loses (according to Open3D, or with pairs for less than a tenth of the target's pixels) fails, and so does
-    every view after it. ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
-    T, lost, found = np.eye(4), "", []
-    # one pinhole camera for all: the first lens's focal lengths, and room for every target's points
+    """Register all views but the first to the first, in the order given, which is that of the
+    walk. A view that odometry loses (according to Open3D, or with pairs for less than a tenth of
+    the target's pixels) fails, and so does every view after it. ``residual_m`` and ``covariance``
+    are NaN. Every view needs colour, a pixel grid and a lens."""
+    T = np.eye(4)
+    lost = ""
+    found = []
+    # one pinhole camera for all: the first lens's focal lengths, and room for every target's
+    # points
     first = views[0].view.cloud.lens
     assert first is not None
     places = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (
@@ -301,7 +339,8 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     lens = width, height, first.fx, first.fy, -float(low[0]), -float(low[1])
     canvas = Lens(*lens)
     with open3d_on_one_thread() as o3d:
-        methods, camera = o3d.pipelines.odometry, o3d.camera.PinholeCameraIntrinsic(*lens)
+        methods = o3d.pipelines.odometry
+        camera = o3d.camera.PinholeCameraIntrinsic(*lens)
         option = methods.OdometryOption(
             depth_diff_max=DEPTH_DIFFERENCE_M, depth_min=0.0, depth_max=1e3
         )
@@ -332,7 +371,8 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
 
 
 def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
-    """Return the view's target as Open3D's intensity and depth on the canvas, both without distortion."""
+    """Return the view's target as Open3D's intensity and depth on the canvas, both without
+    distortion."""
     cloud = view.view.cloud
     lens = cloud.lens
     assert lens is not None and cloud.rgb is not None

@@ -1,8 +1,10 @@
-"""Registers views by the method in the settings, and judges whether each registration can be trusted.
+"""Registers views by the method in the settings, and judges whether each registration can be
+trusted.
 
-Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
-does not explain. They widen the covariance and are noted; a view is refused only if they would blur the merged map by
-more than `BLUR_M`, or by more than a pixel if pixels are coarser."""
+Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between
+registered views that noise does not explain. They widen the covariance and are noted; a view is
+refused only if they would blur the merged map by more than `BLUR_M`, or by more than a pixel if
+pixels are coarser."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,31 +33,37 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 FALSE_ALARM_SIGMAS = 3.09
-"""A view is refused beyond this multiple of the residual's own scatter: a good view once in a thousand."""
+"""A view is refused beyond this multiple of the residual's own scatter: a good view once in a
+thousand."""
 MEDIAN_SCATTER = 1.65
-"""Ratio of a standard deviation's relative error from the median to that from the mean square: 1 / sqrt(0.37)."""
+"""Ratio of a standard deviation's relative error from the median to that from the mean square: 1 /
+sqrt(0.37)."""
 BLUR_M = (
     2.0 * MM
 )  # distance between registered views that blurs a map too much: twice the noise of a single frame
 UNDETERMINED_PITCHES = 3.0
-"""A larger predicted error over the target, in pitches, and above `BLUR_M`, puts every point on a wrong pixel."""
-MAX_JUMP_DEG, MAX_JUMP_M = (
-    30.0,
-    0.1,
-)  # ten times the usual error of a nominal pose (some degrees, about 10 mm)
+"""A larger predicted error over the target, in pitches, and above `BLUR_M`, puts every point on a
+wrong pixel."""
+# ten times the usual error of a nominal pose (some degrees, about 10 mm)
+MAX_JUMP_DEG = 30.0
+MAX_JUMP_M = 0.1
 UNJUDGED_AGREEMENT = ("nominal", "odometry")
-"""Methods that never use the reference's surface: their remaining distance is noted, not refused."""
-TRIMMED = 0.9  # share of the fiducial points, nearest first, that must agree: a colour rule also accepts stray pixels
+"""Methods that never use the reference's surface: their remaining distance is noted, not refused.
+"""
+# share of the fiducial points, nearest first, that must agree: a colour rule also accepts stray
+# pixels
+TRIMMED = 0.9
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share of the view's target
-    points with a reference point within a pitch along the surface, at any distance across it, and within a pitch (or
-    three sigma of noise) across it. ``apart_m``: robust root mean square distance across the surfaces where both exist.
-    ``marks_m``: that of the fiducial points to the nearest of the reference, without the farthest tenth; NaN if either
-    has fewer than three. ``noise_m``, ``grids_m``: distances that noise, and two grids of one pitch, explain.
-    ``scatter``, ``marks_scatter``: relative errors, times `FALSE_ALARM_SIGMAS`."""
+    """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share
+    of the view's target points with a reference point within a pitch along the surface, at any
+    distance across it, and within a pitch (or three sigma of noise) across it. ``apart_m``: robust
+    root mean square distance across the surfaces where both exist. ``marks_m``: that of the
+    fiducial points to the nearest of the reference, without the farthest tenth; NaN if either has
+    fewer than three. ``noise_m``, ``grids_m``: distances that noise, and two grids of one pitch,
+    explain. ``scatter``, ``marks_scatter``: relative errors, times `FALSE_ALARM_SIGMAS`."""
 
     beside: float
     overlap: float
@@ -74,22 +82,17 @@ def _agreement(
     view: PreparedView,
     T_reference_view: np.ndarray,
 ) -> Agreement:
-    """Return the agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ours."""
-    of_view, points, marks = (
-        registered.sampling_of(view),
-        reference.points_m,
-        reference.mark_points_m,
-    )
-    pitch, noise = (
-        max(sampling.pitch_m, of_view.pitch_m),
-        float(np.hypot(sampling.noise_m, of_view.noise_m)),
-    )
-    beside, together, apart, marks_m = (
-        np.zeros(1, bool),
-        np.zeros(1, bool),
-        float("nan"),
-        float("nan"),
-    )
+    """Return the agreement of a view placed by ``T_reference_view`` with the reference's target,
+    sampled as ours."""
+    of_view = registered.sampling_of(view)
+    points = reference.points_m
+    marks = reference.mark_points_m
+    pitch = max(sampling.pitch_m, of_view.pitch_m)
+    noise = float(np.hypot(sampling.noise_m, of_view.noise_m))
+    beside = np.zeros(1, bool)
+    together = np.zeros(1, bool)
+    apart = float("nan")
+    marks_m = float("nan")
     fiducial = transform_points(T_reference_view, view.mark_points_m)
     if len(points) >= 3 and view.inside.any():
         # the reference's surface at a point is the plane through its 25 nearest points
@@ -122,7 +125,8 @@ def _agreement(
 def judge(
     registration: registered.Registration, reference: PreparedView, view: PreparedView
 ) -> registered.Registration:
-    """Return the registration with its overlap and, if it cannot be trusted, a ``failure`` or note."""
+    """Return the registration with its overlap and, if it cannot be trusted, a ``failure`` or
+    note."""
     T = registration.T_reference_view
     is_rigid = np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
     if not is_rigid or np.linalg.det(T[:3, :3]) < 0:
@@ -132,10 +136,8 @@ def judge(
             else "no transform was found"
         )
         return replace(registration, overlap=0.0, failure=registration.failure or broken)
-    sampling, points = (
-        registered.sampling_of(reference),
-        registered.thinned(reference.points_m, 200),
-    )
+    sampling = registered.sampling_of(reference)
+    points = registered.thinned(reference.points_m, 200)
     agreement = _agreement(reference, sampling, view, T)
     judged = replace(registration, overlap=agreement.overlap)
     if judged.failure:
@@ -150,11 +152,10 @@ def judge(
     if elsewhere:
         return replace(judged, failure=elsewhere)
     within, across = registered.predicted_error_m(judged, points, sampling.normal)
-    error_m, limit_m = (
-        float(np.hypot(within, across)),
-        max(UNDETERMINED_PITCHES * sampling.pitch_m, BLUR_M),
-    )
-    undetermined, apart = "", _apart(agreement)
+    error_m = float(np.hypot(within, across))
+    limit_m = max(UNDETERMINED_PITCHES * sampling.pitch_m, BLUR_M)
+    undetermined = ""
+    apart = _apart(agreement)
     if error_m > limit_m:
         undetermined = "not determined: the points let the target slide or rotate (they lie on a line, or the surface"
         undetermined += f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur"
@@ -174,7 +175,8 @@ def judge(
 def _jump(
     registration: registered.Registration, reference: PreparedView, view: PreparedView
 ) -> str:
-    """Return the reason why a pose is too far from its guess to be credible; empty if it is credible."""
+    """Return the reason why a pose is too far from its guess to be credible; empty if it is
+    credible."""
     guess = registered.guess_of(reference, view)
     if guess is None:
         return ""
@@ -192,7 +194,8 @@ def _jump(
 
 
 def _apart(agreement: Agreement) -> str:
-    """Return the reason why surfaces or marks are too far apart to be merged; empty if they are not."""
+    """Return the reason why surfaces or marks are too far apart to be merged; empty if they are
+    not."""
     # views may differ by their noise and BLUR_M, or by a pixel if that is larger
     blur = float(np.hypot(agreement.noise_m, max(BLUR_M, agreement.pitch_m)))
     limit = blur * (1 + agreement.scatter)
@@ -215,9 +218,10 @@ def _widened(
     across: float,
     agreement: Agreement,
 ) -> registered.Registration:
-    """Return the registration with a note and a covariance that includes the errors that a whole view shares, if the
-    views show such errors. Their mean square, which neither noise nor the covariance explains, is added to the shift,
-    across the surface and within it. An offset of a whole view does not show."""
+    """Return the registration with a note and a covariance that includes the errors that a whole
+    view shares, if the views show such errors. Their mean square, which neither noise nor the
+    covariance explains, is added to the shift, across the surface and within it. An offset of a
+    whole view does not show."""
 
     def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
         return (
@@ -252,8 +256,9 @@ def _widened(
 def register(
     views: Sequence[PreparedView], config: AnyRegistration
 ) -> tuple[registered.Registration, ...]:
-    """Return one registration for each view; the first is that of the reference. A registration that cannot be trusted
-    has a ``failure``. Raises UserError if a view lacks an input of the method (colour, a pixel grid, a guess)."""
+    """Return one registration for each view; the first is that of the reference. A registration
+    that cannot be trusted has a ``failure``. Raises UserError if a view lacks an input of the
+    method (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError(
             "no views to register", legal="one or more views, the first being the reference"
@@ -281,7 +286,8 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
     by_colour = config.method != "nominal" and getattr(config, "points", "marks") == "marks"
     of_odometry = config.method == "odometry"
     for view in views:
-        cloud, guess = view.view.cloud, view.view.T_reference_view_guess
+        cloud = view.view.cloud
+        guess = view.view.T_reference_view_guess
         no_grid = not cloud.organised or cloud.lens is None
         by_points = "registration.method: icp or cpd with points: target"
         for lacks, what, fix in (

@@ -25,9 +25,10 @@ class CpdRegistration(Config):
 
 
 class PlainRegistration(Config):
-    """Methods without settings. ``nominal`` uses the nominal poses unchanged. ``marks`` matches centroids of marks by
-    their mutual distances. ``joint`` fits marks and the common surface of all views together. ``odometry`` is RGB-D
-    odometry from view to view (Open3D) without marks: a SLAM system without loop closure."""
+    """Methods without settings. ``nominal`` uses the nominal poses unchanged. ``marks`` matches
+    centroids of marks by their mutual distances. ``joint`` fits marks and the common surface of
+    all views together. ``odometry`` is RGB-D odometry from view to view (Open3D) without marks: a
+    SLAM system without loop closure."""
 
     method: Literal["nominal", "marks", "joint", "odometry"]
 

@@ -1,9 +1,11 @@
-"""A probability of detection curve, its four links, and the likelihood of hits and misses under them.
+"""A probability of detection curve, its four links, and the likelihood of hits and misses under
+them.
 
-POD(a) = F((x - mu) / sigma), x = a or ln a. So mu is the 50 % size for logit and probit only; sigma is the width. For
-all links, ln F and ln(1 - F) are concave, so the likelihood has one maximum if hits and misses overlap; if they do not,
-Firth's penalty makes the estimate finite. Sources: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 4.3;
-Firth, Biometrika 80 (1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
+POD(a) = F((x - mu) / sigma), x = a or ln a. So mu is the 50 % size for logit and probit only;
+sigma is the width. For all links, ln F and ln(1 - F) are concave, so the likelihood has one
+maximum if hits and misses overlap; if they do not, Firth's penalty makes the estimate finite.
+Sources: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 4.3; Firth, Biometrika 80
+(1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ import numpy as np
 from scipy import optimize, special
 
 LARGEST_PREDICTOR = 500.0
-"""Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does not overflow."""
+"""Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does
+not overflow."""
 
 _F_AND_INVERSE: dict[
     str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]
@@ -32,7 +35,8 @@ CELLS = (
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
-    """Return F(t) for one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t)) (loglog)."""
+    """Return F(t) for one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t))
+    (loglog)."""
     with np.errstate(over="ignore"):
         return np.asarray(_F_AND_INVERSE[link][0](np.asarray(t, float)))
 
@@ -43,19 +47,22 @@ def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
 
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in both tails."""
+    """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in
+    both tails."""
     t = np.minimum(
         np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR
     )  # `np.clip` takes five times as long
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
-        log_hit, log_miss = np.minimum(t, 0.0) - tail, np.minimum(-t, 0.0) - tail
+        log_hit = np.minimum(t, 0.0) - tail
+        log_miss = np.minimum(-t, 0.0) - tail
         return log_hit, log_miss, log_hit + log_miss
     if link == "probit":
         return special.log_ndtr(t), special.log_ndtr(-t), -0.5 * t * t - 0.5 * np.log(2.0 * np.pi)
     signed = t if link == "cloglog" else -t
     hazard = np.exp(signed)
-    log_none, log_any = -hazard, np.log(-np.expm1(-hazard))
+    log_none = -hazard
+    log_any = np.log(-np.expm1(-hazard))
     return (
         (log_any, log_none, signed - hazard)
         if link == "cloglog"
@@ -67,7 +74,8 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
     """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of the predictor's shape."""
     t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)
     if link == "logit":  # the most common link: the ratios are the probabilities themselves
-        hit, miss = special.expit(t), special.expit(-t)
+        hit = special.expit(t)
+        miss = special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
     bend = {
@@ -80,7 +88,8 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class PodCurve:
-    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``: (2, 2)."""
+    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``:
+    (2, 2)."""
 
     link: str
     log_size: bool
@@ -101,7 +110,8 @@ class PodCurve:
 
 @dataclass(frozen=True)
 class Bound:
-    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why`` gives the reason."""
+    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why``
+    gives the reason."""
 
     pod: float
     confidence: float
@@ -115,8 +125,10 @@ class Bound:
         return bool(np.isfinite(self.value))
 
 
-STEPS, PLAIN_STEPS = 200, 12
-"""Most steps, with halvings, of a problem; number of plain Newton steps before: five or six usually suffice."""
+STEPS = 200
+PLAIN_STEPS = 12
+"""Most steps, with halvings, of a problem; number of plain Newton steps before: five or six
+usually suffice."""
 TOLERANCE = 1e-7  # a search ends with a smaller step: every Newton step squares the error
 CLIMBED = 6  # number of steep starts that are tried in the search for a penalised maximum
 PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
@@ -125,9 +137,10 @@ PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
 
 @dataclass(frozen=True, eq=False)
 class HitsAndMisses:
-    """Hits and misses of one or several (d) studies on the same rows. ``design`` (n, p): columns of the predictor.
-    ``hits``, ``misses``: (n,) or (d, n) counts. ``penalty`` (a number, or (d,)): multiple of Jeffreys' prior, with p =
-    2 only: None for no penalty, 1 for Firth's, k if every target has k rows."""
+    """Hits and misses of one or several (d) studies on the same rows. ``design`` (n, p): columns
+    of the predictor. ``hits``, ``misses``: (n,) or (d, n) counts. ``penalty`` (a number, or (d,)):
+    multiple of Jeffreys' prior, with p = 2 only: None for no penalty, 1 for Firth's, k if every
+    target has k rows."""
 
     design: np.ndarray
     hits: np.ndarray
@@ -142,26 +155,33 @@ class HitsAndMisses:
         return np.asarray(self.design[:, 1])
 
     def value(self, b: np.ndarray) -> np.ndarray:
-        """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several studies (d,) at (d, p)."""
+        """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several
+        studies (d,) at (d, p)."""
         found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
         value = (self.hits * found + self.misses * missed).sum(axis=-1)
         if self.penalty is not None:
             weight = (self.hits + self.misses) * np.exp(2.0 * density - logs[0] - logs[1])
-            total, cross, square = weight.sum(-1), weight @ self.z, weight @ self.z**2
+            total = weight.sum(-1)
+            cross = weight @ self.z
+            square = weight @ self.z**2
             with np.errstate(divide="ignore", invalid="ignore"):
                 prior = 0.5 * (np.log(total) + np.log(np.maximum(square - cross**2 / total, 0.0)))
             value = value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf)
         return np.asarray(value)
 
     def step(self, b: np.ndarray) -> np.ndarray:
-        """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps. They are meaningless
-        if the information is singular, in studies that diverge to infinity."""
+        """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps.
+        They are meaningless if the information is singular, in studies that diverge to infinity.
+        """
         up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
         slope = self.hits * up - self.misses * down
         with np.errstate(all="ignore"):
             if self.penalty is not None:
-                z, weight = self.z, (self.hits + self.misses) * up * down
-                total, cross, square = weight.sum(axis=1), weight @ z, weight @ z**2
+                z = self.z
+                weight = (self.hits + self.misses) * up * down
+                total = weight.sum(axis=1)
+                cross = weight @ z
+                square = weight @ z**2
                 determinant = total * (square - cross**2 / total)
                 leverage = weight * (
                     square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2
@@ -170,7 +190,8 @@ class HitsAndMisses:
                 slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (
                     2.0 * bend - up + down
                 )
-                first, second = slope.sum(axis=1), slope @ z
+                first = slope.sum(axis=1)
+                second = slope @ z
                 along = np.stack(
                     [square * first - cross * second, total * second - cross * first], axis=1
                 )
@@ -212,9 +233,11 @@ def ascend(
     start: np.ndarray,
     tolerance: float = TOLERANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Climb from ``start`` (d, p) to maxima (d, p) and their values (d,), by ``value_and_step(places (k, p), which
-    (k,))``. A step that lowers the value is halved. A problem without a maximum ends at its last step."""
-    place, moving = start.copy(), np.arange(len(start))
+    """Climb from ``start`` (d, p) to maxima (d, p) and their values (d,), by
+    ``value_and_step(places (k, p), which (k,))``. A step that lowers the value is halved. A
+    problem without a maximum ends at its last step."""
+    place = start.copy()
+    moving = np.arange(len(start))
     best, step = value_and_step(place, moving)
     for _ in range(STEPS):
         moving = moving[
@@ -233,10 +256,11 @@ def ascend(
 
 
 def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Return the coefficients (d, p) with the largest likelihood of several studies, from ``start`` (p,); without a
-    penalty. If hits and misses of a study do not overlap, its coefficients are those of the last step. Plain Newton
-    steps need no values and nearly always reach the maximum. The other studies are searched again, and so are those
-    that end lower than they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
+    """Return the coefficients (d, p) with the largest likelihood of several studies, from
+    ``start`` (p,); without a penalty. If hits and misses of a study do not overlap, its
+    coefficients are those of the last step. Plain Newton steps need no values and nearly always
+    reach the maximum. The other studies are searched again, and so are those that end lower than
+    they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
     place = np.tile(np.asarray(start, float), (len(data.hits), 1))
     moving = np.arange(len(place))
     for _ in range(PLAIN_STEPS):
@@ -254,14 +278,16 @@ def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE)
 
 
 def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several studies; they are finite
-    for separated data too. Logit and probit have one maximum. For cloglog and loglog, the highest of those is returned
-    that are reached from a flat start, the gap between largest miss and smallest hit, and the best `CLIMBED` others."""
-    z, hits = data.z, data.hits
+    """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several
+    studies; they are finite for separated data too. Logit and probit have one maximum. For cloglog
+    and loglog, the highest of those is returned that are reached from a flat start, the gap
+    between largest miss and smallest hit, and the best `CLIMBED` others."""
+    z = data.z
+    hits = data.hits
     below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
     gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
-    # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several widths through
-    # both its ends and its middle.
+    # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several
+    # widths through both its ends and its middle.
     widths = [(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)]
     widths += [
         (np.full_like(gap, slope), share)
@@ -276,7 +302,8 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     share = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
     flat = np.stack([link_ppf(data.link, share), np.ones(len(hits))], axis=1)
     rows = np.arange(len(hits))
-    # the start with the highest value can lie in the basin of a lower maximum, so several of the best are climbed
+    # the start with the highest value can lie in the basin of a lower maximum, so several of the
+    # best are climbed
     order = np.argsort([-data.value(start) for start in steep], axis=0, kind="stable")
     starts = (flat, steep[0], *(steep[k, rows] for k in order[:CLIMBED]))
     places, values = zip(*(ascend(data.climb, start, tolerance) for start in starts), strict=True)
@@ -286,8 +313,9 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
 def profile(
     data: HitsAndMisses, z0: float, level: float, slope: float = 1.0
 ) -> tuple[float, float]:
-    """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is
-    ``level`` at ``z0``, and the slope there. ``slope``: start of the search, such as that of a neighbour."""
+    """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0)
+    whose predictor is ``level`` at ``z0``, and the slope there. ``slope``: start of the search,
+    such as that of a neighbour."""
     if data.penalty is not None:  # concavity is not proved, so the search begins with a grid
 
         def rising(s: np.ndarray) -> np.ndarray:
@@ -303,7 +331,8 @@ def profile(
         hits=data.hits[None],
         misses=data.misses[None],
     )
-    # far out, only slopes near that of the line through the mean probability have a likelihood that is not tiny
+    # far out, only slopes near that of the line through the mean probability have a likelihood
+    # that is not tiny
     rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
     starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
     best, _ = ascend(
@@ -314,8 +343,8 @@ def profile(
 
 
 def flat_maximum(data: HitsAndMisses, highest: float) -> float:
-    """Return the largest (penalised) log-likelihood of one study's flat curves, with a predictor of at most
-    ``highest``: the limit of `profile` as ``z0`` grows to infinity."""
+    """Return the largest (penalised) log-likelihood of one study's flat curves, with a predictor
+    of at most ``highest``: the limit of `profile` as ``z0`` grows to infinity."""
     if data.penalty is None:
         rate = data.hits.sum() / (data.hits + data.misses).sum()
         return float(data.value(np.array([min(highest, float(link_ppf(data.link, rate))), 0.0])))
@@ -325,7 +354,8 @@ def flat_maximum(data: HitsAndMisses, highest: float) -> float:
 
 
 def _largest(function: Callable[[np.ndarray], np.ndarray], grid: np.ndarray) -> float:
-    """Return the largest value of a function of one number, refined around the best point of a grid."""
+    """Return the largest value of a function of one number, refined around the best point of a
+    grid."""
     best = int(np.argmax(function(grid)))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     how: dict[str, Any] = {"bounds": ends, "method": "bounded", "options": {"xatol": 1e-9}}

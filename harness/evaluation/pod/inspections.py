@@ -1,7 +1,9 @@
-"""Reads tables of inspections in common forms: CSV in several encodings and number formats, or a sheet of Excel.
+"""Reads tables of inspections in common forms: CSV in several encodings and number formats, or a
+sheet of Excel.
 
-A row is a flaw, or an inspection of a flaw. Several response columns (one for each inspector, the handbook's own
-layout) are inspections of the row's flaw. `Inspections.notes` says how unclear cells were interpreted."""
+A row is a flaw, or an inspection of a flaw. Several response columns (one for each inspector, the
+handbook's own layout) are inspections of the row's flaw. `Inspections.notes` says how unclear
+cells were interpreted."""
 
 import contextlib
 import csv
@@ -17,7 +19,8 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, limited_memory
 
-FEWEST_ROWS = 10  # rows for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)
+# rows for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)
+FEWEST_ROWS = 10
 SEPARATORS = (",", ";", "\t")
 HITS = dict.fromkeys(("1", "yes", "y", "true", "t", "hit", "h", "found", "detected"), 1.0)
 HITS |= dict.fromkeys(
@@ -43,10 +46,11 @@ Rows = list[tuple[int, list[str]]]
 
 @dataclass(frozen=True)
 class Inspections:
-    """One inspection per row. ``size`` (n,): in the file's unit. ``response`` (n,): hits as 0/1, or signals. ``target``
-    (n,): names of what was inspected; None if every row is a target of its own. ``line`` (n,): in the file, from 1.
-    ``unflawed`` (m,): responses at sites without a flaw, whose size is 0 or missing. ``notes``: sentences on rows that
-    were left out, and on the reading of unclear cells."""
+    """One inspection per row. ``size`` (n,): in the file's unit. ``response`` (n,): hits as 0/1,
+    or signals. ``target`` (n,): names of what was inspected; None if every row is a target of its
+    own. ``line`` (n,): in the file, from 1. ``unflawed`` (m,): responses at sites without a flaw,
+    whose size is 0 or missing. ``notes``: sentences on rows that were left out, and on the reading
+    of unclear cells."""
 
     path: Path
     size_column: str
@@ -67,8 +71,9 @@ class Inspections:
 def read_inspections(
     path: Path, size: str, responses: Sequence[str], target: str | None = None, *, hits: bool = True
 ) -> Inspections:
-    """Read the named columns. ``responses``: one column, or one per inspector. ``hits``: whether responses are words or
-    0/1 rather than signals. Raises UserError, with the line, for cells that cannot be read."""
+    """Read the named columns. ``responses``: one column, or one per inspector. ``hits``: whether
+    responses are words or 0/1 rather than signals. Raises UserError, with the line, for cells that
+    cannot be read."""
     (_, header), *rows = _rows(path, size)
     notes: list[str] = []
     header = [name.strip() for name in header]
@@ -98,15 +103,18 @@ def read_inspections(
                 f"{path}, line {line}: {target} is empty", fix="name the target, or remove the row"
             )
     # from here on, one inspection per row: all of the first inspector, then all of the second ...
-    response, count = np.concatenate(parts), len(responses)
-    sizes, lines = np.tile(sizes, count), np.tile(lines, count)
+    response = np.concatenate(parts)
+    count = len(responses)
+    sizes = np.tile(sizes, count)
+    lines = np.tile(lines, count)
     names = None if names is None else np.tile(names, count)
     if missing := int(np.isnan(response).sum()):
         notes.append(f"{missing} of {len(response)} inspections state no result and are left out")
     if (below := sizes < 0).any():
         what = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, but a size cannot be below 0"
         raise UserError(what, fix="give the sizes, not their logarithms: --log takes these")
-    seen, flawed = ~np.isnan(response), np.nan_to_num(sizes) != 0
+    seen = ~np.isnan(response)
+    flawed = np.nan_to_num(sizes) != 0
     if sites := int((seen & ~flawed).sum()):
         notes.append(
             f"{sites} of {len(response)} inspections are of unflawed sites (no size, or 0): not in the curve"
@@ -127,10 +135,12 @@ def read_inspections(
 
 
 def texts_of(read: Inspections, column: str) -> np.ndarray:
-    """Return the text (n,) of another column in the rows that were read. Raises UserError if there is none."""
+    """Return the text (n,) of another column in the rows that were read. Raises UserError if there
+    is none."""
     (_, header), *rows = _rows(read.path, read.size_column)
     header = [name.strip() for name in header]
-    at, row_of = _column(read.path, header, column, (column,)), dict(rows)
+    at = _column(read.path, header, column, (column,))
+    row_of = dict(rows)
     return np.array([row_of[line][at].strip() for line in read.line.tolist()], dtype=str)
 
 
@@ -147,7 +157,8 @@ def _require_one_size(read: Inspections) -> None:
 
 
 def require_positive(read: Inspections, response: bool, why: str) -> None:
-    """Refuse a size (or a response) that has no logarithm; ``why`` names the option that asks for it."""
+    """Refuse a size (or a response) that has no logarithm; ``why`` names the option that asks for
+    it."""
     values, column = (
         (read.response, read.response_column) if response else (read.size, read.size_column)
     )
@@ -160,7 +171,8 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
 
 
 def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, ...]) -> int:
-    """Return the index of a column. Raises UserError if there is none, or more than one, of this name."""
+    """Return the index of a column. Raises UserError if there is none, or more than one, of this
+    name."""
     if chosen.count(name) > 1:
         raise UserError(
             f"column {name!r} is chosen twice", fix="name a different column for each option"
@@ -172,7 +184,8 @@ def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, 
     if name not in header:
         from harness.vocabulary.declaration.diagnose import nearest
 
-        near, legal = nearest(name, header), ", ".join(map(repr, header))
+        near = nearest(name, header)
+        legal = ", ".join(map(repr, header))
         fix = f"did you mean {near!r}?" if near else "name one of these columns"
         raise UserError(f"{path}: no column {name!r}", legal=legal, fix=fix)
     return header.index(name)
@@ -224,10 +237,13 @@ def _numbers(
 
 
 def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
-    """Return the thousands separators of a column, and an ambiguous number ("" if there is none). The last of two marks
-    in a number is the decimal mark. A mark that occurs twice in a number is a thousands separator, and so is a mark
-    that occurs only before three digits if another mark is the decimal one."""
-    parts, decimals, grouped = set[str](), set[str](), dict[str, str]()
+    """Return the thousands separators of a column, and an ambiguous number ("" if there is none).
+    The last of two marks in a number is the decimal mark. A mark that occurs twice in a number is
+    a thousands separator, and so is a mark that occurs only before three digits if another mark is
+    the decimal one."""
+    parts = set[str]()
+    decimals = set[str]()
+    grouped = dict[str, str]()
     for text in texts:
         marks = [mark for mark in text if mark in MARKS] if NUMBER.fullmatch(text) else []
         if len(marks) > 1:
@@ -247,7 +263,8 @@ def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
 
 
 def _rows(path: Path, column: str) -> Rows:
-    """Return (line, fields) of every row that is not blank. The header is the first row with ``column``."""
+    """Return (line, fields) of every row that is not blank. The header is the first row with
+    ``column``."""
     try:
         content = bounded_bytes(path, TABLE_BYTES)
     except OSError as error:
@@ -267,7 +284,8 @@ def _rows(path: Path, column: str) -> Rows:
 
 
 def _text_rows(path: Path, content: bytes, column: str) -> Rows:
-    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1, separated as ``sep=`` says or to fit the header."""
+    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1, separated as ``sep=`` says or to
+    fit the header."""
     try:
         text = content.decode(
             "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
@@ -308,7 +326,8 @@ def _text_rows(path: Path, content: bytes, column: str) -> Rows:
 
 
 def _sheet_rows(path: Path, content: bytes) -> Rows:
-    """Return the rows of an Excel file's only sheet with content. Raises UserError if openpyxl is missing."""
+    """Return the rows of an Excel file's only sheet with content. Raises UserError if openpyxl is
+    missing."""
     try:
         import openpyxl
     except ImportError as error:
@@ -332,7 +351,8 @@ def _sheet_rows(path: Path, content: bytes) -> Rows:
         ) from error
     filled = {title: rows for title, rows in sheets.items() if rows}
     if len(filled) > 1:
-        legal, fix = "one sheet with inspections", "save the intended sheet as CSV"
+        legal = "one sheet with inspections"
+        fix = "save the intended sheet as CSV"
         raise UserError(
             f"{path}: has {len(filled)} sheets with data: {', '.join(filled)}", legal=legal, fix=fix
         )

@@ -1,4 +1,5 @@
-"""The statement on one set of inspections, from hits and misses or from signals: curve, bounds, and their basis."""
+"""The statement on one set of inspections, from hits and misses or from signals: curve, bounds,
+and their basis."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +18,17 @@ from harness.evaluation.pod.inspections import Inspections
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import jsonable
 
-POD, CONFIDENCE = 0.9, 0.95  # the field's usual statement, a90/95
+# the field's usual statement, a90/95
+POD = 0.9
+CONFIDENCE = 0.95
 DRAWN = 241  # number of sizes at which the curve and the band are drawn
 LEAST_TARGETS = 60  # fewest independent targets of a hit/miss study, by MIL-HDBK-1823A
-APART = 0.05  # largest relative difference between the a90/95 of models that fit about equally well without a warning
+# largest relative difference between the a90/95 of models that fit about equally well without a
+# warning
+APART = 0.05
 DOUBTED = ": do not trust its limit"
-POOLS = cache(ThreadpoolController)  # finds the libraries that compute in threads, which takes 2 ms
+# finds the libraries that compute in threads, which takes 2 ms
+POOLS = cache(ThreadpoolController)
 FEWEST_SITES = 5  # fewest unflawed sites whose signals can be fitted by a distribution
 TESTED: dict[Beyond, str] = {
     "floor": "a floor: hits by chance at any size",
@@ -33,8 +39,8 @@ TESTED: dict[Beyond, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """A model that was tried. ``deviance``: a smaller one fits better. ``near``: whether its bound is among those of
-    which the statement's bound is the largest."""
+    """A model that was tried. ``deviance``: a smaller one fits better. ``near``: whether its bound
+    is among those of which the statement's bound is the largest."""
 
     name: str
     deviance: float
@@ -47,9 +53,10 @@ class ModelRow:
 
 @dataclass(frozen=True)
 class PodStatement:
-    """The statement on the inspections ``read``. ``unit``: of sizes. ``fits``: for hits, the models whose largest bound
-    and widest band are stated, that of the curve first. ``signal``: the regression, None for hits. ``models``: all that
-    were tried. ``numbers``: further results of the fit. ``tests``: (subject, p-value, text)."""
+    """The statement on the inspections ``read``. ``unit``: of sizes. ``fits``: for hits, the
+    models whose largest bound and widest band are stated, that of the curve first. ``signal``: the
+    regression, None for hits. ``models``: all that were tried. ``numbers``: further results of the
+    fit. ``tests``: (subject, p-value, text)."""
 
     read: Inspections
     kind: str
@@ -84,7 +91,8 @@ class PodStatement:
 
     @cached_property
     def band(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper edges (`DRAWN`,) of the band; computed when needed, because it takes long."""
+        """Lower and upper edges (`DRAWN`,) of the band; computed when needed, because it takes
+        long."""
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
         # the envelope of the models: its lower edge crosses 90 % at their `largest_bound`
@@ -104,7 +112,8 @@ class PodStatement:
 
     @property
     def doubts(self) -> list[str]:
-        """Return warnings: near models with a90/95 more than `APART` apart; data that suggest a floor or ceiling."""
+        """Return warnings: near models with a90/95 more than `APART` apart; data that suggest a
+        floor or ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
         most = (
             min(row.deviance for row in self.models)
@@ -123,8 +132,10 @@ class PodStatement:
         ]
 
     def to_data(self) -> dict[str, Any]:
-        """Return the statement as JSON's types; an infinite size becomes None, and ``why`` gives the reason."""
-        curve, read = self.curve, self.read
+        """Return the statement as JSON's types; an infinite size becomes None, and ``why`` gives
+        the reason."""
+        curve = self.curve
+        read = self.read
         of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
         models = [
             {"model": row.name, **{name: getattr(row, name) for name in ("deviance", "a50", "a90")}}
@@ -160,20 +171,25 @@ def state_hits(
     unit: str = "",
     tested: bool = True,
 ) -> PodStatement:
-    """State the curve of hits and misses: the fit with the least deviance, over all links and over sizes or their
-    logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the largest over the `near_models` among
-    these fits. ``tested``: whether to test for hits by chance and misses at any size, which takes most of the time."""
-    # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of 0.6 s on busy cores
+    """State the curve of hits and misses: the fit with the least deviance, over all links and over
+    sizes or their logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the
+    largest over the `near_models` among these fits. ``tested``: whether to test for hits by chance
+    and misses at any size, which takes most of the time."""
+    # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of
+    # 0.6 s on busy cores
     with POOLS().limit(limits=1, user_api="blas"):
-        size, hit = read.size, read.response
+        size = read.size
+        hit = read.response
         tried = hit_miss.choose_model(size, hit, inspections=read.target)
         left = [
             fit
             for fit in tried
             if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)
         ]
-        fit, near = left[0], hit_miss.near_models(left)
-        curve, notes = fit.curve, [*read.notes, *fit.notes]
+        fit = left[0]
+        near = hit_miss.near_models(left)
+        curve = fit.curve
+        notes = [*read.notes, *fit.notes]
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
         models = [(fit, hit_miss.bound(fit, POD, CONFIDENCE)) for fit in tried]
         limit = max((limit for fit, limit in models if fit in near), key=lambda limit: limit.value)
@@ -225,8 +241,9 @@ def state_signals(
     log_signal: bool | None = None,
     unit: str = "",
 ) -> PodStatement:
-    """State the curve of signals against sizes: the fit with the least deviance over all pairs of axes that the data
-    allow, unless ``log_size`` or ``log_signal`` restricts them. Bounds are by the delta method on x."""
+    """State the curve of signals against sizes: the fit with the least deviance over all pairs of
+    axes that the data allow, unless ``log_size`` or ``log_signal`` restricts them. Bounds are by
+    the delta method on x."""
     tried = choose_axes(
         read.size, read.response, decision=decision, left=left, right=right, inspections=read.target
     )
@@ -238,7 +255,8 @@ def state_signals(
     if not fits:
         fix = "leave out --log or --log-signal"
         raise UserError(f"{read.path}: the requested axes need logarithms of values <= 0", fix=fix)
-    fit, curve = fits[0], fits[0].curve
+    fit = fits[0]
+    curve = fits[0].curve
     limit = ahat_bound(fit, POD, CONFIDENCE)
     (of_mu, common), (_, of_sigma) = curve.covariance.tolist()
     numbers = {"b0": fit.b0, "b1": fit.b1, "tau": fit.tau, "mu": curve.mu, "sigma": curve.sigma}
@@ -279,9 +297,10 @@ def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[Mo
 
 
 def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:
-    """Return the probability of a false positive at unflawed sites, by name; empty if there are no sites. It is the
-    share of calls with its upper bound (Clopper and Pearson); for signals, also by the normal distribution that fits
-    the noise best on the fit's axis, with signals up to the left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
+    """Return the probability of a false positive at unflawed sites, by name; empty if there are no
+    sites. It is the share of calls with its upper bound (Clopper and Pearson); for signals, also
+    by the normal distribution that fits the noise best on the fit's axis, with signals up to the
+    left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
     sites = read.unflawed
     if not sites.size:
         return {}
@@ -302,9 +321,11 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
 
 
 def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> np.ndarray:
-    """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond those ``marks`` that
-    are at most twice the largest size; in equal steps, or in equal ratios if ``log_size``."""
-    low, high = float(size.min()), float(size.max())
+    """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond
+    those ``marks`` that are at most twice the largest size; in equal steps, or in equal ratios if
+    ``log_size``."""
+    low = float(size.min())
+    high = float(size.max())
     high = max([high, *(mark for mark in marks if np.isfinite(mark) and high < mark < 2 * high)])
     if log_size:
         margin = (high / low) ** 0.04

@@ -1,6 +1,8 @@
-"""The evaluation of a whole study: every set-up's limit and curves, limits along each swept axis, and their validity.
+"""The evaluation of a whole study: every set-up's limit and curves, limits along each swept axis,
+and their validity.
 
-Intervals of ratios are slightly narrow: 8 to 9 % of those of equal set-ups exclude 1 (60 and 20 boards of 8)."""
+Intervals of ratios are slightly narrow: 8 to 9 % of those of equal set-ups exclude 1 (60 and 20
+boards of 8)."""
 
 from __future__ import annotations
 
@@ -33,8 +35,9 @@ FRAMES = "capture.frames"  # the dotted path of the axis that every experiment h
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Ratio of ``to``'s a90 to ``frm``'s, with its 95 % interval over boards, without draws that are infinite for both.
-    ``paired``: judged on the same boards. ``beyond_chance``: the interval excludes 1."""
+    """Ratio of ``to``'s a90 to ``frm``'s, with its 95 % interval over boards, without draws that
+    are infinite for both. ``paired``: judged on the same boards. ``beyond_chance``: the interval
+    excludes 1."""
 
     frm: SetUpLimit
     to: SetUpLimit
@@ -46,8 +49,9 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class AxisLine:
-    """Set-ups that differ only in ``axis`` (a dotted path). ``held``: the other axes. ``values`` and ``limits``:
-    ascending, text in the declared order. ``steps``: from each to the next. ``numeric``: can be drawn to scale."""
+    """Set-ups that differ only in ``axis`` (a dotted path). ``held``: the other axes. ``values``
+    and ``limits``: ascending, text in the declared order. ``steps``: from each to the next.
+    ``numeric``: can be drawn to scale."""
 
     axis: str
     held: Mapping[str, Any]
@@ -88,13 +92,16 @@ def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
 
 
 def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
-    """Compare a90 of two set-ups: paired if both have the same boards and damage, and no failed trials."""
-    a, b = frm.record.inspected, to.record.inspected
+    """Compare a90 of two set-ups: paired if both have the same boards and damage, and no failed
+    trials."""
+    a = frm.record.inspected
+    b = to.record.inspected
     paired = all(
         np.array_equal(getattr(a, name), getattr(b, name))
         for name in ("board", "hole", "x_mm", "y_mm")
     )
-    before, after = frm.a90_draws_mm, to.a90_draws_mm
+    before = frm.a90_draws_mm
+    after = to.a90_draws_mm
     with np.errstate(invalid="ignore", divide="ignore"):
         interval = percentiles(after / before if paired else np.divide.outer(after, before).ravel())
         ratio = float(np.divide(to.a90_mm, frm.a90_mm))
@@ -117,7 +124,8 @@ KINDS = {
 SIZES = {"diameter_mm": "in diameter", "length_mm": "long", "width_mm": "wide", "depth_mm": "deep"}
 NEARLY = f"deviance is at most {NEAR_DEVIANCE:g} above the least"
 RISE = (0.05, 0.95)
-"""POD between which the curve rises; sizes should reach beyond both, else only one side of the curve is known."""
+"""POD between which the curve rises; sizes should reach beyond both, else only one side of the
+curve is known."""
 
 
 def validity_of(
@@ -126,11 +134,10 @@ def validity_of(
     chances: Sequence[ChanceHits | None],
     facts: Mapping[str, Any],
 ) -> tuple[Section, ...]:
-    """Return headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ...)."""
-    radius, largest = (
-        record.hit_radius_mm,
-        max((limit.largest_mm for limit in limits), default=np.nan),
-    )
+    """Return headings with their sentences. ``facts``: the resolved experiment as plain data
+    (``source``, ...)."""
+    radius = record.hit_radius_mm
+    largest = max((limit.largest_mm for limit in limits), default=np.nan)
     counted = "closest pairs first, each finding for one damage at most; fixed beforehand, the same for all sizes"
     hits = [f"A damage is hit {record.hit_rule} ({counted})."]
     if record.hit_overlap is not None:
@@ -162,15 +169,15 @@ def _span(low: float, high: float) -> str:
 
 
 def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]]) -> tuple[str, ...]:
-    """Return sizes, depths and boards, together if all set-ups share them, else by set-up; and the axes."""
+    """Return sizes, depths and boards, together if all set-ups share them, else by set-up; and the
+    axes."""
     reasons: dict[str, list[str]] = {}
     for limit in limits:
         seen = limit.record.inspected
         if len(seen.hit):
             times = limit.inspections / limit.targets
-            wide, deep = (
-                _span(sizes.min(), sizes.max()) for sizes in (seen.diameter_mm, seen.depth_mm)
-            )
+            wide = _span(seen.diameter_mm.min(), seen.diameter_mm.max())
+            deep = _span(seen.depth_mm.min(), seen.depth_mm.max())
             text = f"{limit.targets} damages on {limit.boards} boards, {wide} in {seen.size_of} and {deep} deep"
             text += "" if times == 1 else f", each inspected {times:.3g} times with new noise"
             reasons.setdefault(text, []).append(limit.record.label)
@@ -198,10 +205,8 @@ def _departures(
         for limit, each in zip(limits, chances, strict=True)
         if each and limit.targets
     ]
-    fewest_places, failed = (
-        min(places, default=np.inf),
-        sum(limit.record.failed for limit in limits),
-    )
+    fewest_places = min(places, default=np.inf)
+    failed = sum(limit.record.failed for limit in limits)
     chosen = any(limit.statement is not None for limit in limits)
     all_found = any(limit.statement is None and limit.a90_95.demonstrated for limit in limits)
     simulated = facts.get("source", {}).get("kind") == "simulated"
@@ -257,7 +262,8 @@ def _departures(
 
 def _sizes_miss_the_rise(limit: SetUpLimit) -> tuple[tuple[bool, str], ...]:
     assert limit.statement is not None
-    label, curve = limit.record.label, limit.statement.curve
+    label = limit.record.label
+    curve = limit.statement.curve
     low, high = curve.pod(
         np.array([limit.record.inspected.size_mm.min(), limit.largest_mm])
     ).tolist()
@@ -281,8 +287,10 @@ def _one_kind(facts: Mapping[str, Any]) -> str:
 
 
 def _damage_words(facts: Mapping[str, Any]) -> str:
-    """Return all damage as ``gouges 60 mm long, 10 mm wide``: its kind, and the sizes that are the same everywhere."""
-    kind, sweep = _one_kind(facts), facts.get("sweep") or {}
+    """Return all damage as ``gouges 60 mm long, 10 mm wide``: its kind, and the sizes that are the
+    same everywhere."""
+    kind = _one_kind(facts)
+    sweep = facts.get("sweep") or {}
     if not kind:
         return ""
     damage = facts["source"]["target"]["damage"]
@@ -299,13 +307,15 @@ def _damage_words(facts: Mapping[str, Any]) -> str:
 
 def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the subjects that this study does not cover."""
-    source, sweep = facts.get("source", {}), facts.get("sweep") or {}
+    source = facts.get("source", {})
+    sweep = facts.get("sweep") or {}
     target = source.get("target", {})
     only = f": all are {KINDS[kind]}" if (kind := _one_kind(facts)) else ""
     one_unit = "camera" in source and "source.camera.unit_seed" not in sweep
     one_unit &= all(limit.record.units == 1 for limit in limits)
     judged = any(limit.boards for limit in limits)
-    simulated, drawn = source.get("kind") == "simulated", target.get("name") == "drawn"
+    simulated = source.get("kind") == "simulated"
+    drawn = target.get("name") == "drawn"
     rules = (
         (
             True,
@@ -343,7 +353,8 @@ CONDITIONS = (
 
 
 def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str:
-    """Return the conditions common to all set-ups in one line, damage first. ``inspected``: damages in view."""
+    """Return the conditions common to all set-ups in one line, damage first. ``inspected``:
+    damages in view."""
     conditions = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts
@@ -356,7 +367,8 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
         if value is not None and not varied and not known:
             text = words.format(camera_title(value) if isinstance(value, str) else value)
             conditions.append(text.replace(" 1 false calls", " 1 false call"))
-    target, study = facts.get("source", {}).get("target") or {}, facts.get("study") or {}
+    target = facts.get("source", {}).get("target") or {}
+    study = facts.get("study") or {}
     declared = target.get("damage", {}).get("per_board", 0) * study.get("boards", 0) or len(
         target.get("holes") or ()
     )
@@ -369,8 +381,9 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
 
 @dataclass(frozen=True, eq=False)
 class SetUpResult:
-    """One set-up. ``chance``: None if there are no other boards to compare. ``roc``, ``free_response``, ``pixels``:
-    None if not counted. ``surface``: over diameter and depth, or ``surface_why`` there is none."""
+    """One set-up. ``chance``: None if there are no other boards to compare. ``roc``,
+    ``free_response``, ``pixels``: None if not counted. ``surface``: over diameter and depth, or
+    ``surface_why`` there is none."""
 
     limit: SetUpLimit
     chance: ChanceHits | None
@@ -383,7 +396,8 @@ class SetUpResult:
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """``set_ups``: in the record's order. ``axes``: lines along swept axes. ``facts``: the resolved experiment."""
+    """``set_ups``: in the record's order. ``axes``: lines along swept axes. ``facts``: the
+    resolved experiment."""
 
     record: StudyRecord
     set_ups: tuple[SetUpResult, ...]
@@ -408,9 +422,9 @@ def evaluate_study(
     draws: int = DRAWS,
     each_of: Callable[..., Iterable[SetUpResult | None]] = starmap,
 ) -> StudyResult:
-    """Evaluate a study. ``facts``: its resolved experiment, plain data. ``each_of``: calls a function with each of
-    several arguments, such as in other processes, which may fail (None). Deterministic. A limit without a curve says
-    why."""
+    """Evaluate a study. ``facts``: its resolved experiment, plain data. ``each_of``: calls a
+    function with each of several arguments, such as in other processes, which may fail (None).
+    Deterministic. A limit without a curve says why."""
     radius_mm = record.hit_radius_mm
     arguments = [
         (each, tables.of(each.variant, each.frames), radius_mm, draws) for each in record.set_ups
@@ -426,8 +440,11 @@ def evaluate_study(
 
 def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: int) -> SetUpResult:
     """Evaluate a set-up from its own ``tables``."""
-    holes, sites, runs = tables.holes, tables.sites, tables.runs
-    limit, chance = limit_of(record, draws=draws, tested=True), None
+    holes = tables.holes
+    sites = tables.sites
+    runs = tables.runs
+    limit = limit_of(record, draws=draws, tested=True)
+    chance = None
     if not holes.empty and not runs.empty:
         column = (
             "model_diameter_mm"

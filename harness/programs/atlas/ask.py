@@ -1,4 +1,5 @@
-"""``tofpod ask``: which camera finds a damage, at which distance, with how many frames, by stored limits."""
+"""``tofpod ask``: which camera finds a damage, at which distance, with how many frames, by stored
+limits."""
 
 from __future__ import annotations
 
@@ -108,7 +109,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
-    """Return the table of limits and the data that is stored with it. Raises UserError if it is no such table."""
+    """Return the table of limits and the data that is stored with it. Raises UserError if it is no
+    such table."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -143,7 +145,8 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:
-    """Return warnings about cameras whose precision is a guess, with a common warning for equal guesses."""
+    """Return warnings about cameras whose precision is a guess, with a common warning for equal
+    guesses."""
     from scenes.sensor.camera import guessed_precision, load_camera
 
     alike: dict[str, list[str]] = {}
@@ -168,10 +171,8 @@ def _answer(
     from harness.programs.atlas.tables import ATLAS, damage_words, rows_at
     from harness.vocabulary.text import many, show
 
-    size_mm, distance_m = (
-        1e3 * length_m("--size", options.size),
-        length_m("--distance", options.distance),
-    )
+    size_mm = 1e3 * length_m("--size", options.size)
+    distance_m = length_m("--distance", options.distance)
     kind = KINDS.get(options.damage, options.damage)
     chosen = _chosen(options, surfaces, kind)
     given = {
@@ -201,7 +202,8 @@ def _answer(
         dict(zip(filter(given.get, given), each, strict=True))
         for each in product(*filter(None, given.values()))
     ]
-    rows, whose = [], dict[str, set[str]]()
+    rows = []
+    whose = dict[str, set[str]]()
     for place in places:
         found, why = rows_at(chosen, titles, place, size_mm)
         rows += found
@@ -229,10 +231,8 @@ def _answer(
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
     left_out = f"the error of a90 at set-ups left out of the fit is {100 * max(errors, default=0):.0f} % (rms) at most"
     missed = f"; {left_out}" if errors else ""
-    study, heads = (
-        about.get("experiment", "the study"),
-        {} if len(given["albedo"]) > 1 else {"albedo": ""},
-    )
+    study = about.get("experiment", "the study")
+    heads = {} if len(given["albedo"]) > 1 else {"albedo": ""}
     notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
     notes += [f"not answered: {reason}" for reason in refused]
     notes.append(

@@ -1,8 +1,10 @@
-"""The atlas of limits: for each camera, kind of damage and detector, a90 of many set-ups as a smooth surface over
-distance, frames, depth and albedo. It answers questions within the computed range and refuses others.
+"""The atlas of limits: for each camera, kind of damage and detector, a90 of many set-ups as a
+smooth surface over distance, frames, depth and albedo. It answers questions within the computed
+range and refuses others.
 
-The surface is a quadratic of ln a90 in the logarithms of the axes, by least squares weighted with each limit's own
-interval. Its stated error is the root mean square error of ln a90 at each set-up when the others predict it."""
+The surface is a quadratic of ln a90 in the logarithms of the axes, by least squares weighted with
+each limit's own interval. Its stated error is the root mean square error of ln a90 at each set-up
+when the others predict it."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +17,9 @@ from scipy import special
 
 from harness.evaluation.intervals import UPPER
 
-CAMERA, DETECTOR, DAMAGE = "source.camera.name", "detector.name", "source.target.damage"
+CAMERA = "source.camera.name"
+DETECTOR = "detector.name"
+DAMAGE = "source.target.damage"
 AXES = {
     "distance_m": "source.target.distance_m",
     "frames": "frames",
@@ -24,19 +28,22 @@ AXES = {
 }
 """The axes of a surface, and the columns of the table of limits that hold their values."""
 UNKNOWN_VARIANCE = (
-    0.25  # variance of ln a90 if an interval has no positive lower end: a factor of 1.65 either way
+    # variance of ln a90 if an interval has no positive lower end: a factor of 1.65 either way
+    0.25
 )
 TOLERANCE = 1e-9
 
 
 class Outside(Exception):
-    """A question that the atlas cannot answer; the text gives the reason and the range of possible questions."""
+    """A question that the atlas cannot answer; the text gives the reason and the range of possible
+    questions."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN if a set-up around it has no limit.
-    ``largest_mm``: the largest size inspected; without a limit NaN, unless all set-ups around it miss it too."""
+    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN if a set-up around it has
+    no limit. ``largest_mm``: the largest size inspected; without a limit NaN, unless all set-ups
+    around it miss it too."""
 
     a90_mm: float
     low_mm: float
@@ -52,10 +59,11 @@ class Answer:
 
 @dataclass(frozen=True)
 class LimitSurface:
-    """Limits of one camera, kind of damage and detector. ``grid``: the values that were computed on each axis.
-    ``nodes`` (n, k): the set-ups' places, axes in the order of ``grid``. ``largest_mm`` (n,): the largest size
-    inspected at each. ``known`` (n,): whether a limit was found. ``beyond`` (n,): whether it lies above all sizes.
-    ``damage``: declaration of the first set-up's damage, as JSON. ``error``: of ln a90, leaving each set-up out."""
+    """Limits of one camera, kind of damage and detector. ``grid``: the values that were computed
+    on each axis. ``nodes`` (n, k): the set-ups' places, axes in the order of ``grid``.
+    ``largest_mm`` (n,): the largest size inspected at each. ``known`` (n,): whether a limit was
+    found. ``beyond`` (n,): whether it lies above all sizes. ``damage``: declaration of the first
+    set-up's damage, as JSON. ``error``: of ln a90, leaving each set-up out."""
 
     camera: str
     kind: str
@@ -73,7 +81,8 @@ class LimitSurface:
     error: float
 
     def at(self, **place: float) -> Answer:
-        """Return the limit at a place: a value for each axis of ``grid``. Raises Outside beyond the computed range."""
+        """Return the limit at a place: a value for each axis of ``grid``. Raises Outside beyond
+        the computed range."""
         ends = {axis: values for axis, values in self.grid.items() if axis in place}
         for axis, values in ends.items():
             if not values[0] - TOLERANCE <= place[axis] <= values[-1] + TOLERANCE:
@@ -97,11 +106,14 @@ class LimitSurface:
         middle = float(row @ self.coefficients)
         spread = np.hypot(np.sqrt(row @ self.covariance @ row), self.error)
         half = float(special.stdtrit(self.degrees, UPPER) * spread)
-        a90, low, high = (float(np.exp(middle + end)) for end in (0.0, -half, half))
+        a90 = float(np.exp(middle + 0.0))
+        low = float(np.exp(middle + -half))
+        high = float(np.exp(middle + half))
         return Answer(a90, low, high, largest_mm)
 
     def _near(self, axis: int, value: float) -> np.ndarray:
-        """Return the nodes of the cell that holds a value: at its neighbours on the axis, or at the value itself."""
+        """Return the nodes of the cell that holds a value: at its neighbours on the axis, or at
+        the value itself."""
         values = np.array(list(self.grid.values())[axis])
         low = values[values <= value + TOLERANCE].max()
         high = values[values >= value - TOLERANCE].min()
@@ -111,7 +123,8 @@ class LimitSurface:
 
 
 def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
-    """Return the surfaces of a table of `LIMITS` by camera, kind and detector. Raises KeyError if it lacks an axis."""
+    """Return the surfaces of a table of `LIMITS` by camera, kind and detector. Raises KeyError if
+    it lacks an axis."""
     rows = limits.copy()
     damages = [json.loads(text) for text in rows[DAMAGE]]
     rows["kind"] = [damage["kind"] for damage in damages]
@@ -148,7 +161,8 @@ def _surface(
     fixed = (camera, kind, detector, grid, nodes, largest, known, beyond, rows.iloc[0][DAMAGE])
     if not terms:
         return LimitSurface(*fixed, np.zeros(0), np.zeros((0, 0)), (), 0, float("nan"))
-    design, weights = _rows(scaled[known], terms), 1.0 / variance[known]
+    design = _rows(scaled[known], terms)
+    weights = 1.0 / variance[known]
     inverse = np.linalg.pinv(design.T @ (weights[:, None] * design))
     coefficients = inverse @ (design.T @ (weights * np.log(a90[known])))
     residuals = np.log(a90[known]) - design @ coefficients
@@ -162,14 +176,16 @@ def _surface(
 
 
 def _scaled(places: np.ndarray, grid: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return places (n, k) as logarithms between -1 and 1 over the grid; 0 on an axis with a single value."""
+    """Return places (n, k) as logarithms between -1 and 1 over the grid; 0 on an axis with a
+    single value."""
     ends = np.log([[values[0], values[-1]] for values in grid])
     half = np.maximum(np.diff(ends, axis=1)[:, 0] / 2, TOLERANCE)
     return np.asarray((np.log(places) - ends.mean(axis=1)) / half)
 
 
 def _terms(counts: Sequence[int], known: int) -> tuple[tuple[int, ...], ...]:
-    """Return products of axes: squares of axes with three values, then products of two axes; few set-ups get none."""
+    """Return products of axes: squares of axes with three values, then products of two axes; few
+    set-ups get none."""
     varied = [axis for axis, count in enumerate(counts) if count > 1]
     plane: list[tuple[int, ...]] = [(), *((axis,) for axis in varied)]
     further: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]

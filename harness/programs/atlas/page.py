@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 
 PALETTE = (*COLOURS, INK, GREY)
 DASHES = {"-": "", "--": "7 4", ":": "2 4"}
-"""Line styles for numbers of frames, from least to most: Matplotlib's names, and the dashes in SVG."""
+"""Line styles for numbers of frames, from least to most: Matplotlib's names, and the dashes in
+SVG."""
 
 
 def atlas_html(
     rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str, Any], command: str
 ) -> str:
-    """Return the page, on which a user chooses damage, size, distance and frames and sees which cameras find it."""
+    """Return the page, on which a user chooses damage, size, distance and frames and sees which
+    cameras find it."""
     curves: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
         place = {axis: value for axis, value in row.place.items() if axis != "distance_m"}
@@ -57,8 +59,9 @@ def atlas_html(
 
 
 def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
-    """Draw a90 against distance for each camera with the fewest and the most frames. Each damage that has a limit in at
-    least half of the places gets a panel. If there are several albedos, the brightest target is drawn."""
+    """Draw a90 against distance for each camera with the fewest and the most frames. Each damage
+    that has a limit in at least half of the places gets a panel. If there are several albedos, the
+    brightest target is drawn."""
     albedos = sorted({row.place["albedo"] for row in rows if "albedo" in row.place})
     rows = [row for row in rows if row.place.get("albedo") in (None, *albedos[-1:])]
     known = pd.Series(

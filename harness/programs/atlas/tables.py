@@ -1,4 +1,5 @@
-"""The table of the atlas: limits at any distance and number of frames, interpolated between computed set-ups."""
+"""The table of the atlas: limits at any distance and number of frames, interpolated between
+computed set-ups."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ DISTANCES = 25  # number of distances on a curve; their logarithms are evenly sp
 
 @dataclass(frozen=True)
 class Row:
-    """The answer of a surface at a place, with the title of its camera and the size in question (or NaN)."""
+    """The answer of a surface at a place, with the title of its camera and the size in question
+    (or NaN)."""
 
     surface: LimitSurface
     title: str
@@ -75,8 +77,10 @@ def rows_at(
     place: Mapping[str, float],
     size_mm: float = np.nan,
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a place, smallest limit first, and (reason, camera title) for surfaces without an answer."""
-    rows, refused = [], []
+    """Return the rows at a place, smallest limit first, and (reason, camera title) for surfaces
+    without an answer."""
+    rows = []
+    refused = []
     for surface in surfaces:
         own = {axis: place[axis] for axis in surface.grid if axis in place}
         try:
@@ -88,7 +92,8 @@ def rows_at(
 
 
 def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[Row]:
-    """Return rows for every surface at `DISTANCES` distances and each computed number of frames, depth and albedo."""
+    """Return rows for every surface at `DISTANCES` distances and each computed number of frames,
+    depth and albedo."""
     rows = []
     for surface in surfaces:
         ends = surface.grid["distance_m"]

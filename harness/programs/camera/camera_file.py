@@ -1,7 +1,9 @@
-"""The camera file that reproduces the captures: the refitted model of a known camera, or an empirical camera.
+"""The camera file that reproduces the captures: the refitted model of a known camera, or an
+empirical camera.
 
-A refitted model has the unit's own lens, gain, fixed pattern, displaced frames and, if the captures show it, gate for
-faint pixels; all other numbers are those of the known camera. The surfaces' albedo is stated and not measured."""
+A refitted model has the unit's own lens, gain, fixed pattern, displaced frames and, if the
+captures show it, gate for faint pixels; all other numbers are those of the known camera. The
+surfaces' albedo is stated and not measured."""
 
 import json
 import os
@@ -44,14 +46,20 @@ UNIT = CameraConfig(
     effects=EffectsConfig().model_copy(update={"unit_offset": False, "warm_up_drift": False})
 )
 """Effects of a simulated unit that captures of a real unit also show."""
-STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
-"""Most steps of the fit of the gain, the relative error at which it ends, its largest change, and frames per step."""
-EDGE_SHARE = 2.56  # width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian
+STEPS = 5
+CLOSE = 0.01
+FARTHEST = 100.0
+FEW_FRAMES = 12
+"""Most steps of the fit of the gain, the relative error at which it ends, its largest change, and
+frames per step."""
+# width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian
+EDGE_SHARE = 2.56
 UNKNOWN = "not determined by the captures"
 
 
 def camera_of_size(lens: Lens) -> str:
-    """Return the only simulated camera with the lens's size, if possible not a guessed one; else raise UserError."""
+    """Return the only simulated camera with the lens's size, if possible not a guessed one; else
+    raise UserError."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [
         name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)
@@ -59,10 +67,8 @@ def camera_of_size(lens: Lens) -> str:
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:
         return (known or fitting)[0]
-    wrong, size = (
-        f"{lens.width} x {lens.height} pixels",
-        "record the camera's own depth images, not those of a",
-    )
+    wrong = f"{lens.width} x {lens.height} pixels"
+    size = "record the camera's own depth images, not those of a"
     raise UserError(
         f"several cameras have {wrong}: {', '.join(fitting)}"
         if fitting
@@ -75,7 +81,8 @@ def camera_of_size(lens: Lens) -> str:
 
 
 def with_lens(name: str, lens: Lens) -> AnyCamera:
-    """Return a known camera with the capture's lens. Raises UserError for an unknown camera or another size."""
+    """Return a known camera with the capture's lens. Raises UserError for an unknown camera or
+    another size."""
     own = load_camera(name).nominal_lens
     if (own.width, own.height) != (lens.width, lens.height):
         raise UserError(
@@ -99,8 +106,9 @@ class Stated(NamedTuple):
 def write_camera(
     path: Path, title: str, like: str | None, found: Characteristics, albedo: float, rate: Stated
 ) -> AnyCamera:
-    """Write the camera file, refitted from a known camera ``like`` or empirical, and return the camera. Raises
-    UserError if the known camera has another image size, or if the file cannot be written."""
+    """Write the camera file, refitted from a known camera ``like`` or empirical, and return the
+    camera. Raises UserError if the known camera has another image size, or if the file cannot be
+    written."""
     names = ", ".join(capture.name for capture in found.captures)
     source = f"measured by tofpod characterise on {names}, {date.today().isoformat()}"
     own = _refitted(like, found, albedo, source) if like else _empirical(found, albedo, source)
@@ -132,7 +140,8 @@ def _text(value: Any) -> str:
 
 def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
     """Yield the numbers that files of both kinds take from the captures."""
-    lens, jumps_m = found.captures[0].lens, found.jumps_m
+    lens = found.captures[0].lens
+    jumps_m = found.jumps_m
     for key in ("width", "height", "fx", "fy", "cx", "cy"):
         yield Stated("lens", f"{key}_px", getattr(lens, key), f"lens of the recording; {source}")
     distortion = lens.distortion if any(lens.distortion) else ()
@@ -149,12 +158,16 @@ def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
 
 
 def _step_mm(found: Characteristics) -> float:
-    """Return the rounding step of the stored captures; a micrometre for numbers that are not rounded."""
+    """Return the rounding step of the stored captures; a micrometre for numbers that are not
+    rounded."""
     return found.captures[0].step_m / MM or 1e-3
 
 
 def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
-    law, pattern, drops, edge = found.law, found.pattern, found.dropouts, found.edge
+    law = found.law
+    pattern = found.pattern
+    drops = found.dropouts
+    edge = found.edge
     yield Stated(
         "", "wavelength_nm", 850.0, f"selects the albedo of simulated surfaces; {UNKNOWN}", "M"
     )
@@ -267,7 +280,8 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
         for key, fact in camera.fixed_pattern.to_data().items():
             if key.endswith("_mm"):
                 yield Stated("fixed_pattern", key, fact["value"] * times, doubt)
-    level, share = found.dropouts.amplitude, found.dropouts.share
+    level = found.dropouts.amplitude
+    share = found.dropouts.share
     if share.max() >= 0.5 > share.min() and isinstance(camera, AmcwCamera):
         falling = np.argsort(-share)
         faint = float(np.exp(np.interp(-0.5, -share[falling], np.log(level[falling]))))
@@ -283,8 +297,8 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
 
 
 def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, Any]]:
-    """Yield the emitter's numbers that exclude pixels with a return, widened: the lit polygon, and the angle at which
-    the cone's light ends; the light fades over as many degrees as before."""
+    """Yield the emitter's numbers that exclude pixels with a return, widened: the lit polygon, and
+    the angle at which the cone's light ends; the light fades over as many degrees as before."""
     often = [np.isfinite(capture.z_m).mean(axis=0) >= 0.5 for capture in found.captures]
     seen = np.concatenate(
         [capture.slopes[mask] for capture, mask in zip(found.captures, often, strict=True)]
@@ -292,21 +306,18 @@ def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, An
     if camera.emitter.mask_slopes is not None:
         around = ConvexHull(np.round([*camera.emitter.mask_slopes.value, *seen], 3))
         yield "mask_slopes", tuple(map(tuple, around.points[around.vertices]))
-    full_deg, cutoff_deg = (
-        camera.emitter.full_half_angle_deg.value,
-        camera.emitter.cutoff_half_angle_deg.value,
-    )
+    full_deg = camera.emitter.full_half_angle_deg.value
+    cutoff_deg = camera.emitter.cutoff_half_angle_deg.value
     widest_deg = float(np.degrees(np.arctan(np.linalg.norm(seen, axis=1).max())))
     if widest_deg > cutoff_deg:
         yield "cutoff_half_angle_deg", widest_deg + cutoff_deg - full_deg
 
 
 def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
-    """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on the logarithms."""
-    wanted, tried = (
-        {(face.capture, face.number): face.temporal.value for face in found.surfaces},
-        [],
-    )
+    """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on
+    the logarithms."""
+    wanted = {(face.capture, face.number): face.temporal.value for face in found.surfaces}
+    tried = []
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):
         camera = with_number(camera, "photons", "signal_electrons", gain)
@@ -334,9 +345,10 @@ def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, floa
 def simulated(
     camera: AnyCamera, found: Characteristics, albedo: float, frames: int | None = None
 ) -> list[StillCapture]:
-    """Return the captures as a unit of the camera would have recorded them: the same surfaces (by smooth fits) with the
-    recorded brightness and the same number of frames, or ``frames``. Not simulated: relief finer than the fits, light
-    between surfaces, the emitter's shadow behind an edge, and the scene beside the surfaces."""
+    """Return the captures as a unit of the camera would have recorded them: the same surfaces (by
+    smooth fits) with the recorded brightness and the same number of frames, or ``frames``. Not
+    simulated: relief finer than the fits, light between surfaces, the emitter's shadow behind an
+    edge, and the scene beside the surfaces."""
     return [
         _again(camera, still, albedo, frames or len(still.z_m), n)
         for n, still in enumerate(found.captures)
@@ -346,11 +358,9 @@ def simulated(
 def _again(
     camera: AnyCamera, capture: StillCapture, albedo: float, frames: int, number: int
 ) -> StillCapture:
-    z_m, lens, config = (
-        capture.mean_m,
-        camera.nominal_lens,
-        UNIT.model_copy(update={"name": camera.name}),
-    )
+    z_m = capture.mean_m
+    lens = camera.nominal_lens
+    config = UNIT.model_copy(update={"name": camera.name})
     if capture.planes:
         labels = np.zeros(z_m.shape, int)
         for place, (_, mask) in enumerate(capture.planes, start=1):
@@ -359,7 +369,8 @@ def _again(
         labels = np.where(distance <= measure.WIDEST_PX / 2, labels[tuple(nearest)], 0)
         halves = labels[None]
         if not isinstance(camera, EmpiricalCamera):  # its edges are steps between pixels
-            # half of each pixel along an edge lies on the other surface, which is the mean over all positions of edges
+            # half of each pixel along an edge lies on the other surface, which is the mean over
+            # all positions of edges
             halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
         z_m = np.full(halves.shape, np.nan)
         for place, shape_m in enumerate(capture.shapes_m, start=1):

@@ -1,6 +1,8 @@
-"""``tofpod validate --capture``: compares a static capture with the simulation of a known camera, unchanged.
+"""``tofpod validate --capture``: compares a static capture with the simulation of a known camera,
+unchanged.
 
-Measurement and simulation are those of `tofpod characterise`; nothing is fitted to make both agree.
+Measurement and simulation are those of `tofpod characterise`; nothing is fitted to make both
+agree.
 """
 
 import argparse
@@ -19,8 +21,9 @@ from harness.vocabulary.errors import UserError
 
 
 def run_capture(options: argparse.Namespace, command: str) -> int:
-    """Compare, print, and write capture.html, the tables and provenance.json. Returns 0. Raises UserError for a capture
-    that cannot be read or simulated: too few frames, another size, no plane, no lens."""
+    """Compare, print, and write capture.html, the tables and provenance.json. Returns 0. Raises
+    UserError for a capture that cannot be read or simulated: too few frames, another size, no
+    plane, no lens."""
     if len(options.camera) > 1:
         raise UserError(
             "--capture: a capture comes from a single camera",
@@ -35,7 +38,8 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     )
     capture = read_still(recording, None if options.mask is None else read_mask(options.mask))
     name = known or camera_of_size(capture.lens)
-    camera, found = with_lens(name, capture.lens), characteristics([capture])
+    camera = with_lens(name, capture.lens)
+    found = characteristics([capture])
     if not found.surfaces:
         legal = "walls, boards, tables: flat surfaces that the simulation can repeat"
         fix = "check the lens (--intrinsics), or exclude other objects with --mask"
@@ -63,12 +67,11 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Return the pixels of an image that are not black, (h, w) bool. Raises UserError if it cannot be read."""
+    """Return the pixels of an image that are not black, (h, w) bool. Raises UserError if it cannot
+    be read."""
     try:
         return np.asarray(read_picture(path, cv2.IMREAD_GRAYSCALE) > 0)
     except UserError as error:
-        legal, why = (
-            "a PNG with the size of the frames; black excludes",
-            error.message.removeprefix(f"{path}: "),
-        )
+        legal = "a PNG with the size of the frames; black excludes"
+        why = error.message.removeprefix(f"{path}: ")
         raise UserError(f"--mask {path}: is not a readable image ({why})", legal=legal) from error

@@ -1,8 +1,9 @@
-"""Two pages to file or to send: the measurements of a unit, in the terms of the standards, and their validity.
+"""Two pages to file or to send: the measurements of a unit, in the terms of the standards, and
+their validity.
 
-The terms are those of VDI/VDE 2634 part 2 and ISO 10360-13 (optical 3D measuring systems), and of MIL-HDBK-1823A, ASTM
-E2862 and E3023 (probability of detection). The figures follow these standards without their artefacts and procedures.
-Nothing here is an accredited calibration."""
+The terms are those of VDI/VDE 2634 part 2 and ISO 10360-13 (optical 3D measuring systems), and of
+MIL-HDBK-1823A, ASTM E2862 and E3023 (probability of detection). The figures follow these standards
+without their artefacts and procedures. Nothing here is an accredited calibration."""
 
 from collections.abc import Iterator, Sequence
 from datetime import date
@@ -59,8 +60,9 @@ CONDITIONS = (
 
 
 def level_of_detection_mm(found: Characteristics, variance_m2: float, frames: int) -> float:
-    """Return 1.96 standard deviations of a pixel's z averaged over ``frames``. Noise averages out; fixed pattern and
-    the remaining rounding error do not. The difference of two captures of the same unit has no fixed pattern."""
+    """Return 1.96 standard deviations of a pixel's z averaged over ``frames``. Noise averages out;
+    fixed pattern and the remaining rounding error do not. The difference of two captures of the
+    same unit has no fixed pattern."""
     step_m = found.captures[0].step_m
     pattern_m2 = found.pattern.field.rms_m**2 if found.pattern is not None else 0.0
     left_m2 = rounding_left_m2(step_m, variance_m2) if step_m > 0 else 0.0
@@ -68,8 +70,9 @@ def level_of_detection_mm(found: Characteristics, variance_m2: float, frames: in
 
 
 def spacings_mm(found: Characteristics, poses: Sequence[np.ndarray]) -> Iterator[float]:
-    """Yield the error of spacing along the surface's normal for each further capture: the distance between its largest
-    surface and that of the first capture, which are the same plane by the stated poses."""
+    """Yield the error of spacing along the surface's normal for each further capture: the distance
+    between its largest surface and that of the first capture, which are the same plane by the
+    stated poses."""
     plane = found.captures[0].planes[0][0]
     for pose, capture in zip(poses[1:], found.captures[1:], strict=True):
         point = transform_points(pose, np.array([0.0, 0.0, capture.planes[0][0].distance_m]))
@@ -102,7 +105,8 @@ def of_surfaces(found: Characteristics) -> Iterator[dict[str, Any]]:
 def certified(
     found: Characteristics, poses: Sequence[np.ndarray] | None
 ) -> Iterator[dict[str, str]]:
-    """Yield the rows of `CERTIFIED`: the figures that belong to no single surface, then those of the standards."""
+    """Yield the rows of `CERTIFIED`: the figures that belong to no single surface, then those of
+    the standards."""
 
     def row(quantity: str, conditions: str, value: str, manner: str) -> dict[str, str]:
         return {"quantity": quantity, "conditions": conditions, "value": value, "manner": manner}
@@ -136,11 +140,10 @@ def write_certificate(
     study: StudyRecord | None,
     command: str,
 ) -> None:
-    """Write certificate.html and .json. ``about`` states unit, mode, firmware and warm-up. May raise UserError."""
-    rows, limits = (
-        list(certified(found, poses)),
-        [limit_of(set_up) for set_up in study.set_ups] if study else [],
-    )
+    """Write certificate.html and .json. ``about`` states unit, mode, firmware and warm-up. May
+    raise UserError."""
+    rows = list(certified(found, poses))
+    limits = [limit_of(set_up) for set_up in study.set_ups] if study else []
     surfaces = list(of_surfaces(found))
     share = "The camera's figures were measured."
     if study is not None:

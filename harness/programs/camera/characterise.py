@@ -1,4 +1,5 @@
-"""``tofpod characterise``: measures your own camera on static captures, as a page and a camera file."""
+"""``tofpod characterise``: measures your own camera on static captures, as a page and a camera
+file."""
 
 import argparse
 import sys
@@ -10,7 +11,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 CAMERA_FILE = "my_camera.yaml"
-REPEATED = 0.15  # relative error of the simulated noise above which the camera file counts as wrong
+# relative error of the simulated noise above which the camera file counts as wrong
+REPEATED = 0.15
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -130,7 +132,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         sources[KNOWN] = characteristics(
             simulated(with_lens(known, captures[0].lens), found, options.albedo), poses
         )
-    rows, label = beside(found, twin, sources.get(KNOWN)), load_camera(known).title if known else ""
+    rows = beside(found, twin, sources.get(KNOWN))
+    label = load_camera(known).title if known else ""
     noise = ", ".join(
         f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in found.surfaces[:3]
     )
@@ -153,7 +156,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     for recording, capture in zip(recordings, captures, strict=True):
         print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")
         print_notes(recording.notes)
-    page, title = options.out / "characterise.html", f"{options.title}, characterised"
+    page = options.out / "characterise.html"
+    title = f"{options.title}, characterised"
     facts = {"like": options.like, "camera_file": CAMERA_FILE}
     write_page(page, sources, rows, title, answer, label, command, facts, warnings)
     if options.certificate:

@@ -1,8 +1,9 @@
 """``tofpod export_noise CAMERA --out DIR``: writes a camera's noise as a table and a file of code.
 
-The files are for simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc): ``NAME.npz`` with the
-table, and ``depth_noise.py`` (NumPy or torch), a copy of `scenes.sensor.tabled`, which states what is not modelled. The
-full model is measured on planes of many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
+The files are for simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc):
+``NAME.npz`` with the table, and ``depth_noise.py`` (NumPy or torch), a copy of
+`scenes.sensor.tabled`, which states what is not modelled. The full model is measured on planes of
+many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
 
@@ -18,13 +19,16 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
 
-ALBEDO = 0.6  # Albedo of the planes; outside the camera's range, darker or brighter planes stand for other distances
+# Albedo of the planes; outside the camera's range, darker or brighter planes stand for other
+# distances
+ALBEDO = 0.6
 DARKEST = 0.02
-MEASURED, PER_OCTAVE = (
-    2,
-    16,
-)  # Brightnesses measured per octave; table entries per octave, of which the nearest counts
-FRAMES, FRAMES_OF_CORRELATION = 40, 100  # Frames of 3,000 pixels give a deviation to 1 %
+# Brightnesses measured per octave; table entries per octave, of which the nearest counts
+MEASURED = 2
+PER_OCTAVE = 16
+# Frames of 3,000 pixels give a deviation to 1 %
+FRAMES = 40
+FRAMES_OF_CORRELATION = 100
 LONGEST_LAG = 12  # Largest lag in pixels of the correlation of neighbours
 
 
@@ -59,7 +63,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         options.out / "depth_noise.py", Path(str(tabled.__file__)).read_text(encoding="utf-8")
     )
     seen = table["seen"] > 0.5
-    low, high = (1e3 * float(table["sigma_m"][seen][k]) for k in (-1, 0))
+    low = 1000.0 * float(table["sigma_m"][seen][-1])
+    high = 1000.0 * float(table["sigma_m"][seen][0])
     print(f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern of a unit "
           f"{1e3 * float(table['pattern_m']):.3g} mm")  # fmt: skip
     print(f"wrote {options.out / camera.name}.npz, depth_noise.py")
@@ -67,17 +72,18 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
-    """Return the arrays of `scenes.sensor.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are the deviation and the
-    probability of a return over log2 of intensity / range^2, from ``first`` on, with ``per_octave`` entries each. There
-    are filters of the noise and of the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff``
-    (h, w), each pixel's light relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
+    """Return the arrays of `scenes.sensor.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are
+    the deviation and the probability of a return over log2 of intensity / range^2, from ``first``
+    on, with ``per_octave`` entries each. There are filters of the noise and of the pattern, whose
+    deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w), each pixel's light
+    relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
     from scenes.sensor.calibration import with_number
 
-    optics, fine = (
-        camera.optics,
-        with_number(camera, "engine", "output_step_mm", 1e-3),
-    )  # the table rounds by itself
-    nearest_m, farthest_m = max(1.05 * optics.nearest_m, 0.1), 0.95 * min(optics.farthest_m, 15.0)
+    # the table rounds by itself
+    optics = camera.optics
+    fine = with_number(camera, "engine", "output_step_mm", 1e-3)
+    nearest_m = max(1.05 * optics.nearest_m, 0.1)
+    farthest_m = 0.95 * min(optics.farthest_m, 15.0)
     levels = np.arange(
         np.log2(DARKEST / farthest_m**2), np.log2(1.0 / nearest_m**2), 1.0 / MEASURED
     )
@@ -134,7 +140,8 @@ def _stack_m(
 def _before_plane(
     camera: AnyCamera, level: float, nearest_m: float, farthest_m: float
 ) -> tuple[float, float]:
-    """Return the deviation of a pixel's range (NaN if there are hardly any returns) and the share of returns."""
+    """Return the deviation of a pixel's range (NaN if there are hardly any returns) and the share
+    of returns."""
     range_m = _stack_m(camera, level, nearest_m, farthest_m, FRAMES)
     valid = np.isfinite(range_m)
     often = valid.sum(axis=0) > FRAMES // 4
@@ -155,11 +162,10 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
     from scenes.sensor.source import SimulatedUnit
 
     lens = camera.nominal_lens
-    row, column = int(lens.cy), int(lens.cx)
-    half_h, half_w = (
-        min(80, row - 8, lens.height - row - 8),
-        min(100, column - 8, lens.width - column - 8),
-    )
+    row = int(lens.cy)
+    column = int(lens.cx)
+    half_h = min(80, row - 8, lens.height - row - 8)
+    half_w = min(100, column - 8, lens.width - column - 8)
     view = plane_view(
         camera, Region(row - half_h, row + half_h, column - half_w, column + half_w), 1.0, ALBEDO
     )
@@ -177,7 +183,8 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
 
 
 def _filter(images: np.ndarray, axis: int) -> np.ndarray:
-    """Return the filter taps that give white noise the mean correlation of the images (n, h, w) along an axis."""
+    """Return the filter taps that give white noise the mean correlation of the images (n, h, w)
+    along an axis."""
     from scenes.sensor.unit import taps_of
 
     images = np.moveaxis(np.nan_to_num(images), axis, -1)
@@ -189,7 +196,8 @@ def _filter(images: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _pixels(camera: AnyCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Return each pixel's slopes (h, w, 2) and its light relative to the axis (h, w), 0 for unlit pixels."""
+    """Return each pixel's slopes (h, w, 2) and its light relative to the axis (h, w), 0 for unlit
+    pixels."""
     from scenes.sensor.amcw.facts import AmcwCamera
     from scenes.sensor.amcw.imager import AmcwImager
     from scenes.sensor.camera import CameraConfig

@@ -63,7 +63,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "python -m harness.detect captures/board --flat-field unit.npz",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0 (also if the pattern is not stable), 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if the pattern is not stable), 2 for a user's mistake, 130
+    after Ctrl-C."""
     from detectors.averages.flat_captures import separated
     from detectors.averages.flat_field import save_flat_field
     from harness.inspection.output import mm, print_warnings
@@ -83,11 +84,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     near, far = field.distances_m
     at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
     answer = f"fixed pattern {mm(field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
-    figures, error_m = list(figures_of(found)), field.error_m
+    figures = list(figures_of(found))
+    error_m = field.error_m
     print_warnings(field.warnings)
     print(answer)
     show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
-    data, picture = (options.out.with_suffix(suffix) for suffix in (".json", ".png"))
+    data = options.out.with_suffix(".json")
+    picture = options.out.with_suffix(".png")
     save_flat_field(options.out, field)
     about = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
     about |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
@@ -98,7 +101,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
-    axes, limit = figure.subplots(), SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
+    axes = figure.subplots()
+    limit = SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
     shown = axes.imshow(
         error_m / MM, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
     )
@@ -109,8 +113,9 @@ def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
 
 
 def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], list[str]]:
-    """Return the lens, the captures minus their smooth fits (a single capture as two halves, which show whether the
-    pattern is stable), and warnings about the recordings. Raises UserError for faulty files or different cameras."""
+    """Return the lens, the captures minus their smooth fits (a single capture as two halves, which
+    show whether the pattern is stable), and warnings about the recordings. Raises UserError for
+    faulty files or different cameras."""
     from detectors.averages.average import RECORDED, average
     from detectors.averages.flat_captures import flattened
     from detectors.crop import crop

@@ -1,8 +1,10 @@
-"""Measures a depth camera on static captures: noise, correlation, dropouts, displacement of whole frames, and edges.
+"""Measures a depth camera on static captures: noise, correlation, dropouts, displacement of whole
+frames, and edges.
 
-Flat surfaces are found in each capture. Without them, every pixel with a steady range counts, and angle, fixed pattern
-and edges are not measured. Temporal noise is that of single pixels about their own mean, without each frame's
-displacement. Not measured: errors that all frames and pixels share, and noise slower than the capture."""
+Flat surfaces are found in each capture. Without them, every pixel with a steady range counts, and
+angle, fixed pattern and edges are not measured. Temporal noise is that of single pixels about
+their own mean, without each frame's displacement. Not measured: errors that all frames and pixels
+share, and noise slower than the capture."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -23,32 +25,52 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens
 from scenes.closed_form import Plane
 
-TOLERANCE_M, LEAST_PLANE_PX = 8 * MM, 2000
-"""Distance within which a point is on a plane (a nominal lens bends real walls by 3 mm rms); least pixels of one."""
-EDGE_PX, WIDEST_PX, LEAST_STEP_M = 3, 24, 20 * MM
-"""Width of a plane's rim in pixels, which is left out because the camera's filter mixes other surfaces into it; largest
-distance in pixels between the two surfaces at an edge; and the least step of depth there."""
-LEAST_BIN_PX = 300  # about 12 windows of 5 x 5 pixels, so that the standard deviation of 20 frames is known to 5 %
+TOLERANCE_M = 8 * MM
+LEAST_PLANE_PX = 2000
+"""Distance within which a point is on a plane (a nominal lens bends real walls by 3 mm rms); least
+pixels of one."""
+EDGE_PX = 3
+WIDEST_PX = 24
+LEAST_STEP_M = 20 * MM
+"""Width of a plane's rim in pixels, which is left out because the camera's filter mixes other
+surfaces into it; largest distance in pixels between the two surfaces at an edge; and the least
+step of depth there."""
+# about 12 windows of 5 x 5 pixels, so that the standard deviation of 20 frames is known to 5 %
+LEAST_BIN_PX = 300
 MOST_FRAMES = 300  # most frames of a capture that are held in memory: 440 MB for 640 x 576 pixels
-RANGE_CELLS, LIGHT_CELLS, ANGLE_CELL_DEG = 1.08, 1.25, 10.0
-"""Ratios of the upper to the lower end of cells of range and of brightness, and the width of cells of angle."""
-TELLING_RATIO = 1.25  # least ratio of the largest to the smallest range (or brightness) that determines an exponent
-LAGS, PATTERN_LAGS, CORRELATED_FRAMES = 12, 40, 16
-"""Largest lags in pixels of the correlations of noise and of pattern, and frames for the correlation of noise."""
-JUMP_M, JUMP_SIGMAS = 3 * MM, 6.0
-"""A frame jumps if its displacement exceeds both values, which are ten times the wander of a static Azure Kinect."""
+RANGE_CELLS = 1.08
+LIGHT_CELLS = 1.25
+ANGLE_CELL_DEG = 10.0
+"""Ratios of the upper to the lower end of cells of range and of brightness, and the width of cells
+of angle."""
+# least ratio of the largest to the smallest range (or brightness) that determines an exponent
+TELLING_RATIO = 1.25
+LAGS = 12
+PATTERN_LAGS = 40
+CORRELATED_FRAMES = 16
+"""Largest lags in pixels of the correlations of noise and of pattern, and frames for the
+correlation of noise."""
+JUMP_M = 3 * MM
+JUMP_SIGMAS = 6.0
+"""A frame jumps if its displacement exceeds both values, which are ten times the wander of a
+static Azure Kinect."""
 ASSUMED = np.array([0.0, 2.0, -0.5])
-"""Exponents of range (read noise, disparity) and brightness (shot noise) if the captures do not determine them."""
+"""Exponents of range (read noise, disparity) and brightness (shot noise) if the captures do not
+determine them."""
 UNSURE = 0.5  # largest standard error of an exponent that is reported
-SLOW, WIDE_PX, COARSE = 0.15, 6.5, 0.35
-"""Limits for the correlation of successive frames, the reach of neighbours' correlation, and the ratio of noise to
-rounding step, which show that a recording was averaged, smoothed or rounded before it was stored."""
+SLOW = 0.15
+WIDE_PX = 6.5
+COARSE = 0.35
+"""Limits for the correlation of successive frames, the reach of neighbours' correlation, and the
+ratio of noise to rounding step, which show that a recording was averaged, smoothed or rounded
+before it was stored."""
 
 
 @dataclass(frozen=True)
 class StillCapture:
-    """Frames of a static scene. ``z_m`` (n, h, w) float32 is NaN where invalid; ``slopes`` (h, w, 2); ``amplitude`` (h,
-    w) is a mean, NaN if never above 0, or None; ``step_m`` is that of stored z; ``planes`` have their pixels (h, w)."""
+    """Frames of a static scene. ``z_m`` (n, h, w) float32 is NaN where invalid; ``slopes`` (h, w,
+    2); ``amplitude`` (h, w) is a mean, NaN if never above 0, or None; ``step_m`` is that of stored
+    z; ``planes`` have their pixels (h, w)."""
 
     name: str
     lens: Lens
@@ -61,7 +83,8 @@ class StillCapture:
 
     @cached_property
     def steady(self) -> np.ndarray:
-        """The pixels of the surfaces, without their rims, that have a range in most frames, (h, w) bool."""
+        """The pixels of the surfaces, without their rims, that have a range in most frames, (h, w)
+        bool."""
         often = np.isfinite(self.z_m).mean(axis=0) > 0.5
         return (
             often & np.any([inner(mask) for _, mask in self.planes], axis=0)
@@ -71,13 +94,15 @@ class StillCapture:
 
     @cached_property
     def offsets_m(self) -> np.ndarray:
-        """Displacement (n,) of each whole frame relative to the mean of all frames, in metres of z."""
+        """Displacement (n,) of each whole frame relative to the mean of all frames, in metres of
+        z."""
         middle = np.nanmean(self.z_m[:, self.steady], axis=0, dtype=np.float64)
         return np.array([np.nanmean(z[self.steady] - middle) for z in self.z_m])
 
     @cached_property
     def drift_m(self) -> float:
-        """Change of the frames' displacement over the capture, from its robust slope (Theil and Sen)."""
+        """Change of the frames' displacement over the capture, from its robust slope (Theil and
+        Sen)."""
         return float(stats.theilslopes(self.offsets_m)[0]) * (len(self.z_m) - 1)
 
     @cached_property
@@ -109,7 +134,8 @@ class StillCapture:
 
     @cached_property
     def noise_m(self) -> np.ndarray:
-        """Deviations (n, h, w) float32 from the mean, without frames' displacements and without frames that jump."""
+        """Deviations (n, h, w) float32 from the mean, without frames' displacements and without
+        frames that jump."""
         return np.asarray(self._moved_m - self.mean_m.astype(np.float32))
 
     @cached_property
@@ -135,10 +161,12 @@ class StillCapture:
 
     @cached_property
     def shapes_m(self) -> tuple[np.ndarray, ...]:
-        """Smooth fit of z (h, w) to each flat surface, with its relief and the lens's error, also beyond its pixels."""
+        """Smooth fit of z (h, w) to each flat surface, with its relief and the lens's error, also
+        beyond its pixels."""
         shapes_m = []
         for plane, mask in self.planes:
-            use, flat_m = mask & np.isfinite(self.mean_m), plane.z_along_m(self.slopes)
+            use = mask & np.isfinite(self.mean_m)
+            flat_m = plane.z_along_m(self.slopes)
             fit = fit_surface(
                 self.slopes[use, 0], self.slopes[use, 1], 1 / self.mean_m[use], SMOOTH
             )
@@ -147,7 +175,8 @@ class StillCapture:
         return tuple(shapes_m)
 
     def whole(self, mask: np.ndarray) -> np.ndarray:
-        """Return a surface's pixels without its rim, (h, w) bool, including pixels without a return."""
+        """Return a surface's pixels without its rim, (h, w) bool, including pixels without a
+        return."""
         near = ndimage.binary_closing(np.pad(mask, 8), np.ones((3, 3)), iterations=3)
         return np.asarray(
             inner(np.asarray(ndimage.binary_fill_holes(near))[8:-8, 8:-8]) & self.used
@@ -159,7 +188,8 @@ class StillCapture:
         points = np.concatenate(
             [self.slopes * self.mean_m[..., None], self.mean_m[..., None]], axis=-1
         )
-        reason, frames = (count == 0).astype(np.uint8), int(self.kept.sum())
+        reason = (count == 0).astype(np.uint8)
+        frames = int(self.kept.sum())
         return Cloud(
             points,
             reason,
@@ -173,14 +203,18 @@ class StillCapture:
 
 
 def inner(mask: np.ndarray) -> np.ndarray:
-    """Return a mask (h, w) without a rim of `EDGE_PX`, into which the camera's filter mixes other surfaces."""
+    """Return a mask (h, w) without a rim of `EDGE_PX`, into which the camera's filter mixes other
+    surfaces."""
     return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] > EDGE_PX)
 
 
 def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCapture:
-    """Read at most `MOST_FRAMES` of a recording into memory; only ``used`` (h, w) pixels count. Raises UserError if it
-    has too few frames, no pixel grid, no lens, another size than ``used``, or no variation."""
-    name, lens, slopes = recording.name, recording.lens, recording.slopes
+    """Read at most `MOST_FRAMES` of a recording into memory; only ``used`` (h, w) pixels count.
+    Raises UserError if it has too few frames, no pixel grid, no lens, another size than ``used``,
+    or no variation."""
+    name = recording.name
+    lens = recording.lens
+    slopes = recording.slopes
     if not recording.organised or lens is None or slopes is None:
         what = f"{name}: without a pixel grid and a lens, the camera's noise cannot be measured"
         raise UserError(
@@ -226,8 +260,9 @@ def mean_amplitude(stack: Sequence[np.ndarray | None]) -> np.ndarray | None:
 
 
 class NoiseCell(NamedTuple):
-    """Pixels under similar conditions: means of range, angle, ``amplitude`` (NaN if not recorded) and ``light``
-    (amplitude times range squared, or the cosine of the angle), and temporal noise along the ray before rounding."""
+    """Pixels under similar conditions: means of range, angle, ``amplitude`` (NaN if not recorded)
+    and ``light`` (amplitude times range squared, or the cosine of the angle), and temporal noise
+    along the ray before rounding."""
 
     capture: str
     pixels: int
@@ -242,7 +277,8 @@ def cells_of(capture: StillCapture) -> Iterator[NoiseCell]:
     """Yield the noise of a capture in cells of range, angle and brightness."""
     use = capture.steady & np.isfinite(capture.variance_m2)
     use &= True if capture.amplitude is None else np.isfinite(capture.amplitude)
-    range_m, cosine = (capture.mean_m * capture.stretch)[use], capture.cosine[use]
+    range_m = (capture.mean_m * capture.stretch)[use]
+    cosine = capture.cosine[use]
     angle_deg = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
     amplitude = (
         np.full(range_m.shape, np.nan) if capture.amplitude is None else capture.amplitude[use]
@@ -265,8 +301,9 @@ def cells_of(capture: StillCapture) -> Iterator[NoiseCell]:
 
 
 def before_rounding_m2(variance_m2: float, step_m: float) -> float:
-    """Return the variance s^2 of z before rounding to a step q, given the variance after rounding. Averaged over all
-    phases of the rounding, the latter is s^2 + q^2 / 12 minus the part that rounding fixes (`rounding_left_m2`)."""
+    """Return the variance s^2 of z before rounding to a step q, given the variance after rounding.
+    Averaged over all phases of the rounding, the latter is s^2 + q^2 / 12 minus the part that
+    rounding fixes (`rounding_left_m2`)."""
 
     def after(s2: float) -> float:
         return s2 + step_m**2 / 12 - rounding_left_m2(step_m, s2) - variance_m2
@@ -277,8 +314,9 @@ def before_rounding_m2(variance_m2: float, step_m: float) -> float:
 
 
 class RangeLaw(NamedTuple):
-    """Noise of the recorded surface at normal incidence before rounding: ``sigma_m`` at ``range_m`` (k,); ``exponents``
-    of range and brightness with standard ``errors``, NaN for an assumed exponent; the brightness that counts as 1."""
+    """Noise of the recorded surface at normal incidence before rounding: ``sigma_m`` at
+    ``range_m`` (k,); ``exponents`` of range and brightness with standard ``errors``, NaN for an
+    assumed exponent; the brightness that counts as 1."""
 
     range_m: np.ndarray
     sigma_m: np.ndarray
@@ -290,19 +328,21 @@ class RangeLaw(NamedTuple):
 def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
     """Fit the law to the cells of all captures by weighted least squares on the logarithms."""
     _, pixels, r, angle_deg, _, light, sigma_m = zip(*cells, strict=True)
-    weight, y, log_r = np.array(pixels, float), np.log(sigma_m), np.log(r)
+    weight = np.array(pixels, float)
+    y = np.log(sigma_m)
+    log_r = np.log(r)
     light_at_1m = float(
         np.average(np.log(light) - np.log(np.cos(np.radians(angle_deg))), weights=weight)
     )
     columns = np.stack([np.ones(len(y)), log_r, np.log(light) - light_at_1m], axis=-1)
     varied = np.array([True, *(np.ptp(columns[:, 1:], axis=0) > np.log(TELLING_RATIO))])
-    law, root, signs = ASSUMED.copy(), np.sqrt(weight), np.sign(ASSUMED)
+    law = ASSUMED.copy()
+    root = np.sqrt(weight)
+    signs = np.sign(ASSUMED)
     while True:
         errors = np.full(3, np.nan)
-        design, rest = (
-            columns[:, varied] * root[:, None],
-            (y - columns[:, ~varied] @ law[~varied]) * root,
-        )
+        design = columns[:, varied] * root[:, None]
+        rest = (y - columns[:, ~varied] @ law[~varied]) * root
         law[varied] = np.linalg.lstsq(design, rest, rcond=None)[0]
         spread = float(((rest - design @ law[varied]) ** 2).sum() / max(len(y) - varied.sum(), 1))
         errors[varied] = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)) * spread)
@@ -310,10 +350,12 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
         doubtful[0] = False
         if not doubtful.any():
             break
-        # on a single slanted surface, range and brightness vary together: the less certain exponent is fixed
+        # on a single slanted surface, range and brightness vary together: the less certain
+        # exponent is fixed
         worst = int(np.argmax(np.where(doubtful, errors, -1.0)))
         varied[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
-    facing, number = y - law[2] * columns[:, 2], np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
+    facing = y - law[2] * columns[:, 2]
+    number = np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
     groups = [number == cell for cell in np.unique(number)]
     at, level = (
         np.exp([np.average(v[g], weights=weight[g]) for g in groups]) for v in (log_r, facing)
@@ -322,7 +364,8 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
 
 
 def correlations(capture: StillCapture) -> np.ndarray:
-    """Return the correlation (2, `LAGS` + 1) of the noise before rounding by lag in pixels, along x and y."""
+    """Return the correlation (2, `LAGS` + 1) of the noise before rounding by lag in pixels, along
+    x and y."""
     noise = capture.noise_m[:CORRELATED_FRAMES]
     use = capture.steady & np.isfinite(noise).all(axis=0)
     variance = float((noise[:, use] ** 2).mean()) if use.any() else 1.0
@@ -337,7 +380,8 @@ def correlations(capture: StillCapture) -> np.ndarray:
 
 
 class Dropouts(NamedTuple):
-    """Share of frames without a return, by ascending ``amplitude`` (NaN if not recorded), of ``pixels``; (k,) each."""
+    """Share of frames without a return, by ascending ``amplitude`` (NaN if not recorded), of
+    ``pixels``; (k,) each."""
 
     amplitude: np.ndarray
     share: np.ndarray
@@ -373,9 +417,10 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
 
 @dataclass(frozen=True)
 class SurfaceFigures:
-    """Figures of a flat surface in mm, with manufacturers' names. ``temporal`` is the noise with its interval.
-    ``frame_rms_mm`` is the rms distance of a frame's points from their own plane, ``average_rms_mm`` the average's.
-    Layers of ``form95_mm`` and ``form997_mm`` hold 95 and 99.7 % of points. ``fill_rate`` is the share of returns."""
+    """Figures of a flat surface in mm, with manufacturers' names. ``temporal`` is the noise with
+    its interval. ``frame_rms_mm`` is the rms distance of a frame's points from their own plane,
+    ``average_rms_mm`` the average's. Layers of ``form95_mm`` and ``form997_mm`` hold 95 and 99.7 %
+    of points. ``fill_rate`` is the share of returns."""
 
     capture: str
     number: int
@@ -401,11 +446,10 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         if len(pixels) < LEAST_BIN_PX:
             continue
         few = pixels[:: max(1, len(pixels) // 20_000)]  # a sample gives the same to within 1 %
-        z_m, noise = (
-            stack.reshape(-1, mask.size)[:, few]
-            for stack in (capture.z_m[capture.kept], capture.noise_m)
-        )
-        mean_m, slopes = capture.mean_m.ravel()[few], capture.slopes.reshape(-1, 2)[few]
+        z_m = capture.z_m[capture.kept].reshape(-1, mask.size)[:, few]
+        noise = capture.noise_m.reshape(-1, mask.size)[:, few]
+        mean_m = capture.mean_m.ravel()[few]
+        slopes = capture.slopes.reshape(-1, 2)[few]
         temporal = statistics.jackknifed(
             noise[:, None], lambda part: statistics.temporal_sigma_m(part) / MM
         )
@@ -422,7 +466,8 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
 
 
 def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
-    """Return the rms in mm of points about their own plane, and the widths of the layers with 95 and 99.7 % of them."""
+    """Return the rms in mm of points about their own plane, and the widths of the layers with 95
+    and 99.7 % of them."""
     z_m, slopes = z_m[np.isfinite(z_m)].astype(float), slopes[np.isfinite(z_m)]
     plane = statistics.fit_plane(z_m, slopes)
     points = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * z_m[:, None]
@@ -432,8 +477,9 @@ def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
 
 
 class EdgeFigures(NamedTuple):
-    """Pixels across an edge between two surfaces, as means over ``lines`` of pixels and all frames: ``gap_px`` without
-    a return, ``flying_px`` with a range on neither surface; and the median step."""
+    """Pixels across an edge between two surfaces, as means over ``lines`` of pixels and all
+    frames: ``gap_px`` without a return, ``flying_px`` with a range on neither surface; and the
+    median step."""
 
     lines: int
     gap_px: float
@@ -442,7 +488,8 @@ class EdgeFigures(NamedTuple):
 
 
 def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
-    """Return the figures of all edges between surfaces in all captures; None if there are no edges."""
+    """Return the figures of all edges between surfaces in all captures; None if there are no
+    edges."""
     lines = defaultdict[tuple[str, frozenset[int]], tuple[list[Any], list[Any]]](lambda: ([], []))
     for capture in captures:
         labels = np.zeros(capture.stretch.shape, int)
@@ -481,8 +528,8 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
 
 @dataclass(frozen=True)
 class Characteristics:
-    """The results of all captures of a camera. ``correlation`` (2, lags) is that of the noise along x and y;
-    ``pattern_correlation`` is that of the fixed pattern, None if it is unknown."""
+    """The results of all captures of a camera. ``correlation`` (2, lags) is that of the noise
+    along x and y; ``pattern_correlation`` is that of the fixed pattern, None if it is unknown."""
 
     captures: tuple[StillCapture, ...]
     cells: tuple[NoiseCell, ...]
@@ -521,13 +568,16 @@ class Characteristics:
     @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Sentences on what these captures cannot show, or show incorrectly."""
-        notes, law, first = [], self.law, self.captures[0]
+        notes = []
+        law = self.law
+        first = self.captures[0]
         if not self.surfaces:
             notes.append(
                 "no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown"
             )
         if np.isnan(law.errors[0]):
-            near, far = law.range_m.min(), law.range_m.max()
+            near = law.range_m.min()
+            far = law.range_m.max()
             notes.append(f"surfaces between {near:.2f} and {far:.2f} m do not show how the noise grows with range: the"
                         f" power {law.exponents[0]:g} is assumed")  # fmt: skip
         if not self.has_amplitude:
@@ -537,10 +587,8 @@ class Characteristics:
         if np.isnan(law.errors[1]):
             notes.append("brightness hardly varies, or only together with range: its effect on noise is unknown,"
                         f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
-        noise, sigma_m = (
-            first.noise_m[:, first.steady],
-            float(np.sqrt(np.nanmedian(first.variance_m2[first.steady]))),
-        )
+        noise = first.noise_m[:, first.steady]
+        sigma_m = float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
         alike = float(np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)) + 1 / len(noise)
         if alike > SLOW:
             notes.append(f"the noise of successive frames is correlated ({alike:.2f}): they were averaged over time"
@@ -565,8 +613,9 @@ class Characteristics:
 def characteristics(
     captures: Sequence[StillCapture], poses: Sequence[np.ndarray | None] | None = None
 ) -> Characteristics:
-    """Measure captures of a camera in order of time. ``poses`` (4 x 4, each camera in the first camera's frame)
-    separate shape from fixed pattern. Raises UserError for different cameras, and if too few pixels are steady."""
+    """Measure captures of a camera in order of time. ``poses`` (4 x 4, each camera in the first
+    camera's frame) separate shape from fixed pattern. Raises UserError for different cameras, and
+    if too few pixels are steady."""
     first = captures[0]
     if differing := next((capture for capture in captures if capture.lens != first.lens), None):
         raise UserError(
@@ -577,10 +626,8 @@ def characteristics(
     if not cells:
         what = f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, angle and brightness"
         raise UserError(what, legal="a static scene", fix="record a matte wall that fills the view")
-    correlation, flat = (
-        correlations(max(captures, key=lambda capture: int(capture.steady.sum()))),
-        [],
-    )
+    correlation = correlations(max(captures, key=lambda capture: int(capture.steady.sum())))
+    flat = []
     for capture, pose in zip(captures, poses or [None] * len(captures), strict=True):
         use = inner(capture.planes[0][1]) & capture.steady if capture.planes else np.zeros(1, bool)
         if use.sum() >= LEAST_BIN_PX:
@@ -597,8 +644,10 @@ def characteristics(
 
 
 def _pattern_correlation(pattern: Separated, of_noise: np.ndarray) -> np.ndarray:
-    """Return the correlation (2, lags) of the fixed pattern along x and y, without the map's noise, faded to 0."""
-    error_m, known = pattern.field.error_m, np.isfinite(pattern.field.error_m)
+    """Return the correlation (2, lags) of the fixed pattern along x and y, without the map's
+    noise, faded to 0."""
+    error_m = pattern.field.error_m
+    known = np.isfinite(pattern.field.error_m)
     lags = range(PATTERN_LAGS + 1)
     pairs = [
         [statistics.covariance(error_m[None], known, *lag)[0] for lag in ((k, 0), (0, k))]

@@ -1,4 +1,5 @@
-"""The page of the user's camera, which compares measured figures with those simulated from its camera file."""
+"""The page of the user's camera, which compares measured figures with those simulated from its
+camera file."""
 
 from __future__ import annotations
 
@@ -31,21 +32,23 @@ from harness.vocabulary.text import show
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MEASURED, SIMULATED, KNOWN = "measured", "simulated", "known camera"
+MEASURED = "measured"
+SIMULATED = "simulated"
+KNOWN = "known camera"
 LOOKS = {MEASURED: (BLUE, "o"), SIMULATED: (ORANGE, "x"), KNOWN: (GREY, "+")}
-RANGE, ANGLE, AMPLITUDE = (
-    f"noise, mm against {x}" for x in ("range, m", "angle, deg", "amplitude")
-)
-NEIGHBOURS, PATTERN = (
-    f"correlation of {quantity} against pixels apart" for quantity in ("noise", "fixed pattern")
-)
-SPECTRUM, OF_PATTERN = (
-    f"spectrum of {quantity} against cycles per pixel" for quantity in ("noise", "fixed pattern")
-)
-FRAMES, DROPPED = "displacement, mm against frame", "share without return against amplitude"
+RANGE = f"noise, mm against {'range, m'}"
+ANGLE = f"noise, mm against {'angle, deg'}"
+AMPLITUDE = f"noise, mm against {'amplitude'}"
+NEIGHBOURS = f"correlation of {'noise'} against pixels apart"
+PATTERN = f"correlation of {'fixed pattern'} against pixels apart"
+SPECTRUM = f"spectrum of {'noise'} against cycles per pixel"
+OF_PATTERN = f"spectrum of {'fixed pattern'} against cycles per pixel"
+FRAMES = "displacement, mm against frame"
+DROPPED = "share without return against amplitude"
 SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRAMES, DROPPED)
 FREQUENCIES = np.linspace(0, 0.5, 41)
-SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
+SHOWN_LAGS = (1, 2, 3, 5)
+SHOWN_PATTERN_LAGS = (1, 3, 5, 10)
 CAPTION = (
     "The surfaces that were found; temporal noise against range, angle and amplitude (a dot stands for pixels with "
     "similar values of all three); correlation of noise and of fixed pattern along x and y, and their spectra (1 for "
@@ -55,7 +58,8 @@ FigureRow = tuple[str, str, str, float, str]  # name, place, unit, value and mea
 
 
 def own_figures(found: Characteristics) -> Iterator[FigureRow]:
-    """Yield the figures of each surface and of the camera; all sources give the same figures in the same order."""
+    """Yield the figures of each surface and of the camera; all sources give the same figures in
+    the same order."""
     for face in found.surfaces:
         relief = "includes the surface's own shape and the lens's error"
         yield (
@@ -179,7 +183,8 @@ def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
 def beside(
     found: Characteristics, twin: Characteristics, known: Characteristics | None
 ) -> list[OwnFigure]:
-    """Return each figure of the captures with those of the simulations; surfaces are matched by their numbers."""
+    """Return each figure of the captures with those of the simulations; surfaces are matched by
+    their numbers."""
     every = (found, twin, known)
     places = [
         {face.where: (face.capture, face.number) for face in each.surfaces} if each else {}
@@ -211,9 +216,11 @@ def write_page(
     facts: Mapping[str, Any],
     warnings: Sequence[str],
 ) -> None:
-    """Print the figures; write a page, its tables and provenance.json with further ``facts``. ``sources`` are measured,
-    simulated, and perhaps those of the ``known`` camera. Raises UserError if they cannot be written."""
-    found, folder = sources[MEASURED], path.parent
+    """Print the figures; write a page, its tables and provenance.json with further ``facts``.
+    ``sources`` are measured, simulated, and perhaps those of the ``known`` camera. Raises
+    UserError if they cannot be written."""
+    found = sources[MEASURED]
+    folder = path.parent
     heads = {"known camera": known, "its ratio": known and "its ratio"}
     show([OWN_FIGURES.grid(rows, terminal=True, heads=heads)])
     print(answer)
@@ -275,8 +282,8 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
 
 
 def density_of(correlation: np.ndarray) -> np.ndarray:
-    """Return the spectral density at `FREQUENCIES` along an axis, relative to white noise of the same variance, from
-    the correlation (lags,) with Parzen's window (Blackman and Tukey)."""
+    """Return the spectral density at `FREQUENCIES` along an axis, relative to white noise of the
+    same variance, from the correlation (lags,) with Parzen's window (Blackman and Tukey)."""
     from scipy.signal.windows import parzen  # whose package takes a third of a second to load
 
     faded = correlation * parzen(2 * len(correlation) - 1)[len(correlation) - 1 :]
@@ -286,7 +293,8 @@ def density_of(correlation: np.ndarray) -> np.ndarray:
 
 
 def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) -> None:
-    axes, first = canvas.subplots(5, 2).ravel(), found.captures[0]
+    axes = canvas.subplots(5, 2).ravel()
+    first = found.captures[0]
     labels = np.full(first.stretch.shape, np.nan)
     for number, (_, mask) in enumerate(first.planes):
         labels[mask] = number

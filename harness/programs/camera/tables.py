@@ -1,4 +1,5 @@
-"""Tables of a user's camera: its flat field, figures of its captures and of simulations, diagrams, its certificate."""
+"""Tables of a user's camera: its flat field, figures of its captures and of simulations, diagrams,
+its certificate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
 
 @dataclass(frozen=True)
 class OwnFigure:
-    """A figure as measured, as simulated from the camera file, and for the nearest known camera (or NaN)."""
+    """A figure as measured, as simulated from the camera file, and for the nearest known camera
+    (or NaN)."""
 
     figure: str
     where: str
@@ -27,12 +29,14 @@ class OwnFigure:
 
     @property
     def ratio(self) -> float:
-        """The simulated value divided by the measured value; NaN if the measured value is close to 0."""
+        """The simulated value divided by the measured value; NaN if the measured value is close to
+        0."""
         return self._by_measured(self.simulated)
 
     @property
     def known_ratio(self) -> float:
-        """The known camera's value divided by the measured value; NaN if the measured value is close to 0."""
+        """The known camera's value divided by the measured value; NaN if the measured value is
+        close to 0."""
         return self._by_measured(self.known)
 
     def _by_measured(self, value: float) -> float:

@@ -1,7 +1,9 @@
-"""Runs jobs on a cluster with dask.distributed. Each dask worker is a node, which runs the local engine.
+"""Runs jobs on a cluster with dask.distributed. Each dask worker is a node, which runs the local
+engine.
 
-The driver sends each node bundles of jobs through the scheduler, two at a time; dask neither queues nor retries them.
-If a node dies, its jobs go to other nodes; a job that was running on `TRIES` nodes as they died has crashed."""
+The driver sends each node bundles of jobs through the scheduler, two at a time; dask neither
+queues nor retries them. If a node dies, its jobs go to other nodes; a job that was running on
+`TRIES` nodes as they died has crashed."""
 
 from __future__ import annotations
 
@@ -41,14 +43,16 @@ WAIT_FOR_NODES_S = (
 TRIES = 5
 ANSWERS_S = 5  # time for a scheduler to answer a connection, which takes milliseconds
 EXAMINED_S = (
-    60.0  # time for a node to describe itself: it reads the sources, possibly from a network's disk
+    # time for a node to describe itself: it reads the sources, possibly from a network's disk
+    60.0
 )
 CLOSES_S = 1.0
 KINDS = {
     name.lower(): f"{name}Cluster"
     for name in ["SLURM", "PBS", "LSF", "SGE", "HTCondor", "OAR", "Moab", "Local"]
 }
-"""Classes of dask-jobqueue, each in a module named after its kind; "local" starts jobs on this machine."""
+"""Classes of dask-jobqueue, each in a module named after its kind; "local" starts jobs on this
+machine."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,8 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """Facts about a node. ``digests``: of its installed code, by stage. ``sees``: content of the probe file there."""
+    """Facts about a node. ``digests``: of its installed code, by stage. ``sees``: content of the
+    probe file there."""
 
     python: str
     digests: Mapping[Stage, str]
@@ -72,7 +77,8 @@ class NodeFacts:
 
 @dataclass
 class _Node:
-    """A node that takes jobs. ``bundles``: those that it works on, by number; ``renders``: the number of renders."""
+    """A node that takes jobs. ``bundles``: those that it works on, by number; ``renders``: the
+    number of renders."""
 
     address: str
     facts: NodeFacts
@@ -82,9 +88,10 @@ class _Node:
 
 
 class ClusterEngine:
-    """Runs jobs on the workers of ``scheduler``: tcp://host:8786, or jobqueue:slurm and the like, which starts
-    ``workers_wanted``. ``limits``: of a trial; renders have its time limit only. ``code``: as in `LocalEngine`.
-    ``folder``: where jobs read and store renders; nodes that do not see it are not used."""
+    """Runs jobs on the workers of ``scheduler``: tcp://host:8786, or jobqueue:slurm and the like,
+    which starts ``workers_wanted``. ``limits``: of a trial; renders have its time limit only.
+    ``code``: as in `LocalEngine`. ``folder``: where jobs read and store renders; nodes that do not
+    see it are not used."""
 
     def __init__(
         self,
@@ -94,7 +101,9 @@ class ClusterEngine:
         code: Mapping[Stage, Code],
         folder: Path,
     ) -> None:
-        self._scheduler, self._limits, self._wanted = scheduler, limits, workers_wanted
+        self._scheduler = scheduler
+        self._limits = limits
+        self._wanted = workers_wanted
         self._code = dict(code)
         self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
         self._client: Any = None
@@ -107,7 +116,8 @@ class ClusterEngine:
         self._done: list[tuple[Job, Ended]] = []
         self._out: Counter[Stage] = Counter()
         self._tries: Counter[str] = Counter()
-        # (node's address, bundle's number, answer); without a number, the answer describes the node
+        # (node's address, bundle's number, answer); without a number, the answer describes the
+        # node
         self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
         self._number = 0
         self._mean_s = (
@@ -119,7 +129,8 @@ class ClusterEngine:
             time.monotonic(),
         )  # lacking for the waiting jobs, and since when
         self._nonce = secrets.token_hex(16)  # identifies this driver to the nodes
-        # a file that shows whether a node sees the folder; the cache of renders treats it as a leftover
+        # a file that shows whether a node sees the folder; the cache of renders treats it as a
+        # leftover
         self._probe = folder.absolute() / f".{self._nonce[:16]}.seen.part.npz"
         self._printed: set[str] = set()
         self._stack = contextlib.ExitStack()
@@ -166,13 +177,15 @@ class ClusterEngine:
         self._waiting[job.stage].append(job)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError if the scheduler, or every node that could run them, is gone."""
+        """Wait for jobs to end. Raises UserError if the scheduler, or every node that could run
+        them, is gone."""
         while not self._done:
             self._hand_out()
             if not self._done:
                 self._step()
         self._hand_out()
-        done, self._done = self._done, []
+        done = self._done
+        self._done = []
         return done
 
     def _bundle_size(self) -> int:
@@ -180,14 +193,16 @@ class ClusterEngine:
 
     def _hand_out(self) -> None:
         """Send each node a bundle of trials, then a second one, and renders where it may render."""
-        renders, trials = self._waiting["renders"], self._waiting["trials"]
+        renders = self._waiting["renders"]
+        trials = self._waiting["trials"]
         some_offer = any(
             node.facts.offers_render and node.can_render for node in self._nodes.values()
         )
         for most, to in product(range(WITH_NODE), list(self._nodes.values())):
-            processes, offers = to.facts.processes, to.facts.offers_render
-            # A node with one process does one thing at a time: trials first, because renders only make more of them;
-            # but nodes that are set aside for renders do these first.
+            processes = to.facts.processes
+            offers = to.facts.offers_render
+            # A node with one process does one thing at a time: trials first, because renders only
+            # make more of them; but nodes that are set aside for renders do these first.
             may_render = to.can_render and (offers or not some_offer)
             may_render &= processes > 1 or not (to.bundles or (trials and not offers))
             if renders and may_render and to.renders < min(MOST_RENDERERS, processes):
@@ -241,7 +256,8 @@ class ClusterEngine:
                 self._heed(*self._events.get_nowait())
 
     def _look_for_nodes(self) -> None:
-        """Ask new nodes to describe themselves, give up those that are gone. Raises UserError without a scheduler."""
+        """Ask new nodes to describe themselves, give up those that are gone. Raises UserError
+        without a scheduler."""
         present = None
         if self._client.status == "running":
             with contextlib.suppress(OSError):
@@ -299,7 +315,8 @@ class ClusterEngine:
                 UserError(f"{where} cannot run tofpod: {type(answer).__name__}: {answer}", fix=fix),
             )
         elif isinstance(answer, BaseException):
-            # it died in the meantime, or the network failed; this says nothing about its installation
+            # it died in the meantime, or the network failed; this says nothing about its
+            # installation
             self._print_once(
                 f"{where} did not state its version ({type(answer).__name__}: {answer}); it is not used"
             )
@@ -336,7 +353,8 @@ class ClusterEngine:
             self._lost(bundle.jobs, why, address)
 
     def _lost(self, jobs: tuple[Job, ...], why: str, address: str) -> None:
-        """Queue the jobs of a node that died again; a job that was at `TRIES` such nodes counts as the cause."""
+        """Queue the jobs of a node that died again; a job that was at `TRIES` such nodes counts as
+        the cause."""
         self._tries.update(job.name for job in jobs)
         hopeless = [job for job in jobs if self._tries[job.name] >= TRIES]
         self._waiting[jobs[0].stage].extendleft(
@@ -351,12 +369,15 @@ class ClusterEngine:
         self._done.append((job, ended))
 
     def _look_for_lack(self) -> None:
-        """Raise UserError if no node can run the waiting jobs for long; a batch system's queue may take any time."""
-        lacking, fix = "", ""
+        """Raise UserError if no node can run the waiting jobs for long; a batch system's queue may
+        take any time."""
+        lacking = ""
+        fix = ""
         if not self._nodes and self._refused and self._asked <= self._refused.keys():
             raise next(iter(self._refused.values()))
         if not self._nodes:
-            lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads PROCESSES`"
+            lacking = "worker"
+            fix = "start some with `dask worker ADDRESS --nthreads PROCESSES`"
         elif self._waiting["renders"] and not any(node.can_render for node in self._nodes.values()):
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
             fix = "install tofpod on the workers just as here"
@@ -384,7 +405,8 @@ class ClusterEngine:
 
 @contextlib.contextmanager
 def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
-    """Connect to a scheduler by its address, or start the user's own dask-jobqueue cluster. Yields dask's client."""
+    """Connect to a scheduler by its address, or start the user's own dask-jobqueue cluster. Yields
+    dask's client."""
     is_address = re.fullmatch(r"(tcp|tls)://.+:\d+", scheduler) is not None
     kind = scheduler.removeprefix("jobqueue:")
     if not is_address and (kind == scheduler or kind not in KINDS):
@@ -444,14 +466,16 @@ def _bare(address: str) -> str:
     return address.rpartition("://")[2]
 
 
-# ---------------------------------------------------------------- in a dask worker, which never computes itself
+# ---------------------------------------------------------------- in a dask worker, which never
+# computes itself
 
 _engines: dict[str, LocalEngine] = {}  # by the code that they run: normally one
 _awaited: dict[str, set[Answers]] = {}  # the queues that each driver waits for
 
 
 def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFacts:
-    """Describe this node. Each process computes digests once: files that change later are not what it runs."""
+    """Describe this node. Each process computes digests once: files that change later are not what
+    it runs."""
     digests: dict[Stage, str] = {}
     for stage, which in code.items():
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -474,7 +498,8 @@ def drop(driver: str) -> None:
 async def carry_out(
     bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any
 ) -> tuple[Ended, ...]:
-    """Run the jobs of a bundle; return their ends. Raises UserError for other code, or if processes cannot start."""
+    """Run the jobs of a bundle; return their ends. Raises UserError for other code, or if
+    processes cannot start."""
     key = repr(sorted(code.items()))
     if key not in _engines:
         _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code)

@@ -31,8 +31,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0, 1 if two journals give different results for a trial, 2 for a user's mistake."""
-    folders, into = options.folders, options.into
+    """Run the program. Returns 0, 1 if two journals give different results for a trial, 2 for a
+    user's mistake."""
+    folders = options.folders
+    into = options.into
     _refuse_others(folders, into)
     declared = next(
         (path for folder in folders if (path := folder / "experiment.yaml").is_file()), None
@@ -44,11 +46,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     # writing an existing file again shows whether the folder is writable before anything is copied
     write_bytes(into / "experiment.yaml", bounded_bytes(declared, TEXT_BYTES))
     counts: Counter[str] = Counter()
-    different, damaged = [], []
+    different = []
+    damaged = []
     with locked(into):
         goal = Journal(into / "journal")
         for folder in folders:
-            before, source = counts["copied"], Journal(folder / "journal")
+            before = counts["copied"]
+            source = Journal(folder / "journal")
             different += merge_into(goal, source, counts)
             damaged += source.damaged
             print(f"{folder}: {counts['copied'] - before} trials copied")
@@ -74,8 +78,9 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy trials that ``into`` lacks or has not finished; count copied, known and alike trials (equal but for the last
-    digits). Return the keys of trials that differ. Raises UserError if a newer tofpod wrote either journal."""
+    """Copy trials that ``into`` lacks or has not finished; count copied, known and alike trials
+    (equal but for the last digits). Return the keys of trials that differ. Raises UserError if a
+    newer tofpod wrote either journal."""
     different = []
     for key, entry in other.entries():
         known = into.read(key)
@@ -85,7 +90,8 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
             continue
         counts["known"] += not key.startswith(THRESHOLDS)
         if known.state == entry.state == "done" and known.value != entry.value:
-            first, second = _without_seconds(known.record), _without_seconds(entry.record)
+            first = _without_seconds(known.record)
+            second = _without_seconds(entry.record)
             if not _alike(first, second):
                 different.append(key)
             elif first != second:
@@ -95,7 +101,8 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
 
 
 def _without_seconds(value: object) -> object:
-    """Return a record without timings and learned arrays, whose last digits differ, so that results can be compared."""
+    """Return a record without timings and learned arrays, whose last digits differ, so that
+    results can be compared."""
     if isinstance(value, dict):
         kept = {
             name: part
@@ -107,7 +114,8 @@ def _without_seconds(value: object) -> object:
 
 
 def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
-    """Return whether values agree within what processors differ: a thousandth, or 1 um; counts must be equal."""
+    """Return whether values agree within what processors differ: a thousandth, or 1 um; counts
+    must be equal."""
     if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
         return all(
             _alike(first[name], second[name], in_tenth_um=name == "error_tenth_um")
@@ -125,7 +133,8 @@ def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
 
 
 def _refuse_others(folders: list[Path], into: Path) -> None:
-    """Raise UserError unless all journals belong to the same experiment, whose digest is the folder's name."""
+    """Raise UserError unless all journals belong to the same experiment, whose digest is the
+    folder's name."""
     for folder in folders:
         if not (folder / "journal").is_dir():
             fix = "name folders that tofpod ls results lists"

@@ -1,4 +1,5 @@
-"""``tofpod coverage EXPERIMENT``: where on a part damage is missed, and which poses cover most of it."""
+"""``tofpod coverage EXPERIMENT``: where on a part damage is missed, and which poses cover most of
+it."""
 
 from __future__ import annotations
 
@@ -17,15 +18,13 @@ from harness.vocabulary.program import program, whole_number
 if TYPE_CHECKING:
     from harness.programs.coverage.jobs import Pose, Survey
 
-TILTS_DEG, GOAL_TILTS_DEG = (
-    (-40.0, -20.0, 0.0, 20.0, 40.0),
-    (-30.0, 0.0, 30.0),
-)  # candidates for --suggest and --goal
+# candidates for --suggest and --goal
+TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0)
+GOAL_TILTS_DEG = (-30.0, 0.0, 30.0)
 GOAL_DISTANCES = (0.7, 1.0, 1.4)  # Distances for --goal, as multiples of the experiment's distance
-MOST_POSES, MOVE_S = (
-    6,
-    10.0,
-)  # Most poses to reach a goal, and seconds to move the camera between two poses
+# Most poses to reach a goal, and seconds to move the camera between two poses
+MOST_POSES = 6
+MOVE_S = 10.0
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -124,17 +123,16 @@ def main(options: argparse.Namespace, command: str) -> int:
     for point in experiment.points:
         refuse_size(point.config, size_mm)
     given, further = _poses(options, declared(experiment.config)[1].distance_m)
-    folder, cache = (
-        options.out or options.results / "coverage" / name,
-        options.results / ".cache" / "renders",
-    )
+    folder = options.out or options.results / "coverage" / name
+    cache = options.results / ".cache" / "renders"
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
     engine = engine_of(
         EngineOptions(jobs=options.jobs, serial=options.serial), {experiment.config.detector.name}
     )
     with in_use(cache), locked(folder), engine:
         surveys = survey(experiment, [*given, *further], cache, folder, engine)
-    chosen, goals = surveys[0], []
+    chosen = surveys[0]
+    goals = []
     if options.goal:
         ways = (
             way
@@ -144,7 +142,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         order = {True: "capture_s", False: "missing_share"}
         goals = sorted(ways, key=lambda way: (not way["reached"], way[order[way["reached"]]]))
         chosen = goals[0]["survey"]
-    wanted, found = size_mm or chosen.found.sizes_mm[1], chosen.found
+    wanted = size_mm or chosen.found.sizes_mm[1]
+    found = chosen.found
     poses = (
         goals[0]["rows"]
         if goals
@@ -154,8 +153,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(
             f"{name}: no pose finds damage of {wanted:.3g} mm anywhere", fix="ask for a larger size"
         )
-    each_mm, patches = np.stack([row["limits_mm"] for row in poses]), chosen.patches
-    best, limits_mm = np.nan_to_num(each_mm, nan=np.inf).argmin(axis=0), np.fmin.reduce(each_mm)
+    each_mm = np.stack([row["limits_mm"] for row in poses])
+    patches = chosen.patches
+    best = np.nan_to_num(each_mm, nan=np.inf).argmin(axis=0)
+    limits_mm = np.fmin.reduce(each_mm)
     seen = [chosen.seen[row["pose"]] for row in poses]
     facts = np.stack([[each.deviation_m, each.cosine, each.range_m] for each in seen])
     columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm, best + 1]
@@ -167,10 +168,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
     write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
-    warnings, sentence = (
-        warnings_of(found, chosen.seen),
-        answer(found, patches, limits_mm, wanted, len(poses)),
-    )
+    warnings = warnings_of(found, chosen.seen)
+    sentence = answer(found, patches, limits_mm, wanted, len(poses))
     if (added := len(poses) - len(given)) < options.suggest:
         few = f"{added} of {many(options.suggest, 'pose')} suggested: no other pose increases the coverage"
         warnings.insert(0, few)
@@ -182,7 +181,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         sentence = (
             f"{lead}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {sentence}"
         )
-    config, scene = chosen.point.config, scene_of(patches, limits_mm, found)
+    config = chosen.point.config
+    scene = scene_of(patches, limits_mm, found)
     camera = config.simulated.camera
     detector = f"the detector {config.detector.name} at a threshold of {chosen.task.threshold:.3g}"
     unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
@@ -198,7 +198,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 def _poses(options: argparse.Namespace, own_m: float) -> tuple[list[Pose], list[Pose]]:
     """Return the given poses, and the further poses to choose from."""
     if options.goal:
-        distances, tilts = [round(own_m * part, 4) for part in GOAL_DISTANCES], GOAL_TILTS_DEG
+        distances = [round(own_m * part, 4) for part in GOAL_DISTANCES]
+        tilts = GOAL_TILTS_DEG
         return [], list(product(distances, tilts, tilts))
     given = list(dict.fromkeys(options.pose or [(own_m, 0.0, 0.0)]))
     grid = [
@@ -215,10 +216,8 @@ def _rows(
     """Return a row for each given pose and for each pose that is added, in order."""
     from harness.programs.coverage.statistics import in_turn
 
-    limits_mm, rows = (
-        [seen.found.limits_mm(seen.seen[pose]) for pose in poses],
-        list[dict[str, Any]](),
-    )
+    limits_mm = [seen.found.limits_mm(seen.seen[pose]) for pose in poses]
+    rows = list[dict[str, Any]]()
     for which, gain, total in in_turn(
         seen.patches, [each <= size_mm for each in limits_mm], given, further
     ):
@@ -230,11 +229,14 @@ def _rows(
 
 
 def _ways(seen: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
-    """Return, for each distance, few poses of a set-up that reach the share, chosen greedily, or `MOST_POSES` poses."""
+    """Return, for each distance, few poses of a set-up that reach the share, chosen greedily, or
+    `MOST_POSES` poses."""
     from scenes.sensor.camera import camera_of
 
-    ways, config = [], seen.point.config
-    camera, frames = camera_of(config.simulated.camera), config.capture.frames
+    ways = []
+    config = seen.point.config
+    camera = camera_of(config.simulated.camera)
+    frames = config.capture.frames
     for distance_m in dict.fromkeys(pose[0] for pose in seen.seen):
         rows = _rows(
             seen, [pose for pose in seen.seen if pose[0] == distance_m], size_mm, 0, MOST_POSES

@@ -1,9 +1,11 @@
-"""A part in front of a camera, patch by patch: its noise, the signal of damage there, and how often damage is found.
+"""A part in front of a camera, patch by patch: its noise, the signal of damage there, and how
+often damage is found.
 
-The noise at a place is the detector's unit of score there, in metres: constant if the detector has one scale for the
-whole part, else measured nearby. The signal of damage and its scatter are learned from the detector's own scores on
-boards of the family, in random poses as wide as those requested. Not modelled: the direction of the undamaged part's
-error at a place (the unit's pattern, the surface's misfit), light of other parts, sizes in missing returns."""
+The noise at a place is the detector's unit of score there, in metres: constant if the detector has
+one scale for the whole part, else measured nearby. The signal of damage and its scatter are
+learned from the detector's own scores on boards of the family, in random poses as wide as those
+requested. Not modelled: the direction of the undamaged part's error at a place (the unit's
+pattern, the surface's misfit), light of other parts, sizes in missing returns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,18 +31,21 @@ from scenes.target.custom import BoardConfig, PoseConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import Damage, face_of
 
-BOARDS, LOOKS = 40, 3  # damaged boards to learn from, and averages in which each is inspected
+# damaged boards to learn from, and averages in which each is inspected
+BOARDS = 40
+LOOKS = 3
 STEEPEST_DEG = 60.0  # largest tilt of these boards about either axis
-DRAWS, AROUND_PX, NEAR_PX = (
-    2,
-    31,
-    15,
-)  # averages for noise; sides of squares for the unit of score, for missing pixels
+# averages for noise; sides of squares for the unit of score, for missing pixels
+DRAWS = 2
+AROUND_PX = 31
+NEAR_PX = 15
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # sizes that differ by less are equal; if all are, the size of damage is its depth
 ON_FACE_M = (
     5 * MM
-)  # a patch is visible if its z and the view's differ by less, or by less than two pixels on the slope
+    # a patch is visible if its z and the view's differ by less, or by less than two pixels on the
+    # slope
+)
 
 Pose = tuple[
     float, float, float
@@ -49,7 +54,8 @@ Pose = tuple[
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A set-up in front of a part. ``task``: has the threshold. ``found``: the signal's law. ``seen``: by pose."""
+    """A set-up in front of a part. ``task``: has the threshold. ``found``: the signal's law.
+    ``seen``: by pose."""
 
     point: Point
     task: PointTask
@@ -61,12 +67,13 @@ class Survey:
 def survey(
     experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine
 ) -> list[Survey]:
-    """Return a survey for each set-up. Views and trials in ``cache`` and ``folder`` are not made again. Raises
-    UserError if a point has no threshold, and as `declared` and `findable` do."""
+    """Return a survey for each set-up. Views and trials in ``cache`` and ``folder`` are not made
+    again. Raises UserError if a point has no threshold, and as `declared` and `findable` do."""
     plan = SweepPlan(
         tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups)
     )
-    journal, scores = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[float]]()
+    journal = Journal(folder / "journal")
+    scores = dict[tuple[str, int, int, str], list[float]]()
     with progress_display() as report:
         outcome = run_plan(plan, journal, engine, report)
     for entry in map(journal.read, outcome.finished):
@@ -78,7 +85,8 @@ def survey(
     for group in plan.groups:
         source, family = declared(group.points[0].config)
         patches = patches_of(family.board)
-        target, wholes = family.drawn("hole_free", 0), [_bare(batch) for batch in group.then]
+        target = family.drawn("hole_free", 0)
+        wholes = [_bare(batch) for batch in group.then]
         configs = [
             PoseConfig(distance_m=distance_m, tilt_x_deg=x, tilt_y_deg=y)
             for distance_m, x, y in poses
@@ -131,7 +139,8 @@ def patches_of(board: BoardConfig) -> Patches:
 
 
 def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConfig]:
-    """Return the source and the family of boards. Raises UserError if there is no study of these in single views."""
+    """Return the source and the family of boards. Raises UserError if there is no study of these
+    in single views."""
     source = config.simulated
     if (
         isinstance(source.target, DrawnTargetConfig)
@@ -144,7 +153,8 @@ def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConf
 
 
 def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
-    """Raise UserError for a size outside the declared range, that of depths if all sizes in plan are equal."""
+    """Raise UserError for a size outside the declared range, that of depths if all sizes in plan
+    are equal."""
     damage = declared(config)[1].damage
     low, high = damage.size_mm
     word = damage.size_of
@@ -157,7 +167,8 @@ def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
 
 
 def _widened(group: Group, poses: Sequence[Pose]) -> Group:
-    """Return the group with damaged boards in poses that reach as far as those given, and as the face is curved."""
+    """Return the group with damaged boards in poses that reach as far as those given, and as the
+    face is curved."""
     source, family = declared(group.points[0].config)
     bent_deg = float(np.degrees(np.arccos(patches_of(family.board).normals[:, 2].min())))
     tilt_deg = min(
@@ -170,7 +181,8 @@ def _widened(group: Group, poses: Sequence[Pose]) -> Group:
         "distance_m": (near_m + far_m) / 2,
         "distance_jitter_mm": jitter_mm,
     }
-    family, cache = family.model_copy(update=wide), group.then[0].renders[0].folder
+    family = family.model_copy(update=wide)
+    cache = group.then[0].renders[0].folder
     then = tuple(
         batch_of(family.drawn("damaged", n), "damaged", source, cache, n) for n in range(BOARDS)
     )
@@ -196,10 +208,8 @@ def _inspections(
     facts = list[tuple[float, ...]]()
     for number, damages in boards:
         for damage, seen in damages:
-            place, own = (
-                (point.variant, point.config.capture.frames, number, str(damage.id)),
-                len(facts),
-            )
+            place = (point.variant, point.config.capture.frames, number, str(damage.id))
+            own = len(facts)
             sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
             facts += [(own, *sizes_mm, *seen, score) for score in scores.get(place, ())]
     if not facts:
@@ -216,8 +226,9 @@ def _inspections(
 
 
 def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
-    """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over score, rms around each
-    pixel; larger if some pixels or averages are not judged, infinite if most are not."""
+    """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over
+    score, rms around each pixel; larger if some pixels or averages are not judged, infinite if
+    most are not."""
     fields = []
     for repeat in range(DRAWS):
         task = TrialTask(
@@ -248,8 +259,11 @@ def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
 def _board_seen(
     batch: Batch, whole: Batch, point: PointTask, seed: int
 ) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
-    """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board without damage."""
-    set_up, unit_m, found = load_set_up(batch.set_ups[0]), _unit_m(whole, point, seed), []
+    """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board
+    without damage."""
+    set_up = load_set_up(batch.set_ups[0])
+    unit_m = _unit_m(whole, point, seed)
+    found = []
     for damage in set_up.truth:
         range_m = float(np.linalg.norm(damage.centre_camera_m))
         cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
@@ -267,7 +281,8 @@ def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Se
     cosine = (
         -(rotate_vectors(set_up.T_camera_board, patches.normals) * points_m).sum(axis=1) / range_m
     )
-    region, camera = set_up.unit.region, set_up.unit.camera
+    region = set_up.unit.region
+    camera = set_up.unit.camera
     lens = camera.nominal_lens
     u, v = np.rint(lens.project(points_m)).astype(int).T - [[region.col0], [region.row0]]
     seen = (
@@ -278,7 +293,8 @@ def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Se
         & (u < region.shape[1])
         & (v < region.shape[0])
     )
-    u, v = np.where(seen, u, 0), np.where(seen, v, 0)
+    u = np.where(seen, u, 0)
+    v = np.where(seen, v, 0)
     # an object in front of a patch has another z
     slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
     reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))

@@ -23,7 +23,8 @@ COLOURS = (
     "#b3261e",
     "#8a8f96",
 )
-"""Seven steps of viridis (van der Walt and Smith, 2015), light for small damage; red for none; grey for not judged."""
+"""Seven steps of viridis (van der Walt and Smith, 2015), light for small damage; red for none;
+grey for not judged."""
 METHOD = (
     "Each patch has the detector's unit of score, an angle of incidence and a distance. The score of damage as a "
     "function of its size and of these three, and its scatter, were estimated from boards of the family in random "
@@ -49,7 +50,8 @@ def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3
     palette = np.array(
         [[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in COLOURS], np.uint8
     )
-    shown, used = f"{found.size_of} found 9 times in 10", np.unique(step).tolist()
+    shown = f"{found.size_of} found 9 times in 10"
+    used = np.unique(step).tolist()
     return Scene3d(
         1e3 * patches.points_m,
         "board",
@@ -62,7 +64,8 @@ def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3
 def answer(
     found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: float, poses: int
 ) -> str:
-    """State the shares of the face on which damage of a size is found, on which no size is, and that is not judged."""
+    """State the shares of the face on which damage of a size is found, on which no size is, and
+    that is not judged."""
     groups = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
     share, blind, unknown = (f"{percent(patches.share(each))} %" for each in groups)
     return (
@@ -86,7 +89,8 @@ def coverage_html(
     name: str, sentence: str, first: str, scene: Scene3d, poses: Sequence[Mapping[str, Any]],
     goals: Sequence[Mapping[str, Any]], warnings: Sequence[str], command: str,
 ) -> str:  # fmt: skip
-    """Return the page as text; it needs no network. ``sentence`` is the answer, ``first`` the note below it."""
+    """Return the page as text; it needs no network. ``sentence`` is the answer, ``first`` the note
+    below it."""
     turns = tag(
         "iframe",
         srcdoc=view3d_html(scene, name),

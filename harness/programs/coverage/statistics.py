@@ -1,10 +1,13 @@
-"""The smallest damage found with a probability of 90 % at each patch of a part, and the poses that cover most of it.
+"""The smallest damage found with a probability of 90 % at each patch of a part, and the poses that
+cover most of it.
 
-The damage's signal, in metres, is the detector's score times its unit of score there. Its logarithm is linear in the
-logarithms of size and range and quadratic in the cosine of the angle of incidence. Its normal scatter is proportional
-to a power of that cosine, because detection at oblique incidence is less certain. Damage is found if its score exceeds
-the threshold, so the law gives POD at every size and place: MIL-HDBK-1823A's signal against size (appendix G), with the
-place beside the size. Not modelled: other differences between places of equal angle, range and unit of score."""
+The damage's signal, in metres, is the detector's score times its unit of score there. Its
+logarithm is linear in the logarithms of size and range and quadratic in the cosine of the angle of
+incidence. Its normal scatter is proportional to a power of that cosine, because detection at
+oblique incidence is less certain. Damage is found if its score exceeds the threshold, so the law
+gives POD at every size and place: MIL-HDBK-1823A's signal against size (appendix G), with the
+place beside the size. Not modelled: other differences between places of equal angle, range and
+unit of score."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,15 +20,19 @@ from harness.evaluation.pod.statement import POD
 from harness.vocabulary.errors import UserError
 
 BEYOND_DEG = 3.0  # largest angle by which a patch may be steeper than all inspected damage
-FAR = 1.5  # ratio of score to threshold above which the score is ignored, so that the law holds near the threshold
+# ratio of score to threshold above which the score is ignored, so that the law holds near the
+# threshold
+FAR = 1.5
 GROWTHS = np.linspace(0.0, 4.0, 17)  # powers of 1 / cosine with which the scatter may grow
-LOOSE = 2.0  # limits count as rough above this ratio of the sizes found with probabilities of 90 % and 50 %
+# limits count as rough above this ratio of the sizes found with probabilities of 90 % and 50 %
+LOOSE = 2.0
 FEWEST = 20  # fewest damages from which the law is fitted
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of a part's face: ``points_m`` and unit ``normals`` (n, 3), board frame, and ``areas_m2`` (n,)."""
+    """Patches of a part's face: ``points_m`` and unit ``normals`` (n, 3), board frame, and
+    ``areas_m2`` (n,)."""
 
     points_m: np.ndarray
     normals: np.ndarray
@@ -38,7 +45,8 @@ class Patches:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """View of places, (n,): noise ``deviation_m``, infinite if not judged; ``cosine`` of incidence; ``range_m``."""
+    """View of places, (n,): noise ``deviation_m``, infinite if not judged; ``cosine`` of
+    incidence; ``range_m``."""
 
     deviation_m: np.ndarray
     cosine: np.ndarray
@@ -47,9 +55,10 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class ScoredDamage:
-    """Inspections of damage, (n,) each. ``damage``: its number. ``size_mm``: the size that ``size_of`` names. ``seen``:
-    its view. ``score``: the lowest threshold at which it is no longer found; NaN if it was missed at the threshold in
-    use, infinite if only missing returns found it."""
+    """Inspections of damage, (n,) each. ``damage``: its number. ``size_mm``: the size that
+    ``size_of`` names. ``seen``: its view. ``score``: the lowest threshold at which it is no longer
+    found; NaN if it was missed at the threshold in use, infinite if only missing returns found it.
+    """
 
     size_of: str
     damage: np.ndarray
@@ -60,9 +69,10 @@ class ScoredDamage:
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """Law of the signal. ``coefficients``: of `_design`. ``scatter``: of the signal's logarithm in a frontal view; it
-    grows with 1 / cosine to the power ``growth``. ``ratio``: of the sizes found with 90 % and 50 % at the median angle.
-    ``steepest``: least cosine inspected. ``damages``: number in the fit."""
+    """Law of the signal. ``coefficients``: of `_design`. ``scatter``: of the signal's logarithm in
+    a frontal view; it grows with 1 / cosine to the power ``growth``. ``ratio``: of the sizes found
+    with 90 % and 50 % at the median angle. ``steepest``: least cosine inspected. ``damages``:
+    number in the fit."""
 
     size_of: str
     coefficients: np.ndarray
@@ -86,7 +96,8 @@ class Findable:
 
     @property
     def doubt(self) -> str:
-        """The reason why the limits are rough; empty if size, angle and distance predict detection well."""
+        """The reason why the limits are rough; empty if size, angle and distance predict detection
+        well."""
         doubts = []
         if self.growth == GROWTHS[-1]:
             doubts.append(
@@ -102,8 +113,8 @@ class Findable:
         return ". Also, ".join(doubts)
 
     def limits_mm(self, seen: Seen) -> np.ndarray:
-        """Return a90 (n,) of places: at least the smallest size inspected, infinite above the largest; NaN where
-        nothing is judged or the angle is steeper than all inspected angles."""
+        """Return a90 (n,) of places: at least the smallest size inspected, infinite above the
+        largest; NaN where nothing is judged or the angle is steeper than all inspected angles."""
         cosine = np.maximum(seen.cosine, self.steepest)
         without_size = _design(np.ones(len(cosine)), cosine, seen.range_m) @ self.coefficients
         needed = (
@@ -126,21 +137,22 @@ def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.
 
 
 def findable(scored: ScoredDamage, threshold: float) -> Findable:
-    """Fit the law to inspections of damage where the detector judges. Raises UserError if these do not suffice."""
+    """Fit the law to inspections of damage where the detector judges. Raises UserError if these do
+    not suffice."""
     judged = np.isfinite(scored.seen.deviation_m) & (scored.seen.cosine > 0)
-    damages, total = len(np.unique(scored.damage[judged])), len(np.unique(scored.damage))
+    damages = len(np.unique(scored.damage[judged]))
+    total = len(np.unique(scored.damage))
     if damages < FEWEST:
         fix = "check the detector's crop, and the sizes of the damage"
         raise UserError(
             f"only {damages} of {total} damages were judged: no limit can be learnt", fix=fix
         )
-    size_mm, cosine, score = (
-        scored.size_mm[judged],
-        scored.seen.cosine[judged],
-        scored.score[judged],
-    )
+    size_mm = scored.size_mm[judged]
+    cosine = scored.seen.cosine[judged]
+    score = scored.score[judged]
     design = _design(size_mm, cosine, scored.seen.range_m[judged])
-    below, found = np.isnan(score), np.sort(score[score > threshold])
+    below = np.isnan(score)
+    found = np.sort(score[score > threshold])
     far = max(FAR * threshold, *found[np.isfinite(found)][:FEWEST])
     above = score > far
     signal = np.log(
@@ -148,7 +160,8 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
     )
 
     def fitted(growth: float) -> tuple[float, CensoredFit]:
-        """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit to weighted rows."""
+        """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit to
+        weighted rows."""
         weight = cosine**growth
         fit = fit_censored(design * weight[:, None], signal * weight, below, above)
         return fit.log_likelihood + float(np.log(weight[~(below | above)]).sum()), fit
@@ -170,10 +183,11 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
 def in_turn(
     patches: Patches, found: Sequence[np.ndarray], given: int, further: int
 ) -> list[tuple[int, float, float]]:
-    """Return the first ``given`` poses, then up to ``further`` others, always the one that adds most. ``found``: by
-    pose, the patches (n,) bool on which damage is found. A row has the pose's index, the share of the area that it
-    adds, and the share that all poses so far cover."""
-    covered, rows = np.zeros(len(patches.areas_m2), bool), list[tuple[int, float, float]]()
+    """Return the first ``given`` poses, then up to ``further`` others, always the one that adds
+    most. ``found``: by pose, the patches (n,) bool on which damage is found. A row has the pose's
+    index, the share of the area that it adds, and the share that all poses so far cover."""
+    covered = np.zeros(len(patches.areas_m2), bool)
+    rows = list[tuple[int, float, float]]()
     for turn in range(given + further):
         gains = [patches.share(each & ~covered) for each in found]
         best = turn if turn < given else int(np.argmax(gains))

@@ -1,4 +1,5 @@
-"""Tables of coverage: patches of a part, camera poses, and sets of poses that reach a goal. Their rows are mappings."""
+"""Tables of coverage: patches of a part, camera poses, and sets of poses that reach a goal. Their
+rows are mappings."""
 
 from harness.records.schema import Column, Table
 from harness.vocabulary.text import percent

@@ -1,7 +1,8 @@
 """Boards of a data set: plans them, writes the files of each, and reads the files.
 
-Every board is one average of frames of one unit of a camera. No two splits share boards; ``validation`` and ``test``
-have those of a study of the same experiment. Several views and real captures are not included."""
+Every board is one average of frames of one unit of a camera. No two splits share boards;
+``validation`` and ``test`` have those of a study of the same experiment. Several views and real
+captures are not included."""
 
 import io
 import json
@@ -39,7 +40,9 @@ from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import truth_of
 
 DATASET_VERSION = 1  # written into ``dataset.json``; increased when the meaning of a file changes
-INDEX, TRUTH, CLOUD = "dataset.json", "truth.json", "cloud.npz"
+INDEX = "dataset.json"
+TRUTH = "truth.json"
+CLOUD = "cloud.npz"
 SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("train", "learning", 0.3),
     ("validation", "calibration", 0.2),
@@ -48,14 +51,16 @@ SPLITS: tuple[tuple[str, Role, float], ...] = (
 )
 """Split, purpose of its boards, and their share of all boards of a category."""
 FEWEST = 10  # fewest boards of a category, so that every split has one
-INSET_PX = 4  # rim of the board that is not inspected: the reach of the cameras' windows and edges, plus a pixel
+# rim of the board that is not inspected: the reach of the cameras' windows and edges, plus a pixel
+INSET_PX = 4
 BRIGHTEST = 0.995  # quantile of a picture's intensity that is shown as white
 AGAIN = "run the command that wrote the data set again"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One board: the render that it needs, and the trial whose average it is. ``label``: good, a kind, or combined."""
+    """One board: the render that it needs, and the trial whose average it is. ``label``: good, a
+    kind, or combined."""
 
     category: str
     split: str
@@ -81,7 +86,8 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     axes = [path for path in experiment.config.sweep if path.startswith(("source.", "capture."))]
     values = {path: [point.values[path] for point in points.values()] for path in axes}
     axes = [path for path in axes if any(value != values[path][0] for value in values[path])]
-    names, found = names_of(axes), dict[str, Point]()
+    names = names_of(axes)
+    found = dict[str, Point]()
     for point in points.values():
         words = []
         for path, own in ((path, point.values[path]) for path in axes):
@@ -98,7 +104,9 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
     """Plan the boards of every category. Raises UserError if the experiment has no random boards."""
     samples = []
     for category, point in categories_of(experiment).items():
-        source, seed, study = point.config.simulated, point.config.seed, point.config.study
+        source = point.config.simulated
+        seed = point.config.seed
+        study = point.config.study
         if source.views or not isinstance(source.target, DrawnTargetConfig):
             fix = "take one with `target: {name: drawn, ...}`, such as detection_limit"
             raise UserError(
@@ -135,10 +143,12 @@ def seen_region(render: RenderJob) -> Region:
 
 
 def write_board(out: Path, sample: Sample, window: Region) -> None:
-    """Write all files of a board on the ``window`` that its category shares; the truth last, to allow resuming."""
+    """Write all files of a board on the ``window`` that its category shares; the truth last, to
+    allow resuming."""
     set_up, (point,) = load_set_up(sample.task.set_ups[0]), sample.task.points
     known = known_view(set_up, cloud_of(sample.task, point), hole_free=sample.task.hole_free)
-    cloud, truth = known.cloud, () if sample.task.hole_free else known.truth
+    cloud = known.cloud
+    truth = () if sample.task.hole_free else known.truth
 
     def put(values: np.ndarray, outside: float) -> np.ndarray:
         return on_window(values, cloud.region, window, outside)
@@ -158,13 +168,15 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "inspected": put(shrunk(np.isfinite(known.places_m[..., 0]), 2 * INSET_PX + 1), False),
         "board_xy_m": put(known.places_m.astype(np.float32), np.nan),
     }
-    mask, points = arrays["damage"], arrays["points_m"]
+    mask = arrays["damage"]
+    points = arrays["points_m"]
     valid = np.isfinite(points[..., 2])
     white = float(np.quantile(arrays["intensity"], BRIGHTEST)) or 1.0
     shown = np.clip(arrays["intensity"] / white, 0, 1)
     grey = np.repeat(np.rint(255 * shown).astype(np.uint8)[..., None], 3, axis=2)
     file = f"{sample.number:04d}"
-    place, mvtec = (out / part / Path(sample.name).parent for part in ("boards", "."))
+    place = out / "boards" / Path(sample.name).parent
+    mvtec = out / "." / Path(sample.name).parent
     stored = io.BytesIO()
     np.savez_compressed(stored, **arrays)  # type: ignore[arg-type]
     files = {
@@ -184,7 +196,8 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         files[mvtec / "gt" / f"{file}.png"] = picture_bytes(".png", np.uint8(255) * (mask > 0))
     for path, content in files.items():
         write_bytes(path, content, durable=False)
-    camera, damages = sample.task.set_ups[0].camera, []
+    camera = sample.task.set_ups[0].camera
+    damages = []
     for flaw in truth:
         own = np.zeros(damage.shape, bool)
         own.ravel()[known.outlines[flaw.id]] = True
@@ -219,7 +232,8 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """Read a data set's ``dataset.json``; ``samples`` is None while the data set is unfinished. Raises UserError."""
+    """Read a data set's ``dataset.json``; ``samples`` is None while the data set is unfinished.
+    Raises UserError."""
     data = _read_json(folder / INDEX, RECORD_BYTES, "name a folder that tofpod dataset wrote")
     check_version(data.get("dataset_version"), DATASET_VERSION, folder / INDEX, "a data set")
     return data

@@ -1,4 +1,5 @@
-"""``tofpod dataset EXPERIMENT --boards 500 --out DIR``: writes boards with masks to train and score on."""
+"""``tofpod dataset EXPERIMENT --boards 500 --out DIR``: writes boards with masks to train and
+score on."""
 
 from __future__ import annotations
 
@@ -76,7 +77,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not FEWEST <= options.boards <= MOST or options.jobs < 1:
         fault = f"--boards {options.boards} --jobs {options.jobs}: out of range"
         raise UserError(fault, legal=f"{FEWEST} to {MOST} boards, 1 process or more")
-    experiment, out = load_experiment(options.experiment, options.overrides), options.out
+    experiment = load_experiment(options.experiment, options.overrides)
+    out = options.out
     cache = options.results / ".cache" / "renders"
     samples = samples_of(experiment, options.boards, cache)
     about = _about(experiment, options.licence, samples, command)
@@ -110,7 +112,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 def _about(
     experiment: Experiment, licence: str, samples: list[Sample], command: str
 ) -> dict[str, Any]:
-    """Return the header of ``dataset.json``; ``content`` is a digest of everything that determines the files."""
+    """Return the header of ``dataset.json``; ``content`` is a digest of everything that determines
+    the files."""
     from harness.programs.dataset.boards import DATASET_VERSION, categories_of
     from harness.runs.plan import PACKAGES
     from harness.vocabulary.provenance import record, source_digest
@@ -145,13 +148,15 @@ def _about(
 
 
 def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
-    """Render missing views and write missing boards; return why jobs failed. Progress is printed to stderr."""
+    """Render missing views and write missing boards; return why jobs failed. Progress is printed
+    to stderr."""
     from harness.programs.dataset.boards import TRUTH, seen_region, write_board
     from harness.runs.estimate import progress_display
     from harness.runs.run import carried_out
     from harness.vocabulary.geometry import Region
 
-    outcome, failures = Outcome(), list[str]()
+    outcome = Outcome()
+    failures = list[str]()
     renders = {sample.render.path: sample.render for sample in samples}
     missing = [sample for sample in samples if not (out / "boards" / sample.name / TRUTH).exists()]
     outcome.renders.total, outcome.trials.total = len(renders), len(samples)

@@ -1,4 +1,5 @@
-"""Writes simulated captures in formats of other programs: TUM RGB-D, ROS 2, MCAP; images and masks of data sets."""
+"""Writes simulated captures in formats of other programs: TUM RGB-D, ROS 2, MCAP; images and masks
+of data sets."""
 
 import errno
 import sqlite3
@@ -18,12 +19,14 @@ START_NS = (
     1_000_000_000 * 10**9
 )  # time of the first frame, in 2001; 0 would mean "the latest" to ROS's tf
 PAUSE_NS = 10**9  # time between two views to move the camera
-BOARD_FRAME = "board"  # the world frame: x along the row of holes, y up the face, z out of it, origin at its centre
+# the world frame: x along the row of holes, y up the face, z out of it, origin at its centre
+BOARD_FRAME = "board"
 
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of a view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4) is the camera's pose."""
+    """Frames of a view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4) is the
+    camera's pose."""
 
     name: str
     source: FrameSource
@@ -44,8 +47,10 @@ class ExportedView:
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
     def exposures(self) -> Iterator[tuple[int, Frame]]:
-        """Yield (time, frame on the whole sensor in float32), without range and black outside the simulated region."""
-        lens, region = self.lens, self.source.region
+        """Yield (time, frame on the whole sensor in float32), without range and black outside the
+        simulated region."""
+        lens = self.lens
+        region = self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
             return on_window(values, region, lens.whole, outside)
@@ -55,9 +60,8 @@ class ExportedView:
             amplitude = (
                 frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
             )
-            z_m, amplitude = (
-                on_sensor(image.astype(np.float32), np.nan) for image in (frame.z_m, amplitude)
-            )
+            z_m = on_sensor(frame.z_m.astype(np.float32), np.nan)
+            amplitude = on_sensor(amplitude.astype(np.float32), np.nan)
             reason = on_sensor(frame.reason, Reason.OUTSIDE_MASK)
             yield (
                 self.stamp_ns(number),
@@ -66,7 +70,8 @@ class ExportedView:
 
 
 def on_window(values: np.ndarray, region: Region, window: Region, outside: float) -> np.ndarray:
-    """Return values (h, w, ...) of a sensor region on a ``window`` that contains it, with ``outside`` elsewhere."""
+    """Return values (h, w, ...) of a sensor region on a ``window`` that contains it, with
+    ``outside`` elsewhere."""
     whole = np.full((*window.shape, *values.shape[2:]), outside, values.dtype)
     whole[region.within(window)] = values
     return whole
@@ -105,11 +110,13 @@ UNITS_PER_M = 5000  # the benchmark's depth scale
 FARTHEST_M = (2**16 - 1) / UNITS_PER_M
 CALIBRATION = "rtabmap_calib.yaml"
 OPTICAL_ROTATION = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
-"""The (3, 4) matrix from the camera's optical frame (z forward, y down) to RTAB-Map's base (x forward, z up)."""
+"""The (3, 4) matrix from the camera's optical frame (z forward, y down) to RTAB-Map's base (x
+forward, z up)."""
 
 
 def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
-    """Write a sequence of all views to an empty folder. Raises UserError if two views have different lenses."""
+    """Write a sequence of all views to an empty folder. Raises UserError if two views have
+    different lenses."""
     lens = views[0].lens
     if any(view.lens != lens for view in views):
         raise UserError("the TUM RGB-D layout allows a single lens, but these views have several")
@@ -143,15 +150,18 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
 
 
 def depth_units(z_m: np.ndarray) -> np.ndarray:
-    """Return (h, w) uint16 in units of 0.2 mm; 0 without range, or beyond the 13.1 m that 16 bits hold."""
+    """Return (h, w) uint16 in units of 0.2 mm; 0 without range, or beyond the 13.1 m that 16 bits
+    hold."""
     with np.errstate(invalid="ignore"):
         held = (z_m > 0) & (z_m <= FARTHEST_M)
     return np.rint(np.where(held, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(np.uint16)
 
 
 def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
-    """Return a picture (h, w[, 3]) for the pinhole camera, from the nearest pixels of the lens's own image, else 0."""
-    matrix, size = lens.matrix, (lens.width, lens.height)
+    """Return a picture (h, w[, 3]) for the pinhole camera, from the nearest pixels of the lens's
+    own image, else 0."""
+    matrix = lens.matrix
+    size = (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(
         matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1
     )
@@ -194,12 +204,14 @@ BAG_VERSION: Literal[8] = (
 )
 FLOAT32 = 7  # sensor_msgs/PointField's code
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
-"""``rgb`` holds the bytes of 0x00RRGGBB; by ROS's convention, its field is declared as a float of these bytes."""
+"""``rgb`` holds the bytes of 0x00RRGGBB; by ROS's convention, its field is declared as a float of
+these bytes."""
 FOREVER = (9223372036, 854775807)  # seconds and nanoseconds of an unlimited duration in ROS 2
 
 
 def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
-    """Write a view's bag to a new ``folder``, as compressed MCAP or as SQLite. Raises OSError as files do."""
+    """Write a view's bag to a new ``folder``, as compressed MCAP or as SQLite. Raises OSError as
+    files do."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -231,7 +243,8 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
                 write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
                 write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, frame, slopes, header))
     except sqlite3.OperationalError as error:
-        # SQLite hides the system's error number; for a new file in a writable folder, only a full disk is an error
+        # SQLite hides the system's error number; for a new file in a writable folder, only a full
+        # disk is an error
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
 
 
@@ -246,7 +259,8 @@ def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
 
 
 def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, header: Any) -> Any:
-    """Return the frame as `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
+    """Return the frame as `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN
+    without range."""
     assert frame.rgb is not None
     points = np.zeros(frame.z_m.shape, POINT)
     x_y = slopes * frame.z_m[..., None].astype(np.float64)
@@ -273,7 +287,8 @@ def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, head
 
 
 def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
-    """Return the lens in ROS's terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as clouds are not rectified."""
+    """Return the lens in ROS's terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as clouds
+    are not rectified."""
     distorted = any(lens.distortion)
     region = types["sensor_msgs/msg/RegionOfInterest"](
         x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
@@ -308,7 +323,8 @@ def _pose_message(types: dict[str, Any], view: ExportedView) -> Any:
 
 
 def _qos(latched: bool) -> tuple[Any, ...]:
-    """Return a reliable profile, history of ten; a latched topic is kept for later subscribers, as tf_static needs."""
+    """Return a reliable profile, history of ten; a latched topic is kept for later subscribers, as
+    tf_static needs."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,
@@ -318,7 +334,8 @@ def _qos(latched: bool) -> tuple[Any, ...]:
         QosTime,
     )
 
-    endless, history = QosTime(*FOREVER), (QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE)
+    endless = QosTime(*FOREVER)
+    history = (QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE)
     durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     return (Qos(*history, durability, endless, endless, QosLiveliness.AUTOMATIC, endless, False),)
 
@@ -327,7 +344,8 @@ def _qos(latched: bool) -> tuple[Any, ...]:
 
 
 def picture_bytes(kind: Literal[".png", ".tiff"], picture: np.ndarray) -> bytes:
-    """Encode a picture (h, w[, 3]) as PNG of 8 or 16 bits or plain TIFF of float32; channels in OpenCV's order."""
+    """Encode a picture (h, w[, 3]) as PNG of 8 or 16 bits or plain TIFF of float32; channels in
+    OpenCV's order."""
     plain = [cv2.IMWRITE_TIFF_COMPRESSION, 1] if kind == ".tiff" else []
     coded, content = cv2.imencode(kind, np.ascontiguousarray(picture), plain)
     assert coded
@@ -335,7 +353,8 @@ def picture_bytes(kind: Literal[".png", ".tiff"], picture: np.ndarray) -> bytes:
 
 
 def run_lengths(mask: np.ndarray) -> list[int]:
-    """Return COCO's uncompressed run lengths of a mask (h, w) bool: pixels outside, inside, outside ..., by columns."""
+    """Return COCO's uncompressed run lengths of a mask (h, w) bool: pixels outside, inside,
+    outside ..., by columns."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     runs = np.diff([0, *changes, flat.size]).tolist()
@@ -345,8 +364,9 @@ def run_lengths(mask: np.ndarray) -> list[int]:
 def coco_data(
     pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return a COCO file's content. Each of the ``pictures`` has ``file_name``, ``width``, ``height`` and ``damages``,
-    which have ``kind``, ``run_lengths``, ``bbox`` (left, top, width, height) and ``pixels``."""
+    """Return a COCO file's content. Each of the ``pictures`` has ``file_name``, ``width``,
+    ``height`` and ``damages``, which have ``kind``, ``run_lengths``, ``bbox`` (left, top, width,
+    height) and ``pixels``."""
     numbers = {kind: number for number, kind in enumerate(kinds, start=1)}
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

@@ -1,4 +1,5 @@
-"""``tofpod export``: exports an experiment's simulated views, with truth, for other mapping programs."""
+"""``tofpod export``: exports an experiment's simulated views, with truth, for other mapping
+programs."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")
-REPEAT = 0  # the repeat whose noise is exported, so that the frames equal those of an experiment's first repeat
+# the repeat whose noise is exported, so that the frames equal those of an experiment's first
+# repeat
+REPEAT = 0
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -61,9 +64,11 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     from scenes.sensor.source import SimulatedUnit
 
     experiment = load_experiment(arguments.experiment, arguments.overrides)
-    source, seed = experiment.config.simulated, experiment.config.seed
+    source = experiment.config.simulated
+    seed = experiment.config.seed
     role: Role = "hole_free" if arguments.hole_free else "damaged"
-    camera, cache = camera_of(source.camera), arguments.results / ".cache" / "renders"
+    camera = camera_of(source.camera)
+    cache = arguments.results / ".cache" / "renders"
     batch = batch_of(source.target.declare(), role, source, cache)
     count = len(batch.renders) if arguments.views is None else arguments.views
     if count > len(batch.renders):
@@ -71,17 +76,16 @@ def main(arguments: argparse.Namespace, command: str) -> int:
             f"--views {count}: the experiment has {len(batch.renders)}",
             legal=f"1 to {len(batch.renders)}",
         )
-    frames, captures = arguments.frames or experiment.config.capture.frames, []
+    frames = arguments.frames or experiment.config.capture.frames
+    captures = []
     with atomic_folder(arguments.out) as folder:
         for number, job in enumerate(batch.renders[:count]):
             view, found = cached_view(job.target, camera.optics, job.config, cache)
             print(
                 f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}"
             )
-            unit, labels = (
-                SimulatedUnit(camera, job.camera, view),
-                ("view", number) if number else (),
-            )
+            unit = SimulatedUnit(camera, job.camera, view)
+            labels = ("view", number) if number else ()
             captures.append(unit.capture(frames, seed, role, REPEAT, *labels))
         targets = [job.target for job in batch.renders[:count]]
         rate = camera.unit.frames_per_second.value
@@ -120,8 +124,10 @@ def _write_beside(
     from scenes.perspectives import guessed_T_reference_view
     from scenes.target.truth import truth_of
 
-    nominal, poses = [np.eye(4)], tuple(target.pose for target in targets)
-    source, role = experiment.config.simulated, "hole_free" if arguments.hole_free else "damaged"
+    nominal = [np.eye(4)]
+    poses = tuple(target.pose for target in targets)
+    source = experiment.config.simulated
+    role = "hole_free" if arguments.hole_free else "damaged"
     if source.views is not None:
         nominal = [
             guessed_T_reference_view(source.views, poses, n, role, REPEAT)

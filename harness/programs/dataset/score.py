@@ -1,12 +1,14 @@
-"""``tofpod score PREDICTIONS --dataset DIR``: states the detection limit of a method's anomaly maps.
+"""``tofpod score PREDICTIONS --dataset DIR``: states the detection limit of a method's anomaly
+maps.
 
-A map is judged like a detector's score in a study. The threshold is the lowest with the wanted rate of false calls on
-the good boards of ``validation``. Pixels above it that are connected by steps of at most `LINK_M` form a finding, which
-hits a damage by the experiment's rule (`harness.trials.judge.matched`). Limits follow from ``test``. Only inspected
-pixels count.
+A map is judged like a detector's score in a study. The threshold is the lowest with the wanted
+rate of false calls on the good boards of ``validation``. Pixels above it that are connected by
+steps of at most `LINK_M` form a finding, which hits a damage by the experiment's rule
+(`harness.trials.judge.matched`). Limits follow from ``test``. Only inspected pixels count.
 
-AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
-`PRO_LIMIT` (Bergmann et al., Int. Journal of Computer Vision 129 (2021), 1038); each damage is a region."""
+AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to
+`PRO_LIMIT` and divided by `PRO_LIMIT` (Bergmann et al., Int. Journal of Computer Vision 129
+(2021), 1038); each damage is a region."""
 
 from __future__ import annotations
 
@@ -90,11 +92,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 per square metre")
     maps = _found(options.predictions, options.dataset, index["samples"])
     judged = [_judged(category, maps, options, index, rate) for category in index["categories"]]
-    limits, rows, origin = (
-        [limit for limit, _ in judged],
-        [row for _, row in judged],
-        record(command),
-    )
+    limits = [limit for limit, _ in judged]
+    rows = [row for _, row in judged]
+    origin = record(command)
     study = StudyRecord(
         name=index["name"],
         digest=digest([index["content"], options.name, rate]),
@@ -122,7 +122,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
-    """Return the file of each board's map. Raises a UserError that names all missing, extra or wrong files."""
+    """Return the file of each board's map. Raises a UserError that names all missing, extra or
+    wrong files."""
     from harness.programs.dataset.boards import read_arrays
 
     wanted = {name for name in samples if name.split("/")[1] in JUDGED}
@@ -194,7 +195,8 @@ def _judged(
     index: dict[str, Any],
     rate: float,
 ) -> tuple[SetUpLimit, dict[str, Any]]:
-    """Judge the maps of a category at a threshold from its good boards of ``validation``: limit and scores."""
+    """Judge the maps of a category at a threshold from its good boards of ``validation``: limit
+    and scores."""
     import pandas as pd
 
     from harness.evaluation.intervals import threshold_for_rate
@@ -205,13 +207,12 @@ def _judged(
     from harness.trials.setup import highest_within, pixel_areas
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
-        """Yield the boards of a split: name, scores (NaN if not inspected), places, damage, inspected area."""
+        """Yield the boards of a split: name, scores (NaN if not inspected), places, damage,
+        inspected area."""
         for sample in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
             inspected, places, damage = read_arrays(options.dataset, sample, *JUDGED_BY)
-            scores, places_m = (
-                np.where(inspected, _read(maps[sample]), np.nan),
-                places.astype(float),
-            )
+            scores = np.where(inspected, _read(maps[sample]), np.nan)
+            places_m = places.astype(float)
             yield (
                 sample,
                 scores,
@@ -223,12 +224,18 @@ def _judged(
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
     highest, areas_m2 = np.array(quiet, float).T
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
-    radius_m, overlap, truths = index["hit_radius_mm"] * MM, index["hit_overlap"], []
-    holes, runs = list[dict[str, Any]](), list[dict[str, Any]]()
-    pixels, regions, tops = list[np.ndarray](), list[np.ndarray](), list[tuple[float, bool]]()
+    radius_m = index["hit_radius_mm"] * MM
+    overlap = index["hit_overlap"]
+    truths = []
+    holes = list[dict[str, Any]]()
+    runs = list[dict[str, Any]]()
+    pixels = list[np.ndarray]()
+    regions = list[np.ndarray]()
+    tops = list[tuple[float, bool]]()
     for name, scores, places_m, damage, area_m2 in boards("test"):
         truth = read_truth(options.dataset, name)
-        damages, board = truth["damages"], truth["board"]
+        damages = truth["damages"]
+        board = truth["board"]
         truths.append([board, damages])
         lines = [np.array(flaw["line_m"]) for flaw in damages]
         found = _findings(places_m, scores > threshold)
@@ -284,10 +291,8 @@ def _judged(
         targets_digest=digest(truths),
         frames_digest=digest([index["content"], category]),
     )
-    scores, region = (
-        np.concatenate(pixels),
-        np.unique(np.concatenate(regions), return_inverse=True)[1],
-    )
+    scores = np.concatenate(pixels)
+    region = np.unique(np.concatenate(regions), return_inverse=True)[1]
     damaged, (top, is_flawed) = (region > 0) * 1.0, np.array(tops, float).T
     return limit_of(record), {
         "category": category,
@@ -298,7 +303,8 @@ def _judged(
 
 
 def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
-    """Return the findings of pixels ``above`` (h, w), without scores; their centres (m, 2) lie on the face."""
+    """Return the findings of pixels ``above`` (h, w), without scores; their centres (m, 2) lie on
+    the face."""
     from detectors.findings.clusters import euclidean_clusters
     from detectors.findings.measure import centres_of
     from detectors.score_map import Findings
@@ -313,14 +319,17 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 def area_under(
     scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0
 ) -> float:
-    """Return the area under the share of the weights ``found`` (n,) above a threshold against the share of ``false``
-    (n,), up to ``limit`` and divided by it; NaN if either has no weight. Equal scores form a single threshold."""
+    """Return the area under the share of the weights ``found`` (n,) above a threshold against the
+    share of ``false`` (n,), up to ``limit`` and divided by it; NaN if either has no weight. Equal
+    scores form a single threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
-    up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))
+    up = np.append(0.0, np.cumsum(found[order])[last])
+    across = np.append(0.0, np.cumsum(false[order])[last])
     if not (up[-1] > 0 and across[-1] > 0):
         return float("nan")
-    up, across = up / up[-1], across / across[-1]
+    up = up / up[-1]
+    across = across / across[-1]
     inside = across <= limit
     ends = np.append(up[inside], np.interp(limit, across, up)), np.append(across[inside], limit)
     return float(np.trapezoid(*ends) / limit)

@@ -49,7 +49,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not (folder / EXPERIMENT.name).is_file():
         fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
         raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
-    experiment, rate = load_experiment(folder / EXPERIMENT.name), study.false_calls_per_m2
+    experiment = load_experiment(folder / EXPERIMENT.name)
+    rate = study.false_calls_per_m2
     if any(
         point.config.mapping is not None or point.config.simulated.views
         for point in experiment.points
@@ -78,10 +79,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             efficiency_of(limit_of(set_up), ideal[set_up.variant, set_up.frames])
             for set_up in study.set_ups
         ]
-        cameras, warnings = (
-            [point.config.simulated.camera for point in experiment.points],
-            warnings_of(rows),
-        )
+        cameras = [point.config.simulated.camera for point in experiment.points]
+        warnings = warnings_of(rows)
         names = ", ".join(dict.fromkeys(camera.name for camera in cameras))
         seeds = ", ".join(dict.fromkeys(str(camera.unit_seed) for camera in cameras))
         first = (

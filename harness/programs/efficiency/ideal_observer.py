@@ -1,16 +1,20 @@
-"""The ideal observer: the detections of the best possible detector at a wanted rate of false calls.
+"""The ideal observer: the detections of the best possible detector at a wanted rate of false
+calls.
 
-It knows the exact signature s of each damage, as far as the camera shows it, and the covariance C of the noise over
-cameras. It knows neither the place of the damage nor the undamaged surface, a polynomial B b with unknown b. Its
-statistic at each place is the log-likelihood ratio of Gaussian noise, s' K r / d' with K = C^-1 - C^-1 B (B' C^-1 B)^-1
-B' C^-1. It has deviation 1 without damage and mean d' at the damage, d'^2 = s' K s (Barrett and Myers, Foundations of
-Image Science (2004), chapter 13; ICRU Report 54 (1996)). At its threshold, the field of this statistic has the wanted
-number of maxima on the pixels. A damage is found if any pixel around its place exceeds the threshold.
+It knows the exact signature s of each damage, as far as the camera shows it, and the covariance C
+of the noise over cameras. It knows neither the place of the damage nor the undamaged surface, a
+polynomial B b with unknown b. Its statistic at each place is the log-likelihood ratio of Gaussian
+noise, s' K r / d' with K = C^-1 - C^-1 B (B' C^-1 B)^-1 B' C^-1. It has deviation 1 without damage
+and mean d' at the damage, d'^2 = s' K s (Barrett and Myers, Foundations of Image Science (2004),
+chapter 13; ICRU Report 54 (1996)). At its threshold, the field of this statistic has the wanted
+number of maxima on the pixels. A damage is found if any pixel around its place exceeds the
+threshold.
 
-C is stationary except for its scale: C = D R D, with the deviations D of each pixel and the autocovariance R of noise
-in deviations, pooled over boards and units and faded out by Parzen's window. Not modelled: tails that are not Gaussian,
-noise that differs within damage, information in missing returns, size and depth as unknowns (with them, a bank of
-templates has a higher threshold)."""
+C is stationary except for its scale: C = D R D, with the deviations D of each pixel and the
+autocovariance R of noise in deviations, pooled over boards and units and faded out by Parzen's
+window. Not modelled: tails that are not Gaussian, noise that differs within damage, information in
+missing returns, size and depth as unknowns (with them, a bank of templates has a higher
+threshold)."""
 
 from __future__ import annotations
 
@@ -26,12 +30,17 @@ from scipy import optimize, special
 from harness.vocabulary.seeds import random_stream
 
 LONGEST_LAG_PX = 72
-"""Lag at which the autocovariance is 0: ten times the length of known cameras' patterns. The window smooths the
-spectrum a little: d' of 50 frames is 1 to 2 % below that with 110 pixels."""
-LEAST_POWER = 1e-3  # least power of the noise at any frequency, as a share of the mean; smaller estimates are error
-CONVERGED, MOST_ITERATIONS = 1e-4, 200
-"""Relative residual of C^-1 s, which is the relative error of d'^2, and the most steps to reach it."""
-NORMALS = 4096  # draws of a neighbourhood of the statistic: rates of maxima are then known to 3 %, thresholds to 0.01
+"""Lag at which the autocovariance is 0: ten times the length of known cameras' patterns. The
+window smooths the spectrum a little: d' of 50 frames is 1 to 2 % below that with 110 pixels."""
+# least power of the noise at any frequency, as a share of the mean; smaller estimates are error
+LEAST_POWER = 1e-3
+CONVERGED = 1e-4
+MOST_ITERATIONS = 200
+"""Relative residual of C^-1 s, which is the relative error of d'^2, and the most steps to reach
+it."""
+# draws of a neighbourhood of the statistic: rates of maxima are then known to 3 %, thresholds to
+# 0.01
+NORMALS = 4096
 AROUND = 3  # half of the lattice of places around a damage at which it may be found, in strides
 NEAR_CORRELATION = (
     0.2  # places with a smaller correlation to the damage's own place do not add to its detection
@@ -42,8 +51,10 @@ LAGS = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
 
 
 def _padded(height: int, width: int) -> tuple[int, int]:
-    """Return the sides of a periodic grid on which points within `LONGEST_LAG_PX` do not overlap by wrapping around."""
-    high, wide = (max(side + LONGEST_LAG_PX, len(LAGS)) for side in (height, width))
+    """Return the sides of a periodic grid on which points within `LONGEST_LAG_PX` do not overlap
+    by wrapping around."""
+    high = max(height + LONGEST_LAG_PX, len(LAGS))
+    wide = max(width + LONGEST_LAG_PX, len(LAGS))
     return int(scipy.fft.next_fast_len(high, real=True)), int(
         scipy.fft.next_fast_len(wide, real=True)
     )
@@ -51,8 +62,9 @@ def _padded(height: int, width: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseSums:
-    """Sums over noise fields, by lag: ``products`` and ``pairs`` (2 m + 1, 2 m + 1) of pairs of known pixels, with
-    m = `LONGEST_LAG_PX`; ``fourth`` and ``pixels``: sum of fourth powers, and number of pixels."""
+    """Sums over noise fields, by lag: ``products`` and ``pairs`` (2 m + 1, 2 m + 1) of pairs of
+    known pixels, with m = `LONGEST_LAG_PX`; ``fourth`` and ``pixels``: sum of fourth powers, and
+    number of pixels."""
 
     products: np.ndarray
     pairs: np.ndarray
@@ -88,7 +100,8 @@ class NoiseSums:
         )
 
     def power(self, shape: tuple[int, int]) -> np.ndarray:
-        """Return the power spectrum on a periodic grid of ``shape``, ordered as by `scipy.fft.rfft2`."""
+        """Return the power spectrum on a periodic grid of ``shape``, ordered as by
+        `scipy.fft.rfft2`."""
         image = np.zeros(shape)
         image[np.ix_(LAGS, LAGS)] = self.autocovariance
         power = scipy.fft.rfft2(image).real
@@ -96,7 +109,8 @@ class NoiseSums:
 
 
 def noise_sums(noise: np.ndarray, known: np.ndarray) -> NoiseSums:
-    """Return the sums over fields ``noise`` (k, h, w), in deviations, at the ``known`` (k, h, w) pixels."""
+    """Return the sums over fields ``noise`` (k, h, w), in deviations, at the ``known`` (k, h, w)
+    pixels."""
     shape = _padded(*noise.shape[1:])
 
     def by_lag(images: np.ndarray) -> np.ndarray:
@@ -110,8 +124,9 @@ def noise_sums(noise: np.ndarray, known: np.ndarray) -> NoiseSums:
 
 
 def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``known`` (h, w) pixels, 0 elsewhere, by conjugate
-    gradients that start from the inverse on a periodic grid; exact for any outline."""
+    """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``known`` (h, w) pixels, 0 elsewhere,
+    by conjugate gradients that start from the inverse on a periodic grid; exact for any outline.
+    """
     h, w = known.shape
     shape = _padded(h, w)
     power = sums.power(shape)
@@ -125,12 +140,14 @@ def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.
     for image, solution in zip(images, found, strict=True):
         rest = known * image
         enough = CONVERGED**2 * float((rest**2).sum())
-        direction, product = np.zeros(rest.shape), 1.0
+        direction = np.zeros(rest.shape)
+        product = 1.0
         for _ in range(MOST_ITERATIONS):
             if float((rest**2).sum()) <= enough:
                 break
             towards = filtered(rest, 1.0 / power)
-            before, product = product, float((rest * towards).sum())
+            before = product
+            product = float((rest * towards).sum())
             direction = towards + product / before * direction
             onward = filtered(direction, power)
             step = product / float((direction * onward).sum())
@@ -142,7 +159,8 @@ def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.
 def detectability(
     signals: np.ndarray, surface: np.ndarray, known: np.ndarray, sums: NoiseSums
 ) -> np.ndarray:
-    """Return d' (n,) of signals (n, h, w) on an unknown sum of images ``surface`` (p, h, w), both in deviations."""
+    """Return d' (n,) of signals (n, h, w) on an unknown sum of images ``surface`` (p, h, w), both
+    in deviations."""
     whitened = inverse_times(np.concatenate([surface, signals]), known, sums)
     flat = whitened.reshape(len(whitened), -1)
     gram = flat @ np.concatenate([surface, signals]).reshape(len(flat), -1).T
@@ -152,8 +170,9 @@ def detectability(
 
 
 def responses(signal: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return s' R^-1 s_k (2 m + 1, 2 m + 1), where s_k is a signal (h, w) in deviations moved by a lag k. The middle is
-    d'^2 on an endless board with a known surface; the others, divided by it, are the statistic's correlation."""
+    """Return s' R^-1 s_k (2 m + 1, 2 m + 1), where s_k is a signal (h, w) in deviations moved by a
+    lag k. The middle is d'^2 on an endless board with a known surface; the others, divided by it,
+    are the statistic's correlation."""
     rows, columns = np.nonzero(signal)
     image = signal[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     shape = _padded(*image.shape)
@@ -161,7 +180,8 @@ def responses(signal: np.ndarray, sums: NoiseSums) -> np.ndarray:
     return np.asarray(field[np.ix_(LAGS, LAGS)])
 
 
-# ---------------------------------------------------------------- threshold and probability of detection
+# ---------------------------------------------------------------- threshold and probability of
+# detection
 
 
 def _covariance(correlated: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -171,7 +191,8 @@ def _covariance(correlated: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Return a matrix whose product with its transpose is a covariance, which rounding may have made indefinite."""
+    """Return a matrix whose product with its transpose is a covariance, which rounding may have
+    made indefinite."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -188,11 +209,13 @@ NEIGHBOURS = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1) if (v, u) 
 
 
 def maxima_per_pixel(correlated: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """Return the expected number (t,) per pixel of local maxima of a Gaussian field above ``thresholds`` (t,): values
-    that exceed their eight neighbours, by integration over the maximum's height."""
+    """Return the expected number (t,) per pixel of local maxima of a Gaussian field above
+    ``thresholds`` (t,): values that exceed their eight neighbours, by integration over the
+    maximum's height."""
     rho = _covariance(correlated, np.concatenate([[(0, 0)], NEIGHBOURS]))
     spread = _normals(len(NEIGHBOURS)) @ _root(rho[1:, 1:] - np.outer(rho[1:, 0], rho[1:, 0])).T
-    # a value z exceeds a neighbour of mean rho z and deviation `spread` if z is above spread / (1 - rho)
+    # a value z exceeds a neighbour of mean rho z and deviation `spread` if z is above spread / (1
+    # - rho)
     least = np.sort((spread / np.maximum(1.0 - rho[1:, 0], 1e-12)).max(axis=1))
     # maxima above t: the mean over draws of the normal's tail beyond max(t, least)
     tails = special.ndtr(-np.maximum(least[None], np.asarray(thresholds, float)[:, None]))
@@ -208,15 +231,17 @@ def threshold_for(correlated: np.ndarray, maxima: float) -> float:
 
 
 def needed_indices(correlated: np.ndarray, threshold: float) -> np.ndarray:
-    """Return draws (n,) of d' minus one standard normal for which the statistic just exceeds the threshold at the best
-    of the near places; its mean is d' at the damage, and d' times its correlation around it."""
+    """Return draws (n,) of d' minus one standard normal for which the statistic just exceeds the
+    threshold at the best of the near places; its mean is d' at the damage, and d' times its
+    correlation around it."""
     middle = len(correlated) // 2
     half = int((correlated[middle, middle:] > 0.5).sum())
     stride = min(max(1, half // AROUND), middle // (2 * AROUND))
     steps = stride * np.arange(-AROUND, AROUND + 1)
     places = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     rho = correlated[places[:, 0] + middle, places[:, 1] + middle]
-    places, rho = places[rho > NEAR_CORRELATION], rho[rho > NEAR_CORRELATION]
+    places = places[rho > NEAR_CORRELATION]
+    rho = rho[rho > NEAR_CORRELATION]
     rest = _normals(len(rho)) @ _root(_covariance(correlated, places) - np.outer(rho, rho)).T
     return np.asarray(((threshold - rest) / rho).min(axis=1))
 
@@ -237,10 +262,11 @@ def index_for(needed: np.ndarray, share: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One damaged board as the ideal observer sees it, (h, w) each. ``known``: judged pixels. ``deviation_m``: of the
-    noise. ``signals_m`` (n, h, w): signatures of the ``holes``, 0 where not known. ``surface`` (p, h, w): polynomials.
-    ``sums``: over the noise of ``units`` units. ``pixel_m2``: area of a pixel on the face. ``lost``: share of the
-    pixels within damage that return nothing."""
+    """One damaged board as the ideal observer sees it, (h, w) each. ``known``: judged pixels.
+    ``deviation_m``: of the noise. ``signals_m`` (n, h, w): signatures of the ``holes``, 0 where
+    not known. ``surface`` (p, h, w): polynomials. ``sums``: over the noise of ``units`` units.
+    ``pixel_m2``: area of a pixel on the face. ``lost``: share of the pixels within damage that
+    return nothing."""
 
     board: int
     holes: tuple[str, ...]
@@ -256,9 +282,9 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class IdealDamages:
-    """The ideal observer on damages, (n,) each. ``index``: d'. ``threshold``: NaN if d' is 0. ``needed`` (2, n): d' at
-    which shares of `SHARES` are found. ``kurtosis``: excess, of the noise of ``units``. ``lost``: largest share of a
-    board's damage without return."""
+    """The ideal observer on damages, (n,) each. ``index``: d'. ``threshold``: NaN if d' is 0.
+    ``needed`` (2, n): d' at which shares of `SHARES` are found. ``kurtosis``: excess, of the noise
+    of ``units``. ``lost``: largest share of a board's damage without return."""
 
     board: np.ndarray
     hole: np.ndarray
@@ -272,14 +298,14 @@ class IdealDamages:
 
 
 def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamages:
-    """Judge the damages of a set-up's boards at a rate of false calls. The noise of all boards is pooled."""
+    """Judge the damages of a set-up's boards at a rate of false calls. The noise of all boards is
+    pooled."""
     sums = reduce(add, (view.sums for view in views))
     rows: list[tuple[int, str, float, float, float]] = []
     at_shares = []
     for view in views:
-        signals, surface = (
-            images / view.deviation_m * view.known for images in (view.signals_m, view.surface)
-        )
+        signals = view.signals_m / view.deviation_m * view.known
+        surface = view.surface / view.deviation_m * view.known
         seen = signals.any(axis=(1, 2))
         index = np.zeros(len(signals))
         index[seen] = detectability(signals[seen], surface, view.known, sums)
@@ -297,7 +323,8 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
     boards, holes, indices, thresholds, pods = (
         np.array(column) for column in zip(*rows, strict=True)
     )
-    units, lost = sum(view.units for view in views), max(view.lost for view in views)
+    units = sum(view.units for view in views)
+    lost = max(view.lost for view in views)
     return IdealDamages(
         boards, holes, indices, thresholds, pods, np.array(at_shares).T, units, sums.kurtosis, lost
     )

@@ -1,8 +1,9 @@
-"""Noise of random units and the signature of each damage: the input of the ideal observer for a study's set-ups.
+"""Noise of random units and the signature of each damage: the input of the ideal observer for a
+study's set-ups.
 
-Noise is a unit's average away from damage and rim, minus a cubic; so errors that the board's grain causes are noise.
-The signature is what a camera without noise, unit errors and rounding shows near damage, minus what it shows of the
-undamaged board."""
+Noise is a unit's average away from damage and rim, minus a cubic; so errors that the board's grain
+causes are noise. The signature is what a camera without noise, unit errors and rounding shows near
+damage, minus what it shows of the undamaged board."""
 
 from dataclasses import replace
 
@@ -33,14 +34,16 @@ SMOOTHED_PX = 61  # side of the square over which a pixel's variance is averaged
 DEGREE = 3  # degree of the undamaged surface, as in the thesis
 FEWEST_PIXELS = 1000  # fewest undamaged pixels of a board to estimate its noise
 FINE_MM = 1e-4  # rounding step of the noise-free camera
-REACH_PX = 8  # distance beyond a damage's outline to which the camera's window and rims spread its signature
+# distance beyond a damage's outline to which the camera's window and rims spread its signature
+REACH_PX = 8
 
 
 def ideal_of_set_ups(
     plan: SweepPlan, engine: JobEngine, calls_per_m2: float
 ) -> dict[tuple[str, int], IdealDamages]:
-    """Return the ideal observer for every set-up of a study, by variant and frames, at a rate of false calls. Views
-    that are not stored are rendered. Raises UserError if a view or a board's noise is not available."""
+    """Return the ideal observer for every set-up of a study, by variant and frames, at a rate of
+    false calls. Views that are not stored are rendered. Raises UserError if a view or a board's
+    noise is not available."""
     found = {}
     for group in plan.groups:
         batches = [batch for batch in group.then if batch.role == "damaged"]
@@ -79,7 +82,8 @@ def _undamaged(batch: Batch) -> RenderJob:
 
 
 def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]:
-    """Return a damaged board as the ideal observer sees it, by the numbers of frames of the points."""
+    """Return a damaged board as the ideal observer sees it, by the numbers of frames of the
+    points."""
     set_up = load_set_up(batch.set_ups[0])
     undamaged = load_set_up(
         replace(batch.set_ups[0], view_path=str(_undamaged(batch).path), damaged=False)
@@ -102,12 +106,14 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     signals_m = np.where(near, clear_z_m - noise_free_z_m(undamaged), 0.0)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
-    board, names = batch.board or 0, tuple(str(damage.id) for damage in set_up.truth)
+    board = batch.board or 0
+    names = tuple(str(damage.id) for damage in set_up.truth)
     facts = (
         float(np.prod(set_up.pitch_mm)) * MM**2,
         float((~np.isfinite(clear_z_m.ravel()[inside])).mean()),
     )
-    shown, views = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut]), {}
+    shown = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut])
+    views = {}
     for point in {point.config.capture.frames: point for point in points}.values():
         noise_m, known = _noise_m(set_up, board, point, surface, intact)
         deviation_m = _deviation_m(noise_m, known)
@@ -120,7 +126,8 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
 
 
 def noise_free_z_m(set_up: SetUp) -> np.ndarray:
-    """Return z (h, w) of the camera without noise, unit errors and rounding; NaN where it shows nothing."""
+    """Return z (h, w) of the camera without noise, unit errors and rounding; NaN where it shows
+    nothing."""
     config = set_up.unit.config
     kept = {
         name: getattr(config.effects, name)
@@ -141,8 +148,10 @@ def _unit(set_up: SetUp, **changes: object) -> SimulatedUnit:
 def _noise_m(
     set_up: SetUp, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise (k, h, w) of `UNITS_A_BOARD` units, each minus its cubic fit, and where it is known."""
-    capture, fields = point.config.capture, []
+    """Return the noise (k, h, w) of `UNITS_A_BOARD` units, each minus its cubic fit, and where it
+    is known."""
+    capture = point.config.capture
+    fields = []
     for number in range(UNITS_A_BOARD):
         labels = ("units of the ideal observer", board, number)
         seed = int(random_stream(point.config.seed, *labels).integers(2**31))
@@ -160,11 +169,10 @@ def _noise_m(
 
 
 def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the root mean square (h, w) of the noise over units and a square around each pixel, or the nearest one."""
-    square, count = (
-        ndimage.uniform_filter(image.sum(axis=0), SMOOTHED_PX)
-        for image in (noise_m**2, known * 1.0)
-    )
+    """Return the root mean square (h, w) of the noise over units and a square around each pixel,
+    or the nearest one."""
+    square = ndimage.uniform_filter((noise_m**2).sum(axis=0), SMOOTHED_PX)
+    count = ndimage.uniform_filter((known * 1.0).sum(axis=0), SMOOTHED_PX)
     enough = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~enough, return_distances=False, return_indices=True)
     return np.asarray(np.sqrt(square[tuple(nearest)] / count[tuple(nearest)]))

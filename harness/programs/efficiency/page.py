@@ -63,7 +63,8 @@ def answer(rows: Sequence[Efficiency]) -> str:
 
 
 def efficiency_figure(rows: Sequence[Efficiency]) -> str:
-    """Draw each set-up's curve against d' with the shares of hits in classes of d', and the ideal observer's POD."""
+    """Draw each set-up's curve against d' with the shares of hits in classes of d', and the ideal
+    observer's POD."""
     detectors = list(dict.fromkeys(row.limit.record.detector for row in rows))
     conditions = list(
         dict.fromkeys((row.limit.record.frames, row.limit.largest_mm) for row in rows)

@@ -1,4 +1,5 @@
-"""Tables of efficiency: detectors compared with the ideal observer, and the ideal observer's result on each damage."""
+"""Tables of efficiency: detectors compared with the ideal observer, and the ideal observer's
+result on each damage."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +11,8 @@ from harness.tables.limits import CALLS, SET_UP, a50_of, a90_of
 from harness.vocabulary.text import unbroken
 
 INDEX = "d' of the ideal observer for the damage"
-INDEX_50, INDEX_90 = (
-    f"{INDEX} that the detector finds {share} % of the time" for share in (50, 90)
-)
+INDEX_50 = f"{INDEX} that the detector finds {50} % of the time"
+INDEX_90 = f"{INDEX} that the detector finds {90} % of the time"
 IDEAL_A90 = "diameter that the ideal observer finds 90 % of the time"
 
 

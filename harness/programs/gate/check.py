@@ -1,15 +1,18 @@
-"""``tofpod check experiments/regression.yaml``: a gate that fails if a detection limit has become worse.
+"""``tofpod check experiments/regression.yaml``: a gate that fails if a detection limit has become
+worse.
 
-The study is run and compared with a committed baseline by `harness.programs.gate.verdict`. A set-up fails if its a90
-or its rate of false calls has grown, or its signals relative to the threshold have fallen, by more than 10 % and the
-tests show that this is not by chance (at 0.1 % for the whole check). It also fails if its limit is lost, if more trials
-failed, or if it is missing. With the same seed and code nothing fails.
+The study is run and compared with a committed baseline by `harness.programs.gate.verdict`. A
+set-up fails if its a90 or its rate of false calls has grown, or its signals relative to the
+threshold have fallen, by more than 10 % and the tests show that this is not by chance (at 0.1 %
+for the whole check). It also fails if its limit is lost, if more trials failed, or if it is
+missing. With the same seed and code nothing fails.
 
-Of 40 checks each, all fail with 1.4 times the camera's noise, 39 with 1.2 times the threshold, and 13 if a90 grows by
-20 % at the same a50; with only another draw of all noise, 2 of 746 fail (95 %: 0.03 to 0.97 %), both by a90
-(`tests/validation/gate_power.py`, boards as in regression.yaml). The limit of through-holes (a diameter)
-hardly depends on noise and threshold; that of blind holes (a depth) is proportional to them. If both thresholds were
-calibrated again, a90 must grow by two more standard errors (`verdict.limit_margin`)."""
+Of 40 checks each, all fail with 1.4 times the camera's noise, 39 with 1.2 times the threshold, and
+13 if a90 grows by 20 % at the same a50; with only another draw of all noise, 2 of 746 fail (95 %:
+0.03 to 0.97 %), both by a90 (`tests/validation/gate_power.py`, boards as in regression.yaml). The
+limit of through-holes (a diameter) hardly depends on noise and threshold; that of blind holes (a
+depth) is proportional to them. If both thresholds were calibrated again, a90 must grow by two more
+standard errors (`verdict.limit_margin`)."""
 
 from __future__ import annotations
 
@@ -67,7 +70,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0, 1 if a set-up is worse or missing, 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 1 if a set-up is worse or missing, 2 for a user's mistake, 130
+    after Ctrl-C."""
     from harness.evaluation.study.record import read_record, record_text
     from harness.experiment.load import load_experiment
     from harness.programs.gate.compare import FILES, write_comparison
@@ -77,7 +81,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.text import many, show
 
     experiment = load_experiment(options.experiment, options.overrides)
-    study, set_ups = experiment.config.study, len(experiment.points)
+    study = experiment.config.study
+    set_ups = len(experiment.points)
     if study is None:
         raise UserError(
             f"{options.experiment}: has no `study`", fix="name an experiment with a study of limits"

@@ -1,4 +1,5 @@
-"""``tofpod compare A B``: compares two studies of detection limits, set-up by set-up, with paired tests."""
+"""``tofpod compare A B``: compares two studies of detection limits, set-up by set-up, with paired
+tests."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "paired if both studies have the same boards. tofpod check fails if a detection limit grew.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0 for any result of the comparison, 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0 for any result of the comparison, 2 for a user's mistake, 130
+    after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.programs.gate.page import compare_parts
     from harness.programs.gate.verdict import compare_studies, paired_set_ups
@@ -52,7 +54,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     if not 1e-6 <= options.alpha <= 0.5:
         raise UserError(f"--alpha {options.alpha:g}", legal="1e-6 to 0.5")
-    first, second = read_record(options.first), read_record(options.second)
+    first = read_record(options.first)
+    second = read_record(options.second)
     if not any(old is not None and new is not None for old, new in paired_set_ups(first, second)):
         both = " / ".join(
             "; ".join(set_up.label for set_up in study.set_ups) for study in (first, second)

@@ -1,4 +1,5 @@
-"""Presents a comparison of two studies as a table for terminal and page, as a sentence, and as data for programs."""
+"""Presents a comparison of two studies as a table for terminal and page, as a sentence, and as
+data for programs."""
 
 from collections.abc import Callable
 from typing import Any

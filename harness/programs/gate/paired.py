@@ -1,6 +1,7 @@
-"""Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units, because damages of one board
-share its render, its pose and its surface. The tests of hits and limits ignore that each set-up drew its own
-calibration of the threshold; those of signals and false calls do not. The first of two p-values means worse."""
+"""Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units, because
+damages of one board share its render, its pose and its surface. The tests of hits and limits
+ignore that each set-up drew its own calibration of the threshold; those of signals and false calls
+do not. The first of two p-values means worse."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,9 +20,10 @@ Tails = tuple[float, float]
 
 @dataclass(frozen=True)
 class HitsChange:
-    """Hits of two set-ups on the same ``inspections`` of ``boards``. ``only_first``, ``only_second``: found by only
-    one. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: the probability of so few (many) hits of the
-    second if each board's two sums of hits are exchangeable."""
+    """Hits of two set-ups on the same ``inspections`` of ``boards``. ``only_first``,
+    ``only_second``: found by only one. ``fewer_p``, ``more_p``: one-sided sign-flip test over
+    boards: the probability of so few (many) hits of the second if each board's two sums of hits
+    are exchangeable."""
 
     boards: int
     inspections: int
@@ -32,12 +34,15 @@ class HitsChange:
 
 
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
-    """Compare hits on the inspections (board, hole, repeat) that both have; None if there are none."""
+    """Compare hits on the inspections (board, hole, repeat) that both have; None if there are
+    none."""
     rows_1, rows_2 = shared_rows(first, second)
     if not len(rows_1):
         return None
-    found, now = first.hit[rows_1], second.hit[rows_2]
-    only_first, only_second = int((found & ~now).sum()), int((now & ~found).sum())
+    found = first.hit[rows_1]
+    now = second.hit[rows_2]
+    only_first = int((found & ~now).sum())
+    only_second = int((now & ~found).sum())
     names, board = np.unique(first.board[rows_1], return_inverse=True)
     gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
     return HitsChange(len(names), len(rows_1), only_first, only_second, *sign_flip(gained))
@@ -57,8 +62,9 @@ def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.nda
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
-    """Return (P(sum <= observed), P(sum >= observed)) of integer differences (n,) with random signs: Fisher's
-    randomisation test for pairs. It is exact: the distribution of the sum is built up board by board."""
+    """Return (P(sum <= observed), P(sum >= observed)) of integer differences (n,) with random
+    signs: Fisher's randomisation test for pairs. It is exact: the distribution of the sum is built
+    up board by board."""
     chance = np.ones(1)  # of the sum of the differences with a positive sign
     for size in np.abs(gained[gained != 0]).tolist():
         chance = 0.5 * (np.pad(chance, (0, size)) + np.pad(chance, (size, 0)))
@@ -72,10 +78,11 @@ def _tails(chance: np.ndarray, observed: int) -> Tails:
 
 @dataclass(frozen=True)
 class LimitChange:
-    """Ratio and difference of the second set-up's a90 to the first's. ``interval_mm``: 95 % percentiles of the
-    difference over resampled boards, the same for both if ``paired``. ``grown_p``, ``shrunk_p``: one-sided, by
-    Student's t of the change's logarithm over its deviation in paired draws. If unpaired, or if many draws have no a90,
-    they are the share of draws in which it has not grown (shrunk)."""
+    """Ratio and difference of the second set-up's a90 to the first's. ``interval_mm``: 95 %
+    percentiles of the difference over resampled boards, the same for both if ``paired``.
+    ``grown_p``, ``shrunk_p``: one-sided, by Student's t of the change's logarithm over its
+    deviation in paired draws. If unpaired, or if many draws have no a90, they are the share of
+    draws in which it has not grown (shrunk)."""
 
     ratio: float
     difference_mm: float
@@ -89,8 +96,10 @@ KNOWN = 0.9  # least share of draws with an a90 whose deviation counts as that o
 
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
-    """Compare two a90 by resampled boards. ``same_boards``: boards with equal damage; paired if both saw the same."""
-    draws_1, draws_2 = first.a90_draws_mm, second.a90_draws_mm
+    """Compare two a90 by resampled boards. ``same_boards``: boards with equal damage; paired if
+    both saw the same."""
+    draws_1 = first.a90_draws_mm
+    draws_2 = second.a90_draws_mm
     boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
     paired = (
         same_boards and bool(np.array_equal(boards[0], boards[1])) and len(draws_1) == len(draws_2)
@@ -103,12 +112,11 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     )  # the least p-value that so few draws can support
     shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
     grown, shrunk = ((1 - weight) * share + weight for share in shares)
-    before, now = first.a90_mm, second.a90_mm
+    before = first.a90_mm
+    now = second.a90_mm
     with np.errstate(all="ignore"):
-        change, logs = (
-            float(np.log(now / before)),
-            np.log(draws_2 / draws_1) if paired else np.empty(0),
-        )
+        change = float(np.log(now / before))
+        logs = np.log(draws_2 / draws_1) if paired else np.empty(0)
     known = logs[np.isfinite(logs)]
     if len(known) > KNOWN * len(logs) and known.std() > 0 and np.isfinite(change):
         grown, shrunk = t.sf([change, -change], len(boards[0]) - 1, scale=known.std()).tolist()
@@ -120,9 +128,10 @@ SAME = 1e-6  # relative difference of equal thresholds between machines
 
 @dataclass(frozen=True)
 class SignalChange:
-    """Change of the signals of ``damages``, each divided by the least signal that is found (``found_from``: first,
-    second). ``ratio``: median, as a factor. ``error``: of its logarithm, over boards, calibrations. p: one-sided, by
-    Student's t, as these errors are estimates too (Satterthwaite, Biometrics Bulletin 2 (1946), 110)."""
+    """Change of the signals of ``damages``, each divided by the least signal that is found
+    (``found_from``: first, second). ``ratio``: median, as a factor. ``error``: of its logarithm,
+    over boards, calibrations. p: one-sided, by Student's t, as these errors are estimates too
+    (Satterthwaite, Biometrics Bulletin 2 (1946), 110)."""
 
     damages: int
     ratio: float
@@ -133,9 +142,10 @@ class SignalChange:
 
 
 def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | None:
-    """Compare signals on the inspections that both have. This is more sensitive than hits: signals change with all
-    noise and with the threshold, hits only near the limit. A damage counts if the geometric mean of its two signals,
-    each over ``found_from``, exceeds 1; smaller signals are noise. None for two detectors or fewer than two boards."""
+    """Compare signals on the inspections that both have. This is more sensitive than hits: signals
+    change with all noise and with the threshold, hits only near the limit. A damage counts if the
+    geometric mean of its two signals, each over ``found_from``, exceeds 1; smaller signals are
+    noise. None for two detectors or fewer than two boards."""
     rows_1, rows_2 = shared_rows(first.inspected, second.inspected)
     if first.detector != second.detector or not len(rows_1):
         return None
@@ -146,7 +156,8 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
             for record, rows, (at, _) in zip((first, second), (rows_1, rows_2), needed, strict=True)
         )
         clear = np.isfinite(before + now) & (before + now > 0)
-    change, board = (now - before)[clear], first.inspected.board[rows_1][clear]
+    change = (now - before)[clear]
+    board = first.inspected.board[rows_1][clear]
     names, which = np.unique(board, return_inverse=True)
     if len(names) < 2:
         return None
@@ -155,7 +166,8 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     if not np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
         parts += [_threshold_variance(first), _threshold_variance(second)]
     variances, freedoms = np.array([*parts, *((unsure, np.inf) for _, unsure in needed)]).T
-    error, median = float(np.sqrt(variances.sum())), float(np.median(change))
+    error = float(np.sqrt(variances.sum()))
+    median = float(np.median(change))
     p = [float(median >= 0), float(median <= 0)]
     if error > 0:
         p = t.cdf(
@@ -165,22 +177,22 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
 
 
 def found_from(record: SetUpRecord) -> tuple[float, float]:
-    """Return the effective threshold and the variance of its logarithm: the set-up's threshold (variance 0) if it
-    divides hits from misses without exception; else the middle between the strongest miss and the weakest hit, if they
-    do not overlap; else the signal at which half is found, by logistic regression. Hits by missing returns alone do
-    not count; NaN without signals, or if hits do not grow with them."""
+    """Return the effective threshold and the variance of its logarithm: the set-up's threshold
+    (variance 0) if it divides hits from misses without exception; else the middle between the
+    strongest miss and the weakest hit, if they do not overlap; else the signal at which half is
+    found, by logistic regression. Hits by missing returns alone do not count; NaN without signals,
+    or if hits do not grow with them."""
     seen = record.inspected
     known = seen.signal > 0
-    signal, hit = seen.signal[known], (seen.hit if seen.by_depth is None else seen.by_depth)[known]
+    signal = seen.signal[known]
+    hit = (seen.hit if seen.by_depth is None else seen.by_depth)[known]
     if not len(signal):
         return np.nan, np.nan
     if (hit == (signal > record.threshold)).all():
         return record.threshold, 0.0
     logs = np.log(signal)
-    strongest_miss, weakest_hit = (
-        logs[~hit].max(initial=logs.min()),
-        logs[hit].min(initial=logs.max()),
-    )
+    strongest_miss = logs[~hit].max(initial=logs.min())
+    weakest_hit = logs[hit].min(initial=logs.max())
     if strongest_miss <= weakest_hit:
         return float(np.exp((strongest_miss + weakest_hit) / 2)), float(
             (weakest_hit - strongest_miss) ** 2 / 12
@@ -193,13 +205,15 @@ def found_from(record: SetUpRecord) -> tuple[float, float]:
 
 
 def _threshold_variance(record: SetUpRecord) -> tuple[float, float]:
-    """Return the variance of a calibrated threshold's logarithm, and its degrees of freedom. Scores above the median
-    are taken to have an exponential tail on a logarithmic scale: the mean excess of so many determines it, where the
-    distance of neighbouring scores would scatter by 40 %."""
+    """Return the variance of a calibrated threshold's logarithm, and its degrees of freedom.
+    Scores above the median are taken to have an exponential tail on a logarithmic scale: the mean
+    excess of so many determines it, where the distance of neighbouring scores would scatter by 40
+    %."""
     if record.calibrated is None or len(record.calibrated.score) < 2:
         return 0.0, np.inf
     falling = np.sort(np.log(np.maximum(record.calibrated.score, 1e-9)))[::-1]
-    n, rank = len(falling), max(int((falling >= np.log(record.threshold)).sum()), 1)
+    n = len(falling)
+    rank = max(int((falling >= np.log(record.threshold)).sum()), 1)
     upper = n // 2
     scale = (falling[:upper] - falling[upper]).mean()
     return float(scale**2 * max(1 / rank - 1 / n, 1 / n**2)), upper / 2
@@ -207,10 +221,10 @@ def _threshold_variance(record: SetUpRecord) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class CallsChange:
-    """False calls, each as (first, second): ``calls`` on ``areas_m2`` of hole-free boards, and ``calling`` of
-    ``boards`` with a call in their first repeat. ``more_p``, ``fewer_p``: one-sided. ``way``: "signs", the signs of
-    boards are randomised (same frames and threshold); "calibrations", two draws of the calibration (different frames);
-    "both", the larger p."""
+    """False calls, each as (first, second): ``calls`` on ``areas_m2`` of hole-free boards, and
+    ``calling`` of ``boards`` with a call in their first repeat. ``more_p``, ``fewer_p``:
+    one-sided. ``way``: "signs", the signs of boards are randomised (same frames and threshold);
+    "calibrations", two draws of the calibration (different frames); "both", the larger p."""
 
     calls: tuple[int, int]
     areas_m2: tuple[float, float]
@@ -235,20 +249,22 @@ class CallsChange:
 def calls_change(
     first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float | None
 ) -> CallsChange | None:
-    """Compare false calls of two set-ups whose thresholds were calibrated on hole-free boards of their own. Two correct
-    calibrations for one rate give two different true rates (Beta distributed, Wilks 1941): at a level of 5 %, a test of
-    two Poisson counts rejects 20 % of equal pairs with 240 boards each. So each set-up gets its own draw of that
-    distribution. On identical frames with the same threshold, the signs of each board's difference are randomised,
-    which shows smaller changes; if the threshold differs on identical frames, both tests must agree. None if either
-    set-up has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
-    unflawed_1, unflawed_2 = first.unflawed, second.unflawed
+    """Compare false calls of two set-ups whose thresholds were calibrated on hole-free boards of
+    their own. Two correct calibrations for one rate give two different true rates (Beta
+    distributed, Wilks 1941): at a level of 5 %, a test of two Poisson counts rejects 20 % of equal
+    pairs with 240 boards each. So each set-up gets its own draw of that distribution. On identical
+    frames with the same threshold, the signs of each board's difference are randomised, which
+    shows smaller changes; if the threshold differs on identical frames, both tests must agree.
+    None if either set-up has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
+    unflawed_1 = first.unflawed
+    unflawed_2 = second.unflawed
     areas = (float(unflawed_1.area_m2.sum()), float(unflawed_2.area_m2.sum()))
     if not min(areas) > 0:
         return None
     calls = (int(unflawed_1.calls.sum()), int(unflawed_2.calls.sum()))
     (boards_1, calling_1), (boards_2, calling_2) = _calling(unflawed_1), _calling(unflawed_2)
-    # on identical frames, an equal calibrated threshold means equal scores: two scorings give the same number by chance
-    # only if scores are few whole numbers; a given threshold has no scatter
+    # on identical frames, an equal calibrated threshold means equal scores: two scorings give the
+    # same number by chance only if scores are few whole numbers; a given threshold has no scatter
     given = not (first.calibration_runs or second.calibration_runs)
     way: Literal["signs", "calibrations", "both"] = "both"
     if first.frames_digest != second.frames_digest:
@@ -282,13 +298,15 @@ def calls_change(
 
 
 def _calling(table: Unflawed) -> tuple[int, int]:
-    """Return (boards, boards with a call) in the first repeat of each: repeats of one board are not independent."""
+    """Return (boards, boards with a call) in the first repeat of each: repeats of one board are
+    not independent."""
     first = table.repeat == table.repeat.min()
     return int(first.sum()), int((table.calls[first] > 0).sum())
 
 
 def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] | None:
-    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None if it was given."""
+    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None if it
+    was given."""
     n = record.calibration_runs
     if not n:
         return None

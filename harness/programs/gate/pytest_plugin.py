@@ -1,10 +1,12 @@
-"""A pytest plug-in that is installed with tofpod. Its fixture ``tofpod_gate`` guards the limit of a detector:
+"""A pytest plug-in that is installed with tofpod. Its fixture ``tofpod_gate`` guards the limit of
+a detector:
 
     def test_the_limit_holds(tofpod_gate):
         tofpod_gate("limit.yaml")
 
-This test runs the study beside it and compares it with ``limit.baseline.json`` there, as `tofpod check` does. ``pytest
---tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder."""
+This test runs the study beside it and compares it with ``limit.baseline.json`` there, as `tofpod
+check` does. ``pytest --tofpod-update`` writes the baseline. Renders and finished trials are kept
+in pytest's cache folder."""
 
 import contextlib
 import io
@@ -22,7 +24,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture
 def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
-    """Return ``gate(experiment, *changes)``, which returns a study's folder or fails as `tofpod check` does."""
+    """Return ``gate(experiment, *changes)``, which returns a study's folder or fails as `tofpod
+    check` does."""
 
     def gate(experiment: str, *changes: str) -> Path:
         from harness.experiment.load import load_experiment
@@ -30,7 +33,8 @@ def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
 
         path = Path(request.path).parent / experiment
         assert request.config.cache is not None
-        out, printed = request.config.cache.mkdir("tofpod"), io.StringIO()
+        out = request.config.cache.mkdir("tofpod")
+        printed = io.StringIO()
         arguments = [
             str(path),
             "--baseline",

@@ -1,8 +1,9 @@
-"""The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. A
-set-up is worse if its a90 or its rate of false calls has grown (or its signals over the threshold have fallen) by more
-than `MARGIN` and by more than chance explains, by Holm's step-down method over the three questions of all set-ups at
-`ALPHA`; or if it has lost its limit. On the same boards, the tests of hits and of a90 decide on the limit; on other
-boards, the bootstrap of a90 does. See `harness.programs.gate.paired`."""
+"""The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv
+judges benchmarks. A set-up is worse if its a90 or its rate of false calls has grown (or its
+signals over the threshold have fallen) by more than `MARGIN` and by more than chance explains, by
+Holm's step-down method over the three questions of all set-ups at `ALPHA`; or if it has lost its
+limit. On the same boards, the tests of hits and of a90 decide on the limit; on other boards, the
+bootstrap of a90 does. See `harness.programs.gate.paired`."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -17,10 +18,13 @@ from harness.programs.gate import paired
 from harness.programs.gate.paired import Tails
 from harness.vocabulary.seeds import canonical_json
 
-MARGIN = 1.10  # largest growth of a90, rate of false calls, or threshold over signals that is neither worse nor better
+# largest growth of a90, rate of false calls, or threshold over signals that is neither worse nor
+# better
+MARGIN = 1.10
 ALPHA = 0.001
-"""Level of a gate's tests, for a whole comparison. It is low because no test over boards includes the scatter of each
-set-up's calibration of the threshold; `tofpod check` says how often the rule fails because of it."""
+"""Level of a gate's tests, for a whole comparison. It is low because no test over boards includes
+the scatter of each set-up's calibration of the threshold; `tofpod check` says how often the rule
+fails because of it."""
 QUESTIONS = 3  # the questions about a set-up: its limit, false calls and signals
 
 Mark = Literal[
@@ -30,13 +34,15 @@ Mark = Literal[
 SIGNS: dict[Mark, str] = dict(zip(get_args(Mark), "+- ~!* x<>", strict=True))
 """Signs of the marks, as in asv where it has them: + means a larger number, which is worse."""
 OTHER_DAMAGE_P = 0.001
-"""Boards of one family that are drawn again differ by chance; with a smaller p-value they count as another family."""
+"""Boards of one family that are drawn again differ by chance; with a smaller p-value they count as
+another family."""
 Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedSetUps:
-    """One set-up of two studies. ``*_p``: adjusted p for (worse, better), 1 without a test. ``why``: reason."""
+    """One set-up of two studies. ``*_p``: adjusted p for (worse, better), 1 without a test.
+    ``why``: reason."""
 
     first: SetUpLimit | None
     second: SetUpLimit | None
@@ -78,8 +84,9 @@ class Comparison:
 
 
 def fewest_boards(set_ups: int) -> int:
-    """Return the fewest shared boards with which the tests can show that one of the set-ups is worse. If it is worse on
-    every board, the p-value is 1 in 2^boards, multiplied by the questions of all set-ups and the limit's two tests."""
+    """Return the fewest shared boards with which the tests can show that one of the set-ups is
+    worse. If it is worse on every board, the p-value is 1 in 2^boards, multiplied by the questions
+    of all set-ups and the limit's two tests."""
     return int(np.floor(np.log2(2 * QUESTIONS * set_ups / ALPHA))) + 1
 
 
@@ -93,7 +100,9 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
                 ComparedSetUps(*limits, mark="only in second" if old is None else "only in first")
             )
             continue
-        before, now, changed = limit_of(old), limit_of(new), differences(old, new)
+        before = limit_of(old)
+        now = limit_of(new)
+        changed = differences(old, new)
         if why := not_comparable(first, second, old, new):
             rows.append(ComparedSetUps(before, now, changed, mark="not comparable", why=why))
             continue
@@ -122,7 +131,8 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
 
 
 def holm(p_values: Iterable[float]) -> np.ndarray:
-    """Return adjusted p-values (n,) by Holm's step-down method (1979): those below a level hold jointly at it."""
+    """Return adjusted p-values (n,) by Holm's step-down method (1979): those below a level hold
+    jointly at it."""
     p = np.asarray(list(p_values), float)
     order = np.argsort(p, kind="stable")
     stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
@@ -132,8 +142,9 @@ def holm(p_values: Iterable[float]) -> np.ndarray:
 
 
 def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
-    """Pair set-ups by variant and frames, then the rest by place on the axes and frames; two single set-ups are a pair.
-    In the order of ``first``; set-ups of only one study are paired with None, those of the second at the end."""
+    """Pair set-ups by variant and frames, then the rest by place on the axes and frames; two
+    single set-ups are a pair. In the order of ``first``; set-ups of only one study are paired with
+    None, those of the second at the end."""
     if len(first.set_ups) == len(second.set_ups) == 1:
         return ((first.set_ups[0], second.set_ups[0]),)
     partner: dict[int, SetUpRecord] = {}
@@ -156,9 +167,9 @@ def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
 def not_comparable(
     first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord
 ) -> str:
-    """Return why the two were not measured in the same way (hit radius, wanted false calls, damage), empty if they
-    were. Damage of other boards is compared by Kolmogorov and Smirnov's test with the boards' number as sample size:
-    cautious unless damages of a board are alike."""
+    """Return why the two were not measured in the same way (hit radius, wanted false calls,
+    damage), empty if they were. Damage of other boards is compared by Kolmogorov and Smirnov's
+    test with the boards' number as sample size: cautious unless damages of a board are alike."""
     if first.hit_radius_mm != second.hit_radius_mm:
         return (
             f"hits within {first.hit_radius_mm:g} mm there, within {second.hit_radius_mm:g} mm here"
@@ -196,7 +207,8 @@ def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
         if before != now
     ]
     for axis in sorted({*one.axes, *other.axes}):
-        before, now = one.axes.get(axis, "default"), other.axes.get(axis, "default")
+        before = one.axes.get(axis, "default")
+        now = other.axes.get(axis, "default")
         if before != now:
             changes.append(f"{axis} {before} → {now}")
     if one.targets_digest != other.targets_digest:
@@ -212,20 +224,23 @@ def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | 
     signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
     if row.limit is None:
         return None, calls, signal
-    worse, better = row.limit.grown_p, row.limit.shrunk_p
+    worse = row.limit.grown_p
+    better = row.limit.shrunk_p
     if row.hits is not None and row.limit.paired:  # the better of two tests counts twice
-        worse, better = (
-            min(1.0, 2 * min(worse, row.hits.fewer_p)),
-            min(1.0, 2 * min(better, row.hits.more_p)),
-        )
+        worse = min(1.0, 2 * min(worse, row.hits.fewer_p))
+        better = min(1.0, 2 * min(better, row.hits.more_p))
     return (worse, better), calls, signal
 
 
 def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
-    """Return mark and reason; failures come first. Growth in either direction must exceed margin and chance."""
-    first, second, calls = row.first, row.second, row.calls
+    """Return mark and reason; failures come first. Growth in either direction must exceed margin
+    and chance."""
+    first = row.first
+    second = row.second
+    calls = row.calls
     assert first is not None and second is not None
-    growth, grown = _growth(first, second), f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
+    growth = _growth(first, second)
+    grown = f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
     if first.a90_95.demonstrated != second.a90_95.demonstrated:
         bounds = (first.a90_95, second.a90_95)
         before, now = (
@@ -255,8 +270,9 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
 
 
 def limit_margin(signal: paired.SignalChange | None) -> float:
-    """Return the margin of a90, widened by two standard errors of the signals over the threshold, if known: a depth
-    limit changes with them, and no test of hits includes the scatter of two calibrations."""
+    """Return the margin of a90, widened by two standard errors of the signals over the threshold,
+    if known: a depth limit changes with them, and no test of hits includes the scatter of two
+    calibrations."""
     return MARGIN * float(np.exp(2 * signal.error)) if signal else MARGIN
 
 
@@ -270,8 +286,10 @@ def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
 
 
 def _growth(first: SetUpLimit, second: SetUpLimit) -> float:
-    """Return the ratio of a90; infinite (0) if a90/95 is no longer (newly) demonstrated; NaN without a limit."""
-    before, now = first.a90_95.demonstrated, second.a90_95.demonstrated
+    """Return the ratio of a90; infinite (0) if a90/95 is no longer (newly) demonstrated; NaN
+    without a limit."""
+    before = first.a90_95.demonstrated
+    now = second.a90_95.demonstrated
     ratio = second.a90_mm / first.a90_mm
     if before == now or not np.isfinite(ratio):
         return ratio if np.isfinite(ratio) else np.nan

@@ -1,4 +1,5 @@
-"""``tofpod implant``: states your camera's detection limit on your part, by virtual damage in captures."""
+"""``tofpod implant``: states your camera's detection limit on your part, by virtual damage in
+captures."""
 
 from __future__ import annotations
 
@@ -20,10 +21,9 @@ if TYPE_CHECKING:
     from scenes.target.drawn import DrawnTargetConfig
 
 DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
-MOST_AT_ONCE, FILLED = (
-    8,
-    0.25,
-)  # Most damages of a placement, and share of the scan within half of --apart from them
+# Most damages of a placement, and share of the scan within half of --apart from them
+MOST_AT_ONCE = 8
+FILLED = 0.25
 COMPARED = (
     "virtual damage may be harder to find than real damage: on the only drilled plate where both were compared, 7 of 23"
     " virtual holes and 50 of 56 real holes of the same apparent width were found; check the limit with a gauge board"
@@ -149,7 +149,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "--diameters 2:10 --out implanted",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130
+    after Ctrl-C."""
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.evaluation.study.result import evaluate_study
     from harness.inspection.arguments import opened_as
@@ -269,7 +270,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig:
-    """Return the damage as a family of boards as large as the largest scan. Raises UserError for illegal options."""
+    """Return the damage as a family of boards as large as the largest scan. Raises UserError for
+    illegal options."""
     from harness.vocabulary.declaration.diagnose import settings_of
     from scenes.sensor.camera import CameraConfig, camera_of
     from scenes.target.drawn import DrawnTargetConfig
@@ -306,7 +308,8 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
 
 def _shares(options: argparse.Namespace, recordings: str, peaks_mm: list[float]) -> list[str]:
-    """Return sentences on what is measured and simulated, and on the limit's validity; ``peaks_mm``: visible depths."""
+    """Return sentences on what is measured and simulated, and on the limit's validity;
+    ``peaks_mm``: visible depths."""
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [
         f"Measured: {recordings}, with their surface, noise, fixed pattern, texture and missing returns.",

@@ -1,7 +1,9 @@
-"""A study on recorded frames: virtual damage at random places of scans of an undamaged part, judged like boards.
+"""A study on recorded frames: virtual damage at random places of scans of an undamaged part,
+judged like boards.
 
-A placement corresponds to a simulated board: some damages at once, in one group of recorded frames. The placements in
-one recording share its surface and fixed pattern and, if it has few frames, its noise."""
+A placement corresponds to a simulated board: some damages at once, in one group of recorded
+frames. The placements in one recording share its surface and fixed pattern and, if it has few
+frames, its noise."""
 
 import math
 import sys
@@ -33,10 +35,9 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
 from scenes.target.truth import truth_of
 
-MOST_HOLE_FREE, MOST_SETTING = (
-    20,
-    5,
-)  # most undamaged averages that count false calls, and that set a threshold
+# most undamaged averages that count false calls, and that set a threshold
+MOST_HOLE_FREE = 20
+MOST_SETTING = 5
 MOST_EMPTY = 200  # give up after this many placements in a row without a place for any damage
 NORMAL_PX = 4  # half the side of the square of surface that determines the tangent plane
 TELLING_DEG = (
@@ -47,7 +48,8 @@ VARIANT = "main"
 
 @dataclass(frozen=True)
 class Judging:
-    """The rule by which clouds are judged. ``threshold`` None: ``threshold_of`` returns it, with warnings."""
+    """The rule by which clouds are judged. ``threshold`` None: ``threshold_of`` returns it, with
+    warnings."""
 
     detector: str
     settings_json: str
@@ -57,7 +59,8 @@ class Judging:
 
 
 class Scan:
-    """A recording of an undamaged part, with its surface and judged area. Raises UserError if either is missing."""
+    """A recording of an undamaged part, with its surface and judged area. Raises UserError if
+    either is missing."""
 
     def __init__(self, recording: Recording, judging: Judging) -> None:
         if recording.lens is None or recording.slopes is None or recording.projection != "central":
@@ -73,7 +76,8 @@ class Scan:
         self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
         self.surface_z_m = np.where(self.judged, evidence.surface_z_m, np.nan)
         points_m = self.rays[self.judged] * self.surface_z_m[self.judged][:, None]
-        # the board's frame: the plane through the surface, z towards the camera, x along the picture's rows
+        # the board's frame: the plane through the surface, z towards the camera, x along the
+        # picture's rows
         centre = points_m.mean(axis=0)
         _, axes = np.linalg.eigh(np.cov((points_m - centre).T))
         normal = axes[:, 0] * -np.sign(axes[2, 0])
@@ -86,10 +90,8 @@ class Scan:
         self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
         self.size_m: np.ndarray = np.ptp(places, axis=0)
         # no damage is placed where the undamaged recording has findings, which would count as hits
-        detector, threshold = (
-            detector_of(judging.detector, judging.settings_json),
-            judging.threshold,
-        )
+        detector = detector_of(judging.detector, judging.settings_json)
+        threshold = judging.threshold
         found = detector.find(
             self.whole, evidence, threshold or judging.threshold_of(self.whole)[0]
         )
@@ -106,7 +108,8 @@ class Scan:
     @cached_property
     def places_m(self) -> np.ndarray:
         """Points (h, w, 2) where each pixel's ray meets the plane; NaN where nothing is judged."""
-        normal, centre = self.T_camera_board[:3, 2], self.T_camera_board[:3, 3]
+        normal = self.T_camera_board[:3, 2]
+        centre = self.T_camera_board[:3, 3]
         met = self.rays * ((centre @ normal) / (self.rays @ normal))[..., None]
         return np.where(
             self.judged[..., None],
@@ -116,7 +119,8 @@ class Scan:
 
     @cached_property
     def depth_px(self) -> np.ndarray:
-        """Distance (h, w) of each pixel to the nearest one that is not judged or is outside the picture."""
+        """Distance (h, w) of each pixel to the nearest one that is not judged or is outside the
+        picture."""
         return np.asarray(ndimage.distance_transform_edt(np.pad(self.judged, 1))[1:-1, 1:-1])
 
     @cached_property
@@ -131,7 +135,8 @@ class Scan:
 
     @cached_property
     def angle_deg(self) -> np.ndarray:
-        """Angle (h, w) between each judged pixel's ray and the fitted surface's normal; NaN elsewhere."""
+        """Angle (h, w) between each judged pixel's ray and the fitted surface's normal; NaN
+        elsewhere."""
         down, across = np.gradient(self.rays * self.surface_z_m[..., None], axis=(0, 1))
         normal = np.cross(down, across)
         along = (normal * self.rays).sum(-1) / (
@@ -140,12 +145,15 @@ class Scan:
         return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
 
     def rim_px(self, family: DrawnTargetConfig) -> float:
-        """Return the least distance of a damage's centre from the edge of the judged area, for any size of damage."""
+        """Return the least distance of a damage's centre from the edge of the judged area, for any
+        size of damage."""
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:
-        """Return a sentence on the rim where no damage is placed; empty if it is not steeper than the rest."""
-        inner, known = self.depth_px >= self.rim_px(family), np.isfinite(self.angle_deg)
+        """Return a sentence on the rim where no damage is placed; empty if it is not steeper than
+        the rest."""
+        inner = self.depth_px >= self.rim_px(family)
+        known = np.isfinite(self.angle_deg)
         if not (inner & known).any():
             return ""
         steep = [
@@ -165,17 +173,20 @@ class Scan:
         return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
 
     def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the surface's point (3,) above a place of the plane and the normal (3,) towards the camera, in its
-        frame; None with less than ``rim_px`` of judged surface around it, or with a finding within the hit radius."""
+        """Return the surface's point (3,) above a place of the plane and the normal (3,) towards
+        the camera, in its frame; None with less than ``rim_px`` of judged surface around it, or
+        with a finding within the hit radius."""
         if (np.linalg.norm(self.taken_m - [x_m, y_m], axis=1) < self.free_m).any():
             return None
         point = transform_points(self.T_camera_board, np.array([x_m, y_m, 0.0]))
         u, v = self.lens.project(point)
-        row, column = round(float(v)), round(float(u))
+        row = round(float(v))
+        column = round(float(u))
         h, w = self.judged.shape
         if not (0 <= row < h and 0 <= column < w) or self.depth_px[row, column] < rim_px:
             return None
-        rows, columns = (slice(max(at - NORMAL_PX, 0), at + NORMAL_PX + 1) for at in (row, column))
+        rows = slice(max(row - NORMAL_PX, 0), row + NORMAL_PX + 1)
+        columns = slice(max(column - NORMAL_PX, 0), column + NORMAL_PX + 1)
         around = rows, columns
         points = (self.rays[around] * self.surface_z_m[around][..., None]).reshape(-1, 3)
         points = points[np.isfinite(points[:, 2])]
@@ -207,7 +218,8 @@ class Implanted:
         """Return the average of a group of the scan's frames with the damage implanted."""
         changed = []
         for number, frame in list(enumerate(self.scan.frames))[group]:
-            z_m, reason = frame.z_m.copy(), frame.reason.copy()
+            z_m = frame.z_m.copy()
+            reason = frame.reason.copy()
             for implant in self.implants:
                 implant.put_into(frame, number, z_m, reason)
             changed.append(replace(frame, z_m=z_m, reason=reason))
@@ -222,7 +234,8 @@ def placements(
     seed: int,
     cache: Path,
 ) -> Iterator[Implanted]:
-    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError if none fits."""
+    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError if
+    none fits."""
     units = [unit_config(camera, scan.lens) for scan in scans]
     found = number = empty = 0
     while found < targets:
@@ -252,8 +265,10 @@ def placements(
 def damages_placed(
     scan: Scan, family: DrawnTargetConfig, camera: str, purpose: Purpose, number: int
 ) -> TargetConfig:
-    """Return a board of the family with only those damages that have enough judged surface around them."""
-    drawn, rim_px = family.drawn(purpose, number), scan.rim_px(family)
+    """Return a board of the family with only those damages that have enough judged surface around
+    them."""
+    drawn = family.drawn(purpose, number)
+    rim_px = scan.rim_px(family)
     kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
     left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
     return drawn.model_copy(update=left)
@@ -263,9 +278,10 @@ def judge_scans(
     scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
     frames: Sequence[int],
 ) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
-    """Set a threshold for each number of frames, count false calls on undamaged frames, and judge all placements.
-    Return tables, a set-up for each number of frames, and warnings. If a recording has two groups of that many frames
-    or more, every second group sets the threshold; otherwise the same frames do both, and a warning says so."""
+    """Set a threshold for each number of frames, count false calls on undamaged frames, and judge
+    all placements. Return tables, a set-up for each number of frames, and warnings. If a recording
+    has two groups of that many frames or more, every second group sets the threshold; otherwise
+    the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
     warnings, calibrated = [text for scan in scans if (text := scan.left_out(family))], {}
     for count in frames:
@@ -284,10 +300,8 @@ def judge_scans(
             warnings.append(
                 f"{count} frames: one average sets the threshold, shows the false calls and is damaged too"
             )
-        setting, quiet = (
-            setting[:MOST_SETTING] if judging.threshold is None else [],
-            judged[:MOST_HOLE_FREE],
-        )
+        setting = setting[:MOST_SETTING] if judging.threshold is None else []
+        quiet = judged[:MOST_HOLE_FREE]
         own = [judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting]
         warnings += dict.fromkeys(f"{count} frames: {text}" for _, doubts in own for text in doubts)
         calibrated[count] = len(own)
@@ -323,9 +337,11 @@ def judge_scans(
     )  # fmt: skip
     detector = detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
-    set_ups, files = [], [str(path) for scan in scans for path in scan.recording.files]
+    set_ups = []
+    files = [str(path) for scan in scans for path in scan.recording.files]
     for count in frames:
-        holes, runs = (table[table["frames"] == count] for table in (tables.holes, tables.runs))
+        holes = tables.holes[tables.holes["frames"] == count]
+        runs = tables.runs[tables.runs["frames"] == count]
         set_ups.append(
             set_up_of(
                 holes,
@@ -346,7 +362,9 @@ def _add(
     rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]
 ) -> None:
     """Judge one cloud and add its rows. ``named``: its frames, board and role."""
-    began, hole_free, radius_m = time.perf_counter(), named["role"] == "hole_free", judging.radius_m
+    began = time.perf_counter()
+    hole_free = named["role"] == "hole_free"
+    radius_m = judging.radius_m
     judged = judge(
         known, judging.detector, judging.settings_json, threshold, radius_m, hole_free=hole_free
     )

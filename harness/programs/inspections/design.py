@@ -16,7 +16,9 @@ LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
 MOST_STUDIES = 100_000  # limited because simulated studies are kept in memory
-LEAST, MOST = 10, 10_000  # targets of a study: the rows that tofpod pod requires; nobody makes more
+# targets of a study: the rows that tofpod pod requires; nobody makes more
+LEAST = 10
+MOST = 10_000
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +78,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="DIR", help=f"also write {', '.join(FILES)} to this folder")
 
 
-# a curve and its origin, sizes to choose from, and the face of a hole-free board in m2 (None if unknown)
+# a curve and its origin, sizes to choose from, and the face of a hole-free board in m2 (None if
+# unknown)
 Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 
 
@@ -89,7 +92,8 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
     "5 ms.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130
+    after Ctrl-C."""
     from harness.programs.inspections import design_statistics as plan
     from harness.programs.inspections.design_page import (
         StudyDesign,
@@ -143,7 +147,8 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         fix = "make a careful guess; a study that is planned for an optimistic guess demonstrates nothing"
         raise UserError(f"{', '.join(missing)}: not stated", legal=legal, fix=fix)
     for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
-        given, owner_value = (getattr(options, each.replace("-", "_")) for each in (name, owner))
+        given = getattr(options, name.replace("-", "_"))
+        owner_value = getattr(options, owner.replace("-", "_"))
         if given is not None and owner_value is None:
             raise UserError(f"--{name} belongs to --{owner}", fix=f"add --{owner}, or leave it out")
 
@@ -165,8 +170,10 @@ def _guess(options: argparse.Namespace) -> Guess:
     if limit.statement is None:
         fix = "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
         raise UserError(f"{options.study}: {record.label} has no curve: {limit.why}", fix=fix)
-    curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
-    seen, boards = record.inspected.size_mm, record.unflawed.area_m2
+    curve = limit.statement.curve
+    origin = f"fitted to {study.name}, {record.label}"
+    seen = record.inspected.size_mm
+    boards = record.unflawed.area_m2
     sizes = options.sizes or (float(seen.min()), float(seen.max()))
     return curve, origin, tuple(sizes), float(boards.mean()) if len(boards) else None
 
@@ -174,7 +181,8 @@ def _guess(options: argparse.Namespace) -> Guess:
 def _check(options: argparse.Namespace, guess: Guess) -> None:
     """Refuse arguments that would fail after minutes or give meaningless results."""
     curve, _, (low, high), board_m2 = guess
-    a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
+    a50 = curve.size_at(0.5)
+    a90 = curve.size_at(0.9)
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
     # NaN compares false with everything, so every rule states the condition that must hold
     rules = (

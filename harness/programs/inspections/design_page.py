@@ -34,8 +34,9 @@ SIZE_IN = (11.5, 4.9)
 
 @dataclass(frozen=True, eq=False)
 class StudyDesign:
-    """Plans for a study. Sizes are in ``unit``; ``origin`` is that of the guessed curve. ``goal`` is the wanted bound,
-    if any, and ``reaches`` whether nine of ten studies by the ``recommended`` plan demonstrate it."""
+    """Plans for a study. Sizes are in ``unit``; ``origin`` is that of the guessed curve. ``goal``
+    is the wanted bound, if any, and ``reaches`` whether nine of ten studies by the ``recommended``
+    plan demonstrate it."""
 
     guess: PodCurve
     origin: str
@@ -62,7 +63,8 @@ class StudyDesign:
 
 
 def design_html(design: StudyDesign, command: str) -> str:
-    """Return the page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
+    """Return the page as text: answer, figure, plans and sizes, hole-free area; it needs no
+    network."""
     caption = (
         "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below which a "
         "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
@@ -107,7 +109,8 @@ def _sizes(plan: planned.StudyPlan) -> str:
 
 def answer(design: StudyDesign) -> str:
     """State the recommendation in a sentence."""
-    plan, wish = design.recommended, ""
+    plan = design.recommended
+    wish = ""
     if design.goal is not None:
         reached = (
             "nine of ten studies demonstrate"
@@ -161,7 +164,8 @@ PLANS = Table(
 
 
 def plans_grid(design: StudyDesign) -> Grid:
-    """Return the table of all plans and what their studies demonstrate; a star marks the recommended plan."""
+    """Return the table of all plans and what their studies demonstrate; a star marks the
+    recommended plan."""
     rows = [(plan, plan is design.recommended) for plan in design.plans]
     return PLANS.grid(rows, heads={"limit": f"a90/95{design.in_unit}"})
 
@@ -252,13 +256,15 @@ def save_design_png(path: Path, design: StudyDesign) -> None:
 
 
 def _draw(canvas: Figure, design: StudyDesign) -> None:
-    """Draw the expected limit against the number of targets (median, 10-90 %), and the sizes on the guessed curve."""
+    """Draw the expected limit against the number of targets (median, 10-90 %), and the sizes on
+    the guessed curve."""
     (left, right), (low, high), plan = (
         canvas.subplots(1, 2),
         design.range_of_sizes,
         design.recommended,
     )
-    places, true_size = np.arange(len(design.plans)), plan.true_size
+    places = np.arange(len(design.plans))
+    true_size = plan.true_size
     # a bound that is not demonstrated is infinite
     lows, bounds, ends = np.array([(plan.low, plan.bound, plan.high) for plan in design.plans]).T
     top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])

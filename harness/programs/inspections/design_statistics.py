@@ -1,4 +1,5 @@
-"""Plans hit/miss studies: it simulates them from a guess of the POD curve and analyses them like real ones."""
+"""Plans hit/miss studies: it simulates them from a guess of the POD curve and analyses them like
+real ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +17,10 @@ from harness.vocabulary.seeds import random_stream
 
 @dataclass(frozen=True, eq=False)
 class StudyPlan:
-    """Expected outcome of studies, if the guess is right. ``true_size``: of the guess. ``bound``: median a90/95 of the
-    simulated studies, infinite if half of them demonstrate none. ``low``, ``high``: 10 % and 90 % quantiles.
-    ``demonstrated``: share of studies with a finite bound. ``sizes`` (targets,): to make."""
+    """Expected outcome of studies, if the guess is right. ``true_size``: of the guess. ``bound``:
+    median a90/95 of the simulated studies, infinite if half of them demonstrate none. ``low``,
+    ``high``: 10 % and 90 % quantiles. ``demonstrated``: share of studies with a finite bound.
+    ``sizes`` (targets,): to make."""
 
     targets: int
     studies: int
@@ -33,8 +35,8 @@ class StudyPlan:
 def curve_through(
     a50: float, a90: float, link: str = "logit", *, log_size: bool = False
 ) -> PodCurve:
-    """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (same unit); its covariance is zero.
-    Raises UserError if it would not rise, or if a size is not above 0."""
+    """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (same unit); its
+    covariance is zero. Raises UserError if it would not rise, or if a size is not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
         what = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
         raise UserError(
@@ -49,7 +51,8 @@ def curve_through(
 
 
 def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
-    """Return ascending sizes (number,): midpoints of equal parts of the range, so that no target lies at its ends."""
+    """Return ascending sizes (number,): midpoints of equal parts of the range, so that no target
+    lies at its ends."""
     low, high = range_of_sizes
     return low + (high - low) * (np.arange(number) + 0.5) / number
 
@@ -62,11 +65,13 @@ def design(
     studies: int = 200,
     seed: int = 0,
 ) -> tuple[StudyPlan, ...]:
-    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the guess's link and
-    axis. A study in which all or no targets are found, or whose POD does not grow with size, demonstrates nothing."""
+    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the
+    guess's link and axis. A study in which all or no targets are found, or whose POD does not grow
+    with size, demonstrates nothing."""
     plans = []
     for number in targets:
-        sizes, bounds = even_sizes(number, range_of_sizes), np.full(studies, np.inf)
+        sizes = even_sizes(number, range_of_sizes)
+        bounds = np.full(studies, np.inf)
         stream = random_stream(seed, "pod design", number, "uniform")
         for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
             try:
@@ -88,8 +93,9 @@ def design(
 def recommend(
     plans: Sequence[StudyPlan], goal: float | None = None
 ) -> tuple[StudyPlan, bool | None]:
-    """Return the plan with the fewest targets, at least `LEAST_TARGETS` if any plan has them, in which 90 % of the
-    studies demonstrate ``goal``, and True; else the plan with the most targets, and False. No goal: (fewest, None)."""
+    """Return the plan with the fewest targets, at least `LEAST_TARGETS` if any plan has them, in
+    which 90 % of the studies demonstrate ``goal``, and True; else the plan with the most targets,
+    and False. No goal: (fewest, None)."""
     most = max(plan.targets for plan in plans)
     # below the handbook's minimum, the largest number of targets is nearest to it
     allowed = sorted(
@@ -102,9 +108,10 @@ def recommend(
 
 @dataclass(frozen=True)
 class HoleFree:
-    """Hole-free boards needed for a rate of false calls. ``calibration_boards``: the fewest that give a threshold, with
-    ``expected_per_m2`` on average and at most ``upper_per_m2`` with ``confidence``. ``silent_m2``: the area without a
-    false call, on ``silent_boards`` other boards, whose upper bound is the wanted rate."""
+    """Hole-free boards needed for a rate of false calls. ``calibration_boards``: the fewest that
+    give a threshold, with ``expected_per_m2`` on average and at most ``upper_per_m2`` with
+    ``confidence``. ``silent_m2``: the area without a false call, on ``silent_boards`` other
+    boards, whose upper bound is the wanted rate."""
 
     rate_per_m2: float
     board_m2: float
@@ -117,7 +124,8 @@ class HoleFree:
 
 
 def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> HoleFree:
-    """Return the hole-free area that must be inspected, by the rule of `threshold_for_rate` and by Poisson's law."""
+    """Return the hole-free area that must be inspected, by the rule of `threshold_for_rate` and by
+    Poisson's law."""
     if not (np.isfinite([rate_per_m2, board_m2]).all() and rate_per_m2 > 0 and board_m2 > 0):
         raise UserError(
             f"{rate_per_m2:g} false calls per m2 on boards of {board_m2:g} m2", legal="both above 0"

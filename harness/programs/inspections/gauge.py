@@ -1,4 +1,5 @@
-"""``tofpod gauge``: designs boards with holes to check a detection limit: drilling template and truth."""
+"""``tofpod gauge``: designs boards with holes to check a detection limit: drilling template and
+truth."""
 
 from __future__ import annotations
 
@@ -16,19 +17,19 @@ if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
     from harness.programs.inspections.gauge_board import Gauge
 
-DICTIONARY, CODES = "DICT_6X6_50", 50
-MARK_MM, DRILLS_MM, SEED = (
-    32.0,
-    0.5,
-    1,
-)  # Side of a mark, step of drill sizes, seed of the order of sizes
-CLEAR_MM, EDGE_MM = (
-    6.0,
-    18.0,
-)  # White margin of a mark; least distance from a hole's rim to the board's edge
+DICTIONARY = "DICT_6X6_50"
+CODES = 50
+# Side of a mark, step of drill sizes, seed of the order of sizes
+MARK_MM = 32.0
+DRILLS_MM = 0.5
+SEED = 1
+# White margin of a mark; least distance from a hole's rim to the board's edge
+CLEAR_MM = 6.0
+EDGE_MM = 18.0
 LARGEST_MM = 5e3  # the largest size that the truth file allows
 HIT_SHARE = (
-    0.4  # Hit radius as a share of the distance between holes, so that no finding can hit two holes
+    # Hit radius as a share of the distance between holes, so that no finding can hit two holes
+    0.4
 )
 
 
@@ -113,7 +114,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not 10 <= options.targets <= 600:
         raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
     curve = _curve(options)
-    # sizes are spread evenly: sizes only where the study's curve rises show nothing if the real curve rises elsewhere
+    # sizes are spread evenly: sizes only where the study's curve rises show nothing if the real
+    # curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
         were = f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is {wrong_mm:.3g} mm"
@@ -166,7 +168,8 @@ def _curve(options: argparse.Namespace) -> PodCurve:
 
 
 def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
-    """Return as few boards as can hold these holes, with sizes spread over all boards in random order."""
+    """Return as few boards as can hold these holes, with sizes spread over all boards in random
+    order."""
     from harness.programs.inspections.gauge_board import Gauge, GaugeBoard, GaugeHole, GaugeMark
     from harness.vocabulary.seeds import random_stream
 
@@ -178,7 +181,8 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         raise UserError(
             f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
         ) from error
-    side, apart = MARK_MM, options.apart
+    side = MARK_MM
+    apart = options.apart
     if not 0 < options.diameters[1] < apart - 4:
         what = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm overlap"
         raise UserError(what, legal="at least their diameter plus 5 mm")

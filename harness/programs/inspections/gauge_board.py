@@ -1,4 +1,5 @@
-"""A gauge board: its declaration, its pose in a capture by its coded marks, and the hits and misses of its holes."""
+"""A gauge board: its declaration, its pose in a capture by its coded marks, and the hits and
+misses of its holes."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +35,8 @@ CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
 
 
 class GaugeMark(Config):
-    """A printed code: its number, its centre on the board, and the side length of its black square."""
+    """A printed code: its number, its centre on the board, and the side length of its black
+    square."""
 
     code: Annotated[int, Field(ge=0, le=999)]
     x_mm: CoordinateMm
@@ -43,7 +45,8 @@ class GaugeMark(Config):
 
 
 class GaugeHole(Config):
-    """A hole to drill: its centre on the board, its diameter, and its depth (None for a through-hole)."""
+    """A hole to drill: its centre on the board, its diameter, and its depth (None for a
+    through-hole)."""
 
     id: Annotated[int, Field(ge=1)]
     diameter_mm: Length
@@ -63,7 +66,8 @@ class GaugeBoard(Config):
 
 
 class Gauge(Config):
-    """All boards, the dictionary of their codes (OpenCV's name), and the radius within which a finding is a hit."""
+    """All boards, the dictionary of their codes (OpenCV's name), and the radius within which a
+    finding is a hit."""
 
     dictionary: str
     hit_radius_mm: Length
@@ -71,7 +75,8 @@ class Gauge(Config):
 
 
 def read_gauge(path: Path) -> Gauge:
-    """Read the truth file of `tofpod gauge`. Raises UserError if it cannot be read or is another kind of file."""
+    """Read the truth file of `tofpod gauge`. Raises UserError if it cannot be read or is another
+    kind of file."""
     legal = "the gauge.json that tofpod gauge wrote"
     try:
         data = strict_json(bounded_bytes(path, RECORD_BYTES))
@@ -85,8 +90,9 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``found`` is hit, miss, or NA if it was not judged on all sides; a hit has ``offset_mm`` and
-    ``score``. ``counted`` holds the detector with its version, its threshold in units of score, and the hit radius."""
+    """A hole in a capture. ``found`` is hit, miss, or NA if it was not judged on all sides; a hit
+    has ``offset_mm`` and ``score``. ``counted`` holds the detector with its version, its threshold
+    in units of score, and the hit radius."""
 
     board: str
     hole: GaugeHole
@@ -149,7 +155,8 @@ HITS_AND_MISSES = Table(
 
 @dataclass(frozen=True)
 class GaugeSeen:
-    """The boards in a capture. ``false_calls`` counts findings on them that hit no hole and lie on no mark."""
+    """The boards in a capture. ``false_calls`` counts findings on them that hit no hole and lie on
+    no mark."""
 
     rows: tuple[GaugeRow, ...]
     false_calls: int
@@ -167,7 +174,8 @@ class GaugeSeen:
 
 
 def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> GaugeSeen:
-    """Find the boards in a capture by their marks, and match findings to holes. Raises UserError without a board."""
+    """Find the boards in a capture by their marks, and match findings to holes. Raises UserError
+    without a board."""
     counted = (detector, threshold, gauge.hit_radius_mm)
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # infrared images show printed codes too
@@ -183,7 +191,9 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
     found = find_marks(cloud, cloud.valid, CodedMarks(dictionary=gauge.dictionary))
     by_code = {mark.code: mark for mark in found.trusted}
     rows: list[GaugeRow] = []
-    warnings, notes, calls = [], [], 0
+    warnings = []
+    notes = []
+    calls = 0
     for board in gauge.boards:
         marks = [mark for mark in board.marks if mark.code in by_code]
         if len(marks) < FEWEST_MARKS:
@@ -221,11 +231,10 @@ def _matched(
     radius_m = counted[2] * MM
 
     def on_face(points_m: np.ndarray) -> np.ndarray:
-        """Return (n, 2): where the lines of sight through points (n, 3) in the camera's frame meet the face."""
-        points, lens = (
-            transform_points(T_board_camera, points_m.reshape(-1, 3)),
-            T_board_camera[:3, 3],
-        )
+        """Return (n, 2): where the lines of sight through points (n, 3) in the camera's frame meet
+        the face."""
+        points = transform_points(T_board_camera, points_m.reshape(-1, 3))
+        lens = T_board_camera[:3, 3]
         return np.asarray(
             (lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2]
         )
@@ -233,7 +242,8 @@ def _matched(
     places = on_face(np.array([each.centre_m for each in judged.detections]))
     centres = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes]) * MM
     pairs = match(centres, places, radius_m)
-    score, points = judged.evidence.score, judged.cloud.points_m
+    score = judged.evidence.score
+    points = judged.cloud.points_m
     seen = on_face(points[np.isfinite(score) & np.isfinite(points[..., 2])])
     rows = []
     for number, (hole, centre) in enumerate(zip(board.holes, centres, strict=True)):

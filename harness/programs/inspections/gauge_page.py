@@ -1,4 +1,5 @@
-"""The drilling template of a gauge board at a scale of 1:1: tiles of a paper size (PDF) and a whole drawing (SVG)."""
+"""The drilling template of a gauge board at a scale of 1:1: tiles of a paper size (PDF) and a
+whole drawing (SVG)."""
 
 from __future__ import annotations
 
@@ -15,16 +16,20 @@ if TYPE_CHECKING:
 
 MM_PER_INCH = 25.4
 PAPER_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN_MM, FOOT_MM, OVERLAP_MM = 10.0, 12.0, 10.0
-"""Unprinted margin of a sheet, height of the line with the scale bar, and overlap of neighbouring tiles."""
+MARGIN_MM = 10.0
+FOOT_MM = 12.0
+OVERLAP_MM = 10.0
+"""Unprinted margin of a sheet, height of the line with the scale bar, and overlap of neighbouring
+tiles."""
 SCALE_MM = 100.0
 
 
 def tiles_of(
     width_mm: float, height_mm: float, paper: str
 ) -> tuple[tuple[float, float], list[tuple[float, float]]]:
-    """Return the sheet's size (width, height) in mm, in the orientation that takes fewer sheets, and the point of the
-    board (x, y from its lower left) at the lower left of each sheet's printed area, row by row from the top."""
+    """Return the sheet's size (width, height) in mm, in the orientation that takes fewer sheets,
+    and the point of the board (x, y from its lower left) at the lower left of each sheet's printed
+    area, row by row from the top."""
     best: tuple[tuple[float, float], list[tuple[float, float]]] | None = None
     for sheet in (PAPER_MM[paper], PAPER_MM[paper][::-1]):
         room = (sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM)
@@ -44,7 +49,8 @@ def tiles_of(
 
 
 def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
-    """Draw a `GaugeBoard` in millimetres about its centre: outline, coded marks, holes with centre marks, and names."""
+    """Draw a `GaugeBoard` in millimetres about its centre: outline, coded marks, holes with centre
+    marks, and names."""
     import cv2
     from matplotlib.patches import Circle, Rectangle
 
@@ -63,7 +69,8 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
             # without edges, hairlines would show between neighbouring modules
             axes.add_patch(Rectangle(corner, step, step, fc="black", ec="black", lw=0.1))
     for hole in board.holes:
-        centre, reach = (hole.x_mm, hole.y_mm), hole.diameter_mm / 2 + 2
+        centre = (hole.x_mm, hole.y_mm)
+        reach = hole.diameter_mm / 2 + 2
         axes.add_patch(Circle(centre, hole.diameter_mm / 2, fill=False, ec=INK, lw=0.4))
         axes.plot([centre[0] - reach, centre[0] + reach], [centre[1]] * 2, color=INK, lw=0.3)
         axes.plot([centre[0]] * 2, [centre[1] - reach, centre[1] + reach], color=INK, lw=0.3)
@@ -81,7 +88,8 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
 
 def template_svg(board: Any, dictionary: str) -> bytes:
     """Return a board as a drawing of the same size."""
-    wide, high = board.width_mm + 2, board.height_mm + 2
+    wide = board.width_mm + 2
+    high = board.height_mm + 2
     figure, axes = _sheet((-wide / 2, -high / 2, wide, high), board.name)
     draw_board(axes, board, dictionary)
     buffer = io.BytesIO()
@@ -90,7 +98,8 @@ def template_svg(board: Any, dictionary: str) -> bytes:
 
 
 def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
-    """Return all boards with one tile per sheet; each sheet has a scale bar and the place of its tile."""
+    """Return all boards with one tile per sheet; each sheet has a scale bar and the place of its
+    tile."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     buffer = io.BytesIO()
@@ -98,7 +107,8 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
         for board in boards:
             sheet, places = tiles_of(board.width_mm, board.height_mm, paper)
             for number, (x, y) in enumerate(places, start=1):
-                left, low = x - board.width_mm / 2, y - board.height_mm / 2
+                left = x - board.width_mm / 2
+                low = y - board.height_mm / 2
                 figure, axes = _sheet(
                     (left - MARGIN_MM, low - MARGIN_MM - FOOT_MM, *sheet), board.name
                 )
@@ -136,7 +146,8 @@ def _frame(axes: Axes, at: tuple[float, float, float, float], title: str) -> Non
 
 
 def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:
-    """Return a figure that shows a box (left, low, width, height) in mm at a scale of 1:1; its axes fill it."""
+    """Return a figure that shows a box (left, low, width, height) in mm at a scale of 1:1; its
+    axes fill it."""
     from matplotlib import rcParams
     from matplotlib.figure import Figure
 

@@ -1,17 +1,20 @@
-"""Model-assisted probability of detection (MAPOD): a simulated curve, corrected by real hits and misses.
+"""Model-assisted probability of detection (MAPOD): a simulated curve, corrected by real hits and
+misses.
 
-The transfer function says that real damage of size a is found as easily as simulated damage of size a / k, and that the
-curve's rise is w times as wide. Prior: ln k and ln w have a bivariate Student distribution about 0 with `FREEDOM`
-degrees of freedom. Its heavy tails let data that contradict the simulation overrule it (O'Hagan and Pericchi, Brazilian
-J. Probability and Statistics 26 (2012), 372); its scale matrix includes the simulated curve's own covariance. Real
-targets differ in more ways than simulated ones, so w < 1 is allowed only within the study's own uncertainty. Posterior:
-prior times the likelihood of the real hits and misses, on a grid; the limit is the largest over all models of the
-simulated curve that fit about equally well. Sources: MIL-HDBK-1823A, appendix H; Thompson et al., Review of Progress in
-QNDE 28 (2009), 1685. If simulations are wrong by factors of 1 to 2 in size and 0.6 to 1.6 in width, and 24 holes
-correct them, the limit covers the true a90 in 98 to 100 % of 300 campaigns (``tests/validation``).
+The transfer function says that real damage of size a is found as easily as simulated damage of
+size a / k, and that the curve's rise is w times as wide. Prior: ln k and ln w have a bivariate
+Student distribution about 0 with `FREEDOM` degrees of freedom. Its heavy tails let data that
+contradict the simulation overrule it (O'Hagan and Pericchi, Brazilian J. Probability and
+Statistics 26 (2012), 372); its scale matrix includes the simulated curve's own covariance. Real
+targets differ in more ways than simulated ones, so w < 1 is allowed only within the study's own
+uncertainty. Posterior: prior times the likelihood of the real hits and misses, on a grid; the
+limit is the largest over all models of the simulated curve that fit about equally well. Sources:
+MIL-HDBK-1823A, appendix H; Thompson et al., Review of Progress in QNDE 28 (2009), 1685. If
+simulations are wrong by factors of 1 to 2 in size and 0.6 to 1.6 in width, and 24 holes correct
+them, the limit covers the true a90 in 98 to 100 % of 300 campaigns (``tests/validation``).
 
-Not modelled: a floor or a ceiling of real inspections, real targets that share a part. The test of agreement looks for
-other errors of the simulation."""
+Not modelled: a floor or a ceiling of real inspections, real targets that share a part. The test of
+agreement looks for other errors of the simulation."""
 
 from __future__ import annotations
 
@@ -31,18 +34,27 @@ from harness.vocabulary.files import jsonable
 from harness.vocabulary.seeds import random_stream
 
 FREEDOM = 3.0
-PRIOR_SIZE, PRIOR_WIDTH = 1.5, 2.0
-"""Scales of the prior: factors by which a simulation may well be wrong in size and in the width of the rise."""
-REACH, NODES = 8.0, (241, 61)  # half the grid's side in scales, and its nodes along ln k and ln w
-DRAWS = 999  # simulated campaigns for the p-values of the tests of agreement: 5 % is then known to 0.7 %
-ENOUGH = 1.2  # stop rule: ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this factor
+PRIOR_SIZE = 1.5
+PRIOR_WIDTH = 2.0
+"""Scales of the prior: factors by which a simulation may well be wrong in size and in the width of
+the rise."""
+# half the grid's side in scales, and its nodes along ln k and ln w
+REACH = 8.0
+NODES = (241, 61)
+# simulated campaigns for the p-values of the tests of agreement: 5 % is then known to 0.7 %
+DRAWS = 999
+# stop rule: ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this
+# factor
+ENOUGH = 1.2
 LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
-"""0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has its bound."""
+"""0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has
+its bound."""
 
 
 @dataclass(frozen=True)
 class BoardStep:
-    """The state after some boards. ``a50``, ``a90``: posterior medians. ``a90_95``: of a90, quantile `LIMIT_AT`."""
+    """The state after some boards. ``a50``, ``a90``: posterior medians. ``a90_95``: of a90,
+    quantile `LIMIT_AT`."""
 
     board: str
     targets: int
@@ -59,7 +71,8 @@ class BoardStep:
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """A simulated ``curve`` and real inspections in its unit (n,): ``size``, ``hit`` bool, ``board`` names."""
+    """A simulated ``curve`` and real inspections in its unit (n,): ``size``, ``hit`` bool,
+    ``board`` names."""
 
     curve: PodCurve
     size: np.ndarray
@@ -68,8 +81,10 @@ class Transfer:
 
     @cached_property
     def own_covariance(self) -> np.ndarray:
-        """The covariance (2, 2) of the simulated curve's ln a50 and ln w, from that of mu, sigma (delta method)."""
-        curve, half = self.curve, float(link_ppf(self.curve.link, np.array(0.5)))
+        """The covariance (2, 2) of the simulated curve's ln a50 and ln w, from that of mu, sigma
+        (delta method)."""
+        curve = self.curve
+        half = float(link_ppf(self.curve.link, np.array(0.5)))
         middle = curve.mu + half * curve.sigma
         slopes = np.array([[1.0, half], [0.0, 1.0 / curve.sigma]])
         if not curve.log_size:
@@ -94,10 +109,8 @@ class Transfer:
         return self._logs(self.grid, self.size)
 
     def _logs(self, nodes: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        half, scaled = (
-            float(link_ppf(self.curve.link, np.array(0.5))),
-            np.log if self.curve.log_size else np.positive,
-        )
+        half = float(link_ppf(self.curve.link, np.array(0.5)))
+        scaled = np.log if self.curve.log_size else np.positive
         k, w = np.exp(nodes.T)[..., None]
         above = scaled(sizes / k) - scaled(self.curve.size_at(0.5))
         found, missed, _ = logs_of_link(self.curve.link, half + above / (self.curve.sigma * w))
@@ -117,7 +130,8 @@ class Transfer:
 
     @cached_property
     def own_spread(self) -> np.ndarray:
-        """The covariance (2, 2) of ln k and ln w from the study's own uncertainty and the distance of the nodes."""
+        """The covariance (2, 2) of ln k and ln w from the study's own uncertainty and the distance
+        of the nodes."""
         return self.own_covariance + np.diag(np.diff(self.grid, axis=0).max(axis=0) ** 2 / 12)
 
     @cached_property
@@ -129,7 +143,8 @@ class Transfer:
         )
 
     def posterior(self, rows: np.ndarray) -> np.ndarray:
-        """Return the weights (g,) of the nodes after the inspections ``rows`` (n,) bool; their sum is 1."""
+        """Return the weights (g,) of the nodes after the inspections ``rows`` (n,) bool; their sum
+        is 1."""
         found, missed = self.logs
         value = found @ (rows & self.hit) + missed @ (rows & ~self.hit) + self.log_prior
         weight = np.exp(value - value.max())
@@ -137,7 +152,8 @@ class Transfer:
 
     def steps(self) -> tuple[BoardStep, ...]:
         """Return the estimates before any board and after each, in the order of the rows."""
-        found, seen = [], np.zeros(len(self.size), bool)
+        found = []
+        seen = np.zeros(len(self.size), bool)
         for board in ("none", *dict.fromkeys(self.board.tolist())):
             seen = seen | (self.board == board)
             weight = self.posterior(seen)
@@ -149,13 +165,12 @@ class Transfer:
         return tuple(found)
 
     def band(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the posterior's median POD at ``sizes`` (m,), and its quantiles 1 - `LIMIT_AT` and `LIMIT_AT`."""
+        """Return the posterior's median POD at ``sizes`` (m,), and its quantiles 1 - `LIMIT_AT`
+        and `LIMIT_AT`."""
         weight = self.posterior(np.ones(len(self.size), bool))
         kept = weight > weight.max() * 1e-6
-        columns, ends = (
-            np.exp(self._logs(self.grid[kept], sizes)[0]).T,
-            (0.5, 1 - LIMIT_AT, LIMIT_AT),
-        )
+        columns = np.exp(self._logs(self.grid[kept], sizes)[0]).T
+        ends = (0.5, 1 - LIMIT_AT, LIMIT_AT)
         middle, low, high = (
             np.array([quantile(column, weight[kept], share) for column in columns])
             for share in ends
@@ -163,9 +178,10 @@ class Transfer:
         return middle, low, high
 
     def agreement(self, seed: int = 1) -> float:
-        """Return the probability, if the simulated curve is right, of real hits and misses at least as far from it as
-        these. The statistic is the largest likelihood over the grid divided by the mean likelihood over the curves that
-        the study's own uncertainty allows; its distribution is simulated at the same sizes."""
+        """Return the probability, if the simulated curve is right, of real hits and misses at
+        least as far from it as these. The statistic is the largest likelihood over the grid
+        divided by the mean likelihood over the curves that the study's own uncertainty allows; its
+        distribution is simulated at the same sizes."""
         found, missed = self.logs
         weight = stats.multivariate_normal(np.zeros(2), self.own_spread).pdf(self.grid)
         weight /= weight.sum()
@@ -183,7 +199,8 @@ class Transfer:
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """Return the interpolated value at which the cumulated weights (n,) of values (n,) reach a share of their sum."""
+    """Return the interpolated value at which the cumulated weights (n,) of values (n,) reach a
+    share of their sum."""
     order = np.argsort(values, kind="stable")
     sorted_weights = weights[order]
     below = np.cumsum(sorted_weights) - sorted_weights / 2
@@ -195,11 +212,12 @@ DISAGREES = 0.05  # probability of agreement below which the real hits contradic
 
 @dataclass(frozen=True, eq=False)
 class Mapod:
-    """A study's curve, real hits and misses, and the combination of both. ``set_up``: name in the study. ``measured``:
-    the real ones alone; None if no curve fits them (``why``). ``transfers``: of all simulated models that fit about
-    equally well. ``steps``: estimates before any board and after each; limits are the largest over ``transfers``.
-    ``agrees``: as in `Transfer.agreement`. ``unlike``: how the counting of the real hits differs from the study's, or
-    that this is unknown; "" if they agree."""
+    """A study's curve, real hits and misses, and the combination of both. ``set_up``: name in the
+    study. ``measured``: the real ones alone; None if no curve fits them (``why``). ``transfers``:
+    of all simulated models that fit about equally well. ``steps``: estimates before any board and
+    after each; limits are the largest over ``transfers``. ``agrees``: as in `Transfer.agreement`.
+    ``unlike``: how the counting of the real hits differs from the study's, or that this is
+    unknown; "" if they agree."""
 
     set_up: str
     simulated: PodStatement
@@ -216,13 +234,15 @@ class Mapod:
         cls, set_up: str, simulated: PodStatement | None, why: str, read: Inspections, boards: np.ndarray | None = None,
         unlike: str = "",
     ) -> Mapod:  # fmt: skip
-        """Correct a study's curve. Raises UserError if the study has no curve, with the reason ``why``."""
+        """Correct a study's curve. Raises UserError if the study has no curve, with the reason
+        ``why``."""
         if simulated is None:
             raise UserError(
                 f"set-up {set_up} has no curve to correct: {why}",
                 fix="name another set-up with --set-up",
             )
-        measured, none = None, ""
+        measured = None
+        none = ""
         try:
             measured = state_hits(read, unit="mm", tested=False)
         except UserError as error:
@@ -255,7 +275,8 @@ class Mapod:
 
     @property
     def a90_95(self) -> float:
-        """The combined limit; if the simulation is contradicted, at least the measured one, which may be infinite."""
+        """The combined limit; if the simulation is contradicted, at least the measured one, which
+        may be infinite."""
         combined = self.steps[-1].a90_95
         if not self.contradicted:
             return combined

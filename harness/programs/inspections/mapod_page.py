@@ -1,4 +1,5 @@
-"""Presents a model-assisted probability of detection: the simulated curve, real hits and misses, and both combined."""
+"""Presents a model-assisted probability of detection: the simulated curve, real hits and misses,
+and both combined."""
 
 from __future__ import annotations
 
@@ -49,7 +50,8 @@ def answer(found: Mapod) -> str:
 
 def sizes_grid(found: Mapod) -> Grid:
     """Return the table of simulated, measured and combined sizes."""
-    last, rows = found.steps[-1], list[tuple[str, ...]]()
+    last = found.steps[-1]
+    rows = list[tuple[str, ...]]()
     for name, sizes in (("simulated", found.simulated), ("measured", found.measured)):
         if sizes is not None:
             bound = sized(sizes.bound.value, "") if sizes.bound.demonstrated else "not demonstrated"

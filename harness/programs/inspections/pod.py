@@ -1,4 +1,5 @@
-"""``tofpod pod``: fits the probability of detection to the user's own inspections (MIL-HDBK-1823A)."""
+"""``tofpod pod``: fits the probability of detection to the user's own inspections
+(MIL-HDBK-1823A)."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ LINKS = ("logit", "probit", "cloglog", "loglog")
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
-    add, switch = parser.add_argument, argparse.BooleanOptionalAction
+    add = parser.add_argument
+    switch = argparse.BooleanOptionalAction
     add(
         "file",
         type=Path,
@@ -90,7 +92,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: tofpod pod blades.csv --hit found --size length --target blade --unit mm",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130
+    after Ctrl-C."""
     from harness.programs.inspections.mapod_page import mapod_html, mapod_parts, save_mapod_png
     from harness.report.pod import pod_html, pod_parts, save_pod_png
     from harness.vocabulary.files import write_json, write_text
@@ -98,11 +101,14 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.text import show
 
     found: Any = _stated(options) if options.prior is None else _corrected(options)
-    alone, combined = (pod_parts, save_pod_png, pod_html), (mapod_parts, save_mapod_png, mapod_html)
+    alone = (pod_parts, save_pod_png, pod_html)
+    combined = (mapod_parts, save_mapod_png, mapod_html)
     parts, save_png, html = alone if options.prior is None else combined
     show(parts(found))
     stem = "pod" if options.prior is None else "mapod"
-    data, picture, page = (options.out / f"{stem}.{ending}" for ending in ("json", "png", "html"))
+    data = options.out / f"{stem}.{'json'}"
+    picture = options.out / f"{stem}.{'png'}"
+    page = options.out / f"{stem}.{'html'}"
     write_json(data, {"results_version": RESULTS_VERSION, **found.to_data(), "command": command})
     save_png(picture, found)
     write_text(page, html(found, command))
@@ -139,7 +145,8 @@ def _corrected(options: argparse.Namespace) -> Mapod:
 
 
 def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
-    """Return a remark if the real hits were counted differently from the study's, or if the table does not show how."""
+    """Return a remark if the real hits were counted differently from the study's, or if the table
+    does not show how."""
     from harness.evaluation.pod.inspections import texts_of
 
     counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"
@@ -164,10 +171,8 @@ def _stated(options: argparse.Namespace) -> PodStatement:
             raise UserError(
                 f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out"
             )
-    of_hits, legal = (
-        options.hit is not None,
-        "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y",
-    )
+    of_hits = options.hit is not None
+    legal = "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
         what = "one of them, not both" if of_hits else "no column states what was found"
         raise UserError(

@@ -43,7 +43,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "tofpod clean results averaging/69346a82f4194e03 --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for a user's mistake."""
+    """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for
+    a user's mistake."""
     from harness.programs.keeping.listing import (
         bytes_of,
         cache_removal,

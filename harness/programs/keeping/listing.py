@@ -1,4 +1,5 @@
-"""Finds what `tofpod ls` lists and `tofpod clean` removes: tofpod's own entries in ``--out``, never behind a link."""
+"""Finds what `tofpod ls` lists and `tofpod clean` removes: tofpod's own entries in ``--out``,
+never behind a link."""
 
 import contextlib
 import csv
@@ -64,7 +65,8 @@ def plug_ins(kind: str) -> PlugIns:
 
 
 def offered(kind: str) -> list[Row]:
-    """Return a row for each offer; that of an unusable offer has ``broken`` with the reason, and ``fix``."""
+    """Return a row for each offer; that of an unusable offer has ``broken`` with the reason, and
+    ``fix``."""
     rows: list[Row] = []
     for offer in plug_ins(kind).offers():
         try:
@@ -81,7 +83,8 @@ def offered(kind: str) -> list[Row]:
 
 
 def shown(kind: str, name: str) -> Row:
-    """Return an offer's row with all of its settings. Raises UserError if it is unknown, ambiguous or broken."""
+    """Return an offer's row with all of its settings. Raises UserError if it is unknown, ambiguous
+    or broken."""
     settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
@@ -95,7 +98,8 @@ def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
     for row in rows:
         cells: tuple[Any, ...] = (row.get("version") or "-", row.get("about", ""))
         if "title" in row:
-            near, far = row["nearest_m"], row["farthest_m"]
+            near = row["nearest_m"]
+            far = row["farthest_m"]
             reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
             cells = (
                 f"{row['columns']} x {row['rows']}",
@@ -137,7 +141,8 @@ def _facts(kind: str, name: str) -> Row:
 
 
 def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Return every setting with default and legal values; of several kinds, only the settings of the default kind."""
+    """Return every setting with default and legal values; of several kinds, only the settings of
+    the default kind."""
     settings_type = detector_type(name).settings_type
     try:
         defaults = settings_type().to_data()
@@ -180,7 +185,8 @@ def leaves(
 
 
 def reference() -> str:
-    """Return every key of an experiment and of tofpod's detectors in Markdown: legal values, default, meaning."""
+    """Return every key of an experiment and of tofpod's detectors in Markdown: legal values,
+    default, meaning."""
     from harness.experiment.schema import ExperimentConfig
 
     sections = {"Experiments": every_key(ExperimentConfig)}
@@ -199,7 +205,8 @@ def reference() -> str:
         places: dict[str, list[str]] = {}
         for path, slot, model in keys:
             place, _, key = path.rpartition(".")
-            default, note = default_at(slot), (slot.field.description if slot.field else "") or ""
+            default = default_at(slot)
+            note = (slot.field.description if slot.field else "") or ""
             legal = (
                 "a mapping"
                 if slot.models
@@ -226,7 +233,8 @@ SHOWN_SETTINGS = 6
 
 
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
-    """Return `described` for every folder, with its ``limits``, the settings in which it ``differs``, ``is_latest``."""
+    """Return `described` for every folder, with its ``limits``, the settings in which it
+    ``differs``, ``is_latest``."""
     found = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
@@ -250,7 +258,8 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
 
 
 def limit_text(limits: list[dict[str, Any]]) -> str:
-    """Return the detection limit with its set-up, or the range of several limits; "" if there is no study."""
+    """Return the detection limit with its set-up, or the range of several limits; "" if there is
+    no study."""
     found = [
         row for row in limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"
     ]
@@ -268,7 +277,8 @@ def limit_text(limits: list[dict[str, Any]]) -> str:
 
 
 def differs_text(differs: dict[str, Any]) -> str:
-    """Return at most `SHOWN_SETTINGS` settings in which a run differs from others of its experiment."""
+    """Return at most `SHOWN_SETTINGS` settings in which a run differs from others of its
+    experiment."""
     names = names_of(differs)
     parts = [f"{names[path]}={value_text(path, value)}" for path, value in differs.items()]
     more = len(parts) - SHOWN_SETTINGS
@@ -276,7 +286,8 @@ def differs_text(differs: dict[str, Any]) -> str:
 
 
 def _settings(run: Path) -> dict[str, Any]:
-    """Return every setting of a run's resolved experiment by its dotted path; empty if it cannot be read."""
+    """Return every setting of a run's resolved experiment by its dotted path; empty if it cannot
+    be read."""
     try:
         found = {
             ".".join(path): value for path, value in leaves(read_yaml(run / EXPERIMENT.name).data)
@@ -294,10 +305,8 @@ def _limits(run: Path) -> list[dict[str, Any]]:
         for row in csv.DictReader(
             io.StringIO(bounded_bytes(run / "limits.csv", TEXT_BYTES).decode())
         ):
-            size, names = (
-                row["a90_95_mm"],
-                {"set_up": row["set_up"][:60], "verdict": row["a90_95_verdict"][:40]},
-            )
+            size = row["a90_95_mm"]
+            names = {"set_up": row["set_up"][:60], "verdict": row["a90_95_verdict"][:40]}
             if not all(word.isprintable() for word in names.values()):
                 return []
             rows.append({**names, "a90_95_mm": float(size) if size else None})
@@ -307,7 +316,8 @@ def _limits(run: Path) -> list[dict[str, Any]]:
 
 
 def described(run: Path) -> dict[str, Any]:
-    """Describe a results folder as JSON types. ``state`` is complete, unfinished, running or broken."""
+    """Describe a results folder as JSON types. ``state`` is complete, unfinished, running or
+    broken."""
     size_bytes = 0
     for path in files_below(run):
         with contextlib.suppress(OSError):
@@ -325,7 +335,8 @@ def described(run: Path) -> dict[str, Any]:
             raise ValueError("is no provenance")
     except FileNotFoundError:  # the run is not finished
         records = 0
-        with contextlib.suppress(UserError):  # written by a newer tofpod, or reached through a link
+        # written by a newer tofpod, or reached through a link
+        with contextlib.suppress(UserError):
             records = len(Journal(run / "journal"))
         if not records and not (run / EXPERIMENT.name).is_file():
             return row | {"note": "broken: it has neither an experiment nor records"}
@@ -339,7 +350,8 @@ def described(run: Path) -> dict[str, Any]:
     done, resumed, failed = (count if type(count) is int and count >= 0 else 0 for count in counts)
     state = "running" if in_use(run) else "unfinished" if failed else "complete"
     note = f"{state}: {many(done + resumed, 'trial')}" + (f", {failed} failed" if failed else "")
-    version, started = facts.get("results_version"), facts.get("started")
+    version = facts.get("results_version")
+    started = facts.get("started")
     if type(version) is int and version != RESULTS_VERSION:
         note += f" (results version {version}, this tofpod writes {RESULTS_VERSION})"
     date = started[:40] if isinstance(started, str) and started.isprintable() else None
@@ -380,14 +392,16 @@ def refuse_links(*paths: Path) -> None:
 
 
 def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
-    """Return the longest unused renders to remove so that the rest fits the limit, and leftovers; None: all of both."""
+    """Return the longest unused renders to remove so that the rest fits the limit, and leftovers;
+    None: all of both."""
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
 
 
 def chosen_results(out: Path, name: str) -> list[Path]:
-    """Return the results folders named ``NAME`` or ``NAME/DIGEST``. Raises UserError if there are none."""
+    """Return the results folders named ``NAME`` or ``NAME/DIGEST``. Raises UserError if there are
+    none."""
     experiment, slash, digest = name.partition("/")
     if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
         legal = "NAME or NAME/DIGEST, as tofpod ls results shows them"
@@ -413,7 +427,8 @@ def removable(folder: Path) -> list[StoredFile]:
     for path in sorted(
         files_below(folder), key=lambda path: LOCK_NAME.fullmatch(path.name) is not None
     ):
-        above, name = path.parent.relative_to(folder), UNFINISHED.sub(r"\1\2", path.name)
+        above = path.parent.relative_to(folder)
+        name = UNFINISHED.sub(r"\1\2", path.name)
         own_files = {
             Path(): is_output(name, "results") or LOCK_NAME.fullmatch(name),
             Path(JOURNAL): SEGMENT_NAME.fullmatch(name),
@@ -424,7 +439,8 @@ def removable(folder: Path) -> list[StoredFile]:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove a results folder if nothing is left in it, and the link ``latest`` if it pointed to it."""
+    """Remove a results folder if nothing is left in it, and the link ``latest`` if it pointed to
+    it."""
     for inner, _, _ in os.walk(folder, topdown=False):
         with contextlib.suppress(OSError):
             os.rmdir(inner)

@@ -1,4 +1,5 @@
-"""``tofpod ls``: lists detectors and cameras with their settings, results folders, and stored renders."""
+"""``tofpod ls``: lists detectors and cameras with their settings, results folders, and stored
+renders."""
 
 import argparse
 import json
@@ -55,13 +56,15 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _list_offers(options: argparse.Namespace) -> int:
-    """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown name."""
+    """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown
+    name."""
     from harness.programs.keeping.listing import SETTABLE, grid_of, offered, plug_ins, shown
     from harness.vocabulary.declaration.diagnose import nearest
     from harness.vocabulary.seeds import canonical_json
     from harness.vocabulary.text import Grid, show
 
-    word, name = options.what, options.name
+    word = options.what
+    name = options.name
     if word in (None, *SETTABLE) and name is None:
         rows = {kind: offered(kind) for kind in ([word] if word else SETTABLE)}
         if options.json:
@@ -105,7 +108,8 @@ def _list_offers(options: argparse.Namespace) -> int:
 
 
 def _list_results(options: argparse.Namespace) -> int:
-    """List every results folder with its state, limit and differences. Raises UserError for an unknown experiment."""
+    """List every results folder with its state, limit and differences. Raises UserError for an
+    unknown experiment."""
     from harness.programs.keeping.listing import differs_text, limit_text, result_folders
     from harness.vocabulary.text import Grid
 
@@ -139,7 +143,8 @@ def _list_cache(options: argparse.Namespace) -> int:
     if options.name is not None:
         raise UserError(f"the cache has no part called {options.name!r}", fix="tofpod ls cache")
     folder = options.out / ".cache" / "renders"
-    renders, left = stored_renders(folder), leftovers(folder)
+    renders = stored_renders(folder)
+    left = leftovers(folder)
     size_bytes = sum(file.size_bytes for file in renders)
     unused_days = max(
         (max(time.time() - file.used_s, 0.0) / DAY_S for file in renders), default=0.0

@@ -10,7 +10,8 @@ from harness.vocabulary.program import program
 
 @program(lambda parser: None, "Compile the inner loops once.")
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the loops of single views on small captures, in two processes; map loops compile at first use. Returns 0."""
+    """Run the loops of single views on small captures, in two processes; map loops compile at
+    first use. Returns 0."""
     from harness.runs.processes import PROCESSES
 
     began = time.perf_counter()
@@ -35,14 +36,16 @@ def draw_frames() -> None:
 
     for name in camera_names():
         camera = load_camera(name)
-        row, column = int(camera.nominal_lens.cy), int(camera.nominal_lens.cx)
+        row = int(camera.nominal_lens.cy)
+        column = int(camera.nominal_lens.cx)
         view = plane_view(
             camera, Region(row - 20, row + 20, column - 30, column + 30), 0.7, 0.6, 0.05, 0.02
         )
         capture = SimulatedUnit(camera, CameraConfig(name=name), view).capture(6, 1)
         next(iter(capture.frames()))
     # no camera's file is empirical
-    image, number = np.ones((2, 2), np.float32), np.float32(1)
+    image = np.ones((2, 2), np.float32)
+    number = np.float32(1)
     decode(*6 * (image,), *4 * (number,), image.copy(), image.astype(np.uint8))
     for method in ("mean", "median", "clipped"):
         prefix_averages(capture, [1, 6], AverageConfig.from_data({"method": method}))

@@ -1,4 +1,5 @@
-"""The text of `results/README.md`; ``python -m harness.programs.keeping.readme > results/README.md`` writes it."""
+"""The text of `results/README.md`; ``python -m harness.programs.keeping.readme >
+results/README.md`` writes it."""
 
 from collections.abc import Iterable, Iterator
 

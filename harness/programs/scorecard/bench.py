@@ -14,14 +14,16 @@ from scenes.sensor.source import SimulatedUnit
 
 SEED = 1
 NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
-"""Effects of each pixel's noise, to which the calibration point refers, without effects of a unit or of a frame."""
+"""Effects of each pixel's noise, to which the calibration point refers, without effects of a unit
+or of a frame."""
 STEADY = EffectsConfig().model_copy(update={"frame_jumps": False})
 PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Numbers of frames for each kind of measurement, and of units for measurements of a unit's error."""
+    """Numbers of frames for each kind of measurement, and of units for measurements of a unit's
+    error."""
 
     noise_frames: int
     few_frames: int
@@ -45,9 +47,11 @@ class Bench:
         return load_camera(self.camera_name)
 
     def patch(self, height: int, width: int) -> Region:
-        """Return pixels about the optical axis with the margin for the camera's own filter, clipped to the sensor."""
+        """Return pixels about the optical axis with the margin for the camera's own filter,
+        clipped to the sensor."""
         lens = self.camera.nominal_lens
-        row, column = round(lens.cy) - height // 2, round(lens.cx) - width // 2
+        row = round(lens.cy) - height // 2
+        column = round(lens.cx) - width // 2
         tight = Region(row, row + height, column, column + width)
         return tight.grown(self.camera.optics.margin_px, lens.height, lens.width)
 
@@ -59,7 +63,8 @@ class Bench:
         *labels: str | int,
         **settings: Any,
     ) -> FrameStack:
-        """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels`` select the noise."""
+        """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels``
+        select the noise."""
         unit = SimulatedUnit(
             self.camera, CameraConfig(name=self.camera_name, effects=effects, **settings), view
         )
@@ -72,7 +77,8 @@ class Bench:
 
 @dataclass(frozen=True)
 class FrameStack:
-    """A static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w, 2); ``region``."""
+    """A static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w,
+    2); ``region``."""
 
     z_m: np.ndarray
     true_z_m: np.ndarray

@@ -1,12 +1,14 @@
-"""Compares a declared drilled board with a real capture of it: noise, fixed pattern, hole depths and detections.
+"""Compares a declared drilled board with a real capture of it: noise, fixed pattern, hole depths
+and detections.
 
-Every set-up of an experiment is simulated and, if the capture was aligned to the colour camera, resampled to its
-pixels. The same analysis is applied to both around each declared hole: a quadratic surface is fitted to a ring around
-it, and the hole's peak is the largest deviation behind that surface near its centre. Detectors see whole images. No
-parameter is fitted: set-ups are declared, and all of them are shown.
+Every set-up of an experiment is simulated and, if the capture was aligned to the colour camera,
+resampled to its pixels. The same analysis is applied to both around each declared hole: a
+quadratic surface is fitted to a ring around it, and the hole's peak is the largest deviation
+behind that surface near its centre. Detectors see whole images. No parameter is fitted: set-ups
+are declared, and all of them are shown.
 
-Not modelled: objects on the board, the board's relief, and the maker's alignment between two surfaces (here the depth
-image is interpolated linearly where the board's plane projects to)."""
+Not modelled: objects on the board, the board's relief, and the maker's alignment between two
+surfaces (here the depth image is interpolated linearly where the board's plane projects to)."""
 
 from __future__ import annotations
 
@@ -44,11 +46,15 @@ if TYPE_CHECKING:
 
     from detectors.recordings import Recording
 
-PEAK_MM, RING_MM = 6.0, (6.5, 13.5)
-"""Distances from a hole's centre on the board: the largest for its peak, and the radii of the ring around it."""
+PEAK_MM = 6.0
+RING_MM = (6.5, 13.5)
+"""Distances from a hole's centre on the board: the largest for its peak, and the radii of the ring
+around it."""
 OFF_RING = 4.0
-"""Robust standard deviations beyond which a ring's pixel is excluded, since it belongs to an object such as a tag."""
-PATTERN_PX, ANGLES_DEG = (3, 6, 12), (0, 20, 35, 60)
+"""Robust standard deviations beyond which a ring's pixel is excluded, since it belongs to an
+object such as a tag."""
+PATTERN_PX = (3, 6, 12)
+ANGLES_DEG = (0, 20, 35, 60)
 CLOSE = 0.3  # largest difference of a ratio from 1 that counts as agreement
 HOW = (
     "The board is declared, its view is rendered with light between its surfaces, the camera is simulated from its "
@@ -67,7 +73,8 @@ Readings = dict[tuple[str, str, str], tuple[Reading, int]]
 
 @dataclass(frozen=True)
 class Image:
-    """The pixels on which board and capture are compared: their lens, and the frames of board and depth camera."""
+    """The pixels on which board and capture are compared: their lens, and the frames of board and
+    depth camera."""
 
     lens: Lens
     T_image_board: np.ndarray
@@ -83,13 +90,16 @@ class Image:
 
     @cached_property
     def plan_mm(self) -> np.ndarray:
-        """The points (h, w, 2) where each pixel's ray meets the board's plane, in the board's frame."""
+        """The points (h, w, 2) where each pixel's ray meets the board's plane, in the board's
+        frame."""
         T_board_image = invert(self.T_image_board)
-        rays, start = self.rays @ T_board_image[:3, :3].T, T_board_image[:3, 3]
+        rays = self.rays @ T_board_image[:3, :3].T
+        start = T_board_image[:3, 3]
         return np.asarray((start[:2] - rays[..., :2] * (start[2] / rays[..., 2:])) / MM)
 
     def resampled(self, z_m: np.ndarray, camera: AnyCamera) -> np.ndarray:
-        """Return frames (n, h, w) of the depth camera, aligned to this image, with z in whole steps of its output."""
+        """Return frames (n, h, w) of the depth camera, aligned to this image, with z in whole
+        steps of its output."""
         plane = np.concatenate([self.plan_mm * MM, np.zeros((*self.lens.whole.shape, 1))], axis=-1)
         in_depth = transform_points(invert(self.T_image_depth) @ self.T_image_board, plane)
         u, v = np.moveaxis(camera.nominal_lens.project(in_depth).astype(np.float32), -1, 0)
@@ -100,9 +110,11 @@ class Image:
 
 
 def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Image:
-    """Return the image to compare: the depth camera's own if there is no capture or the capture has its size, otherwise
-    that of the camera's colour camera. Raises UserError if the camera's file has no colour camera."""
-    own, T_depth_board = camera.nominal_lens, target.pose.T_camera_board
+    """Return the image to compare: the depth camera's own if there is no capture or the capture
+    has its size, otherwise that of the camera's colour camera. Raises UserError if the camera's
+    file has no colour camera."""
+    own = camera.nominal_lens
+    T_depth_board = target.pose.T_camera_board
     if lens is None or (lens.width, lens.height) == (own.width, own.height):
         return Image(lens or own, T_depth_board, np.eye(4))
     colour = getattr(camera, "colour", None)
@@ -123,9 +135,11 @@ def measured(
     config: ExperimentConfig,
     detectors: dict[str, dict[str, Any]],
 ) -> tuple[Readings, np.ndarray]:
-    """Measure frames (n, h, w) on the image's pixels; ``detectors`` maps names to settings. Returns readings and the
-    holes' peaks in mm (n,), NaN for holes that are not entirely in view. Raises UserError if no hole is in view."""
-    cloud, noises = _cloud(z_m, image), []
+    """Measure frames (n, h, w) on the image's pixels; ``detectors`` maps names to settings.
+    Returns readings and the holes' peaks in mm (n,), NaN for holes that are not entirely in view.
+    Raises UserError if no hole is in view."""
+    cloud = _cloud(z_m, image)
+    noises = []
     centres, (height, width) = (
         np.array([hole.centre_mm for hole in target.holes]),
         image.lens.whole.shape,
@@ -142,13 +156,12 @@ def measured(
         ):
             continue
         cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-        plan, z = image.plan_mm[cut] - centre, cloud.points_m[*cut, 2]
+        plan = image.plan_mm[cut] - centre
+        z = cloud.points_m[*cut, 2]
         from_centre, (x, y) = np.linalg.norm(plan, axis=-1), np.moveaxis(plan, -1, 0)
         ring = (from_centre > RING_MM[0]) & (from_centre < RING_MM[1]) & np.isfinite(z)
-        basis, weight = (
-            np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1),
-            np.ones(int(ring.sum())),
-        )
+        basis = np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
+        weight = np.ones(int(ring.sum()))
         for _ in range(10):
             surface = np.linalg.lstsq(basis[ring] * weight[:, None], z[ring] * weight, rcond=None)[
                 0
@@ -166,11 +179,9 @@ def measured(
         raise UserError(
             "no hole is in view together with the face around it", fix="check the declared pose"
         )
-    flat, seen, angles = (
-        np.concatenate(noises, axis=1)[:, None],
-        np.isfinite(peaks),
-        _angles_deg(target),
-    )
+    flat = np.concatenate(noises, axis=1)[:, None]
+    seen = np.isfinite(peaks)
+    angles = _angles_deg(target)
     noise = jackknifed(flat, lambda z: temporal_sigma_m(z) / MM)
     readings: Readings = {("temporal deviation", "on the face", "mm"): (noise, flat.shape[2])}
     for size, parts in patterns.items():
@@ -224,28 +235,35 @@ def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
 
 
 def run_board(options: argparse.Namespace, recording: Recording | None, command: str) -> int:
-    """Compare and print; write capture.csv, capture.html and provenance.json. Returns 0. Raises UserError if the
-    experiment declares no board in front of a simulated camera, or if the capture cannot be compared with it."""
+    """Compare and print; write capture.csv, capture.html and provenance.json. Returns 0. Raises
+    UserError if the experiment declares no board in front of a simulated camera, or if the capture
+    cannot be compared with it."""
     experiment = load_experiment(options.board)
     points = list({point.frames_key: point for point in experiment.points}.values())
     detectors = {
         point.config.detector.name: point.config.detector.settings for point in experiment.points
     }
-    config, source = points[0].config, points[0].config.simulated
+    config = points[0].config
+    source = points[0].config.simulated
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
         what = f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k"
         legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
         raise UserError(what, legal=legal)
-    camera, frames, remarks, rows = camera_of(source.camera), config.capture.frames, [], []
-    image, judged = image_of(target, camera, recording.lens if recording else None), {}
+    camera = camera_of(source.camera)
+    frames = config.capture.frames
+    remarks = []
+    rows = []
+    image = image_of(target, camera, recording.lens if recording else None)
+    judged = {}
     if recording is not None:
         left_out = {left.name: left.why for left in average(recording, AverageConfig()).left_out}
         remarks = [f"{name} is left out: {why}" for name, why in left_out.items()]
         z_m = np.stack(
             [frame.z_m for frame in recording.frames() if frame.name not in left_out]
         ).astype(float)
-        frames, judged["capture"] = len(z_m), measured(z_m, image, target, config, detectors)
+        frames = len(z_m)
+        judged["capture"] = measured(z_m, image, target, config, detectors)
     for point in points:
         label = point.variant.split(", detector=")[0]
         judged[label] = measured(

@@ -1,7 +1,9 @@
-"""Published figures of cameras (measured or specified), the simulated values, and their comparison.
+"""Published figures of cameras (measured or specified), the simulated values, and their
+comparison.
 
-The file of figures is YAML; a new figure needs only an entry there. All problems of a file are reported together, each
-with its place. The file states a reason for each figure that fails; all others must pass."""
+The file of figures is YAML; a new figure needs only an entry there. All problems of a file are
+reported together, each with its place. The file states a reason for each figure that fails; all
+others must pass."""
 
 import sys
 import time
@@ -32,7 +34,9 @@ from harness.vocabulary.seeds import canonical_json
 from scenes.sensor.camera import camera_names
 
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
-NEAR = 0.25  # a figure of a real camera passes within this share of a published value; a published bound must hold
+# a figure of a real camera passes within this share of a published value; a published bound must
+# hold
+NEAR = 0.25
 PROGRESS_EVERY_S = 10.0
 Request = tuple[str, str, Config]  # the camera, the quantity and its conditions
 
@@ -61,12 +65,14 @@ class Published(Config):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The lowest and highest value that agree with the publication; infinite if there is no bound."""
+        """The lowest and highest value that agree with the publication; infinite if there is no
+        bound."""
         low, high = (self.above, self.below) if self.value is None else (self.value, self.value)
         return (-float("inf") if low is None else low), (float("inf") if high is None else high)
 
     def limits(self, near: float, tolerance: float = 0.0) -> tuple[float, float]:
-        """Return the lowest and highest value that pass: ``tolerance`` beyond the ends, or a share ``near`` if more."""
+        """Return the lowest and highest value that pass: ``tolerance`` beyond the ends, or a share
+        ``near`` if more."""
         slack = max(tolerance, near * abs(self.value or 0.0))
         return self.ends[0] - slack, self.ends[1] + slack
 
@@ -80,9 +86,10 @@ class Published(Config):
 
 
 class Figure(Config):
-    """A published figure in the file. ``calibration``: the camera file was, or may have been, fitted to it. ``kind``: a
-    figure of real cameras, or a check of the code against the arithmetic of a stated filter or limit. ``fails``: why it
-    is known to fail; a failure without a reason counts as a regression."""
+    """A published figure in the file. ``calibration``: the camera file was, or may have been,
+    fitted to it. ``kind``: a figure of real cameras, or a check of the code against the arithmetic
+    of a stated filter or limit. ``fails``: why it is known to fail; a failure without a reason
+    counts as a regression."""
 
     name: Annotated[
         str,
@@ -108,7 +115,8 @@ class Figure(Config):
 
     @property
     def use(self) -> Literal["blind", "calibration", "code"]:
-        """The use of the figure; a blind figure tests the model against real cameras and was not used to fit it."""
+        """The use of the figure; a blind figure tests the model against real cameras and was not
+        used to fit it."""
         return "code" if self.kind == "code" else "calibration" if self.calibration else "blind"
 
     @cached_property
@@ -133,21 +141,25 @@ class FiguresFile(Config):
 
 
 def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
-    """Read a file of figures. Raises UserError with each missing, unknown or illegal key and its place."""
+    """Read a file of figures. Raises UserError with each missing, unknown or illegal key and its
+    place."""
     source = read_yaml(path)
-    entries, problems = child(source.data, "figures"), list[Problem]()
+    entries = child(source.data, "figures")
+    problems = list[Problem]()
     first: dict[str, int] = {}
     splices: dict[KeyPath, type[Config]] = {}
     for number, data in enumerate(entries if isinstance(entries, list) else []):
         for key, legal in (("quantity", QUANTITIES), ("camera", camera_names())):
-            word, at = child(data, key), ("figures", number, key)
+            word = child(data, key)
+            at = ("figures", number, key)
             if (
                 isinstance(word, str)
                 and word not in legal
                 and not (key == "camera" and word.endswith(".yaml"))
             ):
                 problems.append(wrong_choice(at, word, legal, source.place_of(at)))
-        quantity, name = child(data, "quantity"), child(data, "name")
+        quantity = child(data, "quantity")
+        name = child(data, "name")
         if (
             isinstance(quantity, str)
             and quantity in QUANTITIES
@@ -155,7 +167,8 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
         ):
             splices["figures", number, "conditions"] = QUANTITIES[quantity].conditions
         if isinstance(name, str) and first.setdefault(name, number) != number:
-            place, used = (source.place_of(("figures", n, "name")) for n in (number, first[name]))
+            place = source.place_of(("figures", number, "name"))
+            used = source.place_of(("figures", first[name], "name"))
             problems.append(
                 Problem(
                     f"two figures have the name {name}",
@@ -179,7 +192,8 @@ class Score:
 
     @property
     def ratio(self) -> float:
-        """The simulated value divided by the published value, or by the nearer bound; NaN if that is 0."""
+        """The simulated value divided by the published value, or by the nearer bound; NaN if that
+        is 0."""
         value = self.simulated.value
         nearest = min(self.figure.published.ends, key=lambda end: abs(end - value))
         return value / nearest if nearest else float("nan")
@@ -192,7 +206,8 @@ class Score:
 
     @property
     def passes_by_tolerance(self) -> bool:
-        """True if a figure of a real camera passes only by the source's tolerance, which is wider than `NEAR`."""
+        """True if a figure of a real camera passes only by the source's tolerance, which is wider
+        than `NEAR`."""
         low, high = self.figure.published.limits(NEAR)
         return (
             self.figure.kind == "reality"
@@ -207,21 +222,24 @@ class Score:
 
     @property
     def verdict(self) -> str:
-        """The verdict: ``pass``, ``pass (tolerance)``, ``fail`` with a reason in the file, or ``FAIL (new)``."""
+        """The verdict: ``pass``, ``pass (tolerance)``, ``fail`` with a reason in the file, or
+        ``FAIL (new)``."""
         if self.passes:
             return "pass (tolerance)" if self.passes_by_tolerance else "pass"
         return "FAIL (new)" if self.fell_behind else "fail"
 
 
 def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Request, Reading]:
-    """Measure all requests, ``jobs`` scenes at a time. The results do not depend on ``jobs`` or on the order."""
+    """Measure all requests, ``jobs`` scenes at a time. The results do not depend on ``jobs`` or on
+    the order."""
     scenes: dict[str, list[Request]] = defaultdict(list)
     for request in requests:
         scenes[canonical_json([request[0], *scene_of(request[2])])].append(request)
     groups = list(scenes.values())
     results: dict[Request, Reading] = {}
     last_s = time.monotonic()
-    # new processes are spawned, since a forked process would share the locks of this process's libraries
+    # new processes are spawned, since a forked process would share the locks of this process's
+    # libraries
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         mapped = map if jobs == 1 else pool.map
         for group, readings in zip(
@@ -277,7 +295,8 @@ def _interval(between: Interval) -> str:
 
 
 def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
-    """Return the columns of a reading, its value and the ends of its interval: three in a file, two on a page."""
+    """Return the columns of a reading, its value and the ends of its interval: three in a file,
+    two on a page."""
     return (
         Column(name, name, f"{name}.value", note, number),
         Column(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),

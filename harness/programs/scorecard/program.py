@@ -1,4 +1,5 @@
-"""Runs the scorecard: it measures, judges and draws, writes the table and the page, and names failures."""
+"""Runs the scorecard: it measures, judges and draws, writes the table and the page, and names
+failures."""
 
 from __future__ import annotations
 
@@ -63,8 +64,9 @@ FAMILIES = {
 
 
 def run_scorecard(options: argparse.Namespace, command: str) -> int:
-    """Measure, print and write the scorecard. Returns 1 if a figure fails and its entry gives no reason, else 0.
-    Raises UserError for an unknown camera, a faulty file of figures, or a folder that cannot be written."""
+    """Measure, print and write the scorecard. Returns 1 if a figure fails and its entry gives no
+    reason, else 0. Raises UserError for an unknown camera, a faulty file of figures, or a folder
+    that cannot be written."""
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
     every = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
@@ -107,14 +109,16 @@ def _page(
     provenance: dict[str, object],
     command: str,
 ) -> str:
-    """Return the page: the figure of ratios, figures of cameras, checks of the code, and the quantities' meanings."""
+    """Return the page: the figure of ratios, figures of cameras, checks of the code, and the
+    quantities' meanings."""
     body = [heading("Simulated and published values")]
     real = [score for score in scores if score.figure.kind == "reality"]
     ratios = [
         score for score in real if score.figure.published.value is not None and score.ratio > 0
     ]
     if ratios:
-        size, name = (9.5, 1.2 + 0.17 * len(ratios)), "ratios"
+        size = (9.5, 1.2 + 0.17 * len(ratios))
+        name = "ratios"
         drawn = {
             name: svg(
                 name, size, "Simulated over published value", lambda canvas: _draw(canvas, ratios)
@@ -152,11 +156,9 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
     axis.axvspan(1 - scoring.NEAR, 1 + scoring.NEAR, color=BLUE, alpha=0.12)
     axis.axvline(1, color=BLUE, linewidth=0.8)
     for row, score in enumerate(scores):
-        known, value, colour = (
-            score.simulated.interval,
-            score.figure.published.value,
-            BLUE if score.passes else RED,
-        )
+        known = score.simulated.interval
+        value = score.figure.published.value
+        colour = BLUE if score.passes else RED
         if known.known and value:
             axis.plot(
                 np.maximum([known.low / value, known.high / value], 1e-3),

@@ -1,7 +1,9 @@
-"""All quantities that the scorecard measures, each with its conditions and the function that measures it.
+"""All quantities that the scorecard measures, each with its conditions and the function that
+measures it.
 
-A published figure names a quantity and those conditions that differ from the defaults. A curve is a quantity over a
-range of conditions and is measured by the same function. All scenes lie about the optical axis.
+A published figure names a quantity and those conditions that differ from the defaults. A curve is
+a quantity over a range of conditions and is measured by the same function. All scenes lie about
+the optical axis.
 """
 
 from collections.abc import Callable
@@ -34,15 +36,19 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import CameraConfig, EffectsConfig
 
 PATCH = (40, 24)
-"""Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by 6 % to either side on
-the coarsest camera, and the mean deviation by less than 1 %."""
+"""Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by
+6 % to either side on the coarsest camera, and the mean deviation by less than 1 %."""
 PATTERN_PATCH = (140, 180)
 LEAST_TILT = (0.05, 0.02)
-"""Slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step occur."""
+"""Slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step
+occur."""
 EDGE_PATCH = (40, 96)
 REACH_PX = 44.0
-"""Distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m, under 44 pixels."""
-SLANT = 0.1  # pixels across per pixel along the edge: all positions of an edge in a pixel occur, as in ISO 12233
+"""Distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m,
+under 44 pixels."""
+# pixels across per pixel along the edge: all positions of an edge in a pixel occur, as in ISO
+# 12233
+SLANT = 0.1
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
@@ -53,8 +59,8 @@ Lag = Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")]
 
 
 class PlaneConditions(Config):
-    """An infinite matte plane; ambient light is as in `CameraConfig`. For a continuous-wave camera, the sum of the
-    amplitudes may be given instead of the albedo."""
+    """An infinite matte plane; ambient light is as in `CameraConfig`. For a continuous-wave
+    camera, the sum of the amplitudes may be given instead of the albedo."""
 
     distance_m: Distance = 1.5
     albedo: Albedo = 0.8
@@ -77,7 +83,8 @@ class LagConditions(PlaneConditions):
 
 
 class PatchConditions(PlaneConditions):
-    """Square patches of a plane, each minus its own fitted plane, and a distance between pixels within them."""
+    """Square patches of a plane, each minus its own fitted plane, and a distance between pixels
+    within them."""
 
     patch_px: Annotated[
         int, Field(ge=3, le=70, description="side of a patch in pixels, 3 to 70")
@@ -89,8 +96,9 @@ class PatchConditions(PlaneConditions):
 
 
 class StepConditions(Config):
-    """A straight edge of a matte plane in front of another, both frontal, 6 degrees off the pixel grid. z steps along
-    the image axis ``across``; with ``shadow``, the front is on the emitter's side and casts its shadow on the back."""
+    """A straight edge of a matte plane in front of another, both frontal, 6 degrees off the pixel
+    grid. z steps along the image axis ``across``; with ``shadow``, the front is on the emitter's
+    side and casts its shadow on the back."""
 
     distance_m: Distance = 0.75
     step_mm: Annotated[
@@ -128,7 +136,8 @@ def in_words(conditions: Config) -> str:
 
 
 def scene_of(conditions: Config) -> tuple[str, dict[str, Any]]:
-    """Return the scene for conditions; conditions that share a scene, such as lags on a plane, give equal results."""
+    """Return the scene for conditions; conditions that share a scene, such as lags on a plane,
+    give equal results."""
     shared = _plane(conditions) if isinstance(conditions, PlaneConditions) else conditions
     return type(shared).__name__, shared.to_data()
 
@@ -156,13 +165,12 @@ QUANTITIES: dict[str, Quantity] = {}
 
 
 def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
-    """Register a measuring function. The ending of its name is the unit; the page quotes its docstring's start."""
+    """Register a measuring function. The ending of its name is the unit; the page quotes its
+    docstring's start."""
 
     def listed(measure: Measure) -> Measure:
-        name, says = (
-            measure.__name__,
-            " ".join((measure.__doc__ or "").partition("\n\n")[0].split()),
-        )
+        name = measure.__name__
+        says = " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
         ending = name.rpartition("_")[2]
         unit = ending if ending in ("mm", "px") else ""
         QUANTITIES[name] = Quantity(name, title, unit, conditions, measure, says)
@@ -180,7 +188,8 @@ def plane_stack(
     unit: int = 1,
     patch: tuple[int, int] = PATCH,
 ) -> FrameStack:
-    """Return frames of a plane about the axis; all measurements of a plane with the same effects share them."""
+    """Return frames of a plane about the axis; all measurements of a plane with the same effects
+    share them."""
     slope_x = max(float(np.tan(np.radians(c.angle_deg))), LEAST_TILT[0])
     albedo = c.albedo
     if c.amplitude_units is not None:
@@ -215,7 +224,8 @@ def temporal_sigma_mm(bench: Bench, c: PlaneConditions) -> Reading:
 
 @_quantity("random error", PlaneConditions)
 def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Standard deviation of a pixel's z over frames, with whole-frame jitter and jumps, rms over pixels."""
+    """Standard deviation of a pixel's z over frames, with whole-frame jitter and jumps, rms over
+    pixels."""
     return _deviation(plane_stack(bench, c, EffectsConfig(), bench.effort.whole_frames))
 
 
@@ -254,14 +264,18 @@ def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
 
 
 def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
-    """Return (units, patches) in mm^2: the variance about each patch's plane in a frame, and the product at the lag."""
-    n, k, found = c.patch_px, c.apart_px, []
+    """Return (units, patches) in mm^2: the variance about each patch's plane in a frame, and the
+    product at the lag."""
+    n = c.patch_px
+    k = c.apart_px
+    found = []
     for z_m in _single_frames(bench, _plane(c)):
         stored_m = (
             np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
         )
         left = _left_of_patches(stored_m, n)
-        beside, below = left[:, :, k:] * left[:, :, : n - k], left[:, k:] * left[:, : n - k]
+        beside = left[:, :, k:] * left[:, :, : n - k]
+        below = left[:, k:] * left[:, : n - k]
         found.append(
             (left.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2)
         )
@@ -271,37 +285,38 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
 
 @_quantity("deviation within patches", PatchConditions)
 def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
-    """Standard deviation of a single frame about the patch's own plane, with noise and fixed pattern: median over
-    patches, mean over units."""
+    """Standard deviation of a single frame about the patch's own plane, with noise and fixed
+    pattern: median over patches, mean over units."""
     return mean_of(np.sqrt(np.median(_patch_products(bench, c)[0], axis=1)))
 
 
 @_quantity("pattern within patches", PatchConditions)
 def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
-    """Standard deviation about the patch's own plane that two averages of different frames share: rms over patches,
-    mean over units."""
+    """Standard deviation about the patch's own plane that two averages of different frames share:
+    rms over patches, mean over units."""
     found = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         z_m = plane_stack(
             bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
         ).z_m
-        even, odd = (
-            _left_of_patches(half.mean(axis=0), c.patch_px) for half in (z_m[::2], z_m[1::2])
-        )
+        even = _left_of_patches(z_m[::2].mean(axis=0), c.patch_px)
+        odd = _left_of_patches(z_m[1::2].mean(axis=0), c.patch_px)
         found.append(float(np.sqrt(max((even * odd).mean(), 0.0))))
     return mean_of(found)
 
 
 @_quantity("correlation within patches", PatchConditions)
 def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
-    """Correlation between pixels of a single frame about the patch's own plane, mean over rows and columns."""
+    """Correlation between pixels of a single frame about the patch's own plane, mean over rows and
+    columns."""
     variance, product = _patch_products(bench, c)
     return mean_of(product.mean(axis=1) / variance.mean(axis=1))
 
 
 @_quantity("systematic error", PlaneConditions)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Largest absolute mean error of z among ten units, one hour after power-on, direct light only."""
+    """Largest absolute mean error of z among ten units, one hour after power-on, direct light
+    only."""
     errors = []
     for unit in range(1, bench.effort.units + 1):
         stack = plane_stack(bench, c, STEADY, bench.effort.few_frames, unit)
@@ -312,7 +327,8 @@ def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
 
 @_quantity("fixed pattern", PlaneConditions)
 def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Standard deviation over pixels of the average minus a smooth surface and the remaining noise, mean of 5 units."""
+    """Standard deviation over pixels of the average minus a smooth surface and the remaining
+    noise, mean of 5 units."""
     found = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         stack = plane_stack(
@@ -328,8 +344,10 @@ def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
 
 @lru_cache(maxsize=4)
 def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
-    """Return widths at a straight edge near the axis; in front, sign (across - slant along) < 0 in ideal pixels."""
-    camera, axis = bench.camera, ("x", "y").index(c.across)
+    """Return widths at a straight edge near the axis; in front, sign (across - slant along) < 0 in
+    ideal pixels."""
+    camera = bench.camera
+    axis = ("x", "y").index(c.across)
     lens = camera.nominal_lens
     region = bench.patch(*(EDGE_PATCH if axis == 0 else EDGE_PATCH[::-1]))
     toward_emitter = -1.0 if camera.optics.emitter_m[axis] < 0 else 1.0
@@ -340,20 +358,20 @@ def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
         px = slopes * np.array([lens.fx, lens.fy])
         return np.asarray(sign * (px[..., axis] - SLANT * px[..., 1 - axis]))
 
-    front, back = Plane(c.distance_m), Plane(c.distance_m + c.step_mm * MM)
+    front = Plane(c.distance_m)
+    back = Plane(c.distance_m + c.step_mm * MM)
     view = layered_view(camera, region, front, back, lambda slopes: signed_px(slopes) < 0, c.albedo)
     stack = bench.taken(view, NOISE, bench.effort.few_frames, "step", digest(c.to_data()))
     from_edge = signed_px(lens.region_slopes(stack.region))
     tolerance_m = on_surface_tolerance_m(
         temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX), c.step_mm * MM
     )
-    front_z, back_z = (plane.z_along_m(stack.slopes) for plane in (front, back))
+    front_z = front.z_along_m(stack.slopes)
+    back_z = back.z_along_m(stack.slopes)
     widths = edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, 2 - axis)
     # pixels so far from the edge that the camera's filter mixes in no other surface
-    on_front, on_back = (
-        from_edge < -FLAT_PX,
-        (from_edge > FLAT_PX) & np.isfinite(stack.z_m).all(axis=0),
-    )
+    on_front = from_edge < -FLAT_PX
+    on_back = (from_edge > FLAT_PX) & np.isfinite(stack.z_m).all(axis=0)
     return widths | {
         "height": stack.z_m[:, on_back].mean(axis=1) - np.nanmean(stack.z_m[:, on_front], axis=1)
     }
@@ -367,8 +385,8 @@ def edge_gap_px(bench: Bench, c: StepConditions) -> Reading:
 
 @_quantity("flying pixels", StepConditions)
 def flying_pixels_px(bench: Bench, c: StepConditions) -> Reading:
-    """Width across an edge of the pixels whose range differs from both surfaces by more than four standard deviations
-    plus a tenth of the step."""
+    """Width across an edge of the pixels whose range differs from both surfaces by more than four
+    standard deviations plus a tenth of the step."""
     return mean_of(_widths(bench, c)["flying"])
 
 

@@ -1,4 +1,5 @@
-"""``tofpod validate``: compares the simulated cameras with published figures, or with a real capture."""
+"""``tofpod validate``: compares the simulated cameras with published figures, or with a real
+capture."""
 
 import argparse
 from pathlib import Path
@@ -70,7 +71,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives no reason.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the program. Returns 0, 1 if a figure fails without a reason, 2 for a user's mistake, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 1 if a figure fails without a reason, 2 for a user's mistake,
+    130 after Ctrl-C."""
     if options.capture or options.board:
         if options.figures:
             raise UserError("--figures belongs to the scorecard, not to a capture")

@@ -1,7 +1,8 @@
-"""Rules for the claims on a single view (C1 to C6, C9) and on cameras (C11), the same for every run.
+"""Rules for the claims on a single view (C1 to C6, C9) and on cameras (C11), the same for every
+run.
 
-A verdict needs certainty in either direction: if an interval allows both, it is "undecided". No experiment can change a
-rule, and no rule was chosen to make a claim come out."""
+A verdict needs certainty in either direction: if an interval allows both, it is "undecided". No
+experiment can change a rule, and no rule was chosen to make a claim come out."""
 
 import json
 import warnings
@@ -32,12 +33,14 @@ from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.path_names import value_text
 
 Answer = Literal["borne out", "not borne out", "undecided"]
-FEW = 1  # the smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger
+# the smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger
+FEW = 1
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim with its verdict, the numbers that support it, and the criterion, which was fixed in advance."""
+    """A claim with its verdict, the numbers that support it, and the criterion, which was fixed in
+    advance."""
 
     claim: str
     text: str
@@ -54,7 +57,8 @@ def declared() -> dict[str, dict[str, str]]:
 
 
 def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
-    """Return the verdict on a claim of claims.yaml, with this module's constants filled into its criterion."""
+    """Return the verdict on a claim of claims.yaml, with this module's constants filled into its
+    criterion."""
     declaration = declared()[claim]
     return Verdict(
         claim, declaration["says"], answer, evidence, declaration["criterion"].format_map(globals())
@@ -62,7 +66,8 @@ def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
 
 
 def decide(parts: Iterable[bool | None]) -> Answer:
-    """Return "borne out" if all parts hold, "not borne out" if any part fails, and "undecided" otherwise."""
+    """Return "borne out" if all parts hold, "not borne out" if any part fails, and "undecided"
+    otherwise."""
     values = list(parts)
     if any(value is False for value in values):
         return "not borne out"
@@ -70,22 +75,29 @@ def decide(parts: Iterable[bool | None]) -> Answer:
 
 
 THESIS_HOLES = tuple(str(number) for number in range(1, 12))
-FOUND_WITH_MANY, FOUND_WITH_FEW = frozenset(THESIS_HOLES[3:]), frozenset(THESIS_HOLES[4:])
+FOUND_WITH_MANY = frozenset(THESIS_HOLES[3:])
+FOUND_WITH_FEW = frozenset(THESIS_HOLES[4:])
 RULER_MM = (
     25.4 / 16
 )  # one graduation of the ruler (1/16 in) with which the thesis read its reference positions
 SLOPE_MARGIN = 0.05
-"""Exponents within this distance of -0.5 count as 1/sqrt(N); over 50 frames, it is a factor of 1.22 in noise."""
-UNCHANGED = 0.9  # the systematic error counts as lowered if it falls below this share, while white noise falls to 0.14
-FEWEST_UNITS = 3  # fewest units of a camera, which must all agree, to decide a claim that depends on its fixed pattern
+"""Exponents within this distance of -0.5 count as 1/sqrt(N); over 50 frames, it is a factor of
+1.22 in noise."""
+# the systematic error counts as lowered if it falls below this share, while white noise falls to
+# 0.14
+UNCHANGED = 0.9
+# fewest units of a camera, which must all agree, to decide a claim that depends on its fixed
+# pattern
+FEWEST_UNITS = 3
 FEWEST_PAIRS = 5  # fewest pairs of views to compare registrations
-FEWEST_RANKED = 4  # fewest holes to rank; with fewer, even a perfect order has a probability above 1 in 20 by chance
+# fewest holes to rank; with fewer, even a perfect order has a probability above 1 in 20 by chance
+FEWEST_RANKED = 4
 
 
 @dataclass(frozen=True)
 class Case:
-    """The tables of a variant that rules use, and its averaged clouds. ``units`` are the summary rows of this variant
-    and of the variations that change only the camera's unit."""
+    """The tables of a variant that rules use, and its averaged clouds. ``units`` are the summary
+    rows of this variant and of the variations that change only the camera's unit."""
 
     variant: str
     summary: pd.DataFrame
@@ -105,7 +117,8 @@ def _c2(case: Case) -> tuple[Answer, str]:
     set_agrees = {"borne out": True, "not borne out": False, "undecided": None}[answer]
     damaged = case.runs[case.runs["role"] == "damaged"]
     in_mm = damaged["threshold"] * damaged["scale_mm"]
-    few, many = (in_mm[damaged["frames"] == frames].dropna() for frames in (FEW, MANY))
+    few = in_mm[damaged["frames"] == FEW].dropna()
+    many = in_mm[damaged["frames"] == MANY].dropna()
     interval = mean_difference(few, many)
     if not interval.known:
         return decide(
@@ -124,10 +137,12 @@ def _c3(case: Case) -> tuple[Answer, str]:
     parts: list[bool | None] = []
     ratios = []
     for _, row in rows.iterrows():
-        bias, std = float(row["extent_bias_mm"]), float(row["extent_diameter_std_mm"])
+        bias = float(row["extent_bias_mm"])
+        std = float(row["extent_diameter_std_mm"])
         interval = standardised_bias(bias, std, int(row["extent_measured"]))
         ratio = bias / std if std > 0 else interval.low
-        within, outside = interval.within(-1, 1), interval.above(1) or interval.below(-1)
+        within = interval.within(-1, 1)
+        outside = interval.above(1) or interval.below(-1)
         parts.append(True if within else False if outside else None)
         ratios.append(
             f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}"
@@ -139,7 +154,8 @@ def _c3(case: Case) -> tuple[Answer, str]:
 
 
 def _between_units(case: Case, rows: pd.DataFrame) -> str:
-    """Return the error of the mean size of the holes found (``rows``) in standard deviations between units."""
+    """Return the error of the mean size of the holes found (``rows``) in standard deviations
+    between units."""
     many = case.units[case.units["frames"] == MANY]
     means = many.pivot(index="variant", columns="hole", values="extent_diameter_mean_mm")
     if len(means) < FEWEST_UNITS:
@@ -158,12 +174,14 @@ def _c4(case: Case) -> tuple[Answer, str]:
     error = rows["extent_bias_mm"].abs().to_numpy(float)
     rho, p = falling_rank(diameter, error)
     p_rises = falling_rank(diameter, -error)[1]
-    smallest, largest = rows.iloc[diameter.argmin()], rows.iloc[diameter.argmax()]
+    smallest = rows.iloc[diameter.argmin()]
+    largest = rows.iloc[diameter.argmax()]
     errors = (
         f"{abs(at['extent_bias_mm']):.2f} mm at {at['true_diameter_mm']:.2f} mm"
         for at in (smallest, largest)
     )
-    falls, rises = ("< 0.001" if each < 0.001 else f"= {each:.3f}" for each in (p, p_rises))
+    falls = "< 0.001" if p < 0.001 else f"= {p:.3f}"
+    rises = "< 0.001" if p_rises < 0.001 else f"= {p_rises:.3f}"
     evidence = (
         f"Rank correlation {rho:+.2f} over {len(rows)} holes (one-sided p {falls} that it falls with the diameter, "
         f"{rises} that it grows). Error {', '.join(errors)}."
@@ -207,9 +225,11 @@ def _c6(case: Case) -> tuple[Answer, str]:
         look: [s.hole for s in shapes if s.looks == look]
         for look in ("bowl", "cylinder", "neither")
     }
-    bowls, cylinders = len(looks["bowl"]), len(looks["cylinder"])
+    bowls = len(looks["bowl"])
+    cylinders = len(looks["cylinder"])
     most = len(shapes) / 2
-    bowl, cylinder = bowls > most and not cylinders, cylinders > most and not bowls
+    bowl = bowls > most and not cylinders
+    cylinder = cylinders > most and not bowls
     answer: Answer = "borne out" if bowl else "not borne out" if cylinder else "undecided"
     ratio = float(np.median([shape.bowl_rms_mm / shape.cylinder_rms_mm for shape in shapes]))
     control = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
@@ -226,8 +246,10 @@ def _c9(case: Case) -> tuple[Answer, str]:
     law = noise_law(case.probes, case.variant)
     if law is None:
         return "undecided", "Not judged: too few sample pixels or numbers of frames."
-    low, high = -0.5 - SLOPE_MARGIN, -0.5 + SLOPE_MARGIN
-    slope, ratio = law.slope_interval, law.systematic_ratio_interval
+    low = -0.5 - SLOPE_MARGIN
+    high = -0.5 + SLOPE_MARGIN
+    slope = law.slope_interval
+    ratio = law.systematic_ratio_interval
     falls = (
         True
         if slope.within(low, high)
@@ -255,7 +277,8 @@ def score_claims(
     examples: Sequence[Any] = (),
     summary: pd.DataFrame | None = None,
 ) -> list[Verdict]:
-    """Return a verdict for each of `RULES` on a variant. ``summary`` is the result of `summarise_holes`, if known."""
+    """Return a verdict for each of `RULES` on a variant. ``summary`` is the result of
+    `summarise_holes`, if known."""
     summary = summarise_holes(tables.holes) if summary is None else summary
     alone = tables.variants["settings"].map(
         lambda text: list(json.loads(text or "{}")) == [CAMERA_UNIT]
@@ -276,11 +299,14 @@ def score_claims(
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return Spearman's rho and the one-sided permutation p of "y falls as x grows", exact up to 8 pairs, or (0, 1)."""
-    x_ranks, y_ranks = rankdata(x), rankdata(y)
+    """Return Spearman's rho and the one-sided permutation p of "y falls as x grows", exact up to 8
+    pairs, or (0, 1)."""
+    x_ranks = rankdata(x)
+    y_ranks = rankdata(y)
     if np.ptp(x_ranks) == 0 or np.ptp(y_ranks) == 0:
         return 0.0, 1.0
-    a, b = x_ranks - x_ranks.mean(), y_ranks - y_ranks.mean()
+    a = x_ranks - x_ranks.mean()
+    b = y_ranks - y_ranks.mean()
     norm = np.sqrt((a @ a) * (b @ b))
     null = a[_orders(len(a))] @ b
     return float(a @ b / norm), float((null <= a @ b + 1e-12 * norm).mean())
@@ -288,7 +314,8 @@ def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 @lru_cache
 def _orders(count: int) -> np.ndarray:
-    """Return all orders of up to 8 numbers, or 20,000 random orders of more numbers, including the given order."""
+    """Return all orders of up to 8 numbers, or 20,000 random orders of more numbers, including the
+    given order."""
     if count <= 8:
         return np.array(list(permutations(range(count))))
     random = np.random.default_rng(0).permuted(np.tile(np.arange(count), (20_000, 1)), axis=1)
@@ -296,12 +323,11 @@ def _orders(count: int) -> np.ndarray:
 
 
 def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, Interval]:
-    """Return the median over holes of var(first) / var(second) over repeats with both values, and its bootstrap
-    interval over repeats; infinite if no hole's second column varies. ``holes`` has a row per repeat and hole."""
-    top, bottom = (
-        holes.pivot(index="repeat", columns="hole", values=c).to_numpy(float)
-        for c in (first, second)
-    )
+    """Return the median over holes of var(first) / var(second) over repeats with both values, and
+    its bootstrap interval over repeats; infinite if no hole's second column varies. ``holes`` has
+    a row per repeat and hole."""
+    top = holes.pivot(index="repeat", columns="hole", values=first).to_numpy(float)
+    bottom = holes.pivot(index="repeat", columns="hole", values=second).to_numpy(float)
     both = np.isfinite(top) & np.isfinite(bottom)
 
     def ratio(chosen: np.ndarray) -> np.ndarray:
@@ -309,10 +335,8 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
             np.errstate(invalid="ignore", divide="ignore"),
             warnings.catch_warnings(action="ignore"),
         ):
-            over, under = (
-                np.nanvar(np.where(both, data, np.nan)[chosen], axis=1, ddof=1)
-                for data in (top, bottom)
-            )
+            over = np.nanvar(np.where(both, top, np.nan)[chosen], axis=1, ddof=1)
+            under = np.nanvar(np.where(both, bottom, np.nan)[chosen], axis=1, ddof=1)
             ratios = over / under
         return np.nanmedian(
             np.where(np.isnan(ratios).all(axis=1, keepdims=True), np.inf, ratios), axis=1
@@ -324,7 +348,8 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
 def _found(
     case: Case, frames: int, expected: frozenset[str], unexpected: frozenset[str]
 ) -> tuple[Answer, str]:
-    """Judge whether the expected holes are found and the unexpected holes missed; return also the counts."""
+    """Judge whether the expected holes are found and the unexpected holes missed; return also the
+    counts."""
     status = found_holes(case.summary, case.variant, frames)
     if set(status) != set(THESIS_HOLES):
         why = (
@@ -364,8 +389,9 @@ OTHERS = ("kinect_v2", "realsense_l515")
 
 
 def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
-    """Return the verdict from summary rows of all set-ups and variations; None if none of the ``axes`` holds the three
-    cameras. At each place, a camera's range of counts covers all its units and variations."""
+    """Return the verdict from summary rows of all set-ups and variations; None if none of the
+    ``axes`` holds the three cameras. At each place, a camera's range of counts covers all its
+    units and variations."""
     if CAMERA not in axes or not {BEST, *OTHERS} <= set(summary[CAMERA]):
         return None
     rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]

@@ -1,8 +1,10 @@
-"""The likelihood and posterior probability of each set-up of an experiment, given the thesis' result.
+"""The likelihood and posterior probability of each set-up of an experiment, given the thesis'
+result.
 
-The result is a cloud of 1 frame in which holes 5 to 11 were found, and a cloud of 50 frames with holes 4 to 11. A hole
-is found with probability (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything. Holes
-are assumed independent given the set-up. All set-ups have the same prior probability."""
+The result is a cloud of 1 frame in which holes 5 to 11 were found, and a cloud of 50 frames with
+holes 4 to 11. A hole is found with probability (hits + 1/2) / (repeats + 1), so that few repeats
+neither prove nor exclude anything. Holes are assumed independent given the set-up. All set-ups
+have the same prior probability."""
 
 from collections.abc import Sequence
 
@@ -20,20 +22,23 @@ from harness.programs.thesis.claims import (
 from harness.vocabulary.path_names import in_words, names_of, value_text
 
 FEWEST_SET_UPS = 20  # fewest set-ups for which a posterior is computed
-DOUBTED = 0.5  # a value is doubted if its posterior probability is less than this share of its prior probability
+# a value is doubted if its posterior probability is less than this share of its prior probability
+DOUBTED = 0.5
 SET_UP = "set-up"
 KIND = "source.target.hole_kind"
 SPEAKS_OF = {
     "source.target.blind_depth_mm": "blind",
     "source.target.backing_distance_mm": "through",
 }
-"""Facts that only one kind of hole has; if both kinds are tried, probabilities are those given that kind."""
+"""Facts that only one kind of hole has; if both kinds are tried, probabilities are those given
+that kind."""
 
 
 def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | None:
-    """Return rows of `harness.records.trials.POSTERIOR`: every set-up, likeliest first, then every value of each axis.
-    Return None for another target, too few set-ups, several cameras, or without both numbers of frames. The probability
-    of a fact that only one kind of hole has is conditional on this kind."""
+    """Return rows of `harness.records.trials.POSTERIOR`: every set-up, likeliest first, then every
+    value of each axis. Return None for another target, too few set-ups, several cameras, or
+    without both numbers of frames. The probability of a fact that only one kind of hole has is
+    conditional on this kind."""
     rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
     rows = rows[rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)]
     if CAMERA in axes or rows["variant"].nunique() < FEWEST_SET_UPS:
@@ -63,9 +68,11 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     ]
     of_set_up = rows.drop_duplicates("variant").set_index("variant")
     for path, name in names_of(list(axes)).items():
-        among, kind = of_set_up, SPEAKS_OF.get(path)
+        among = of_set_up
+        kind = SPEAKS_OF.get(path)
         if kind and KIND in axes:
-            among, name = of_set_up[of_set_up[KIND] == kind], f"{name} of {kind} holes"
+            among = of_set_up[of_set_up[KIND] == kind]
+            name = f"{name} of {kind} holes"
         for value, group in among.groupby(path, dropna=False):
             own = {
                 "axis": name,
@@ -79,12 +86,11 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
-    """Return a sentence on the facts that the thesis' result requires (the values of each axis that are not `DOUBTED`,
-    without facts of a doubted kind of hole) and its probability in the likeliest set-up."""
-    best, doubted = (
-        posterior.iloc[0],
-        posterior["posterior_share"] < DOUBTED * posterior["prior_share"],
-    )
+    """Return a sentence on the facts that the thesis' result requires (the values of each axis
+    that are not `DOUBTED`, without facts of a doubted kind of hole) and its probability in the
+    likeliest set-up."""
+    best = posterior.iloc[0]
+    doubted = posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
     required = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
         kept = rows["value"][~doubted[rows.index]]

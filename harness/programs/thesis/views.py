@@ -1,7 +1,9 @@
-"""Rules for the claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for a place of an experiment.
+"""Rules for the claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for a
+place of an experiment.
 
-Repeats vary the noise and the errors of the nominal poses, but not the poses, the board or the camera's unit. So C7 is
-judged over pairs of views; C8 and C10, which have a single pair, are judged over units of the camera."""
+Repeats vary the noise and the errors of the nominal poses, but not the poses, the board or the
+camera's unit. So C7 is judged over pairs of views; C8 and C10, which have a single pair, are
+judged over units of the camera."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,7 +27,8 @@ from harness.vocabulary.text import many
 Standing = Literal["ahead", "behind", "level", "open"]
 
 SLAM = ("odometry", "volume")
-"""Registration and merging of the map that represents a SLAM system, without marks or loop closure."""
+"""Registration and merging of the map that represents a SLAM system, without marks or loop
+closure."""
 NOISE_REDUCING = "fusion"
 MARKED = ("joint", "marks")
 RESPECTS = ("holes", "size", "noise")
@@ -49,7 +52,8 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     errors = []
     for method, part in pairs.items():
         good = maps.trusted(part)
-        plane, across = (float(good[f"tre_{way}_mm"].median()) for way in ("in_plane", "across"))
+        plane = float(good[f"tre_{'in_plane'}_mm"].median())
+        across = float(good[f"tre_{'across'}_mm"].median())
         errors.append(
             f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}"
         )
@@ -62,7 +66,8 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
-    """Return whether a method's error perpendicular to the board is at most the noise of a surface."""
+    """Return whether a method's error perpendicular to the board is at most the noise of a
+    surface."""
     if intervals.wilson(len(rows) - len(maps.trusted(rows)), len(rows))[0] > 0.5:
         return False
     across = maps.per_pair(rows, "tre_across_mm").to_numpy(float)
@@ -101,11 +106,9 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
     finished = (
         maps.Map(set_up.variant, case.frames(set_up.variant)[-1], set_up.views) for set_up in ended
     )
-    slam, alone, two = (
-        next(finished, None),
-        case.single(),
-        case.named(2, maps.THESIS_REGISTRATION, maps.THESIS_MERGE),
-    )
+    slam = next(finished, None)
+    alone = case.single()
+    two = case.named(2, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if slam is None or alone is None or two is None:
         named = {"SLAM map": slam, "single view": alone, "merge of two": two}
         missing = ", no ".join(name for name, found in named.items() if not found)
@@ -126,13 +129,15 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         return runs["surface_noise_mm"][runs["role"] == "damaged"].dropna().to_numpy(float)
 
     def errors(mapped: maps.Map, measured: str, true: str) -> np.ndarray:
-        """Return errors (repeats, h), NaN if not measured, without the hole from which positions are measured."""
+        """Return errors (repeats, h), NaN if not measured, without the hole from which positions
+        are measured."""
         rows = case.holes(mapped)
         rows = rows[rows["hole"].isin(common) & (rows[true] > 0)]
         rows = rows.assign(_error=rows[measured] - rows[true])
         return rows.pivot(index="repeat", columns="hole", values="_error").to_numpy(float)
 
-    parts, texts = [], []
+    parts = []
+    texts = []
     for what, values, size, gap in (
         (
             "surface noise",
@@ -173,7 +178,8 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def rms_gap(first: np.ndarray, second: np.ndarray) -> intervals.Interval:
-    """Return the 95 % bootstrap interval of rms(first) - rms(second), both (repeats, h) with NaN; unknown below two."""
+    """Return the 95 % bootstrap interval of rms(first) - rms(second), both (repeats, h) with NaN;
+    unknown below two."""
     if min(len(first), len(second)) < 2 or not (
         np.isfinite(first).any() and np.isfinite(second).any()
     ):
@@ -217,8 +223,9 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def duels_of(case: maps.MapCase) -> list[tuple[tuple[Standing, ...], str]]:
-    """Compare H1's map with a single view that has as many frames as each of its views, and with a single view that has
-    as many exposures in total, if they exist. Return the standing in each respect, and the numbers as text."""
+    """Compare H1's map with a single view that has as many frames as each of its views, and with a
+    single view that has as many exposures in total, if they exist. Return the standing in each
+    respect, and the numbers as text."""
     fused = [
         way
         for way in case.set_ups
@@ -304,7 +311,8 @@ VIEW_CLAIMS: dict[str, Callable[[maps.MapCase], tuple[Answer, str]]] = {
 
 
 def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
-    """Return a verdict for each of `VIEW_CLAIMS` and each place; if there are several, the evidence names the place."""
+    """Return a verdict for each of `VIEW_CLAIMS` and each place; if there are several, the
+    evidence names the place."""
     verdicts: list[Verdict] = []
     for claim, rule in VIEW_CLAIMS.items():
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
@@ -325,7 +333,8 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
 
 
 def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
-    """Combine the verdicts on units of a camera: their common verdict if they agree and are enough, or "undecided"."""
+    """Combine the verdicts on units of a camera: their common verdict if they agree and are
+    enough, or "undecided"."""
     evidence = " ".join(verdict.evidence for verdict in verdicts)
     answers = [verdict.verdict for verdict in verdicts]
     if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:

@@ -1,4 +1,5 @@
-"""Translates pydantic's errors into problems with a place, the legal values and the nearest legal word."""
+"""Translates pydantic's errors into problems with a place, the legal values and the nearest legal
+word."""
 
 import difflib
 import json
@@ -47,10 +48,13 @@ C = TypeVar("C", bound=Config)
 def validated(
     model: type[C], source: Source, splices: shape.Splices
 ) -> tuple[C | None, list[Problem]]:
-    """Validate a source's data, and free data at ``splices`` against the models that belong there. Returns all problems
-    and the declaration, whose spliced data is completed with defaults (None if there is any problem)."""
+    """Validate a source's data, and free data at ``splices`` against the models that belong there.
+    Returns all problems and the declaration, whose spliced data is completed with defaults (None
+    if there is any problem)."""
     problems: list[Problem] = []
-    declared, data, config = shape.Declared(model, source.data, splices), source.data, None
+    declared = shape.Declared(model, source.data, splices)
+    data = source.data
+    config = None
     for path, spliced in splices.items():
         try:
             data = with_value_at(
@@ -66,7 +70,8 @@ def validated(
 
 
 def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
-    """Return data with a value set at a path; unchanged if the path passes anything but mappings and lists."""
+    """Return data with a value set at a path; unchanged if the path passes anything but mappings
+    and lists."""
     if not path:
         return value
     inner = with_value_at(shape.child(data, path[0]), path[1:], value)
@@ -76,8 +81,10 @@ def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
 
 
 def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
-    """Return the declaration in a file whose ``key`` selects one of ``models``. Raises DeclarationError."""
-    name, place = source.data.get(key), source.place_of((key,))
+    """Return the declaration in a file whose ``key`` selects one of ``models``. Raises
+    DeclarationError."""
+    name = source.data.get(key)
+    place = source.place_of((key,))
     if name is None:
         problems = [
             Problem(f"the file lacks the key `{key}`", place, legal="one of " + ", ".join(models))
@@ -92,8 +99,9 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
 
 
 def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str | None = None) -> C:
-    """Validate plain data from command line options and return it as a declaration. Raises a single UserError with all
-    problems under the heading ``what``; ``within`` is the key that precedes each path there."""
+    """Validate plain data from command line options and return it as a declaration. Raises a
+    single UserError with all problems under the heading ``what``; ``within`` is the key that
+    precedes each path there."""
     try:
         return model.from_data(data)
     except ValidationError as error:
@@ -112,14 +120,17 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
 def problems_of(
     error: ValidationError, declared: shape.Declared, source: Source, base: KeyPath = ()
 ) -> list[Problem]:
-    """Return the first `MAX_PROBLEMS` problems of a ValidationError whose locations start at ``base``. pydantic's
-    locations mix keys of the data with labels of union branches. For a union without a discriminator, only the errors
-    of the intended branch are reported; if that branch is unclear, the union as a whole is the problem."""
+    """Return the first `MAX_PROBLEMS` problems of a ValidationError whose locations start at
+    ``base``. pydantic's locations mix keys of the data with labels of union branches. For a union
+    without a discriminator, only the errors of the intended branch are reported; if that branch is
+    unclear, the union as a whole is the problem."""
     alone: list[tuple[KeyPath, Any]] = []
     unions: dict[KeyPath, list[tuple[str, KeyPath, Any]]] = defaultdict(list)
     for detail in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
         path: KeyPath = ()
-        label, location, data = None, (*base, *detail["loc"]), declared.data
+        label = None
+        location = (*base, *detail["loc"])
+        data = declared.data
         for number, key in enumerate(location, start=1):
             known = (
                 key in data
@@ -127,7 +138,8 @@ def problems_of(
                 else isinstance(data, list) and key in range(len(data))
             )
             if known or (detail["type"] == "missing" and number == len(location)):
-                path, data = (*path, key), shape.child(data, key)
+                path = (*path, key)
+                data = shape.child(data, key)
             else:
                 label = label or (path, str(key))
         if label:
@@ -136,11 +148,9 @@ def problems_of(
             alone.append((path, detail))
     problems = []
     for path, errors in unions.items():
-        labels, data, slot = (
-            {label for label, _, _ in errors},
-            shape.get(declared.data, path),
-            declared.at(path),
-        )
+        labels = {label for label, _, _ in errors}
+        data = shape.get(declared.data, path)
+        slot = declared.at(path)
         meant = labels if len(labels) == 1 else set[str]()
         if isinstance(data, dict):
             meant = meant or {getattr(shape.model_for(slot, data), "__name__", "")} & labels
@@ -155,10 +165,16 @@ def problems_of(
 
 def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source) -> Problem:
     """Describe one of pydantic's errors, at a path in the data, in the user's terms."""
-    value, slot, place = shape.get(source.data, path), declared.at(path), source.place_of(path)
-    kind, legal, kinds, fix = error["type"], shape.legal_at(slot), shape.kinds_of(slot), None
+    value = shape.get(source.data, path)
+    slot = declared.at(path)
+    place = source.place_of(path)
+    kind = error["type"]
+    legal = shape.legal_at(slot)
+    kinds = shape.kinds_of(slot)
+    fix = None
     if kind == "missing":
-        parent, name = path[:-1], path[-1]
+        parent = path[:-1]
+        name = path[-1]
         inside = f"`{dotted(parent)}` lacks" if parent else "the file lacks"
         if isinstance(name, int):
             return Problem(f"{inside} item number {name + 1}", source.place_of(parent), legal)
@@ -175,7 +191,8 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
             message, place, legal=f"a mapping with `{kinds[0]}`: one of {', '.join(kinds[1])}"
         )
     if kinds and kind in ("union_tag_invalid", "union_tag_not_found"):
-        key, tags = kinds[0], list(kinds[1])
+        key = kinds[0]
+        tags = list(kinds[1])
         if key in value:
             return wrong_choice((*path, key), value[key], tags, source.place_of((*path, key)))
         near = nearest(key, value)
@@ -212,8 +229,9 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
 
 
 def nearest(word: object, words: Iterable[object]) -> str | None:
-    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most similar spelling, else
-    the shortest that contains the word (three letters or more), as realsense_l515 contains l515; None if neither."""
+    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most
+    similar spelling, else the shortest that contains the word (three letters or more), as
+    realsense_l515 contains l515; None if neither."""
     folded = {str(known).lower().replace("-", "_"): str(known) for known in words}
     sought = str(word).lower().replace("-", "_")
     found = difflib.get_close_matches(sought, folded, n=1)
@@ -257,7 +275,8 @@ def wrong_choice(
 def unknown_key(
     name: str, where: KeyPath, legal: Sequence[str], place: Place | None, taken: Iterable[str] = ()
 ) -> Problem:
-    """Return the problem for an illegal key in the mapping at ``where``, which already has the keys ``taken``."""
+    """Return the problem for an illegal key in the mapping at ``where``, which already has the
+    keys ``taken``."""
     inside = f" in `{dotted(where)}`" if where else ""
     free = [key for key in legal if key not in set(taken)]
     return Problem(

@@ -1,7 +1,9 @@
-"""Reads YAML 1.2 as plain data with the place of every key and value, so that all problems are shown at their places.
+"""Reads YAML 1.2 as plain data with the place of every key and value, so that all problems are
+shown at their places.
 
-Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Deliberately
-unsupported: merge keys (``<<``, not part of YAML 1.2), tags, several documents, and keys that are not text."""
+Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is
+seen. Deliberately unsupported: merge keys (``<<``, not part of YAML 1.2), tags, several documents,
+and keys that are not text."""
 
 from __future__ import annotations
 
@@ -33,8 +35,9 @@ MAX_PROBLEMS = (
 
 @dataclass(frozen=True)
 class Place:
-    """A position in a text. ``line`` and ``column`` count from 1, in characters; ``width`` is that of the caret. A
-    ``line`` of 0 means an argument of the command line; ``line_text`` is then the whole argument."""
+    """A position in a text. ``line`` and ``column`` count from 1, in characters; ``width`` is that
+    of the caret. A ``line`` of 0 means an argument of the command line; ``line_text`` is then the
+    whole argument."""
 
     origin: str
     line: int
@@ -66,7 +69,8 @@ class Place:
 
 @dataclass(frozen=True)
 class Problem:
-    """A mistake: message, place, legal values, the nearest legal word, and a second place that is involved."""
+    """A mistake: message, place, legal values, the nearest legal word, and a second place that is
+    involved."""
 
     message: str
     place: Place | None
@@ -109,7 +113,8 @@ class DeclarationError(UserError):
 
 
 def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
-    """Return the problems sorted by place, without duplicates: without place first, then the command line's."""
+    """Return the problems sorted by place, without duplicates: without place first, then the
+    command line's."""
     unique = {(problem.place, problem.message): problem for problem in problems}.values()
 
     def position(problem: Problem) -> tuple[int, int]:
@@ -122,7 +127,8 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
 KeyPath = tuple[
     str | int, ...
 ]  # Position of a value in the data: keys of mappings and indices of lists
-MAX_BYTES = 500_000  # An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
+# An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
+MAX_BYTES = 500_000
 MAX_NODES = 50_000  # Values after aliases are expanded; this stops an alias bomb
 MAX_DEPTH = 40  # Levels of nesting; the schema needs 8
 _TAG = "tag:yaml.org,2002:"
@@ -140,13 +146,15 @@ class Source:
     keys: Mapping[KeyPath, Place]
 
     def place_of(self, path: KeyPath) -> Place:
-        """Return the place of a value, or of the innermost enclosing value if it is not in the text (a default)."""
+        """Return the place of a value, or of the innermost enclosing value if it is not in the
+        text (a default)."""
         while path and path not in self.values:
             path = path[:-1]
         return self.values[path]
 
     def key_place_of(self, path: KeyPath) -> Place:
-        """Return the place of a key, or else of the innermost enclosing key or value that has a place."""
+        """Return the place of a key, or else of the innermost enclosing key or value that has a
+        place."""
         while path and path not in self.keys and path not in self.values:
             path = path[:-1]
         return self.keys[path] if path in self.keys else self.values[path]
@@ -154,8 +162,10 @@ class Source:
     def with_value(
         self, path: KeyPath, data: Any, donor: Source, donor_path: KeyPath = ()
     ) -> Source:
-        """Return this source with new ``data``, whose value at ``path`` came from ``donor`` at ``donor_path``."""
-        depth, merged = len(donor_path), []
+        """Return this source with new ``data``, whose value at ``path`` came from ``donor`` at
+        ``donor_path``."""
+        depth = len(donor_path)
+        merged = []
         for own, donated in ((self.values, donor.values), (self.keys, donor.keys)):
             kept = {at: place for at, place in own.items() if at[: len(path)] != path}
             merged.append(
@@ -167,8 +177,12 @@ class Source:
 
 
 def read_yaml(path: Path) -> Source:
-    """Read a file whose top level is a mapping. Raises DeclarationError with every problem and its place."""
-    path, place, legal, fix = Path(path), None, None, None
+    """Read a file whose top level is a mapping. Raises DeclarationError with every problem and its
+    place."""
+    path = Path(path)
+    place = None
+    legal = None
+    fix = None
     try:
         with path.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)
@@ -178,18 +192,18 @@ def read_yaml(path: Path) -> Source:
             if isinstance(source.data, dict):
                 return source
             kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
-            message, place, legal = (
-                f"the file {kind}",
-                source.place_of(()),
-                "keys and values, as in `name: thesis`",
-            )
+            message = f"the file {kind}"
+            place = source.place_of(())
+            legal = "keys and values, as in `name: thesis`"
         else:
-            message, legal = "the file is too large for a declaration", f"at most {MAX_BYTES} bytes"
+            message = "the file is too large for a declaration"
+            legal = f"at most {MAX_BYTES} bytes"
     except FileNotFoundError:
         found = (
             sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
         )
-        message, legal = "there is no such file", ", ".join(found[:10]) or None
+        message = "there is no such file"
+        legal = ", ".join(found[:10]) or None
     except IsADirectoryError:
         message = "this is a folder, not a YAML file"
     except OSError as error:
@@ -198,14 +212,17 @@ def read_yaml(path: Path) -> Source:
         lines = content[: error.start].decode("utf-8", errors="replace").split("\n")
         rest = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
         place = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + rest)
-        message, fix = f"byte 0x{content[error.start]:02x} is not UTF-8", "save the file as UTF-8"
+        message = f"byte 0x{content[error.start]:02x} is not UTF-8"
+        fix = "save the file as UTF-8"
     raise DeclarationError(str(path), [Problem(message, place, legal=legal, fix=fix)])
 
 
 def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
-    """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text is an argument of the
-    command line, so that places have no line number. Raises DeclarationError."""
-    starts, lines = [0, *(match.end() for match in re.finditer("\n", text))], text.split("\n")
+    """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text
+    is an argument of the command line, so that places have no line number. Raises
+    DeclarationError."""
+    starts = [0, *(match.end() for match in re.finditer("\n", text))]
+    lines = text.split("\n")
 
     def place(index: int, end: int) -> Place:
         """Return the place of the characters from ``index`` to ``end``, counted after ``start``."""
@@ -232,7 +249,8 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         message, limit, index = error.args
         problem = Problem(message, place(index, index + 1), legal=f"at most {limit}")
     except MarkedYAMLError as error:
-        mark, context = error.problem_mark or error.context_mark, error.context_mark
+        mark = error.problem_mark or error.context_mark
+        context = error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
         begun = (
             place(context.index, context.index + 1)
@@ -254,18 +272,22 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
 
 def to_yaml(data: Any) -> str:
     """Return plain data as YAML 1.2 with the order of keys kept; `parse_yaml` inverts it."""
-    writer, stream = YAML(), StringIO()
-    writer.default_flow_style, writer.width = False, 120
+    writer = YAML()
+    stream = StringIO()
+    writer.default_flow_style = False
+    writer.width = 120
     writer.dump(data, stream)
     return stream.getvalue()
 
 
 class _TooMuch(Exception):
-    """A declaration exceeds a limit. Its arguments are the message, the limit, and the character where that happens."""
+    """A declaration exceeds a limit. Its arguments are the message, the limit, and the character
+    where that happens."""
 
 
 class _BoundedParser(Parser):
-    """Refuses a text before the composer recurses too deeply, the scanner becomes slow, or nodes fill the memory."""
+    """Refuses a text before the composer recurses too deeply, the scanner becomes slow, or nodes
+    fill the memory."""
 
     depth = nodes = 0
 
@@ -323,7 +345,8 @@ class _Builder:
     ) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            at, before = self._of(key_node), len(self.problems)
+            at = self._of(key_node)
+            before = len(self.problems)
             if key_node.tag == _TAG + "merge":
                 fix = "write the keys out, or use an alias for a whole value"
                 self.problems.append(
@@ -335,7 +358,8 @@ class _Builder:
                 self.keys[(*path, key)] = at
                 result[key] = self.build(value_node, (*path, key), within)
             elif isinstance(key, str):
-                first, message = self.keys[(*path, key)], f"duplicate key `{key}`"
+                first = self.keys[(*path, key)]
+                message = f"duplicate key `{key}`"
                 self.problems.append(
                     Problem(
                         message, at, other=first, other_says="already written at", fix="keep one"
@@ -346,7 +370,8 @@ class _Builder:
         return result
 
     def _scalar(self, node: Node, place: Place) -> Any:
-        kind, text = str(node.tag).removeprefix(_TAG), node.value
+        kind = str(node.tag).removeprefix(_TAG)
+        text = node.value
         try:
             if not isinstance(node, ScalarNode):
                 pass

@@ -120,7 +120,8 @@ def test_the_order_of_good_frames_does_not_matter(order: list[int]) -> None:
     shuffled = replace(stack, z_m=stack.z_m[order])
     for method in ("mean", "median"):
         config = AverageConfig.from_data({"method": method})
-        a, b = average(stack, config), average(shuffled, config)
+        a = average(stack, config)
+        b = average(shuffled, config)
         np.testing.assert_allclose(a.points_m, b.points_m, rtol=1e-12)
 
 
@@ -208,7 +209,8 @@ def test_clipped_mean_of_gaussian_noise_is_the_mean() -> None:
     stack = noisy(50, sigma_m=1e-3)
     plain = average(stack, AverageConfig()).points_m[..., 2]
     clipped = average(stack, AverageConfig(method="clipped")).points_m[..., 2]
-    # a standard error is 1 mm / sqrt(50) = 0.14 mm; clipping at five sigma moves the mean by a small part of it
+    # a standard error is 1 mm / sqrt(50) = 0.14 mm; clipping at five sigma moves the mean by a
+    # small part of it
     assert np.sqrt(np.mean((plain - clipped) ** 2)) < 0.01e-3
 
 

@@ -1,4 +1,5 @@
-"""The flat field of a unit: the pattern found again, the surface parted from it, doubts told, files refused."""
+"""The flat field of a unit: the pattern found again, the surface parted from it, doubts told,
+files refused."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ from tests.support.serial_run import records_of, run_serially
 from tests.support.tiny_sweep import STUDY
 
 LENS = Lens(160, 128, 250.0, 250.0, 80.0, 64.0)
-FRAMES, NOISE_M = 50, 0.5 * MM
+FRAMES = 50
+NOISE_M = 0.5 * MM
 SHIFTS = (
     (0.55, 0.0, 0.0),
     (0.55, 0.04, 0.01),
@@ -79,7 +81,8 @@ def capture(
 ) -> Cloud:
     """An average of a wall with a shape, seen from a place, each frame's z with white noise."""
     distance_m, x_m, y_m = place
-    slopes, rng = LENS.region_slopes(LENS.whole), np.random.default_rng([3, number])
+    slopes = LENS.region_slopes(LENS.whole)
+    rng = np.random.default_rng([3, number])
     at = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
     length = np.sqrt(1 + (slopes**2).sum(axis=-1))
     z_m = distance_m + ndimage.map_coordinates(shape_m, np.moveaxis(at, -1, 0), order=1)
@@ -123,11 +126,13 @@ def errors(result: Separated, truth_m: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(np.nanmean(off_m**2))) / MM, float(np.sqrt(np.nanmean(ratio)))
 
 
-# ---- the pattern and the surface -------------------------------------------------------------------------------------
+# ---- the pattern and the surface
+# -------------------------------------------------------------------------------------
 
 
 def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
-    """20,480 pixels: the ratio is known to 0.5 %; the frames' scatter tells the noise to a per cent."""
+    """20,480 pixels: the ratio is known to 0.5 %; the frames' scatter tells the noise to a per
+    cent."""
     result = found(wall(0.0), poses=False)
     error_mm, ratio = errors(result, truth_m)
     assert error_mm == pytest.approx(NOISE_M / MM / np.sqrt(FRAMES * len(SHIFTS)), rel=0.1)
@@ -139,10 +144,12 @@ def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
 
 @pytest.mark.parametrize(("rough_mm", "gain", "most_ratio"), [(0.1, 0.85, 1.15), (0.25, 0.6, 1.35)])
 def test_the_surface_is_parted_from_the_pattern(truth_m, rough_mm, gain, most_ratio):
-    """Walls rough by a fifth and by half of the pattern: with poses the map is better than without, and says nothing;
-    the stated deviation is too small by no more than `detectors.averages.flat_captures` states."""
+    """Walls rough by a fifth and by half of the pattern: with poses the map is better than
+    without, and says nothing; the stated deviation is too small by no more than
+    `detectors.averages.flat_captures` states."""
     rough = wall(rough_mm * MM)
-    solved, averaged = found(rough, poses=True), found(rough, poses=False)
+    solved = found(rough, poses=True)
+    averaged = found(rough, poses=False)
     error_mm, ratio = errors(solved, truth_m)
     assert error_mm < gain * errors(averaged, truth_m)[0]
     assert 0.85 < ratio < most_ratio
@@ -197,11 +204,13 @@ def test_few_frames_cannot_tell_their_noise():
         flattened(cloud, cloud.valid, "short")
 
 
-# ---- the correction --------------------------------------------------------------------------------------------------
+# ---- the correction
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
-    field, cloud = found(wall(0.0), poses=False).field, capture(9, wall(0.0), (0.7, 0.0, 0.0))
+    field = found(wall(0.0), poses=False).field
+    cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
     made = corrected(cloud, field)
     residual_m = flattened(made, made.valid, "corrected").residual_m
     assert made.mean_variance_m2 is not None
@@ -226,7 +235,8 @@ def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
 
 
 def test_pixels_without_a_pattern_stay_and_are_told():
-    field, cloud = found(wall(0.0), poses=False).field, capture(9, wall(0.0))
+    field = found(wall(0.0), poses=False).field
+    cloud = capture(9, wall(0.0))
     error_m = field.error_m.copy()
     error_m[:, :40] = np.nan
     holed = replace(field, error_m=error_m, warnings=("it drifts",))
@@ -262,7 +272,8 @@ def test_another_camera_s_cloud_is_refused(changes, message):
         corrected(replace(capture(0, wall(0.0)), **changes), flat)
 
 
-# ---- files and programs ----------------------------------------------------------------------------------------------
+# ---- files and programs
+# ----------------------------------------------------------------------------------------------
 
 
 def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
@@ -312,7 +323,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.usefixtures("unpictured")
 def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_path, capsys, truth_m):
-    walls, given = [str(path) for path in sorted(recorded.glob("*.npy"))], ["--unit", "m"]
+    walls = [str(path) for path in sorted(recorded.glob("*.npy"))]
+    given = ["--unit", "m"]
     given += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
     unit = tmp_path / "unit.npz"
     assert flatfield.main([*walls, *given, "--out", str(unit)]) == 0
@@ -341,10 +353,8 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
 
 
 def test_the_program_refuses_what_makes_no_flat_field(recorded, tmp_path, capsys):
-    one, lens = (
-        str(recorded / "wall0.npy"),
-        ["--unit", "m", "--intrinsics", str(recorded / "lens.json")],
-    )
+    one = str(recorded / "wall0.npy")
+    lens = ["--unit", "m", "--intrinsics", str(recorded / "lens.json")]
     single = tmp_path.parent / "single.npy"
     np.save(single, np.load(one)[:1])
     for arguments, message in (
@@ -372,15 +382,16 @@ def test_a_lone_capture_is_judged_by_its_halves(recorded, tmp_path, capsys):
     ]
     figures = {row["figure"]: row["value"] for row in told["figures"]}
     # 4 frames in each half
-    signal, noise = figures["pattern"] ** 2, (NOISE_M / MM) ** 2 / 4
+    signal = figures["pattern"] ** 2
+    noise = (NOISE_M / MM) ** 2 / 4
     expected = signal / (signal + noise)
     assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.slow
 def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path, capsys):
-    """22 frames of a real Azure Kinect from one place: the pattern of the first half is that of the second, within the
-    noise, so that their correlation is what pattern and noise make it."""
+    """22 frames of a real Azure Kinect from one place: the pattern of the first half is that of
+    the second, within the noise, so that their correlation is what pattern and noise make it."""
     walls = tmp_path / "walls"
     walls.mkdir()
     for path in sorted((shared_data / "azure_nfov_walls").glob("[0-9]*.png")):
@@ -399,7 +410,8 @@ def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path,
     assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.05)
 
 
-# ---- experiments -----------------------------------------------------------------------------------------------------
+# ---- experiments
+# -----------------------------------------------------------------------------------------------------
 
 BINNED = "source.camera.name=azure_kinect_nfov_binned"  # a quarter of the pixels
 FLAT = "capture.flat_field={frames: 20, distance_m: 1.0}"

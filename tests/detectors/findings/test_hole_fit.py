@@ -47,7 +47,8 @@ def by_minpack(
         return np.append(image + q[4] - data, weight * (hole[4] - WALL_PRIOR[0]))
 
     def jacobian(q: np.ndarray) -> np.ndarray:
-        hole, steps = hole_of(q), np.array([1e-3, 1e-3, 1e-6, 1e-6, 1e-3])
+        hole = hole_of(q)
+        steps = np.array([1e-3, 1e-3, 1e-6, 1e-6, 1e-3])
         ends = (
             pictures(patch, hole + sign * np.diag(steps))[:, patch.used] for sign in (0.5, -0.5)
         )
@@ -95,7 +96,8 @@ def test_the_fit_is_that_of_the_plainly_written_least_squares(
     )
     apart = np.abs(ours - [*expected[:4], offset, expected[4]])
     error = np.sqrt(np.diag(found.covariance))
-    # the sum of squares has kinks where circles cross strips, so that descents end near its least, not at one place
+    # the sum of squares has kinks where circles cross strips, so that descents end near its least,
+    # not at one place
     assert (apart < error).all()
     sums = [
         square_of(patch, *fit)
@@ -138,7 +140,8 @@ def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("projection", ["central", "parallel"])
 def test_a_local_plane_is_that_of_exact_points(projection: str) -> None:
-    """A point and derivatives of a plane that is known everywhere, from some of its pixels with other depths."""
+    """A point and derivatives of a plane that is known everywhere, from some of its pixels with
+    other depths."""
     random = np.random.default_rng(2)
     v, u = np.mgrid[:9, :11].astype(float)
     if projection == "parallel":
@@ -150,7 +153,8 @@ def test_a_local_plane_is_that_of_exact_points(projection: str) -> None:
         z = 0.7 + 2e-4 * u - 1e-4 * v
         surface = rays * z[..., None]
         points = rays * random.uniform(0.69, 0.71, u.shape)[..., None]
-    finite, own = random.random(u.shape) > 0.3, np.zeros(u.shape, dtype=bool)
+    finite = random.random(u.shape) > 0.3
+    own = np.zeros(u.shape, dtype=bool)
     own[3:6, 4:7] = True
     found = local_plane(points, surface[..., 2], finite, own, projection)
     assert found is not None
@@ -167,7 +171,8 @@ def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
     found = sight(CENTRE_M, PER_PX_M, emitter)
     normal = np.cross(*PER_PX_M)
     normal /= np.copysign(np.linalg.norm(normal), normal @ CENTRE_M)
-    ray, z = CENTRE_M / CENTRE_M[2], CENTRE_M[2]
+    ray = CENTRE_M / CENTRE_M[2]
+    z = CENTRE_M[2]
     slopes = ((PER_PX_M - np.outer(PER_PX_M[:, 2], ray)) / z)[:, :2].T
     np.testing.assert_allclose(
         found[1:3], np.linalg.pinv(slopes) @ (normal - normal[2] * ray)[:2] / z, rtol=1e-10

@@ -1,4 +1,5 @@
-"""Measurements: extents by hand, the blurred disc against brute force, standard errors against simulation."""
+"""Measurements: extents by hand, the blurred disc against brute force, standard errors against
+simulation."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.geometry import Cloud, Region
 
 FOCAL_PX = 504.0
-HEIGHT, WIDTH = 60, 70
+HEIGHT = 60
+WIDTH = 70
 REGION = Region(100, 100 + HEIGHT, 200, 200 + WIDTH)
 MIDDLE = (250.0, 120.0)
 """Principal point (u, v) on the sensor."""
@@ -65,10 +67,12 @@ def test_blurred_disc_equals_brute_force(blur: int, radius_px: float) -> None:
 
 
 class Board:
-    """A tilted plane with one drilled hole, seen through the filter: truth by rays in space, not by the model.
+    """A tilted plane with one drilled hole, seen through the filter: truth by rays in space, not
+    by the model.
 
-    ``depth_mm`` along the optical axis, negative for a disc before the surface; ``wall``: the tube's length over it. A
-    ray counts as deep as it is in the tube (or behind its end) and lit from the emitter.
+    ``depth_mm`` along the optical axis, negative for a disc before the surface; ``wall``: the
+    tube's length over it. A ray counts as deep as it is in the tube (or behind its end) and lit
+    from the emitter.
     """
 
     def __init__(
@@ -82,7 +86,9 @@ class Board:
         emitter_mm: tuple[float, float, float] = HoleModelConfig().emitter_mm,
         middle: tuple[float, float] = MIDDLE,
     ):
-        self.depth_m, self.blur, self.middle = depth_mm * 1e-3, blur, middle
+        self.depth_m = depth_mm * 1e-3
+        self.blur = blur
+        self.middle = middle
         self.emitter = np.array(emitter_mm) * 1e-3
         # the plane z = 0.75 + 0.1 x - 0.15 y, and the hole's centre on it
         self.tilt = np.array([0.1, -0.15])
@@ -112,7 +118,8 @@ class Board:
         for depth in (np.arange(steps) + 0.5) / steps * tube:
             at = points * (1.0 + depth / to_plane)
             total += tube / steps * (self.passes(at, 0.0, depth) & self.within(at, depth))
-        end, floor = points * (1.0 + tube / to_plane), points * (1.0 + deep / to_plane)
+        end = points * (1.0 + tube / to_plane)
+        floor = points * (1.0 + deep / to_plane)
         lit = self.passes(floor, 0.0, deep) & self.passes(floor, tube, deep)
         total += (deep - tube) * (self.within(end, tube) & lit)
         residual[mouth] = total * points[:, 2] / to_plane
@@ -123,7 +130,8 @@ class Board:
         return (apart**2).sum(axis=-1) < self.radius**2
 
     def passes(self, points: np.ndarray, rim: float, depth: float) -> np.ndarray:
-        """Whether light from the emitter to points at a depth passes the circle at the depth ``rim``."""
+        """Whether light from the emitter to points at a depth passes the circle at the depth
+        ``rim``."""
         height = self.normal @ (self.centre - self.emitter)
         part = (depth - rim) / (depth + height)
         return self.within(points + part * (self.emitter - points), rim)
@@ -193,7 +201,8 @@ def patch_of(board: Board) -> tuple[HolePatch, np.ndarray]:
 
 
 OBLIQUE = (60.0, 200.0)
-"""A principal point that puts the hole 20 degrees off the axis, as the thesis' outermost hole at 0.7 m."""
+"""A principal point that puts the hole 20 degrees off the axis, as the thesis' outermost hole at
+0.7 m."""
 
 
 @pytest.mark.parametrize("middle", [MIDDLE, OBLIQUE])
@@ -224,7 +233,8 @@ def test_a_nearly_noise_free_hole_or_bump_is_measured_exactly(
     u, v = board.centre[:2] / board.centre[2] * FOCAL_PX + MIDDLE
     assert (m.u_px, m.v_px) == pytest.approx((u, v), abs=0.04)
     assert m.extent_diameter_m > m.model_diameter_m + 2e-3
-    # the area that faces the camera is the disc's times the cosine of the tilt; of a hole less is seen
+    # the area that faces the camera is the disc's times the cosine of the tilt; of a hole less is
+    # seen
     volume = sign * np.pi * board.radius**2 * board.normal[2] * 12.7e-3
     assert (
         m.volume_m3 == pytest.approx(volume, rel=0.02)
@@ -251,9 +261,10 @@ def test_an_oblique_hole_has_the_diameter_and_the_place_of_its_mouth(
 
 @pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
 def test_standard_errors_cover_the_truth(count: int) -> None:
-    """Draws of correlated noise, over walls of every length as the prior has it. The deviation of 200 standard scores
-    with some 20 degrees of freedom each has a standard error of 0.055, so 1 -+ 0.2 holds with a risk below 0.1 % for
-    each of the three; means within 0.25 (3.5 standard errors). Of fewer draws the bounds are wider."""
+    """Draws of correlated noise, over walls of every length as the prior has it. The deviation of
+    200 standard scores with some 20 degrees of freedom each has a standard error of 0.055, so 1 -+
+    0.2 holds with a risk below 0.1 % for each of the three; means within 0.25 (3.5 standard
+    errors). Of fewer draws the bounds are wider."""
     boards = [Board(12.7, 5.0, wall=wall) for wall in (0.1, 0.3, 0.5, 0.7, 0.9)]
     draws = [(boards[seed % 5], measured(boards[seed % 5], 0.25, seed)) for seed in range(count)]
     assert all(m.model_note == "" for _, m in draws)
@@ -325,7 +336,8 @@ def test_a_deep_hole_falls_back_to_its_contour() -> None:
 
 
 def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_through() -> None:
-    # 26 degrees off the axis and 20 off the normal, the tube of 20 mm hides most of what lies 0.5 m behind
+    # 26 degrees off the axis and 20 off the normal, the tube of 20 mm hides most of what lies 0.5
+    # m behind
     board = Board(
         19.0,
         500.0,
@@ -356,7 +368,8 @@ def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
 
 
 def test_a_neighbour_is_masked() -> None:
-    board, other = Board(12.7, 12.7), Board(12.7, 12.7, at=(24e-3, 2e-3))
+    board = Board(12.7, 12.7)
+    other = Board(12.7, 12.7, at=(24e-3, 2e-3))
     cloud, evidence = board.seen(0.1, 3)
     alone = measure_detection(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig())
     pixels = strongest(cloud, evidence, 5.0)

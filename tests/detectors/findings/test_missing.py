@@ -1,4 +1,5 @@
-"""Missing returns: what is found, where and how large, how often chance passes for a finding, and one damage once."""
+"""Missing returns: what is found, where and how large, how often chance passes for a finding, and
+one damage once."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def test_a_hole_without_return_is_found_where_it_is_and_as_large_as_it_is(
     slope = LENS.slopes(columns.mean(), rows.mean())
     z = 0.7 / (1.0 - tilt * slope[0])
     np.testing.assert_allclose(measured.extent_centre_m, [*(slope * z), z], atol=2e-4)
-    # a pixel covers (z / f)^2 across the axis, on the tilted plane by sqrt(1 + tilt^2) / (1 - tilt x/z) more
+    # a pixel covers (z / f)^2 across the axis, on the tilted plane by sqrt(1 + tilt^2) / (1 - tilt
+    # x/z) more
     pixel_m2 = (z / LENS.fx) ** 2 * np.sqrt(1.0 + tilt**2) / (1.0 - tilt * slope[0])
     assert measured.extent_diameter_m == pytest.approx(
         2.0 * np.sqrt(gone.sum() * pixel_m2 / np.pi), rel=0.02
@@ -86,8 +88,8 @@ MANY = [
     ("rate", "square", "fields"), [(0.02, 3, 8), (0.15, 1, 4), (0.05, 5, 8), *MANY]
 )
 def test_scattered_dropouts_are_no_findings(rate: float, square: int, fields: int) -> None:
-    """At most ALPHA = 0.01 findings are expected in a field, so that the number of fields with a finding is binomial at
-    most: alpha of each test 1e-4."""
+    """At most ALPHA = 0.01 findings are expected in a field, so that the number of fields with a
+    finding is binomial at most: alpha of each test 1e-4."""
     with_findings = 0
     for seed in range(fields):
         missing = missing_returns(*looked(scattered(np.random.default_rng(seed), rate, square)))
@@ -110,7 +112,8 @@ def test_the_rate_of_dropouts_is_measured_and_a_hole_stands_out_of_them() -> Non
 
 
 def test_blobs_of_the_size_of_a_filter_raise_the_bound() -> None:
-    """A 3 x 3 filter makes nine pixels of one bad sample: at 4 % of the pixels such blobs are no findings."""
+    """A 3 x 3 filter makes nine pixels of one bad sample: at 4 % of the pixels such blobs are no
+    findings."""
     random = np.random.default_rng(3)
     blobs = cv2.dilate((random.random(FIELD) < 0.0045).astype(np.uint8), np.ones((3, 3))) > 0
     single = random.random(FIELD) < 0.01
@@ -148,9 +151,11 @@ def test_a_cloud_without_a_grid_does_not_tell_what_it_lacks() -> None:
 
 
 def test_cells_that_no_view_saw_are_blind_on_a_map() -> None:
-    """A map's cells are equal squares of x and y; the number of its samples says nothing of frames."""
+    """A map's cells are equal squares of x and y; the number of its samples says nothing of
+    frames."""
     gone = disc(60, 45, 10)
-    x, y = (U - 60) * 1e-3, (V - 45) * 1e-3
+    x = (U - 60) * 1e-3
+    y = (V - 45) * 1e-3
     points = np.where(gone[..., None], np.nan, np.stack([x, y, np.zeros(SHAPE)], axis=-1))
     flat = np.zeros(SHAPE, np.uint8)
     cloud = Cloud(
@@ -180,10 +185,12 @@ def depth_finding(pixels: np.ndarray, score: float = 9.0) -> Detection:
 
 
 def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
-    core, ring = disc(60, 45, 8), disc(60, 45, 20) & ~disc(60, 45, 8)
+    core = disc(60, 45, 8)
+    ring = disc(60, 45, 20) & ~disc(60, 45, 8)
     far = depth_finding(disc(20, 20, 5), score=6.0)
     nothing = Detection(12.0, np.flatnonzero(core), np.zeros(3), "no return")
-    # a ring of valid deep pixels around a core that returned nothing: the larger ring stands for the hole
+    # a ring of valid deep pixels around a core that returned nothing: the larger ring stands for
+    # the hole
     kept = one_damage_once(SHAPE, (depth_finding(ring), far), (nothing,))
     assert [one.kind for one in kept] == ["depth", "depth"]
     # a ring without return around a small valid floor: what it encloses counts as its own
@@ -194,7 +201,8 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
     specks = (depth_finding(disc(55, 45, 2), 8.0), depth_finding(disc(65, 45, 2), 7.0))
     kept = one_damage_once(SHAPE, (*specks, far), (nothing,))
     assert [(one.kind, one.score) for one in kept] == [("no return", 12.0), ("depth", 6.0)]
-    # a hole most of which is deep; a part of it and of its rim returned nothing, and a speck of the rim did
+    # a hole most of which is deep; a part of it and of its rim returned nothing, and a speck of
+    # the rim did
     hole = disc(60, 45, 12)
     gap = Detection(12.0, np.flatnonzero(hole & (U >= 62)), np.zeros(3), "no return")
     found = (depth_finding(hole & (U < 62)), depth_finding(disc(67, 45, 4), 8.0), far)
@@ -202,7 +210,9 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
 
 
 def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
-    gone, hole = disc(60, 45, 24), disc(60, 62, 10)  # their edges touch
+    # their edges touch
+    gone = disc(60, 45, 24)
+    hole = disc(60, 62, 10)
     nothing = Detection(12.0, np.flatnonzero(gone), np.zeros(3), "no return")
     kept = one_damage_once(SHAPE, (depth_finding(hole),), (nothing,))
     assert [one.kind for one in kept] == ["no return", "depth"]
@@ -247,7 +257,8 @@ def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
     grid = LIMITS.grid(limits)
     both, alone = (row[grid.heads.index("found")].text for row in grid.rows)
 
-    n, hits = len(by_depth), int(by_depth.sum())
+    n = len(by_depth)
+    hits = int(by_depth.sum())
     assert both == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
     assert f"5 of {hits + 5} hits by missing returns alone" in "; ".join(notes_of(limits[0]))
     assert alone == f"{hits} of {n}"

@@ -1,4 +1,5 @@
-"""The threshold that a capture sets itself: calls counted against expected, objects, rims, and what is refused."""
+"""The threshold that a capture sets itself: calls counted against expected, objects, rims, and
+what is refused."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from detectors.interface import Evidence
 from harness.vocabulary.geometry import Cloud, Region
 from tests.validation.own_null import boards
 
-PITCH_M, DISTANCE_M, SIGMA_M = 2e-3, 0.7, 1e-3
+PITCH_M = 2e-3
+DISTANCE_M = 0.7
+SIGMA_M = 1e-3
 DETECTOR = load_detector("thesis", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
 ALPHA = 1e-3
 BOARDS = 8
@@ -67,10 +70,11 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_as_many_false_calls_as_expected(name: str, kind: str) -> None:
-    """Within a factor of 1.5 of the mean, but for chance: counts are Poisson and a little more, as the thresholds
-    scatter (variance of twice the mean). Two sides of all cases share alpha."""
+    """Within a factor of 1.5 of the mean, but for chance: counts are Poisson and a little more, as
+    the thresholds scatter (variance of twice the mean). Two sides of all cases share alpha."""
     detector = load_detector(name, {"crop": {"kind": "none"}, "surface": {"degree": 1}})
-    count, wanted = 0, 3.0
+    count = 0
+    wanted = 3.0
     for seed in range(BOARDS):
         cloud = plane(noise(kind, seed))
         evidence = detector.analyse(cloud)
@@ -80,34 +84,41 @@ def test_as_many_false_calls_as_expected(name: str, kind: str) -> None:
         assert own.expected == pytest.approx(wanted, rel=1e-6)
         count += len(detector.find(cloud, own.evidence, own.threshold))
     beyond = stats.norm.isf(ALPHA / (2 * len(CASES)))
-    low, high = (wanted * BOARDS * factor for factor in (1 / 1.5, 1.5))
+    low = wanted * BOARDS * (1 / 1.5)
+    high = wanted * BOARDS * 1.5
     assert low - beyond * np.sqrt(2 * low) < count < high + beyond * np.sqrt(2 * high)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", ["azure_kinect_nfov", "realsense_l515"])
 def test_as_many_false_calls_as_stated_on_rendered_boards(camera: str, tmp_path: Path) -> None:
-    """Ten hole-free boards, each before a unit of its own, with one frame and with 50, whose fixed pattern is left: the
-    calls of all boards within the interval that the captures state together, and within a factor of 2 of 60."""
+    """Ten hole-free boards, each before a unit of its own, with one frame and with 50, whose fixed
+    pattern is left: the calls of all boards within the interval that the captures state together,
+    and within a factor of 2 of 60."""
     detector = load_detector("matched", {"crop": {"kind": "auto"}})
-    count, low, high = {1: 0, 50: 0}, 0.0, 0.0
+    count = {1: 0, 50: 0}
+    low = 0.0
+    high = 0.0
     for number in range(10):
         for frames, board in boards(camera, "hole-free", number, tmp_path).items():
             evidence = detector.analyse(board.cloud)
             own = own_threshold(detector, board.cloud, evidence, 3.0)
-            # the average of 50 frames of the L515 leaves little but its fixed pattern: the threshold is up to 13 there,
-            # which the capture says
+            # the average of 50 frames of the L515 leaves little but its fixed pattern: the
+            # threshold is up to 13 there, which the capture says
             assert bool(own.doubts) == (own.threshold > MOST)
             assert not own.doubts or (camera, frames) == ("realsense_l515", 50)
             count[frames] += len(detector.find(board.cloud, own.evidence, own.threshold))
-            low, high = low + own.low, high + own.high
+            low = low + own.low
+            high = high + own.high
     assert low < sum(count.values()) < high
     assert all(15 - 3 * np.sqrt(15) < each < 60 + 3 * np.sqrt(60) for each in count.values())
 
 
 def test_the_interval_holds_the_truth() -> None:
     """Peaks whose tail is known: exponential in the square of the score."""
-    held, expected, captures = 0, [], 150
+    held = 0
+    expected = []
+    captures = 150
     for seed in range(captures):
         random = np.random.default_rng([5, seed])
         peaks = np.sqrt(9.0 + 2.0 * random.exponential(size=random.poisson(50)))
@@ -128,9 +139,8 @@ def test_an_object_on_the_target_does_not_raise_the_threshold_and_is_reported() 
     v, u = np.mgrid[: offset_m.shape[0], : offset_m.shape[1]]
     inside = ndimage.gaussian_filter(((abs(v - 40) < 14) & (abs(u - 60) < 20)).astype(float), 1.0)
     with_object = plane(offset_m - 15e-3 * inside)
-    alone, beside = (
-        own_threshold(DETECTOR, cloud, analysed(cloud), 1.0) for cloud in (bare, with_object)
-    )
+    alone = own_threshold(DETECTOR, bare, analysed(bare), 1.0)
+    beside = own_threshold(DETECTOR, with_object, analysed(with_object), 1.0)
     assert beside.objects == 1 and alone.objects == 0 and not beside.doubts
     assert beside.threshold == pytest.approx(alone.threshold, rel=0.25)
     strongest = DETECTOR.find(with_object, beside.evidence, beside.threshold)[0]
@@ -142,10 +152,10 @@ def test_holes_do_not_raise_the_threshold() -> None:
     offset_m = noise("smooth", 2)
     v, u = np.mgrid[: offset_m.shape[0], : offset_m.shape[1]]
     holes = ((v % 22 - 11) ** 2 + (u % 30 - 15) ** 2 < 9.0) * 10e-3
-    bare, drilled = plane(offset_m), plane(offset_m + holes)
-    alone, beside = (
-        own_threshold(DETECTOR, cloud, analysed(cloud), 1.0) for cloud in (bare, drilled)
-    )
+    bare = plane(offset_m)
+    drilled = plane(offset_m + holes)
+    alone = own_threshold(DETECTOR, bare, analysed(bare), 1.0)
+    beside = own_threshold(DETECTOR, drilled, analysed(drilled), 1.0)
     assert beside.threshold == pytest.approx(alone.threshold, rel=0.15)
     assert len(DETECTOR.find(drilled, beside.evidence, beside.threshold)) >= 25
 
@@ -191,7 +201,8 @@ def test_it_says_what_it_cannot_know() -> None:
 
 
 def test_bumps_that_raise_the_threshold_are_told() -> None:
-    """Sixty bumps of some 8 mm, smaller than an object: holes below their score would not be found."""
+    """Sixty bumps of some 8 mm, smaller than an object: holes below their score would not be
+    found."""
     detector = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
     bumps = np.zeros((110, 150))
     bumps.ravel()[np.random.default_rng(1).choice(bumps.size, 60, replace=False)] = (

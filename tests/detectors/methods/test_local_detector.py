@@ -1,5 +1,5 @@
-"""The local and the matched detector: the contract, single pixels, neighbours, the noise of each place, clouds without
-a grid, maps."""
+"""The local and the matched detector: the contract, single pixels, neighbours, the noise of each
+place, clouds without a grid, maps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def detector(request: pytest.FixtureRequest) -> LocalDetector:
 def seen(
     depth_m: Callable[[np.ndarray, np.ndarray], np.ndarray], seed: int = 1, noise_m: float = NOISE_M
 ) -> Cloud:
-    """A frontal plane at 0.7 m, 1.4 mm a pixel, with ``depth_m(u, v)`` of pixels added and white noise."""
+    """A frontal plane at 0.7 m, 1.4 mm a pixel, with ``depth_m(u, v)`` of pixels added and white
+    noise."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     z = 0.7 + depth_m(u, v) + noise_m * np.random.default_rng(seed).standard_normal(SHAPE)
     slopes = np.stack([(u - 119.5) / LENS.fx, (v - 99.5) / LENS.fy, np.ones(SHAPE)], axis=-1)
@@ -75,14 +76,15 @@ def test_it_keeps_the_contract_on_every_face(detector: LocalDetector) -> None:
 
 
 def test_white_noise_scores_as_noise_does(detector: LocalDetector) -> None:
-    """Some 4,000 independent means of seven widths: beyond 6 deviations by chance with probability 5e-5."""
+    """Some 4,000 independent means of seven widths: beyond 6 deviations by chance with probability
+    5e-5."""
     evidence = detector.analyse(seen(lambda u, v: 0 * u))
     assert 3.0 < detector.quiet_threshold(seen(lambda u, v: 0 * u), evidence) < 6.0
 
 
 def test_peaks_are_the_same_at_every_threshold(detector: LocalDetector) -> None:
-    """A threshold between a peak and its saddle parts no peak: the tail of low peaks tells how many there
-    are at a higher one."""
+    """A threshold between a peak and its saddle parts no peak: the tail of low peaks tells how
+    many there are at a higher one."""
     cloud = seen(lambda u, v: 0 * u)
     evidence = detector.analyse(cloud)
     scores = [
@@ -95,7 +97,8 @@ def test_peaks_are_the_same_at_every_threshold(detector: LocalDetector) -> None:
 
 
 def test_what_no_single_pixel_shows_is_found_by_its_mean(detector: LocalDetector) -> None:
-    """A dent of one deviation, 30 pixels wide: 700 pixels, so that their mean stands out by 20 deviations."""
+    """A dent of one deviation, 30 pixels wide: 700 pixels, so that their mean stands out by 20
+    deviations."""
     cloud = seen(disc(120, 100, 15, NOISE_M))
     places = places_px(cloud, found(detector, cloud))
     assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 4
@@ -114,8 +117,8 @@ def test_a_flying_pixel_alone_is_no_finding_but_a_small_hole_is(detector: LocalD
 def test_neighbours_stay_apart_and_a_deep_hole_hides_no_shallow_one(
     detector: LocalDetector,
 ) -> None:
-    """Two diameters from centre to centre; gaps of 7 mm, which a linkage of 10 mm closes. The deep hole is 100 times as
-    deep as its neighbour."""
+    """Two diameters from centre to centre; gaps of 7 mm, which a linkage of 10 mm closes. The deep
+    hole is 100 times as deep as its neighbour."""
     row = [(60.0, 0.003), (70.0, 0.003), (80.0, 0.003), (150.0, 0.2), (164.0, 0.002)]
     cloud = seen(
         lambda u, v: sum((disc(u0, 100, 2.5, depth)(u, v) for u0, depth in row), start=0 * u)
@@ -138,15 +141,17 @@ def test_holes_and_bumps_side_by_side_are_findings_of_their_own(detector: LocalD
 
 
 def test_noise_counts_where_it_is(detector: LocalDetector) -> None:
-    """Ten times the noise on the right half: a hole that is found in the quiet half is lost in the noise there, and
-    the noisy half calls no more often. The window of the noise blurs the step itself."""
+    """Ten times the noise on the right half: a hole that is found in the quiet half is lost in the
+    noise there, and the noisy half calls no more often. The window of the noise blurs the step
+    itself."""
     rough = np.random.default_rng(5).standard_normal(SHAPE)
 
     def half(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         noise = np.where(u >= 120, 10 * NOISE_M * rough, 0.0)
         return noise + disc(60, 100, 3, 0.0015)(u, v) + disc(180, 100, 3, 0.0015)(u, v)
 
-    # the noisy half draws the surface by a fifth of a deviation of the quiet one, which wide templates see
+    # the noisy half draws the surface by a fifth of a deviation of the quiet one, which wide
+    # templates see
     threshold = 6.5 if isinstance(detector, MatchedDetector) else 6.0
     places = places_px(seen(half), found(detector, seen(half), threshold))
     away = places[np.abs(places[:, 0] - 120) > 50]
@@ -182,7 +187,8 @@ def test_a_cloud_without_a_grid_is_judged_on_a_raster(detector: LocalDetector) -
 
 
 def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
-    """Every second column is ten times as noisy: with variances the dent stands out by the quiet columns alone."""
+    """Every second column is ten times as noisy: with variances the dent stands out by the quiet
+    columns alone."""
     rough = 10 * NOISE_M * np.random.default_rng(4).standard_normal(SHAPE)
     cloud = seen(lambda u, v: np.where(u % 2 == 1, rough, 0.0) + disc(120, 100, 6, 0.0015)(u, v))
     noise = np.where(np.arange(SHAPE[1]) % 2 == 1, 10 * NOISE_M, NOISE_M)
@@ -194,7 +200,8 @@ def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
 
 
 def test_the_matched_filter_is_the_likelihoods_with_pixels_missing() -> None:
-    """Beside the dense covariance of the known pixels alone, for noise that a filter over 3 x 3 pixels correlates."""
+    """Beside the dense covariance of the known pixels alone, for noise that a filter over 3 x 3
+    pixels correlates."""
     rng = np.random.default_rng(6)
     raw = rng.standard_normal((66, 70)).astype(np.float32)
     noise = sum(np.roll(raw, (i, j), (0, 1)) for i in range(3) for j in range(3)) / 3.0
@@ -203,12 +210,14 @@ def test_the_matched_filter_is_the_likelihoods_with_pixels_missing() -> None:
     lags = noise_covariance(noise, known, shape)
     power = spectrum(lags, shape)
     part = (slice(20, 42), slice(24, 46))
-    known_part, noise_part = known[part], noise[part]
+    known_part = known[part]
+    noise_part = noise[part]
     covariance = np.fft.irfft2(power, shape)
     places = np.argwhere(known_part)
     apart = places[:, None] - places
     dense = covariance[apart[..., 0], apart[..., 1]]
-    # the products of neighbours are two thirds of the variance; the least power adds to the variance alone
+    # the products of neighbours are two thirds of the variance; the least power adds to the
+    # variance alone
     assert 0.5 < covariance[0, 1] / covariance[0, 0] < 2 / 3
     by = filters(lags, known_part.shape)
     solved = inverse_times(
@@ -224,12 +233,14 @@ MOUTHS_U += (244, 340, 437, 726, 825, 721, 816, 718, 809, 902, 716, 803, 390)
 MOUTHS_V = (603, 602, 601, 603, 603, 605, 492, 491, 491, 491, 493, 493, 494)
 MOUTHS_V += (394, 394, 393, 392, 392, 303, 302, 222, 219, 216, 147, 144, 85)
 MOUTHS_PX = np.array([MOUTHS_U, MOUTHS_V]).T
-"""Mouths of a drilled plate that nothing lies beside, read off the mean depth by eye, to some 3 pixels."""
+"""Mouths of a drilled plate that nothing lies beside, read off the mean depth by eye, to some 3
+pixels."""
 
 
 @pytest.mark.slow
 def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> None:
-    """A metal plate with holes of 5 mm at 0.25 m, with tags and an object on it, seen by an Azure Kinect."""
+    """A metal plate with holes of 5 mm at 0.25 m, with tags and an object on it, seen by an Azure
+    Kinect."""
     from detectors.averages.average import AverageConfig, average
     from detectors.averages.noise import REACH_FRAMES, noise_reach_px
     from detectors.recordings import open_capture
@@ -260,7 +271,8 @@ def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> Non
 def test_findings_at_many_thresholds_are_those_of_each(detector: LocalDetector) -> None:
     """Among noise, where peaks join and part by the threshold."""
     cloud = with_gaps(seen(disc(120, 100, 6.0, 2.0 * NOISE_M)), seed=3)
-    evidence, thresholds = detector.analyse(cloud), [0.8, 1.1, 1.6, 2.2, 3.1, 4.4]
+    evidence = detector.analyse(cloud)
+    thresholds = [0.8, 1.1, 1.6, 2.2, 3.1, 4.4]
     for together, threshold in zip(
         detector.findings(cloud, evidence, thresholds), thresholds, strict=True
     ):

@@ -1,5 +1,5 @@
-"""The matched detector: whitening against dense algebra, learning, heavy tails, holes that leave one finding each, and
-sizes under correlated noise."""
+"""The matched detector: whitening against dense algebra, learning, heavy tails, holes that leave
+one finding each, and sizes under correlated noise."""
 
 from __future__ import annotations
 
@@ -71,8 +71,9 @@ def found(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
 
 
 def test_a_score_is_the_likelihoods_where_pixels_are_missing() -> None:
-    """Beside the dense covariance of the known pixels alone, for each template that the picture holds: closely if
-    solved to a small error, and within twice the error that `CONVERGED` states."""
+    """Beside the dense covariance of the known pixels alone, for each template that the picture
+    holds: closely if solved to a small error, and within twice the error that `CONVERGED` states.
+    """
     noise = blurred(1, (26, 30)).astype(np.float32)
     known = np.random.default_rng(2).random(noise.shape) > 0.1
     grid = grid_of(noise.shape)
@@ -83,8 +84,10 @@ def test_a_score_is_the_likelihoods_where_pixels_are_missing() -> None:
     apart = places[:, None] - places
     dense = covariance[apart[..., 0], apart[..., 1]]
     assert window_of(lags) == BLUR_PX
-    seen, by = np.where(known, noise, np.float32(0.0)), filters(lags, noise.shape)
-    solved, rough = inverse_times(seen, known, by, error=0.01), inverse_times(seen, known, by)
+    seen = np.where(known, noise, np.float32(0.0))
+    by = filters(lags, noise.shape)
+    solved = inverse_times(seen, known, by, error=0.01)
+    rough = inverse_times(seen, known, by)
     for drawn, worth in zip(
         bank(BLUR_PX)[:10], worths(spectrum(lags, (GRID, GRID)), BLUR_PX), strict=False
     ):
@@ -103,10 +106,8 @@ def test_a_factor_is_that_of_the_covariance_of_the_used_pixels() -> None:
     random = np.random.default_rng(4)
     used = random.random((9, 11)) > 0.2
     lags = np.abs(np.arange(-8, 9))
-    correlation, error = (
-        np.outer(0.6**lags, 0.7**lags),
-        np.where(used, 2e-4 * random.random(used.shape), np.nan),
-    )
+    correlation = np.outer(0.6**lags, 0.7**lags)
+    error = np.where(used, 2e-4 * random.random(used.shape), np.nan)
     factor = covariance_factor(used, correlation, 3e-4, error)
     assert factor is not None
     apart = np.abs(np.argwhere(used)[:, None] - np.argwhere(used))
@@ -118,9 +119,12 @@ def test_a_factor_is_that_of_the_covariance_of_the_used_pixels() -> None:
 
 
 def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
-    """A hundred blind holes of 10 mm and 6 mm: scatter and stated errors are those of the Cramér-Rao bound, where plain
-    least squares scatter half as widely again, and the far pixels that are left out would add next to nothing."""
-    pitch, shape, noise_m = 1.4e-3, (31, 31), 4e-4
+    """A hundred blind holes of 10 mm and 6 mm: scatter and stated errors are those of the
+    Cramér-Rao bound, where plain least squares scatter half as widely again, and the far pixels
+    that are left out would add next to nothing."""
+    pitch = 1.4e-3
+    shape = (31, 31)
+    noise_m = 4e-4
     per_px = np.array([[pitch, 0.0, 0.0], [0.0, pitch, 0.0]])
     lags = BLUR_PX - np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
     correlation = np.outer(np.maximum(lags, 0), np.maximum(lags, 0)) / BLUR_PX**2
@@ -167,8 +171,8 @@ def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
 
 
 def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
-    """A slot 2 pixels wide and 20 long under white noise, at an angle that no template has: found at a score of 5.5 at
-    a depth at which the best disc or dent would have less."""
+    """A slot 2 pixels wide and 20 long under white noise, at an angle that no template has: found
+    at a score of 5.5 at a depth at which the best disc or dent would have less."""
     finer = 4
     places = (np.indices((SHAPE[0] * finer, SHAPE[1] * finer)) + 0.5) / finer - 0.5
     along = (places[1] - 60.4 + 1j * (places[0] - 45.2)) * np.exp(-1j * np.radians(50.0))
@@ -185,7 +189,8 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
             scores[bank(1)[number].slot].append(
                 float(fields[..., channel].max()) / energies[number] ** 0.5
             )
-    discs, slots = max(scores[False]), max(scores[True])
+    discs = max(scores[False])
+    slots = max(scores[True])
     depth = 7.5 / slots
     assert depth * discs < 5.5
     for seed in (20, 21, 22):
@@ -199,7 +204,8 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
 
 
 def test_a_hole_that_the_model_does_not_fit_is_measured_by_its_contour() -> None:
-    """A mouth as sharp as no camera with the assumed window shows it, beside the same through that window."""
+    """A mouth as sharp as no camera with the assumed window shows it, beside the same through that
+    window."""
     rows, columns = np.indices(SHAPE)
     sharp = 0.01 * (np.hypot(columns - 60, rows - 45) < 4.0)
     notes = []
@@ -213,13 +219,14 @@ def test_a_hole_that_the_model_does_not_fit_is_measured_by_its_contour() -> None
 
 
 def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
-    """Six pixels without a return in a hole whose depth alone is not enough; scattered ones change the noise's highest
-    score by less than 0.3, and six that stand alone stay below a threshold."""
+    """Six pixels without a return in a hole whose depth alone is not enough; scattered ones change
+    the noise's highest score by less than 0.3, and six that stand alone stay below a threshold."""
     noise = cloud_of(3e-4 * blurred(15))
     gone = np.zeros(SHAPE, bool)
     gone[44:46, 59:62] = True
     faint = cloud_of(3e-4 * blurred(15) + hole(60, 44.5, 2.5, 1.1e-3))
-    with_depth, alone = without(faint, gone), without(noise, gone)
+    with_depth = without(faint, gone)
+    alone = without(noise, gone)
     shown = np.flatnonzero(hole(60, 44.5, 2.5, 1.0) > 0)
     without_channel = LocalDetector.analyse(DETECTOR, with_depth).score.ravel()[shown]
     assert np.nanmax(without_channel) < 4.2
@@ -231,7 +238,8 @@ def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
 
 
 def test_light_along_the_rim_is_no_finding() -> None:
-    """The outer three rows stand three deviations before the surface, as where a floor's light comes back."""
+    """The outer three rows stand three deviations before the surface, as where a floor's light
+    comes back."""
     rim = np.where(np.arange(SHAPE[0])[:, None] >= SHAPE[0] - 3, -9e-4, 0.0) + 3e-4 * blurred(7)
     assert not found(cloud_of(rim), 5.5)
 
@@ -248,15 +256,17 @@ def test_the_learned_covariance_is_that_of_the_noise_and_is_used() -> None:
     cloud = cloud_of(3e-4 * blurred(13) + hole(60, 45, 2.0, 0.002))
     taught = DETECTOR.calibrated(learned)
     assert (taught.name, taught.version) == (DETECTOR.name, DETECTOR.version)
-    own, by_others = (each.analyse(cloud).score for each in (DETECTOR, taught))
+    own = DETECTOR.analyse(cloud).score
+    by_others = taught.analyse(cloud).score
     assert not np.array_equal(own, by_others)
     assert abs(np.log(np.nanmax(by_others) / np.nanmax(own))) < 0.2
     assert not DETECTOR.calibrate([])
 
 
 def test_heavy_tails_raise_single_pixels_no_farther_than_they_reach() -> None:
-    """One pixel in 300 has five times the noise: the narrow templates' scores are scaled by their own tail, so that the
-    highest (5.4 without) is little above that of Gaussian noise (4.7), and a hole of many pixels is found beside."""
+    """One pixel in 300 has five times the noise: the narrow templates' scores are scaled by their
+    own tail, so that the highest (5.4 without) is little above that of Gaussian noise (4.7), and a
+    hole of many pixels is found beside."""
     rng = np.random.default_rng(14)
     sizes = np.where(rng.random(SHAPE) < 1 / 300, 5.0, 1.0)
     noise = 3e-4 * sizes * rng.standard_normal(SHAPE)

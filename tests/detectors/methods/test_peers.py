@@ -1,4 +1,5 @@
-"""Detectors from other libraries: the contract, each library's numbers against their formulas, references, memories."""
+"""Detectors from other libraries: the contract, each library's numbers against their formulas,
+references, memories."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ def undamaged(seed: int) -> Cloud:
 
 @lru_cache(maxsize=1)
 def learned() -> FpfhMemoryDetector:
-    """The memory of three undamaged planes; features of fewer neighbours than usual take a third of the time."""
+    """The memory of three undamaged planes; features of fewer neighbours than usual take a third
+    of the time."""
     blank = FpfhMemoryDetector(
         FpfhMemoryConfig.from_data({**WHOLE, "feature_neighbours": 40, "memory": 60})
     )
@@ -65,8 +67,10 @@ def test_they_keep_the_contract(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["plane_ransac", "m3c2", "fpfh_memory"])
 def test_they_find_dents_and_nothing_else(name: str) -> None:
-    """Two dents 6 mm deep and 12 mm wide at half their depth; the threshold is well above an undamaged plane."""
-    quiet, detector = undamaged(14), made(name)
+    """Two dents 6 mm deep and 12 mm wide at half their depth; the threshold is well above an
+    undamaged plane."""
+    quiet = undamaged(14)
+    detector = made(name)
     threshold = 1.3 * detector.quiet_threshold(quiet, detector.analyse(quiet))
     centres = quiet.points_m[[12, 26], [14, 42]][:, :2]
     apart_m = np.linalg.norm(quiet.points_m[..., None, :2] - centres, axis=-1)
@@ -78,9 +82,10 @@ def test_they_find_dents_and_nothing_else(name: str) -> None:
 
 
 def test_a_rim_and_what_lies_deep_behind_it_are_one_finding_of_m3c2_and_none_of_fpfh() -> None:
-    """A hole whose floor lies 35 mm behind the face, with nothing in between; findings are joined over 10 mm. The
-    features of some millimetres see two flat surfaces, as is said of them."""
-    quiet, detector = undamaged(18), made("m3c2")
+    """A hole whose floor lies 35 mm behind the face, with nothing in between; findings are joined
+    over 10 mm. The features of some millimetres see two flat surfaces, as is said of them."""
+    quiet = undamaged(18)
+    detector = made("m3c2")
     apart_m = np.linalg.norm(quiet.points_m[..., :2] - quiet.points_m[20, 30, :2], axis=-1)
     cloud = replace(quiet, points_m=quiet.points_m * np.where(apart_m < 9e-3, 1.05, 1.0)[..., None])
     threshold = 1.3 * detector.quiet_threshold(quiet, detector.analyse(quiet))
@@ -94,7 +99,9 @@ def test_a_rim_and_what_lies_deep_behind_it_are_one_finding_of_m3c2_and_none_of_
 
 def test_a_plane_is_that_of_its_supporting_points() -> None:
     evidence = load_detector("plane_ransac", WHOLE).analyse(plane(1, tilt=0.2))
-    x, y, z = plane(1).points_m[..., 0], plane(1).points_m[..., 1], evidence.surface_z_m
+    x = plane(1).points_m[..., 0]
+    y = plane(1).points_m[..., 1]
+    z = evidence.surface_z_m
     slope_x, slope_y, level = np.linalg.lstsq(
         np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1), z.ravel(), rcond=None
     )[0]
@@ -114,11 +121,13 @@ def test_points_on_a_line_determine_no_plane() -> None:
 
 
 def test_m3c2_is_the_formula_of_its_paper() -> None:
-    """Beside means and standard deviations over cylinders that are counted out, at places off and on a rim."""
+    """Beside means and standard deviations over cylinders that are counted out, at places off and
+    on a rim."""
     cloud = plane(1, tilt=0.0)
     settings = {"surface": {"shape": "polynomial", "degree": 1}, "registration_error_mm": 0.2}
     evidence = made("m3c2", **settings).analyse(cloud)
-    points, surface = cloud.points_m.reshape(-1, 3), evidence.surface_z_m.ravel()
+    points = cloud.points_m.reshape(-1, 3)
+    surface = evidence.surface_z_m.ravel()
     for row, column in ((45, 60), (20, 31), (37, 20), (59, 81)):
         place = row * 120 + column
         near = np.hypot(*(points[:, :2] - points[place, :2]).T) < 4e-3
@@ -144,10 +153,12 @@ def test_without_a_registration_error_the_targets_own_scatter_counts() -> None:
 
 
 def test_a_reference_scan_of_any_shape(tmp_path: Path) -> None:
-    """A step of 20 mm, which no fitted surface follows, with a dent that only the later scan has; then the whole moved
-    by 3 mm, which is said."""
-    before, after = plane(5), plane(6)
-    flawless, step = before.points_m[50:90, 0:60], np.array([0.0, 0.0, 0.02])
+    """A step of 20 mm, which no fitted surface follows, with a dent that only the later scan has;
+    then the whole moved by 3 mm, which is said."""
+    before = plane(5)
+    after = plane(6)
+    flawless = before.points_m[50:90, 0:60]
+    step = np.array([0.0, 0.0, 0.02])
     path = tmp_path / "before.npy"
     stepped = flawless + step * (np.arange(60) >= 30)[None, :, None]
     np.save(path, stepped)

@@ -1,4 +1,5 @@
-"""The thesis' detector: its two variants, thresholds, the rounding floor, and the registry of detectors."""
+"""The thesis' detector: its two variants, thresholds, the rounding floor, and the registry of
+detectors."""
 
 from __future__ import annotations
 
@@ -178,7 +179,8 @@ def test_without_rounding_a_perfect_board_still_has_a_scale() -> None:
 def test_the_floor_is_the_rounding_error_of_simulated_averages(
     noise_mm: float, frames: int
 ) -> None:
-    """Rounded averages less unrounded averages of the same noise, over surfaces at all phases of the step."""
+    """Rounded averages less unrounded averages of the same noise, over surfaces at all phases of
+    the step."""
     random = np.random.default_rng(int(100 * noise_mm) + frames)
     true = np.linspace(700.0, 740.0, 20_000)
     samples = true + noise_mm * random.standard_normal((frames, true.size))

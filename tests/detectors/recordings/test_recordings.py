@@ -237,7 +237,10 @@ def test_a_cloud_behind_or_beside_the_lens_keeps_a_reason() -> None:
         [[[0.0, 0, 1], [0, 0, 0], [np.inf, 0, 1], [0, 0, np.nan], [0, 0, -1], [0, 0, 2]]]
     )
     frame = frame_of("a", stored, 1.0)
-    valid, none, odd, out = Reason.VALID, Reason.NO_RETURN, Reason.NOT_FINITE, Reason.OUT_OF_RANGE
+    valid = Reason.VALID
+    none = Reason.NO_RETURN
+    odd = Reason.NOT_FINITE
+    out = Reason.OUT_OF_RANGE
     assert frame.reason.tolist() == [[valid, none, odd, odd, out, valid]]
     np.testing.assert_array_equal(np.isfinite(frame.z_m), frame.reason == Reason.VALID)
 
@@ -260,7 +263,8 @@ def test_the_rounding_step_is_found_in_floating_point_metres(step_m: float, seed
     assert rounding_step_m(free) == 0.0
 
 
-# ---- lenses ----------------------------------------------------------------------------------------------------------
+# ---- lenses
+# ----------------------------------------------------------------------------------------------------------
 
 DISTORTION = (0.1, -0.2, 0.001, -0.002, 0.03, 0.4, 0.05, 0.006)
 
@@ -281,20 +285,23 @@ def opencv_yaml(lens: Lens) -> str:
         head = f" !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n"
         return head + f"   data: [ {', '.join(map(repr, values))} ]\n"
 
-    k, d = lens.matrix.ravel().tolist(), list(lens.distortion)
+    k = lens.matrix.ravel().tolist()
+    d = list(lens.distortion)
     size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
     return f"%YAML:1.0\n---\n{size}camera_matrix:{matrix(3, 3, k)}distortion_coefficients:{matrix(1, 8, d)}"
 
 
 def ros_yaml(lens: Lens) -> str:
-    k, d = lens.matrix.ravel().tolist(), list(lens.distortion)
+    k = lens.matrix.ravel().tolist()
+    d = list(lens.distortion)
     size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
     matrices = f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\ndistortion_coefficients:\n  data: {d}\n"
     return f"{size}camera_name: depth\ndistortion_model: rational_polynomial\n{matrices}"
 
 
 def ros_message(lens: Lens) -> str:
-    k, d = lens.matrix.ravel().tolist(), list(lens.distortion)
+    k = lens.matrix.ravel().tolist()
+    d = list(lens.distortion)
     return f"height: {lens.height}\nwidth: {lens.width}\ndistortion_model: rational_polynomial\nD: {d}\nK: {k}\n"
 
 
@@ -412,7 +419,8 @@ def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
     assert read_lens(folder / "intrinsic.json", 96, 72) == plane.LENS
 
 
-# ---- real captures ---------------------------------------------------------------------------------------------------
+# ---- real captures
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_the_drilled_plate_opens_as_it_stands(shared_data: Path) -> None:
@@ -437,7 +445,8 @@ def test_the_walls_need_a_lens_and_leave_their_mask_out(shared_data: Path) -> No
 
 
 def test_pixels_without_a_ray_are_outside_the_mask(tmp_path: Path) -> None:
-    """With k1 = -0.5 the distorted radius r - r^3 / 2 never exceeds 0.544: pixels beyond see nothing."""
+    """With k1 = -0.5 the distorted radius r - r^3 / 2 never exceeds 0.544: pixels beyond see
+    nothing."""
     np.save(tmp_path / "d.npy", np.full((101, 101), 1000, np.uint16))
     lens = Lens(101, 101, 60.0, 60.0, 50.0, 50.0, (-0.5, *[0.0] * 7))
     recording = open_capture([tmp_path / "d.npy"], lens=lens)
@@ -458,7 +467,8 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
     )
 
 
-# ---- lists of points -------------------------------------------------------------------------------------------------
+# ---- lists of points
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -492,7 +502,8 @@ def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do
     points = np.stack([(u - 127) / 210, (v - 95) / 210, np.ones(u.shape)], axis=-1) * 0.8
     grid = open_capture([plane.write_points(tmp_path / "a.xyz", points)])
     assert grid.organised and grid.region.shape == (192, 256)
-    # Arena and pylon leave a cloud's grid out, or state it in a comment; their points without return are 0 0 0
+    # Arena and pylon leave a cloud's grid out, or state it in a comment; their points without
+    # return are 0 0 0
     points[3, 5] = 0
     bare = plane.write_ply(tmp_path / "a.ply", points, grid=False)
     recording = open_capture([bare])
@@ -506,7 +517,8 @@ def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do
     assert not open_capture([plane.write_points(tmp_path / "b.xyz", shuffled)]).organised
 
 
-# ---- height maps -----------------------------------------------------------------------------------------------------
+# ---- height maps
+# -----------------------------------------------------------------------------------------------------
 
 
 def height_map(relief: float = 1.0) -> np.ndarray:
@@ -557,7 +569,8 @@ def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
     assert findings[0]["kind"] == "hole" and float(findings[0]["u_px"]) == pytest.approx(120, abs=2)
 
 
-# ---- phones ----------------------------------------------------------------------------------------------------------
+# ---- phones
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_pixels_of_low_confidence_are_no_return_and_motion_is_warned_of(tmp_path: Path) -> None:
@@ -597,10 +610,8 @@ def test_the_raw_frame_of_a_plane(shared_data: Path) -> None:
 
 
 def test_the_interleaved_frame_of_another_maker(shared_data: Path) -> None:
-    path, lens = (
-        shared_data / "adi_tof" / "frame_mode2.bin",
-        Lens(512, 512, 400.0, 400.0, 256.0, 256.0),
-    )
+    path = shared_data / "adi_tof" / "frame_mode2.bin"
+    lens = Lens(512, 512, 400.0, 400.0, 256.0, 256.0)
     with pytest.raises(UserError, match="512x512:u2/5"):
         open_capture([path])
     z_m = next(open_capture([path], lens=lens, raw="512x512:u2/5", unit="mm").frames()).z_m

@@ -1,4 +1,5 @@
-"""ROS 2 bags as captures: every layout of a cloud gives the same frame, and every fault is told once."""
+"""ROS 2 bags as captures: every layout of a cloud gives the same frame, and every fault is told
+once."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ from tests.support import recorded_plane as plane
 POINTS = plane.points_m(plane.depth_mm())
 VALID = np.isfinite(POINTS[..., 2])
 BOMB_BYTES = 1 << 27
-MAGIC_BYTES, CHUNK_INDEX = 8, 8
+MAGIC_BYTES = 8
+CHUNK_INDEX = 8
 """MCAP: the length of its first and last bytes, and the code of a chunk's entry in the index."""
 
 
@@ -39,7 +41,8 @@ def refusal(path: Path, **options: Any) -> str:
     return str(caught.value)
 
 
-# ---- a message -------------------------------------------------------------------------------------------------------
+# ---- a message
+# -------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
@@ -126,7 +129,8 @@ def test_layouts_that_contradict_themselves_are_refused() -> None:
     assert "count 3" in told(fields=[type(f)(f.name, f.offset, 7, 3) for f in message.fields])
 
 
-# ---- a bag -----------------------------------------------------------------------------------------------------------
+# ---- a bag
+# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mcap", (False, True))
@@ -187,7 +191,8 @@ def test_a_lens_counts_only_where_the_points_lie_on_its_rays(tmp_path: Path) -> 
     exact = open_capture(
         [bags.write_bag(tmp_path / "exact", [("/c", bags.INFO, bags.info()), *points])]
     )
-    by_lens, by_points = (average(source, AverageConfig()).points_m for source in (exact, apart))
+    by_lens = average(exact, AverageConfig()).points_m
+    by_points = average(apart, AverageConfig()).points_m
     np.testing.assert_allclose(by_lens, by_points, atol=3e-8)
 
 
@@ -226,10 +231,12 @@ def test_the_usual_topic_the_only_one_or_the_named_one(tmp_path: Path) -> None:
     assert len(list(open_capture([only]).frames())) == 1
 
 
-# ---- depth images ----------------------------------------------------------------------------------------------------
+# ---- depth images
+# ----------------------------------------------------------------------------------------------------
 
 STORED = plane.depth_mm()
-DEPTH, LENS_TOPIC = "/camera/depth/image_raw", "/camera/depth/camera_info"
+DEPTH = "/camera/depth/image_raw"
+LENS_TOPIC = "/camera/depth/camera_info"
 
 
 @settings(max_examples=40, deadline=None)
@@ -295,10 +302,8 @@ def test_clouds_of_ros_1_are_read(tmp_path: Path) -> None:
 
 
 def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None:
-    picture, lens = (
-        (DEPTH, bags.IMAGE, bags.depth_image(STORED)),
-        (LENS_TOPIC, bags.INFO, bags.info()),
-    )
+    picture = (DEPTH, bags.IMAGE, bags.depth_image(STORED))
+    lens = (LENS_TOPIC, bags.INFO, bags.info())
     both = bags.write_bag(tmp_path / "both", [picture, lens, *bags.clouds(1)])
     recording = open_capture([both])
     assert (
@@ -342,7 +347,8 @@ def test_the_lens_of_a_camera_info() -> None:
     rectified.p = np.array([140.0, 0, 45, 0, 0, 141, 35, 0, 0, 0, 1, 0])
     flat = lens_of_info(rectified, shape, is_rectified=True)
     assert isinstance(flat, Lens) and (flat.fx, flat.cy, any(flat.distortion)) == (140, 35, False)
-    # the centre of a binned pixel lies between those of its four; the region's first pixel is (10, 20)
+    # the centre of a binned pixel lies between those of its four; the region's first pixel is (10,
+    # 20)
     binned = bags.info()
     binned.binning_x = binned.binning_y = 2
     binned.roi = type(binned.roi)(x_offset=10, y_offset=20, width=40, height=30, do_rectify=False)
@@ -430,7 +436,8 @@ def test_a_chunk_of_ros_1_may_not_fill_the_memory(
     assert "there is not enough memory" in refusal(path)
 
 
-# ---- what it refuses -------------------------------------------------------------------------------------------------
+# ---- what it refuses
+# -------------------------------------------------------------------------------------------------
 
 
 def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
@@ -538,7 +545,8 @@ def test_a_chunk_that_unpacks_to_another_size_than_it_states_is_refused(tmp_path
     )
     file = folder / "bag.mcap"
     content = bytearray(file.read_bytes())
-    # the index repeats the size: op 8, eight bytes of length, .., and at its end the sizes, packed and unpacked
+    # the index repeats the size: op 8, eight bytes of length, .., and at its end the sizes, packed
+    # and unpacked
     start = next(at for at in _records(content) if content[at] == CHUNK_INDEX)
     end = start + 9 + struct.unpack_from("<Q", content, start + 1)[0]
     (promised,) = struct.unpack_from("<Q", content, end - 8)
@@ -558,7 +566,8 @@ def test_a_message_may_not_be_larger_than_a_cloud(
 
 def _records(content: bytearray) -> list[int]:
     """Where the records of an MCAP begin."""
-    at, found = MAGIC_BYTES, []
+    at = MAGIC_BYTES
+    found = []
     while at < len(content) - MAGIC_BYTES:
         found.append(at)
         at += 9 + struct.unpack_from("<Q", content, at + 1)[0]

@@ -30,7 +30,8 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-# ---- the calibration -------------------------------------------------------------------------------------------------
+# ---- the calibration
+# -------------------------------------------------------------------------------------------------
 
 
 def test_the_nfov_lens_by_hand() -> None:
@@ -53,12 +54,11 @@ def test_the_nfov_lens_by_hand() -> None:
 def test_modes_look_along_the_same_rays(
     mode: str, other: str, scale: int, shift: tuple[int, int]
 ) -> None:
-    """A pixel of a crop, or the middle of four binned pixels, sees what it sees on the whole sensor."""
+    """A pixel of a crop, or the middle of four binned pixels, sees what it sees on the whole
+    sensor."""
     u, v = np.meshgrid(np.linspace(100, 200, 5), np.linspace(100, 200, 5))
-    there_u, there_v = (
-        scale * u + (scale - 1) / 2 + shift[0],
-        scale * v + (scale - 1) / 2 + shift[1],
-    )
+    there_u = scale * u + (scale - 1) / 2 + shift[0]
+    there_v = scale * v + (scale - 1) / 2 + shift[1]
     here = depth_lens("test", CAMERAS, mode).slopes(u, v)
     np.testing.assert_allclose(
         here, depth_lens("test", CAMERAS, other).slopes(there_u, there_v), atol=1e-9
@@ -70,7 +70,9 @@ def test_colour_modes_are_crops_of_one_picture() -> None:
     cropped = colour_camera("test", CAMERAS, 1280, 720)
     assert whole is not None and cropped is not None
     # 1280 x 960 scaled down from 4096 x 3072, then rows 120 to 839
-    u, v, scale = 300.0, 200.0, 3.2
+    u = 300.0
+    v = 200.0
+    scale = 3.2
     expected = whole.lens.slopes(
         np.array((u + 0.5) * scale - 0.5), np.array((v + 120 + 0.5) * scale - 0.5)
     )
@@ -112,7 +114,8 @@ def test_a_calibration_that_is_not_understood_is_refused(
         depth_lens("test", parse_calibration("test", json.dumps(data).encode()), "NFOV_UNBINNED")
 
 
-# ---- colour ----------------------------------------------------------------------------------------------------------
+# ---- colour
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_colour_is_taken_where_the_point_appears_in_the_colour_camera() -> None:
@@ -132,7 +135,8 @@ def test_colour_is_taken_where_the_point_appears_in_the_colour_camera() -> None:
     np.testing.assert_array_equal(sampled, expected)
 
 
-# ---- the file --------------------------------------------------------------------------------------------------------
+# ---- the file
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_a_recording_gives_its_pictures_together(tmp_path: Path) -> None:
@@ -190,7 +194,8 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
     )
 
 
-# ---- a real one ------------------------------------------------------------------------------------------------------
+# ---- a real one
+# ------------------------------------------------------------------------------------------------------
 
 
 def plane_rms_mm(points: np.ndarray) -> float:
@@ -216,7 +221,8 @@ def test_the_calibration_flattens_a_real_wall(shared_data: Path) -> None:
 
 
 def test_real_colour_falls_on_the_depth_pixels(shared_data: Path) -> None:
-    """The window's blind is bright in colour and dark in infrared: its edge must lie on the same pixels in both."""
+    """The window's blind is bright in colour and dark in infrared: its edge must lie on the same
+    pixels in both."""
     (frame,) = open_capture([shared_data / "azure_mkv" / "recording.mkv"]).frames()
     assert frame.rgb is not None and frame.amplitude is not None
     rows = slice(160, 300)

@@ -73,7 +73,8 @@ def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:
     assert (
         refusal(tmp_path).splitlines()[0] == f"{tmp_path}: contains no capture; it holds notes.txt"
     )
-    bag, other = bags.write_bag(tmp_path / "left", bags.clouds(1)), tmp_path / "other.mkv"
+    bag = bags.write_bag(tmp_path / "left", bags.clouds(1))
+    other = tmp_path / "other.mkv"
     other.touch()
     plane.write_open3d_folder(tmp_path / "right", 1)
     said = refusal(tmp_path)
@@ -411,7 +412,8 @@ def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> Non
     assert "off the camera's axis" in message and "another frame" in message
 
 
-# ---- lenses ----------------------------------------------------------------------------------------------------------
+# ---- lenses
+# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""What stored numbers mean: codes for no return, the unit and who says so, and clouds that look backwards."""
+"""What stored numbers mean: codes for no return, the unit and who says so, and clouds that look
+backwards."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ def opened(
     return open_capture([folder], lens=lens, unit=unit)
 
 
-# ---- codes for no return ---------------------------------------------------------------------------------------------
+# ---- codes for no return
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,8 @@ def test_a_cloud_that_looks_backwards_is_turned_and_said(tmp_path: Path) -> None
     np.testing.assert_allclose(np.dstack([frame.xy_m, frame.z_m]), points, atol=1e-6)
 
 
-# ---- units -----------------------------------------------------------------------------------------------------------
+# ---- units
+# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -197,7 +200,8 @@ def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
     )
 
 
-# ---- named cameras and lenses of other sizes -------------------------------------------------------------------------
+# ---- named cameras and lenses of other sizes
+# -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -241,9 +245,11 @@ def test_modes_look_along_the_directions_of_the_factory_calibration() -> None:
         "azure_kinect_wfov_unbinned",
         "realsense_l515_vga",
     }
-    whole, binned = lens_named("azure_kinect_wfov_unbinned"), lens_named("azure_kinect_wfov_binned")
+    whole = lens_named("azure_kinect_wfov_unbinned")
+    binned = lens_named("azure_kinect_wfov_binned")
     np.testing.assert_allclose(binned.slopes(100, 200), whole.slopes(200.5, 400.5), atol=1e-6)
-    narrow, small = lens_named("azure_kinect_nfov"), lens_named("azure_kinect_nfov_binned")
+    narrow = lens_named("azure_kinect_nfov")
+    small = lens_named("azure_kinect_nfov_binned")
     np.testing.assert_allclose(narrow.slopes(8, 20), whole.slopes(200, 200), atol=1e-6)
     np.testing.assert_allclose(small.slopes(8, 20), narrow.slopes(16.5, 40.5), atol=1e-6)
 
@@ -256,7 +262,8 @@ def test_a_lens_of_larger_images_of_the_same_shape_is_scaled_and_said(tmp_path: 
     assert recording.lens == plane.LENS and "scaled to 96 x 72" in recording.warnings[0]
 
 
-# ---- images that are not the camera's own ----------------------------------------------------------------------------
+# ---- images that are not the camera's own
+# ----------------------------------------------------------------------------
 
 
 def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: Path) -> None:
@@ -282,7 +289,8 @@ def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: 
 def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
     side: int, finer: int, least: int, most: int
 ) -> None:
-    rng, frames = np.random.default_rng(3), []
+    rng = np.random.default_rng(3)
+    frames = []
     for number in range(3):
         noise = cv2.blur(rng.normal(0, 1e-3 * side, (240, 240)), (side, side))
         z_m = cv2.resize(
@@ -296,7 +304,8 @@ def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
 @pytest.mark.parametrize("slope_m", (2e-4, 1.5e-3))
 @pytest.mark.parametrize(("side", "reach_px"), ((1, 1), (3, 3), (5, 5), (12, 0)))
 def test_a_lone_frame_shows_the_reach_of_its_noise_beside_edges(side, reach_px, slope_m) -> None:
-    """The noise of 1 mm is unknown where it does not exceed the rounding. A tilted board's edges do not lengthen it."""
+    """The noise of 1 mm is unknown where it does not exceed the rounding. A tilted board's edges
+    do not lengthen it."""
     v, u = np.mgrid[:240, :320]
     z_m = (
         0.7
@@ -333,7 +342,8 @@ def test_a_missing_colour_picture_is_said(tmp_path: Path) -> None:
     )
 
 
-# ---- how often the unit is right -------------------------------------------------------------------------------------
+# ---- how often the unit is right
+# -------------------------------------------------------------------------------------
 
 
 def test_units_of_many_scenes_are_right_or_asked_for() -> None:
@@ -347,13 +357,12 @@ def test_units_of_many_scenes_are_right_or_asked_for() -> None:
 
 
 def verdicts(unit_mm: float, scenes: int = 200) -> Counter[str]:
-    rng, found = np.random.default_rng(11), Counter[str]()
+    rng = np.random.default_rng(11)
+    found = Counter[str]()
     for _ in range(scenes):
-        near_m, share, behind_m = (
-            rng.uniform(0.3, 1.5),
-            rng.uniform(0.1, 1.0),
-            rng.uniform(0.2, 2.0),
-        )
+        near_m = rng.uniform(0.3, 1.5)
+        share = rng.uniform(0.1, 1.0)
+        behind_m = rng.uniform(0.2, 2.0)
         z_m = np.where(np.arange(2000) < 2000 * share, near_m, near_m + behind_m) + rng.normal(
             0, 2e-3, 2000
         )

@@ -1,6 +1,8 @@
-"""Captures that somebody made to harm: each is one clear message, in little time and little memory.
+"""Captures that somebody made to harm: each is one clear message, in little time and little
+memory.
 
-Every file is opened in a process whose memory is limited to what its libraries need and 1 GiB more.
+Every file is opened in a process whose memory is limited to what its libraries need and 1 GiB
+more.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ def limited() -> Iterator[None]:
         yield
 
 
-# ---- arrays ---------------------------------------------------------------------------------------------------------
+# ---- arrays
+# ---------------------------------------------------------------------------------------------------------
 
 
 def npy_header(shape: str, dtype: str = "<u2") -> bytes:
@@ -133,7 +136,8 @@ def test_a_frame_of_too_many_pixels(tmp_path):
     assert "10000 x 10000 pixels\n  legal: 1 to 64 million" in capture_refusal(path)
 
 
-# ---- MATLAB ---------------------------------------------------------------------------------------------------------
+# ---- MATLAB
+# ---------------------------------------------------------------------------------------------------------
 
 MAT_HEAD = b"MATLAB 5.0 MAT-file".ljust(116) + bytes(8) + b"\x00\x01IM"
 
@@ -182,7 +186,8 @@ def test_cells_in_cells_in_a_mat_file_are_not_followed(tmp_path: Path) -> None:
     """A hundred thousand deep, which ends a process that follows them."""
     inner = struct.pack("<IIIIIIiiIIIId", 6, 8, 6, 0, 5, 8, 1, 1, 1, 0, 9, 8, 1.0)
     level = struct.pack("<IIIIIIii", 6, 8, 1, 0, 5, 8, 1, 1)
-    heads, size = [struct.pack("<II", 14, len(inner))], len(inner) + 8
+    heads = [struct.pack("<II", 14, len(inner))]
+    size = len(inner) + 8
     for depth in range(100_000):
         name = (
             struct.pack("<II5s3x", 1, 5, b"depth") if depth == 99_999 else struct.pack("<II", 1, 0)
@@ -194,7 +199,8 @@ def test_cells_in_cells_in_a_mat_file_are_not_followed(tmp_path: Path) -> None:
     assert "holds no numeric array" in capture_refusal(tmp_path / "a.mat")
 
 
-# ---- phones and lists of points --------------------------------------------------------------------------------------
+# ---- phones and lists of points
+# --------------------------------------------------------------------------------------
 
 
 def test_an_archive_of_a_phone_that_unpacks_to_much(tmp_path):
@@ -217,7 +223,8 @@ def test_a_list_of_points_that_is_too_long(tmp_path):
     assert "has more than 256 MiB" in capture_refusal(tmp_path / "a.xyz")
 
 
-# ---- pictures -------------------------------------------------------------------------------------------------------
+# ---- pictures
+# -------------------------------------------------------------------------------------------------------
 
 
 def png_of(width: int, height: int) -> bytes:
@@ -267,7 +274,8 @@ def test_the_sizes_of_true_pictures():
         assert decoded("a", content, cv2.IMREAD_COLOR).shape == (30, 50, 3)
 
 
-# ---- clouds ---------------------------------------------------------------------------------------------------------
+# ---- clouds
+# ---------------------------------------------------------------------------------------------------------
 
 
 def ply(*lines: str) -> bytes:
@@ -337,7 +345,8 @@ def test_hostile_pcd(tmp_path, content, told):
     assert told in capture_refusal(tmp_path / "a.pcd")
 
 
-# ---- recordings -----------------------------------------------------------------------------------------------------
+# ---- recordings
+# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -366,7 +375,9 @@ def test_a_recording_of_too_large_pictures(tmp_path):
     path = tmp_path / "a.mkv"
     with av.open(str(path), "w", format="matroska") as container:
         stream = container.add_stream("ffv1", rate=5)
-        stream.width, stream.height, stream.pix_fmt = 96, 72, "gray16le"
+        stream.width = 96
+        stream.height = 72
+        stream.pix_fmt = "gray16le"
         stream.metadata["title"] = "DEPTH"
         container.mux(stream.encode(av.VideoFrame.from_ndarray(STORED, format="gray16le")))
         container.mux(stream.encode())

@@ -14,9 +14,12 @@ from detectors.surfaces.surface import SurfaceConfig
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Region
 
-SHAPE, FOCAL_PX, NOISE_M = (144, 160), 140.0, 3e-4
+SHAPE = (144, 160)
+FOCAL_PX = 140.0
+NOISE_M = 3e-4
 V, U = np.mgrid[: SHAPE[0], : SHAPE[1]]
-X, Y = (U - 79.5) / FOCAL_PX, (V - 71.5) / FOCAL_PX
+X = (U - 79.5) / FOCAL_PX
+Y = (V - 71.5) / FOCAL_PX
 """Slopes x/z and y/z: at 0.7 m a pixel is 5 mm wide and the picture 0.8 m."""
 DAMAGE = ((0.0, 0.0, 0.06, 0.004), (0.10, 0.06, 0.04, 0.003), (-0.08, -0.10, 0.04, -0.003))
 """x, y, diameter, depth (negative: a bump), metres: parabolic dents."""
@@ -163,7 +166,8 @@ def test_what_is_seen_too_obliquely_is_left_out_and_said() -> None:
     z = pipe(radius_m=0.2)
     answer = found(measured(z, damage=()))
     judged = np.isfinite(answer.residual_m)
-    # the ray meets the pipe's normal at asin(centre / radius * sine of the ray's angle to the axis plane)
+    # the ray meets the pipe's normal at asin(centre / radius * sine of the ray's angle to the axis
+    # plane)
     sine = np.abs(X) / np.hypot(X, 1) * 0.9 / 0.2
     incidence = np.degrees(np.arcsin(np.minimum(sine, 1)))
     # to the next pixel the sine grows by 0.03: from 75 to 82 degrees

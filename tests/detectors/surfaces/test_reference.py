@@ -1,4 +1,5 @@
-"""A part's own mesh as the undamaged surface: it is found where it lies, and what differs from it is damage."""
+"""A part's own mesh as the undamaged surface: it is found where it lies, and what differs from it
+is damage."""
 
 from __future__ import annotations
 
@@ -87,8 +88,10 @@ def stood(turn_deg: tuple[float, float, float], quarter: int = 0) -> np.ndarray:
 def test_a_part_is_found_where_it_lies(
     tmp_path: Path, turn_deg: tuple[float, float, float], quarter: int
 ) -> None:
-    path, T = casting(tmp_path / "casting.stl"), stood(turn_deg, quarter)
-    cloud, true = seen(path, T, 0.5, dent_mm=3.0), seen(path, T, 0.0)
+    path = casting(tmp_path / "casting.stl")
+    T = stood(turn_deg, quarter)
+    cloud = seen(path, T, 0.5, dent_mm=3.0)
+    true = seen(path, T, 0.0)
     points = cloud.points_m[cloud.valid]
     said, surface = laid_on(points, ReferenceConfig(file=str(path)), central=True)
     off_m = surface(points) - true.points_m[cloud.valid][:, 2]
@@ -111,7 +114,8 @@ def test_a_part_is_found_where_it_lies(
     ],
 )
 def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> None:
-    path, T = casting(tmp_path / "casting.stl"), stood((6, -8, 3))
+    path = casting(tmp_path / "casting.stl")
+    T = stood((6, -8, 3))
     cloud = seen(path, T, 0.5, dent_mm=3.0)
 
     def found(surface: dict[str, object]) -> list[np.ndarray]:

@@ -1,4 +1,5 @@
-"""Surface fits against exact solutions: linear programming, a plain robust fit, closed forms; and gross damage."""
+"""Surface fits against exact solutions: linear programming, a plain robust fit, closed forms; and
+gross damage."""
 
 from __future__ import annotations
 
@@ -25,13 +26,15 @@ def cloud(
     n: int, seed: int = 0, sigma_m: float = 3e-4
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     random = np.random.default_rng(seed)
-    x, y = random.uniform(-0.2, 0.3, n), random.uniform(-0.1, 0.2, n)
+    x = random.uniform(-0.2, 0.3, n)
+    y = random.uniform(-0.1, 0.2, n)
     return x, y, truth(x, y) + sigma_m * random.standard_normal(n)
 
 
 def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The ten columns of a cubic, scaled by hand and independently of the fit's basis."""
-    u, v = 4 * x - 0.2, 6 * y - 0.3
+    u = 4 * x - 0.2
+    v = 6 * y - 0.3
     return np.stack([u**i * v**j for i in range(4) for j in range(4) if i + j <= 3], axis=1)
 
 
@@ -68,7 +71,8 @@ def test_lar_is_the_exact_least_absolute_solution(n: int) -> None:
     exact = linprog(cost, A_eq=equalities, b_eq=z, bounds=bounds, method="highs")
     surface = fit(x, y, z, method="lar")
     assert np.abs(z - surface.evaluate(x, y)).sum() <= exact.fun * (1 + 2e-6)
-    # 0.3 mm of noise; the standard error of an L1 fit is 1.25 sigma sqrt(p / n), at the corners three times that
+    # 0.3 mm of noise; the standard error of an L1 fit is 1.25 sigma sqrt(p / n), at the corners
+    # three times that
     assert difference_m(surface, a @ exact.x[:p], x, y) < 0.15 * 3e-4 * np.sqrt(10 / n)
 
 
@@ -156,7 +160,8 @@ def test_the_order_of_points_does_not_matter(method: str) -> None:
 def test_repeating_a_fit_repeats_every_bit() -> None:
     x, y, z = cloud(20_000)
     for method in METHODS:
-        a, b = fit(x, y, z, method=method), fit(x, y, z, method=method)
+        a = fit(x, y, z, method=method)
+        b = fit(x, y, z, method=method)
         np.testing.assert_array_equal(a.coefficients, b.coefficients)
 
 
@@ -200,7 +205,10 @@ def test_products_and_their_sum_are_numpys(degree: int) -> None:
 
 def test_a_free_form_is_the_penalised_spline() -> None:
     """The same knots and penalty, built densely from scipy's splines."""
-    random, spacing, wavelength, cell = np.random.default_rng(4), 0.05, 0.2, 0.01
+    random = np.random.default_rng(4)
+    spacing = 0.05
+    wavelength = 0.2
+    cell = 0.01
     points = np.column_stack([random.uniform(0, 0.3, (400, 2)), random.normal(0, 1e-3, 400)])
     points[:2, :2] = [[0, 0], [0.3, 0.3]]
     weights = random.uniform(0, 1, 400)

@@ -49,7 +49,8 @@ def test_mean_of_four_by_hand() -> None:
 
 def test_difference_of_means_equals_scipys_welch_and_is_a_point_without_scatter() -> None:
     rng = np.random.default_rng(3)
-    a, b = rng.normal(2, 1, 12), rng.normal(0, 3, 30)
+    a = rng.normal(2, 1, 12)
+    b = rng.normal(0, 3, 30)
     theirs = stats.ttest_ind(a, b, equal_var=False).confidence_interval(0.95)
     ours = intervals.mean_difference(a, b)
     assert (ours.low, ours.high) == (pytest.approx(theirs.low), pytest.approx(theirs.high))
@@ -65,7 +66,8 @@ def test_standardised_bias_without_scatter_is_exact() -> None:
 
 
 def test_standardised_bias_covers() -> None:
-    """2000 samples of 50 at a true ratio of 1: coverage 0.95 within 4 binomial standard errors (alpha 6e-5)."""
+    """2000 samples of 50 at a true ratio of 1: coverage 0.95 within 4 binomial standard errors
+    (alpha 6e-5)."""
     samples = np.random.default_rng(5).normal(1.0, 1.0, (2000, 50))
     spans = [intervals.standardised_bias(s.mean(), s.std(ddof=1), 50) for s in samples]
     covered = np.mean([span.low <= 1 <= span.high for span in spans])
@@ -73,7 +75,8 @@ def test_standardised_bias_covers() -> None:
 
 
 def test_bootstrap_covers_a_mean() -> None:
-    """400 samples of 50: the percentile interval of a mean covers between 0.90 and 0.99 (expected 0.94; alpha 1e-3)."""
+    """400 samples of 50: the percentile interval of a mean covers between 0.90 and 0.99 (expected
+    0.94; alpha 1e-3)."""
     samples = np.random.default_rng(6).normal(0.0, 1.0, (400, 50))
     spans = [
         intervals.bootstrap(lambda i, s=s: s[i].mean(axis=1), 50, resamples=400) for s in samples

@@ -1,4 +1,5 @@
-"""Maps side by side: what registrations amount to, paired differences, and where one map begins to size better."""
+"""Maps side by side: what registrations amount to, paired differences, and where one map begins to
+size better."""
 
 from __future__ import annotations
 

@@ -79,10 +79,8 @@ def test_hole_free_runs_at_a_given_threshold_are_counted() -> None:
 
 def test_a_repeat_of_rows_changes_counts_not_means() -> None:
     holes = tables(frames=(50,)).holes
-    once, twice = (
-        summarise_holes(holes),
-        summarise_holes(pd.concat([holes, holes], ignore_index=True)),
-    )
+    once = summarise_holes(holes)
+    twice = summarise_holes(pd.concat([holes, holes], ignore_index=True))
     pd.testing.assert_series_equal(
         once["extent_diameter_mean_mm"], twice["extent_diameter_mean_mm"]
     )

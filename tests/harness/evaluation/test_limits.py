@@ -57,10 +57,8 @@ def test_interval_is_a_point_without_chance_and_covers_with_it():
     interval = percentiles(certain.half_draws_mm)
     assert interval.low == interval.high == 2.5
     rng = np.random.default_rng(1)
-    sizes, chance = (
-        np.repeat(np.arange(1.0, 10), 3),
-        1 / (1 + np.exp(-(np.repeat(np.arange(1.0, 10), 3) - 5))),
-    )
+    sizes = np.repeat(np.arange(1.0, 10), 3)
+    chance = 1 / (1 + np.exp(-(np.repeat(np.arange(1.0, 10), 3) - 5)))
     covered = [
         (one := percentiles(Ladder(sizes, rng.random((10, 27)) < chance).half_draws_mm)).low
         <= 5

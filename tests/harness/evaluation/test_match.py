@@ -37,7 +37,8 @@ places = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=0,
 @settings(max_examples=60, deadline=None)
 @given(places, places, st.floats(0.1, 40))
 def test_matching_is_one_to_one_within_the_radius_and_maximal(a, b, radius):
-    truth, found = np.array(a).reshape(-1, 2), np.array(b).reshape(-1, 2)
+    truth = np.array(a).reshape(-1, 2)
+    found = np.array(b).reshape(-1, 2)
     pairs = match(truth, found, radius)
     assert len(set(pairs.values())) == len(pairs)
     for t, f in pairs.items():
@@ -64,10 +65,8 @@ def by_falling_through_all_pairs(
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 8), m=st.integers(1, 20))
 def test_pairs_are_those_of_all_pairs_in_order_ties_included(seed: int, n: int, m: int):
     random = np.random.default_rng(seed)
-    truth, found = (
-        random.integers(0, 8, (n, 2)).astype(float),
-        random.integers(0, 8, (m, 2)).astype(float),
-    )
+    truth = random.integers(0, 8, (n, 2)).astype(float)
+    found = random.integers(0, 8, (m, 2)).astype(float)
     pairs = match(truth, found, 3.0)
     assert pairs == by_falling_through_all_pairs(truth, found, 3.0)
     assert list(pairs) == list(by_falling_through_all_pairs(truth, found, 3.0))

@@ -1,4 +1,5 @@
-"""Several set-ups in one experiment: how axes and switches make them, what they are called, what is compared."""
+"""Several set-ups in one experiment: how axes and switches make them, what they are called, what
+is compared."""
 
 from __future__ import annotations
 

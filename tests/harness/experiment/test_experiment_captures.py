@@ -1,4 +1,5 @@
-"""A real capture as the source of an experiment: known by its content, and each mistake with its place."""
+"""A real capture as the source of an experiment: known by its content, and each mistake with its
+place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""From pydantic's errors to messages: each kind with its line, column, caret, what is legal and the nearest name."""
+"""From pydantic's errors to messages: each kind with its line, column, caret, what is legal and
+the nearest name."""
 
 from __future__ import annotations
 
@@ -309,7 +310,8 @@ def test_legal_words_of_annotations() -> None:
 def test_a_kind_or_name_that_is_no_text_is_refused_with_its_place(
     tmp_path: Path, value: str
 ) -> None:
-    target, camera = tmp_path / "target.yaml", tmp_path / "camera.yaml"
+    target = tmp_path / "target.yaml"
+    camera = tmp_path / "camera.yaml"
     target.write_text(f"name: {value}\n")
     camera.write_text(f"kind: {value}\n")
     with pytest.raises(

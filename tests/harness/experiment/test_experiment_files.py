@@ -1,4 +1,5 @@
-"""The experiments that come with tofpod: valid, complete, crop and radius fit for the board in every variation."""
+"""The experiments that come with tofpod: valid, complete, crop and radius fit for the board in
+every variation."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from harness.vocabulary.geometry import MM, transform_points
 FOLDER = Path(__file__).resolve().parents[3] / "experiments"
 MANY = 200  # set-ups
 RIM_MM = 5.9
-"""The crop leaves a rim of 6 mm of the untilted board (and 3 pixels more); the tilt shortens it by 0.1 mm."""
+"""The crop leaves a rim of 6 mm of the untilted board (and 3 pixels more); the tilt shortens it by
+0.1 mm."""
 
 
 @cache
@@ -59,10 +61,8 @@ def test_a_quick_run_has_few_repeats_or_boards_and_says_that_it_is_a_first_look(
     assert first.config.repeats == 5 and first.config.threshold.calibrate.repeats == 7  # type: ignore[union-attr]
     assert first.config.sensitivity is None and {point.variant for point in first.points} == {MAIN}
     assert first.config.title == f"{experiment('averaging').config.title} (a first look)"
-    whole, study = (
-        load_experiment(FOLDER / "detection_limit.yaml", quick=quick).config
-        for quick in (False, True)
-    )
+    whole = load_experiment(FOLDER / "detection_limit.yaml", quick=False).config
+    study = load_experiment(FOLDER / "detection_limit.yaml", quick=True).config
     boards = [
         [c.study.boards, c.study.hole_free_boards, c.threshold.calibrate.boards]
         for c in (whole, study)
@@ -81,10 +81,8 @@ def test_every_variation_of_averaging_changes_something() -> None:
 @pytest.mark.parametrize("name", ["averaging", "smoke"])
 def test_the_crop_keeps_all_holes_and_leaves_a_rim(name: str) -> None:
     for point in points_of(name):
-        source, crop = (
-            point.config.source,
-            ThesisConfig.from_data(point.config.detector.settings).crop,
-        )
+        source = point.config.source
+        crop = ThesisConfig.from_data(point.config.detector.settings).crop
         assert isinstance(source, SimulatedSource)
         assert isinstance(crop, BoxCrop)
         target = source.target.declare()
@@ -93,7 +91,8 @@ def test_the_crop_keeps_all_holes_and_leaves_a_rim(name: str) -> None:
         corners = [[x * half[0], y * half[1], 0.0] for x, y in product((-1, 1), repeat=2)]
         board_mm = transform_points(to_camera, np.array(corners) * MM) / MM
         for axis, (low, high) in enumerate((crop.x_mm, crop.y_mm)):
-            # the board's edges are within a degree of the camera's axes, so the inner corner on each side is its limit
+            # the board's edges are within a degree of the camera's axes, so the inner corner on
+            # each side is its limit
             assert low - np.sort(board_mm[:, axis])[1] >= RIM_MM, point.label
             assert np.sort(board_mm[:, axis])[2] - high >= RIM_MM, point.label
         assert crop.z_mm[0] < board_mm[:, 2].min(), point.label

@@ -1,4 +1,5 @@
-"""Whatever stands in place of a value of an experiment: one message of plain words, or a valid experiment."""
+"""Whatever stands in place of a value of an experiment: one message of plain words, or a valid
+experiment."""
 
 from __future__ import annotations
 

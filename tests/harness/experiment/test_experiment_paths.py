@@ -1,4 +1,5 @@
-"""Dotted paths: setting one value changes that value and nothing else; ``--set`` reads YAML and points to itself."""
+"""Dotted paths: setting one value changes that value and nothing else; ``--set`` reads YAML and
+points to itself."""
 
 from __future__ import annotations
 
@@ -76,7 +77,8 @@ def test_set_then_get_and_nothing_else_changes(
     data: dict[str, Any], value: Any, draw: st.DataObject
 ) -> None:
     path = draw.draw(st.sampled_from(paths_in(data)))
-    before, old = copy.deepcopy(data), shape.get(data, path)
+    before = copy.deepcopy(data)
+    old = shape.get(data, path)
     changed = set_path(data, path, value)
     assert shape.get(changed, path) == value
     assert data == before

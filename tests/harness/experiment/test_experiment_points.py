@@ -1,4 +1,5 @@
-"""Loading an experiment: every problem with its place, points in order, digests that cover numbers and only those."""
+"""Loading an experiment: every problem with its place, points in order, digests that cover numbers
+and only those."""
 
 from __future__ import annotations
 
@@ -147,7 +148,8 @@ def test_a_new_value_on_an_axis_leaves_all_other_points_as_they_were(folder: Pat
     "override", ["name=other", "title=new words", "repeats=99", "sensitivity=null"]
 )
 def test_what_changes_no_number_changes_no_digest(folder: Path, override: str) -> None:
-    before, after = loaded(folder, BASE + SWEEP), loaded(folder, BASE + SWEEP, override)
+    before = loaded(folder, BASE + SWEEP)
+    after = loaded(folder, BASE + SWEEP, override)
     assert [point.digest for point in after.points] == [point.digest for point in before.points]
 
 

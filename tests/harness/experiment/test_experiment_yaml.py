@@ -1,4 +1,5 @@
-"""Reading YAML: YAML 1.2's types, the place of everything, and one clear message for every bad text."""
+"""Reading YAML: YAML 1.2's types, the place of everything, and one clear message for every bad
+text."""
 
 from __future__ import annotations
 

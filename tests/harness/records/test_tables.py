@@ -57,7 +57,8 @@ def test_order_of_records_does_not_matter_and_none_is_nan():
     assert np.isnan(tables.holes.score[1])
     assert tables.holes.equals(again.holes)
     assert tables.probes.equals(again.probes)
-    # tenths of a micrometre: the repeats' medians are 2250 and 1500, so the clouds lie 375 to either side of the middle
+    # tenths of a micrometre: the repeats' medians are 2250 and 1500, so the clouds lie 375 to
+    # either side of the middle
     probes = tables.probes
     assert abs(probes.mean_error_mm[0] - 0.2) < 1e-12  # mean of 3000 - 375 and 1000 + 375
     assert abs(probes.temporal_std_mm[0] - 0.0625 * np.sqrt(2)) < 1e-12
@@ -115,12 +116,11 @@ def test_set_ups_carry_their_place_on_the_axes_and_one_set_up_carries_nothing():
 
 
 def study_record(number: int) -> dict[str, list[dict[str, object]]]:
-    """A trial of a study at 1 and 50 frames: one in four on a damaged board, one hole-free, two that calibrate."""
+    """A trial of a study at 1 and 50 frames: one in four on a damaged board, one hole-free, two
+    that calibrate."""
     role = ("damaged", "hole_free", "calibration", "calibration")[number % 4]
-    stream, numbers = (
-        np.random.default_rng(number),
-        dict.fromkeys([f"measure_{k}_mm" for k in range(20)], 0.0),
-    )
+    stream = np.random.default_rng(number)
+    numbers = dict.fromkeys([f"measure_{k}_mm" for k in range(20)], 0.0)
     record: dict[str, list[dict[str, object]]] = {}
     for frames in (1, 50):
         common = {"variant": "main", "frames": frames, "repeat": 0, "board": number, "role": role}

@@ -1,4 +1,5 @@
-"""The page of several views and its table for a terminal: complete, self-contained, honest about what is missing."""
+"""The page of several views and its table for a terminal: complete, self-contained, honest about
+what is missing."""
 
 from __future__ import annotations
 

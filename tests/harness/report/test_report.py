@@ -1,4 +1,5 @@
-"""The report: complete, self-contained, the same bytes twice, and honest about what is missing or failed."""
+"""The report: complete, self-contained, the same bytes twice, and honest about what is missing or
+failed."""
 
 from __future__ import annotations
 

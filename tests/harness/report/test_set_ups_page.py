@@ -1,4 +1,5 @@
-"""The page and the final table of several set-ups: complete, self-contained, honest about what failed."""
+"""The page and the final table of several set-ups: complete, self-contained, honest about what
+failed."""
 
 from __future__ import annotations
 
@@ -213,10 +214,13 @@ def test_pair_noise_finds_the_grain_of_a_known_filter():
         return (white[:, :-2] + white[:, 1:-1] + white[:, 2:]) / np.sqrt(3) + 0.7 + shift_m
 
     everywhere = np.ones((204, 300), bool)
-    first, second = frame(0.0), frame(0.017)  # the second is displaced as a whole
+    # the second is displaced as a whole
+    first = frame(0.0)
+    second = frame(0.017)
     first[:3] = np.nan
     found = pair_noise(first, second, everywhere)
-    # three of 60,000 pixels' worth of averages: 1 mm, 2/3, 1/3 and 0 to four standard errors of about 0.01
+    # three of 60,000 pixels' worth of averages: 1 mm, 2/3, 1/3 and 0 to four standard errors of
+    # about 0.01
     assert found["single_frame_mm"] == pytest.approx(1.0, abs=0.02)
     assert found["correlation_u1"] == pytest.approx(2 / 3, abs=0.02)
     assert found["correlation_u2"] == pytest.approx(1 / 3, abs=0.03)

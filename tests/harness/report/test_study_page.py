@@ -1,4 +1,5 @@
-"""The page of a study: complete, self-contained, honest about what is not demonstrated, and the same every time."""
+"""The page of a study: complete, self-contained, honest about what is not demonstrated, and the
+same every time."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ SECTIONS = [
 
 
 def judged(study: Study, **changed: object) -> StudyResult:
-    record, tables = study_record(study), study_tables(study)
+    record = study_record(study)
+    tables = study_tables(study)
     record = replace(record, **changed)  # type: ignore[arg-type]
     return evaluate_study(record, tables, {}, draws=60)
 
@@ -189,7 +191,8 @@ def test_false_calls_stand_beside_the_wanted_rate(page: str) -> None:
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_threshold_that_noise_cannot_set_is_warned_of_first() -> None:
-    """In the first lines of the page and of the terminal, with the place; not at ten deviations, not where given."""
+    """In the first lines of the page and of the terminal, with the place; not at ten deviations,
+    not where given."""
     result = judged(small(SetUp()))
     (one,) = result.record.set_ups
 
@@ -281,7 +284,8 @@ def test_depths_without_a_surface_say_why() -> None:
 
 @pytest.fixture(scope="module")
 def beyond() -> StudyResult:
-    """Half of the largest damage is found: every a90/95 lies beyond the 14 mm inspected, some with a50 within."""
+    """Half of the largest damage is found: every a90/95 lies beyond the 14 mm inspected, some with
+    a50 within."""
     set_ups = [SetUp(frames=n, a50_mm=size) for n, size in ((1, 14.0), (10, 13.0), (50, 11.0))]
     return judged(small(*set_ups, depths_mm=(2.0, 10.0)))
 

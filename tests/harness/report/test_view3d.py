@@ -120,7 +120,8 @@ document.body.dataset.said = said.join(" ");
 
 
 def browsed(path, *options: str) -> str:
-    """The page's elements after its scripts have run, in a browser without a window; skips where there is none."""
+    """The page's elements after its scripts have run, in a browser without a window; skips where
+    there is none."""
     browser = (
         shutil.which("chromium")
         or shutil.which("chromium-browser")
@@ -161,7 +162,8 @@ def test_a_browser_turns_the_cloud_when_it_is_dragged(tmp_path):
         re.search(r'data-said="([^"]+)"', shown).group(1).split()
     )
     assert first == again
-    assert (yaw, pitch, zoom) == ("0.600", "0.180", "1.822")  # 100 and 30 pixels of 0.006; exp(0.6)
+    # 100 and 30 pixels of 0.006; exp(0.6)
+    assert (yaw, pitch, zoom) == ("0.600", "0.180", "1.822")
     assert len({first, turned, near, other}) == 4
     assert back == first
 

@@ -33,7 +33,8 @@ def at(renders: StageCounts | None = None, trials: StageCounts | None = None) ->
 
 
 def lines_of(states: list[tuple[float, Outcome]]) -> list[str]:
-    clock, stream = Clock(), io.StringIO()
+    clock = Clock()
+    stream = io.StringIO()
     with progress_display(stream, clock) as show:
         for seconds, state in states:
             clock.seconds = 1000.0 + seconds

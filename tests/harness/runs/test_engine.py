@@ -1,4 +1,5 @@
-"""The engine end to end on a tiny experiment: same numbers however it is run; nothing finished is lost."""
+"""The engine end to end on a tiny experiment: same numbers however it is run; nothing finished is
+lost."""
 
 from __future__ import annotations
 
@@ -140,7 +141,8 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
 
 @pytest.mark.slow  # a sweep in a process of its own; test_engine_run interrupts in process
 def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished, tmp_path):
-    """Ctrl-C after the first finished trial of many: exit 130, the journal whole, the command to resume told."""
+    """Ctrl-C after the first finished trial of many: exit 130, the journal whole, the command to
+    resume told."""
     cut = tmp_path / "cut"
     shutil.copytree(finished / ".cache", cut / ".cache")
     command = sweep_command(
@@ -171,7 +173,8 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
 
 @pytest.mark.slow
 def test_workers_end_with_a_driver_that_is_killed(finished, tmp_path):
-    """SIGKILL to the driver alone, in the middle of its trials: soon no process of the sweep is left."""
+    """SIGKILL to the driver alone, in the middle of its trials: soon no process of the sweep is
+    left."""
     cut = tmp_path / "killed"
     shutil.copytree(finished / ".cache", cut / ".cache")
     command = sweep_command(
@@ -255,7 +258,8 @@ def test_seeds_change_the_frames_but_not_the_render(finished):
     first = load_experiment(finished.parent / "tiny.yaml")
     second = load_experiment(finished.parent / "tiny.yaml", ["seed=4"])
     cache = finished / ".cache" / "renders"
-    a, b = plan_of(first, cache), plan_of(second, cache)
+    a = plan_of(first, cache)
+    b = plan_of(second, cache)
     assert [job.path for job in a.renders] == [job.path for job in b.renders]
     assert first.digest != second.digest
 
@@ -309,7 +313,8 @@ def test_a_target_without_damage_is_refused_before_anything_runs(tmp_path):
 
 
 def test_a_bug_in_one_trial_costs_that_trial_only(finished, monkeypatch, tmp_path):
-    """A trial that raises becomes a failure with its traceback; the other trials end. Run without workers."""
+    """A trial that raises becomes a failure with its traceback; the other trials end. Run without
+    workers."""
 
     def faulty(task):
         if task.role == "damaged" and task.repeat == 1:
@@ -382,7 +387,8 @@ def test_matching_places_findings_on_a_curved_face():
     unit = cast("SimulatedUnit", None)
     set_up = SetUp(unit, True, (damage,), target, T_camera_board)
     deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
-    one, pixels = np.ones((1, 1)), {1: np.array([0])}
+    one = np.ones((1, 1))
+    pixels = {1: np.array([0])}
     vars(set_up).update(
         {"outlines": pixels, "intact": one > 0, "seen_depth_m": {1: 0.0}, "on_face_m": one}
     )

@@ -1,4 +1,5 @@
-"""Faults put into whole sweeps: each costs at most the trial that it hits, is told, and is mended by running on."""
+"""Faults put into whole sweeps: each costs at most the trial that it hits, is told, and is mended
+by running on."""
 
 from __future__ import annotations
 
@@ -98,9 +99,10 @@ def with_renders(home: Path, out: str) -> Path:
 
 
 def test_faults_in_trials_are_told_and_mended(home):
-    """One trial raises, one hangs, one wants too much memory, one kills its process: four of twelve are lost, the
-    summary and the exit code say so; the same command leaves them, --retry-failed ends as if nothing had been. A fifth,
-    which sets the threshold, kills its process and is tried again at once."""
+    """One trial raises, one hangs, one wants too much memory, one kills its process: four of
+    twelve are lost, the summary and the exit code say so; the same command leaves them,
+    --retry-failed ends as if nothing had been. A fifth, which sets the threshold, kills its
+    process and is tried again at once."""
     with_renders(home, "disturbed")
     limits = ("--time-limit", "120", "--memory-limit", "1.5")
     done = run(
@@ -161,7 +163,8 @@ def test_a_killed_driver_costs_what_was_under_way(home):
 
 
 def test_damaged_files_are_noticed_and_made_anew(home):
-    """A render cut short, one with a flipped bit, a record half written and one with another word in it."""
+    """A render cut short, one with a flipped bit, a record half written and one with another word
+    in it."""
     out = home / "damaged"
     shutil.copytree(home / "calm", out)
     first, second = sorted((out / ".cache" / "renders").glob("*.npz"))
@@ -200,7 +203,8 @@ def test_a_full_disk_ends_with_a_message_and_keeps_what_is_finished(home, tmp_pa
     monkeypatch.syspath_prepend(str(home / "plug_in"))
     experiment = load_experiment(home / "tiny.yaml", [REPEATS])
     plan = plan_of(experiment, home / "calm" / ".cache" / "renders")
-    real, written = os.write, []
+    real = os.write
+    written = []
 
     def write(file: int, content: bytes) -> int:
         if b'"key":"' in content:
@@ -220,11 +224,13 @@ def test_a_full_disk_ends_with_a_message_and_keeps_what_is_finished(home, tmp_pa
 
 
 def test_a_clock_that_jumps_changes_nothing(home, tmp_path, monkeypatch):
-    """The wall clock goes back a year and forth ten at every look: no limit is reached, no duration is negative."""
+    """The wall clock goes back a year and forth ten at every look: no limit is reached, no
+    duration is negative."""
     monkeypatch.syspath_prepend(str(home / "plug_in"))
     experiment = load_experiment(home / "tiny.yaml", [REPEATS])
     plan = plan_of(experiment, home / "calm" / ".cache" / "renders")
-    year, looks = 365 * 86400.0, iter(range(10**9))
+    year = 365 * 86400.0
+    looks = iter(range(10**9))
     monkeypatch.setattr(time, "time", lambda: 1.8e9 + year * (10 if next(looks) % 2 else -1))
     outcome = run_serially(plan, tmp_path)
     assert outcome.failures == []
@@ -247,7 +253,8 @@ def test_a_newer_journal_is_refused(home):
 
 
 def test_a_lost_render_costs_what_needs_it(home, tmp_path, monkeypatch):
-    """The damaged view cannot be rendered: hole-free trials end, the others are skipped, and run when it can be."""
+    """The damaged view cannot be rendered: hole-free trials end, the others are skipped, and run
+    when it can be."""
     from harness.runs import run as engine_run
 
     monkeypatch.syspath_prepend(str(home / "plug_in"))

@@ -1,4 +1,5 @@
-"""Detectors that learn on boards of their own, and studies over units of the camera, through the engine."""
+"""Detectors that learn on boards of their own, and studies over units of the camera, through the
+engine."""
 
 from __future__ import annotations
 
@@ -47,10 +48,8 @@ def plan_in(study_out: Path, folder: Path, *changes: str) -> SweepPlan:
 
 def study_of(study_out: Path, folder: Path, *changes: str, shards: int = 1) -> StudyRecord:
     """A study run serially in this process, its journal in ``folder``."""
-    experiment, plan = (
-        load_experiment(study_out.parent / "tiny.yaml", changes),
-        plan_in(study_out, folder, *changes),
-    )
+    experiment = load_experiment(study_out.parent / "tiny.yaml", changes)
+    plan = plan_in(study_out, folder, *changes)
     for number in range(shards if shards > 1 else 0):
         run_serially(plan, folder / "journal", shard=Shard(number + 1, shards))
     outcome = run_serially(plan, folder / "journal")
@@ -66,7 +65,8 @@ def group_in(study_out: Path, folder: Path, *changes: str) -> Group:
     return group
 
 
-# ---- learning --------------------------------------------------------------------------------------------------------
+# ---- learning
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_the_contract_of_a_detector_that_learns_is_checked() -> None:
@@ -111,7 +111,8 @@ def learned(study_out: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 
 def test_every_judge_uses_what_was_learned(learned, study_out):
-    """The scale is that of the learning boards, for every trial alike, and stands in the journal and in a file."""
+    """The scale is that of the learning boards, for every trial alike, and stands in the journal
+    and in a file."""
     folder, record = learned
     (file,) = folder.glob("learning-*.npz")
     with np.load(file) as arrays:
@@ -162,7 +163,8 @@ def test_a_detector_that_learns_nothing_costs_itself_only(study_out, tmp_path):
     assert all("runs" in record for record in records_of(tmp_path / "journal", outcome))
 
 
-# ---- units -----------------------------------------------------------------------------------------------------------
+# ---- units
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_unit_inspects_every_damaged_board_and_others_have_units_of_their_own(
@@ -232,7 +234,8 @@ def test_one_unit_is_said_first(study_out, tmp_path):
 
 @pytest.mark.slow  # three studies
 def test_one_blob_of_one_unit_decides_its_calibration_and_units_spread_it(study_out, tmp_path):
-    """With a fixed pattern alone, without noise, the same pixels of one unit are loudest on most boards."""
+    """With a fixed pattern alone, without noise, the same pixels of one unit are loudest on most
+    boards."""
     asked = ("source.camera.effects={noise: false}", *ONE_FRAME)
     records = (
         study_of(study_out, tmp_path / "one", *asked),

@@ -1,4 +1,5 @@
-"""Maps in the engine: errors of registrations, the truth on a map, and a sweep over views end to end."""
+"""Maps in the engine: errors of registrations, the truth on a map, and a sweep over views end to
+end."""
 
 from __future__ import annotations
 
@@ -38,14 +39,16 @@ T_CAMERA_BOARD = TARGET.pose.T_camera_board
 def map_of(
     height_m: float, *, step_m: float = 2e-3, missing: bool = False
 ) -> tuple[Cloud, np.ndarray]:
-    """A parallel map, its frame turned like the board, of a plane so far before the true face; and its frame."""
+    """A parallel map, its frame turned like the board, of a plane so far before the true face; and
+    its frame."""
     T_board_map = np.diag([1.0, -1.0, -1.0, 1.0])
     T_board_map[:3, 3] = 0.0, 0.0, 0.7
     x, y = np.meshgrid(np.arange(-70, 71) * step_m, np.arange(-45, 46) * step_m)
     points = np.stack([x, y, np.full(x.shape, 0.7 - height_m)], axis=-1)
     if missing:
         points[np.hypot(x - 0.05, y) < 8e-3] = np.nan
-    none, zeros = np.full(x.shape, np.nan), np.zeros(x.shape, np.uint8)
+    none = np.full(x.shape, np.nan)
+    zeros = np.zeros(x.shape, np.uint8)
     region = Region(0, x.shape[0], 0, x.shape[1])
     cloud = Cloud(points, zeros, zeros.astype(int), none, region, 0.0, 1, projection="parallel")
     return cloud, T_CAMERA_BOARD @ T_board_map

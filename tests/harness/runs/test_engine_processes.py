@@ -22,7 +22,8 @@ from tests.support.tiny_sweep import ROOT
 
 def run(engine: JobEngine, jobs: list[Job]) -> dict[str, Ended]:
     """All jobs, by name."""
-    waiting, found = list(jobs), {}
+    waiting = list(jobs)
+    found = {}
     with engine:
         while len(found) < len(jobs):
             while waiting and engine.room(waiting[0].stage) > 0:
@@ -127,7 +128,8 @@ with LocalEngine(1, Limits()) as engine:
 
 
 def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_in(tmp_path):
-    """A second `harness`, as another checkout has it, would be found first in the folder where a sweep is started."""
+    """A second `harness`, as another checkout has it, would be found first in the folder where a
+    sweep is started."""
     other = tmp_path / "harness" / "engine"
     other.mkdir(parents=True)
     for path in (other.parent / "__init__.py", other / "__init__.py", other / "trial.py"):
@@ -197,7 +199,8 @@ def test_time_in_which_everything_stood_still_is_not_counted(monkeypatch):
     from harness.runs import processes
 
     clock = {"ahead_s": 0.0}
-    real, real_poll = time.monotonic, Connection.poll
+    real = time.monotonic
+    real_poll = Connection.poll
     monkeypatch.setattr(processes.time, "monotonic", lambda: real() + clock["ahead_s"])
 
     def stopped(pipe: Connection, timeout: float = 0.0) -> bool:

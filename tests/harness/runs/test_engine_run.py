@@ -1,4 +1,5 @@
-"""The run loop with an engine that runs nothing and ends jobs in any order: no trial is lost, whatever happens when."""
+"""The run loop with an engine that runs nothing and ends jobs in any order: no trial is lost,
+whatever happens when."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ STATES: tuple[State, ...] = ("failed", "crashed", "timed out")
 
 
 class Pretended:
-    """An engine: records are made up from the task, jobs end in the order that ``seed`` draws, or badly by ``ends``."""
+    """An engine: records are made up from the task, jobs end in the order that ``seed`` draws, or
+    badly by ``ends``."""
 
     def __init__(
         self,
@@ -35,7 +37,9 @@ class Pretended:
         ends: Callable[[Job], State | None] = lambda job: None,
         factor: float = 1.0,
     ) -> None:
-        self._rng, self._ends, self._factor = random.Random(seed), ends, factor
+        self._rng = random.Random(seed)
+        self._ends = ends
+        self._factor = factor
         self._jobs: list[Job] = []
         self.begun: Counter[str] = Counter()
 
@@ -151,7 +155,9 @@ def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
     rng = random.Random(1)
     for number in range(3):
         folder = tmp_path / str(number)
-        kept, journal, source = 0, Journal(folder), Journal(tmp_path / "whole")
+        kept = 0
+        journal = Journal(folder)
+        source = Journal(tmp_path / "whole")
         for key in whole.finished:
             entry = source.read(key)
             assert entry is not None
@@ -220,13 +226,15 @@ def test_a_calibration_whose_process_dies_is_tried_once_more(tmp_path):
 
 
 def test_shards_that_finish_each_others_calibration(plan, tmp_path):
-    """While one shard works, another in the same folder does; in any order of events no judged trial is lost."""
+    """While one shard works, another in the same folder does; in any order of events no judged
+    trial is lost."""
     whole = go(plan, tmp_path / "whole", Pretended())
     for seed in range(3):
         folder = tmp_path / str(seed)
 
         def other_is_faster(job: Job, folder: Path = folder) -> None:
-            source, journal = Journal(tmp_path / "whole"), Journal(folder)
+            source = Journal(tmp_path / "whole")
+            journal = Journal(folder)
             for key in whole.finished:
                 entry = source.read(key)
                 if entry is not None and key.startswith(("calibration", "hole_free")):
@@ -251,8 +259,8 @@ def test_shards_that_finish_each_others_calibration(plan, tmp_path):
 
 
 def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Path:
-    """Two shards, each with a folder of its own, the second on a machine whose scores differ by a factor; merged into
-    a third folder."""
+    """Two shards, each with a folder of its own, the second on a machine whose scores differ by a
+    factor; merged into a third folder."""
     into = Journal(home / "into")
     for number, own in ((1, 1.0), (2, factor)):
         go(plan, home / str(number), Pretended(factor=own), shard=Shard(number, 2))
@@ -261,7 +269,8 @@ def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Pat
 
 
 def test_shards_of_unlike_machines_lose_no_work(plan, tmp_path):
-    """Their thresholds differ in the last digits: nothing is judged again, and all rows state the threshold in use."""
+    """Their thresholds differ in the last digits: nothing is judged again, and all rows state the
+    threshold in use."""
     whole = go(plan, tmp_path / "whole", Pretended())
     into = shards_of_unlike_machines(plan, tmp_path, 1 + 1e-9)
     joined = go(plan, into, Pretended())
@@ -305,11 +314,13 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
 
 
 def test_work_ahead_is_bounded(tmp_path, monkeypatch):
-    """However many repeats: a few thousand tasks are in memory, and the engine gets its first at once."""
+    """However many repeats: a few thousand tasks are in memory, and the engine gets its first at
+    once."""
     (tmp_path / "tiny.yaml").write_text(TINY)
     changes = ["repeats=100000", "threshold={k: 5.0}"]
     plan = plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path)
-    made, real = [], Group._key
+    made = []
+    real = Group._key
 
     class Stopped(Pretended):
         def ended(self) -> list[tuple[Job, Ended]]:

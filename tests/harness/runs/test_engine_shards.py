@@ -58,7 +58,8 @@ def test_shards_with_a_common_folder_share_the_calibration(home, tmp_path):
 
 
 def test_a_shard_takes_the_calibration_that_is_merged_into_its_folder(home, tmp_path):
-    """The second shard of two without a common folder runs no calibrating trial, and judges by the same thresholds."""
+    """The second shard of two without a common folder runs no calibrating trial, and judges by the
+    same thresholds."""
     study = plan(home)
     first = run_serially(study, tmp_path / "part1", shard=Shard(1, 2))
     merge.merge_into(Journal(tmp_path / "part2"), Journal(tmp_path / "part1"), Counter())
@@ -113,7 +114,8 @@ def test_the_same_shard_twice_or_beside_a_whole_sweep_is_refused(tmp_path):
         pass
 
 
-# ---- merging ---------------------------------------------------------------------------------------------------------
+# ---- merging
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

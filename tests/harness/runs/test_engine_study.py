@@ -1,4 +1,5 @@
-"""Studies through the engine: boards of their own for thresholds, what a board gives, the same numbers however run."""
+"""Studies through the engine: boards of their own for thresholds, what a board gives, the same
+numbers however run."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def written(folder: Path, text: str = STUDY) -> Path:
     return folder / "tiny.yaml"
 
 
-# ---- what an experiment may say --------------------------------------------------------------------------------------
+# ---- what an experiment may say
+# --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -73,10 +75,12 @@ def test_the_rate_of_false_calls_has_a_default_and_is_written_out(tmp_path):
 
 
 def test_more_boards_are_another_study_of_the_same_boards(tmp_path):
-    few, more = (load_experiment(written(tmp_path), ["study.boards=" + n]) for n in ("4", "6"))
+    few = load_experiment(written(tmp_path), ["study.boards=" + "4"])
+    more = load_experiment(written(tmp_path), ["study.boards=" + "6"])
     assert few.digest != more.digest
     assert [point.digest for point in few.points] == [point.digest for point in more.points]
-    a, b = (plan_of(one, tmp_path).groups[0].then for one in (few, more))
+    a = plan_of(few, tmp_path).groups[0].then
+    b = plan_of(more, tmp_path).groups[0].then
     assert {job.path for batch in a for job in batch.renders} < {
         job.path for batch in b for job in batch.renders
     }
@@ -90,7 +94,8 @@ def test_boards_differ_by_purpose_and_number_and_hole_free_ones_show_no_damage(t
     assert [batch.role for batch in group.then] == ["damaged"] * 4 + ["hole_free"] * 3
     assert len({batch.renders[0].path for batch in group.batches}) == 12
     for batch in group.batches:
-        shown, target = batch.renders[0].target, batch.set_ups[0].target
+        shown = batch.renders[0].target
+        target = batch.set_ups[0].target
         assert len(target.damages) == 5
         assert shown == (target if batch.role == "damaged" else target.hole_free())
 
@@ -123,22 +128,24 @@ def test_groups_that_differ_in_damage_share_their_trials_before_thresholds(tmp_p
         assert [group.leader for group in groups] == [None, None]
 
 
-# ---- thresholds ------------------------------------------------------------------------------------------------------
+# ---- thresholds
+# ------------------------------------------------------------------------------------------------------
 
 
 def point_with(**threshold: object) -> Point:
     calibrate = SimpleNamespace(**{"repeats": None, "false_calls_per_m2": None, **threshold})
     board = SimpleNamespace(width_mm=400.0, height_mm=300.0)
     target = SimpleNamespace(declare=lambda: SimpleNamespace(board=board))
-    threshold, source = SimpleNamespace(k=None, calibrate=calibrate), SimpleNamespace(target=target)
+    threshold = SimpleNamespace(k=None, calibrate=calibrate)
+    source = SimpleNamespace(target=target)
     return cast(
         "Point", SimpleNamespace(config=SimpleNamespace(threshold=threshold, simulated=source))
     )
 
 
 def test_a_study_s_threshold_is_set_by_the_wanted_rate():
-    """At 1 per m2 a run of 0.1 m2 calls with probability 0.0952. A new run exceeds the third highest of 39 with
-    probability 3 / 40, the fourth with 4 / 40, which is too often."""
+    """At 1 per m2 a run of 0.1 m2 calls with probability 0.0952. A new run exceeds the third
+    highest of 39 with probability 3 / 40, the fourth with 4 / 40, which is too often."""
     quiet = [(float(k), 0.1) for k in range(39)]
     assert threshold_of(point_with(false_calls_per_m2=1.0), quiet) == 36.0
     assert threshold_of(point_with(repeats=39), quiet) == 38.0
@@ -161,7 +168,8 @@ AT_5 = SimpleNamespace(get=lambda _digest, _given: 5.0)
 
 
 def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monkeypatch):
-    """With two numbers of frames, one of which no hole-free run of ends: the other is judged all the same."""
+    """With two numbers of frames, one of which no hole-free run of ends: the other is judged all
+    the same."""
 
     def faulty(task: TrialTask) -> object:
         if task.role == "calibration":
@@ -209,7 +217,8 @@ def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_pat
     assert "leaves none of the cloud's points" in said
 
 
-# ---- the whole study -------------------------------------------------------------------------------------------------
+# ---- the whole study
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -252,7 +261,8 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
 def judged(
     home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str
 ) -> tuple[StudyRecord, ResultTables]:
-    """A study run serially in this process, on the renders that are there, its journal in ``folder``."""
+    """A study run serially in this process, on the renders that are there, its journal in
+    ``folder``."""
     experiment = load_experiment(home / "tiny.yaml", changes)
     plan = plan_of(experiment, home / "out" / ".cache" / "renders")
     outcome = run_serially(plan, folder)
@@ -280,14 +290,16 @@ def test_a_serial_and_a_resumed_study_give_the_same_record(finished, tmp_path, m
     assert set_ups_of(resumed) == parallel
 
 
-# ---- two detectors that test the harness -----------------------------------------------------------------------------
+# ---- two detectors that test the harness
+# -----------------------------------------------------------------------------
 
 ONE_FRAME = ("sweep={}", "capture.frames=1")
 
 
 @pytest.mark.usefixtures("control_detectors")
 def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
-    """Handed the truth it finds every damage once and nothing else: whatever is less is a fault of the harness."""
+    """Handed the truth it finds every damage once and nothing else: whatever is less is a fault of
+    the harness."""
     oracle = "detector={name: oracle, settings: {}}"
     record, tables = judged(finished.parent, tmp_path, monkeypatch, *ONE_FRAME, oracle)
     result = evaluate_study(record, tables, {})
@@ -310,8 +322,9 @@ def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
 @pytest.mark.slow  # a Monte Carlo of 48 boards
 @pytest.mark.usefixtures("control_detectors")
 def test_the_blind_detector_scores_what_chance_gives(finished, tmp_path, monkeypatch):
-    """Its false calls per area are those of its own law at the threshold, its hits those of places laid anywhere: a
-    damage is hit where one guess or more falls within the radius, 1 - exp(-rate pi r^2), and no limit is shown.
+    """Its false calls per area are those of its own law at the threshold, its hits those of places
+    laid anywhere: a damage is hit where one guess or more falls within the radius, 1 - exp(-rate
+    pi r^2), and no limit is shown.
 
     Two-sided tests at 0.1 % each; the seed is fixed.
     """
@@ -324,7 +337,8 @@ def test_the_blind_detector_scores_what_chance_gives(finished, tmp_path, monkeyp
     )
     (of_one,) = record.set_ups
     rate_per_m2 = 400 * np.exp(-of_one.threshold)
-    calls, area_m2 = int(of_one.unflawed.calls.sum()), float(of_one.unflawed.area_m2.sum())
+    calls = int(of_one.unflawed.calls.sum())
+    area_m2 = float(of_one.unflawed.area_m2.sum())
     assert poisson_p(calls, rate_per_m2 * area_m2) > 1e-3
     by_chance = 1 - np.exp(-rate_per_m2 * np.pi * 0.015**2)
     hits = of_one.inspected.hit
@@ -347,9 +361,8 @@ def poisson_p(count: int, mean: float) -> float:
 def test_another_seed_of_the_noise_keeps_the_boards(finished, tmp_path):
     config = finished.parent / "tiny.yaml"
     cache = finished / ".cache" / "renders"
-    here, there = (
-        plan_of(load_experiment(config, changed), cache) for changed in ((), ("seed=4",))
-    )
+    here = plan_of(load_experiment(config, ()), cache)
+    there = plan_of(load_experiment(config, ("seed=4",)), cache)
     assert [job.path for job in here.renders] == [job.path for job in there.renders]
     keys = [
         {key for g in plan.groups for b in g.first for key, _ in g.trials(b, {})}

@@ -1,4 +1,5 @@
-"""The journal: few files for many trials, torn and altered lines left out, several writers, no links."""
+"""The journal: few files for many trials, torn and altered lines left out, several writers, no
+links."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def test_thousands_of_trials_are_in_few_files(tmp_path):
 
 @pytest.mark.parametrize("keep", range(0, 400, 37))
 def test_a_torn_end_costs_the_last_entry_only(tmp_path, keep):
-    """Whatever a crash leaves of the file: entries before are whole, and a later run writes a file of its own."""
+    """Whatever a crash leaves of the file: entries before are whole, and a later run writes a file
+    of its own."""
     filled(tmp_path, 3)
     (segment,) = tmp_path.iterdir()
     content = segment.read_bytes()
@@ -71,7 +73,8 @@ def test_a_later_entry_counts_unless_only_the_earlier_trial_is_done(tmp_path):
 
 
 def test_several_processes_write_and_see_each_others_entries_when_they_look(tmp_path):
-    first, second = Journal(tmp_path), Journal(tmp_path)
+    first = Journal(tmp_path)
+    second = Journal(tmp_path)
     first.write("a", done(1))
     assert second.read("a") == done(1)
     first.write("b", done(2))

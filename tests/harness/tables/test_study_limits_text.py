@@ -161,7 +161,8 @@ def test_what_all_set_ups_have_in_common_is_said_once(two: list[SetUpLimit]) -> 
 
 def test_where_everything_is_found_the_method_is_named(everything_found: SetUpLimit) -> None:
     row = row_of(everything_found)
-    # the smallest of 160 sizes from 1 to 14 mm: an upper limit of both estimates, and none of them has an interval
+    # the smallest of 160 sizes from 1 to 14 mm: an upper limit of both estimates, and none of them
+    # has an interval
     assert row["a50 (mm)"] == row["a90 (mm)"] == "≤\u00a01.00"
     assert row["a90/95 (mm)"] == size(everything_found.a90_95.value)
     assert notes_of(everything_found)[0].startswith("all found: binomial")
@@ -246,8 +247,8 @@ def test_few_targets_are_told() -> None:
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
 def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
-    """To two decimals, or to two significant digits of the estimate (of the upper end where that is 0), where the
-    interval is wider than a tenth of it."""
+    """To two decimals, or to two significant digits of the estimate (of the upper end where that
+    is 0), where the interval is wider than a tenth of it."""
     text = with_interval(value, value - down, value + up)
     numbers = [float(one) for one in re.findall(r"-?\d+(?:\.\d+)?", text)]
     assert np.allclose(

@@ -1,4 +1,5 @@
-"""The contract kit: what keeps the contract passes, and each check fails for a detector that breaks just that."""
+"""The contract kit: what keeps the contract passes, and each check fails for a detector that
+breaks just that."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ CLOUD = with_gaps(plane(seed=3), seed=4)
 
 
 class Sound(ScoreMapDetector[ScoreMapConfig]):
-    """A plane by least squares, refitted twice without what lies far off: the least that keeps the contract."""
+    """A plane by least squares, refitted twice without what lies far off: the least that keeps the
+    contract."""
 
     name = "sound"
     version = 1
@@ -79,7 +81,8 @@ def test_a_cloud_without_a_grid_can_be_checked_on() -> None:
     check_detector(Sound, clouds=[replace(CLOUD, **row, organised=False, lens=None)])
 
 
-# ---------------------------------------------------------------- one broken detector for each check
+# ---------------------------------------------------------------- one broken detector for each
+# check
 
 
 class NoVersion(Sound):

@@ -149,8 +149,11 @@ def test_guesses_are_those_of_the_seed_and_the_cloud() -> None:
 
 def test_guesses_are_as_many_as_stated_everywhere_alike_and_exponential() -> None:
     """400 clouds of 0.021 m^2: some 3,400 guesses at 400 per square metre."""
-    cloud, detector = plane(seed=1, tilt=0.0), blind()
-    rows, scores, area_m2 = [], [], 0.0
+    cloud = plane(seed=1, tilt=0.0)
+    detector = blind()
+    rows = []
+    scores = []
+    area_m2 = 0.0
     for seed in range(400):
         evidence = blind(seed=seed).analyse(cloud)
         found = detector.find(cloud, evidence, 0.0)
@@ -171,7 +174,8 @@ def test_guesses_do_not_look_at_depth() -> None:
     """Damaged pixels draw their share: 3.9 % of them are in a hole or on a bump."""
     cloud = plane(seed=1, tilt=0.0)
     damaged = np.abs(cloud.points_m[..., 2] - DISTANCE_M) > 3e-3
-    inside, total = 0, 0
+    inside = 0
+    total = 0
     for seed in range(300):
         places = np.flatnonzero(blind(seed=seed).analyse(cloud).score > 0)
         inside += int(damaged.reshape(-1)[places].sum())
@@ -181,7 +185,8 @@ def test_guesses_do_not_look_at_depth() -> None:
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_the_judged_area_is_the_faces(tilt: float) -> None:
-    """A plane z = d + t x cuts a ray of slope s at z = d / (1 - t s); its corners' quadrilateral, over its tilt."""
+    """A plane z = d + t x cuts a ray of slope s at z = d / (1 - t s); its corners' quadrilateral,
+    over its tilt."""
     cloud = plane(seed=1, tilt=tilt)
     h, w = SHAPE
     slopes = LENS.slopes(np.array([0, w - 1, w - 1, 0]), np.array([0, 0, h - 1, h - 1]))

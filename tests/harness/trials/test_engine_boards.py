@@ -28,7 +28,8 @@ from scenes.target.truth import face_of, truth_of
 
 
 def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud]:
-    """A board of 100 x 60 mm on a grid of 1 mm, two damages; the first's pixel scores 9, one far from both 5."""
+    """A board of 100 x 60 mm on a grid of 1 mm, two damages; the first's pixel scores 9, one far
+    from both 5."""
     target = TargetConfig.from_data(
         {
             "name": "custom",
@@ -42,7 +43,8 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud
     T_board_cloud = np.eye(4)
     x, y = np.meshgrid(np.arange(-49.5, 50) * 1e-3, np.arange(-29.5, 30) * 1e-3)
     points = np.stack([x, y, np.zeros(x.shape)], axis=-1)
-    none, zeros = np.full(x.shape, np.nan), np.zeros(x.shape, np.uint8)
+    none = np.full(x.shape, np.nan)
+    zeros = np.zeros(x.shape, np.uint8)
     region = Region(0, x.shape[0], 0, x.shape[1])
     cloud = Cloud(points, zeros, zeros.astype(int), none, region, 0.0, 1, projection="parallel")
     places = points[..., :2]
@@ -61,10 +63,8 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud
     score = np.zeros(x.shape)
     score[:, 90:] = np.nan
     score[29, 19], score[10, 50] = 9.0, 5.0
-    hit, call = (
-        Detection(score[at], np.array([at[0] * 100 + at[1]]), points[at])
-        for at in ((29, 19), (10, 50))
-    )
+    hit = Detection(score[29, 19], np.array([(29, 19)[0] * 100 + (29, 19)[1]]), points[29, 19])
+    call = Detection(score[10, 50], np.array([(10, 50)[0] * 100 + (10, 50)[1]]), points[10, 50])
 
     class Found:
         def find(self, cloud: Cloud, evidence: object, threshold: float) -> tuple[Detection, ...]:
@@ -171,7 +171,8 @@ def test_lines_of_sight_meet_a_sphere_where_they_should():
 
 def test_signals_are_the_highest_scores_within_the_radius():
     random = np.random.default_rng(0)
-    places, score = random.uniform(-0.05, 0.05, (17, 23, 2)), random.exponential(1.0, (17, 23))
+    places = random.uniform(-0.05, 0.05, (17, 23, 2))
+    score = random.exponential(1.0, (17, 23))
     places[random.random((17, 23)) < 0.1] = np.nan
     score[random.random((17, 23)) < 0.1] = np.nan
     score[0, 0] = np.inf
@@ -233,10 +234,8 @@ def test_the_margin_is_taken_off_as_by_plain_erosion():
 
 def test_lines_of_sight_meet_a_flat_face_where_they_should():
     board = BoardConfig(width_mm=200, height_mm=200, thickness_mm=5)
-    points, direction = (
-        np.array([[0.0, 0.0, 0.7], [0.1, 0.0, 0.6]]),
-        np.array([[0.1, -0.05, -1.0], [-0.15, 0.1, -0.9]]),
-    )
+    points = np.array([[0.0, 0.0, 0.7], [0.1, 0.0, 0.6]])
+    direction = np.array([[0.1, -0.05, -1.0], [-0.15, 0.1, -0.9]])
     met = met_on_face(points, direction, face_of(board))
     np.testing.assert_allclose(
         met, points - (points[:, 2] / direction[:, 2])[:, None] * direction, atol=1e-15

@@ -1,4 +1,5 @@
-"""How programs end: their own code, the user's mistake, Ctrl-C, a reader that leaves; a bug keeps its traceback."""
+"""How programs end: their own code, the user's mistake, Ctrl-C, a reader that leaves; a bug keeps
+its traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Atomic writing: whole or not at all, with a clear message where a folder or a disk is in the way."""
+"""Atomic writing: whole or not at all, with a clear message where a folder or a disk is in the
+way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Detectors and cameras by name, tofpod's own and those of other packages, and the program that lists them."""
+"""Detectors and cameras by name, tofpod's own and those of other packages, and the program that
+lists them."""
 
 from __future__ import annotations
 
@@ -211,7 +212,8 @@ def acme_camera(monkeypatch, tmp_path) -> Path:
 def test_a_packages_camera_is_read_like_any_other(acme_camera):
     assert {"acme_tof", "azure_kinect_nfov", "kinect_v2", "realsense_l515"} < set(camera_names())
     assert camera_file("acme_tof") == acme_camera
-    own, copied = load_camera("kinect_v2"), load_camera("acme_tof")
+    own = load_camera("kinect_v2")
+    copied = load_camera("acme_tof")
     assert copied.name == "acme_tof" and copied.to_data() == {**own.to_data(), "name": "acme_tof"}
 
 

@@ -103,7 +103,8 @@ def test_a_trial_reaches_what_it_runs_and_not_what_evaluates_or_draws() -> None:
 
 
 def test_a_source_that_is_edited_stays_what_this_process_has_loaded(project: Path) -> None:
-    """So that a worker that reads the edited source, or has loaded it, is found out whatever is asked later."""
+    """So that a worker that reads the edited source, or has loaded it, is found out whatever is
+    asked later."""
     forget()
     before = source_digest(("harness.trial",), ("numpy",))
     (project / "harness" / "engine" / "judge.py").write_text("K = 5\n")

@@ -1,4 +1,5 @@
-"""A package with a detector and a camera is built, installed into an environment of its own, listed and swept with."""
+"""A package with a detector and a camera is built, installed into an environment of its own,
+listed and swept with."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ repeats: 1
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new environment that sees this one's packages and has the third-party one installed."""
+    """The interpreter of a new environment that sees this one's packages and has the third-party
+    one installed."""
     home = tmp_path_factory.mktemp("third_party")
     subprocess.run(
         [sys.executable, "-m", "venv", "--without-pip", str(home / "venv")], check=True, timeout=900
@@ -126,7 +128,8 @@ def test_an_experiment_sweeps_with_its_detector_and_its_camera(
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "out" / "third_party").glob("[0-9a-f]*")
     trials = pd.read_parquet(folder / "trials.parquet")
-    # a hole of 14 pixels stands out from any mean of its surroundings, one of less than a pixel from none
+    # a hole of 14 pixels stands out from any mean of its surroundings, one of less than a pixel
+    # from none
     assert dict(zip(trials.hole, trials.detected, strict=True)) == {"1": False, "2": True}
 
 

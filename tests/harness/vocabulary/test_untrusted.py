@@ -1,4 +1,5 @@
-"""Data that somebody made to harm: no code in it is run, no file written elsewhere; each is one clear message."""
+"""Data that somebody made to harm: no code in it is run, no file written elsewhere; each is one
+clear message."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def limited() -> Iterator[None]:
         yield
 
 
-# ---- no code from data ----------------------------------------------------------------------------------------------
+# ---- no code from data
+# ----------------------------------------------------------------------------------------------
 
 FORBIDDEN = {
     "pickle.load", "pickle.loads", "pickle.Unpickler", "cPickle.load", "dill.load", "dill.loads", "cloudpickle.load",
@@ -45,11 +47,13 @@ FORBIDDEN = {
 LOADS = ("np.load", "numpy.load")
 SUSPECT = re.compile(rf"\b(?:{'|'.join(map(re.escape, FORBIDDEN))})\(|allow_pickle|YAML\(")
 ALLOWED = {("harness/testing/contract.py", "pickle.loads")}
-"""A detector that was pickled in the same line: the contract asks whether it can go to another process."""
+"""A detector that was pickled in the same line: the contract asks whether it can go to another
+process."""
 
 
 def forbidden_calls(text: str) -> set[str]:
-    """Calls in a source text that could run what a file holds; ``np.load`` with ``allow_pickle=False`` cannot."""
+    """Calls in a source text that could run what a file holds; ``np.load`` with
+    ``allow_pickle=False`` cannot."""
     found: set[str] = set()
     if not SUSPECT.search(text):  # to parse all sources takes seconds
         return found
@@ -130,7 +134,8 @@ def test_arrays_of_objects_are_not_unpickled(tmp_path, suffix):
     assert (tmp_path / "touched").exists(), "the file would have done it"
 
 
-# ---- YAML and JSON --------------------------------------------------------------------------------------------------
+# ---- YAML and JSON
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -148,7 +153,8 @@ def test_arrays_of_objects_are_not_unpickled(tmp_path, suffix):
 )
 def test_hostile_yaml(tmp_path, monkeypatch, text, told):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(yaml_source, "MAX_NODES", MAX_NODES // 10)  # the limit itself takes seconds
+    # the limit itself takes seconds
+    monkeypatch.setattr(yaml_source, "MAX_NODES", MAX_NODES // 10)
     path = tmp_path / "lens.yaml"
     path.write_text(text)
     message = refusal(lambda: read_yaml(path))
@@ -246,7 +252,8 @@ def test_a_setting_that_is_no_json_is_text(text):
     assert settings == {"a": {"b": text}}
 
 
-# ---- names ----------------------------------------------------------------------------------------------------------
+# ---- names
+# ----------------------------------------------------------------------------------------------------------
 
 NAMES = ["..", "../a", "a/b", "/etc/a", "a\\b", "", ".", "a\0b"]
 
@@ -258,7 +265,8 @@ def test_a_name_cannot_leave_the_folder(tmp_path, name):
 
 
 def test_a_link_cannot_leave_the_folder_but_may_be_it(tmp_path):
-    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    out = tmp_path / "out"
+    elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     out.mkdir()
     (out / "study").symlink_to(elsewhere)

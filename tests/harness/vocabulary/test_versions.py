@@ -1,4 +1,5 @@
-"""Every kind of file that a result folder holds says its version; a newer one is refused, and what is none, too."""
+"""Every kind of file that a result folder holds says its version; a newer one is refused, and what
+is none, too."""
 
 from __future__ import annotations
 
@@ -144,7 +145,8 @@ def test_a_comparison_and_its_page(tmp_path):
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_every_page_names_its_version(path):
-    page, name = template(path.name, path.parent), path.name
+    page = template(path.name, path.parent)
+    name = path.name
     source = page.environment.loader.get_source(page.environment, name)[0]
     assert (
         '<meta name="generator" content="{{ generator }}">' in source

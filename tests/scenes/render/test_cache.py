@@ -1,4 +1,5 @@
-"""Stored renders: nothing damaged or hostile is ever read as a view, and the cache's folder keeps within its limit."""
+"""Stored renders: nothing damaged or hostile is ever read as a view, and the cache's folder keeps
+within its limit."""
 
 from __future__ import annotations
 
@@ -89,7 +90,8 @@ def test_the_same_view_gives_the_same_bytes(stored, view, tmp_path):
 
 
 def test_flipped_bits_are_found_wherever_they_are(stored, view):
-    whole, rng = stored.read_bytes(), random.Random(1)
+    whole = stored.read_bytes()
+    rng = random.Random(1)
     for place in (0, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(60))):
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.randrange(8)
@@ -163,7 +165,9 @@ def test_folders_links_and_pipes_under_a_renders_name(stored, view, tmp_path):
 
 
 def test_a_damaged_render_is_rendered_again_and_a_found_one_is_not(tmp_path, view, monkeypatch):
-    target, config, rendered = ThesisTargetConfig().declare(), RenderConfig(), []
+    target = ThesisTargetConfig().declare()
+    config = RenderConfig()
+    rendered = []
     monkeypatch.setattr("scenes.target.mesh.build_target", lambda target: target)
     monkeypatch.setattr("scenes.render.view.render_view", lambda *_: rendered.append(1) or view)
     path = tmp_path / f"{render_key(target, CAMERA.optics, config)}.npz"

@@ -117,7 +117,8 @@ def test_light_outside_the_cone_is_none_and_the_roll_off_linear_in_the_cosine():
 
 
 def test_step_edge_mixes_phasors_by_area():
-    """A plate that covers part of a pixel: the phasor is the area-weighted sum of both planes' phasors."""
+    """A plate that covers part of a pixel: the phasor is the area-weighted sum of both planes'
+    phasors."""
     lens = CAMERA.nominal_lens
     from harness.vocabulary.geometry import Region
 
@@ -128,18 +129,20 @@ def test_step_edge_mixes_phasors_by_area():
     column = 322 - region.col0
     assert light.fine[:, column].all()
     roughly = np.ones(region.shape, bool)
-    slopes, footprint = lens.region_slopes(region), footprint_of(lens, region, None)
+    slopes = lens.region_slopes(region)
+    footprint = footprint_of(lens, region, None)
     rough = direct_light(lit, slopes, footprint, CAMERA.frequencies_hz, None, roughly)
     assert (
         not rough.fine.any()
     )  # 16 sub-rays lie in four columns: the edge is wrong by half of one at most
     assert np.abs(rough.coverage - light.coverage).max() < 1 / 8 + 1 / 256
     assert rough.off_face.share.max() == 1.0
-    near, far = (
-        light_on(scene_of(frontal(z)), lens, region).phasor[:, :, column] for z in (0.7, 0.75)
-    )
-    # the edge stands 0.3 px right of the pixel's left border; the lens sees a little of the far plane shadowed by the
-    # plate (emitter 14 mm to the left: 1 mm wide, 0.7 px), so between 0.3 and 1.0 px nothing comes back
+    near = light_on(scene_of(frontal(0.7)), lens, region).phasor[:, :, column]
+    far = light_on(scene_of(frontal(0.75)), lens, region).phasor[:, :, column]
+    # the edge stands 0.3 px right of the pixel's left border; the lens sees a little of the far
+    # plane shadowed by the plate (emitter 14 mm to the left: 1 mm wide, 0.7 px), so between 0.3
+    # and 1.0 px nothing comes
+    # back
     assert light.coverage[:, column] == pytest.approx(1 - 0.3, abs=1 / 16)
     shadow_px = (EMITTER[0] * -1 * 0.05 / 0.7) / (0.75 / lens.fx)
     lit_share = max(0.7 - shadow_px, 0)
@@ -148,7 +151,8 @@ def test_step_edge_mixes_phasors_by_area():
 
 
 def test_hole_walls_shadow_the_floor():
-    """Blind hole, floor lit exactly where the emitter sees it through the mouth: two circles' intersection."""
+    """Blind hole, floor lit exactly where the emitter sees it through the mouth: two circles'
+    intersection."""
     target = build_target(
         TargetConfig.from_data(
             {
@@ -176,7 +180,8 @@ def test_hole_walls_shadow_the_floor():
     grid = np.linspace(-0.019, 0.019, 41)
     x, y = (a.ravel() for a in np.meshgrid(grid, grid))
     keep = np.hypot(x, y) < 0.0185
-    x, y = x[keep], y[keep]
+    x = x[keep]
+    y = y[keep]
     hits = cast(scene_of(*target.parts, camera=camera), np.column_stack([x, y]) / 0.55)
     on_floor = np.abs(hits.range_m - 0.55 * np.sqrt(1 + (x**2 + y**2) / 0.55**2)) < 1e-5
     assert on_floor.mean() > 0.9
@@ -188,7 +193,8 @@ def test_hole_walls_shadow_the_floor():
 
 
 def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
-    """A 90-degree corner: floor y = 0.3 and wall z = 1; the wall's light by way of the floor, once reflected."""
+    """A 90-degree corner: floor y = 0.3 and wall z = 1; the wall's light by way of the floor, once
+    reflected."""
     wall = quad([[-1, -1, 1.0], [1, -1, 1.0], [1, 0.3, 1.0], [-1, 0.3, 1.0]], "wall", 0.8)
     floor = quad([[-1, 0.3, 0.2], [1, 0.3, 0.2], [1, 0.3, 1.0], [-1, 0.3, 1.0]], "floor", 0.6)
     lit = scene_of(wall, floor)
@@ -200,8 +206,10 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
         PathWork(CAMERA.frequencies_hz, 0, seed=3),
         65536,
     )
-    xs, zs = np.linspace(-1, 1, 1601), np.linspace(0.2, 1.0, 1601)
-    xs, zs = (xs[1:] + xs[:-1]) / 2, (zs[1:] + zs[:-1]) / 2
+    xs = np.linspace(-1, 1, 1601)
+    zs = np.linspace(0.2, 1.0, 1601)
+    xs = (xs[1:] + xs[:-1]) / 2
+    zs = (zs[1:] + zs[:-1]) / 2
     q = np.stack(np.broadcast_arrays(xs[None, :], 0.3, zs[:, None]), axis=-1)
     to_emitter = EMITTER - q
     leg = np.linalg.norm(to_emitter, axis=-1)
@@ -273,9 +281,11 @@ def test_thesis_view_is_whole(thesis_view):
 
 @pytest.mark.slow
 def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
-    """Eight gatherings with other seeds: the spread of the ranges is what each reports, within 35 %, inside the holes
-    where noise is white from pixel to pixel."""
-    target, optics, slopes = build_target(SMALL), CAMERA.optics, thesis_view.slopes
+    """Eight gatherings with other seeds: the spread of the ranges is what each reports, within 35
+    %, inside the holes where noise is white from pixel to pixel."""
+    target = build_target(SMALL)
+    optics = CAMERA.optics
+    slopes = thesis_view.slopes
     lit = lit_scene(load_mitsuba(), target.parts, optics, face_triangles(target))
     footprint = footprint_of(optics.lens, thesis_view.region, optics.beam_fwhm_rad)
     direct = direct_light(lit, slopes, footprint, optics.frequencies_hz)
@@ -299,7 +309,8 @@ def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
 
 
 def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
-    """Indirect light on the face: interpolation from nodes against a path tracer through the same pixels.
+    """Indirect light on the face: interpolation from nodes against a path tracer through the same
+    pixels.
 
     Compared as range over 300 pixels: within 4 standard errors of the difference and 0.02 mm."""
     target = build_target(SMALL)
@@ -323,8 +334,8 @@ def test_target_out_of_view_is_refused():
 
 
 def test_a_board_that_exceeds_the_view_is_rendered_as_far_as_it_is_seen():
-    """A plate larger than the field: its direct light is that of an endless plane, to the last pixel of the sensor, and
-    what lies within the view is as on a plate that ends inside."""
+    """A plate larger than the field: its direct light is that of an endless plane, to the last
+    pixel of the sensor, and what lies within the view is as on a plate that ends inside."""
     camera = load_camera("azure_kinect_nfov_binned")
     large = TargetConfig.from_data({
         "name": "custom",
@@ -336,7 +347,8 @@ def test_a_board_that_exceeds_the_view_is_rendered_as_far_as_it_is_seen():
     assert target_region(build_target(large), camera.optics) == camera.nominal_lens.whole
     view = render_view(build_target(large), camera.optics, RenderConfig(bounces=0))
     normal = large.pose.T_camera_board[:3, 2]
-    slope_x, slope_y = -normal[0] / normal[2], -normal[1] / normal[2]
+    slope_x = -normal[0] / normal[2]
+    slope_y = -normal[1] / normal[2]
     plane = plane_view(camera, camera.nominal_lens.whole, 0.6, 0.6, slope_x, slope_y)
     lit = ~hole_pixels(view, large) & (
         np.hypot(view.slopes[..., 0], view.slopes[..., 1]) < np.tan(np.deg2rad(34))
@@ -400,10 +412,12 @@ def test_no_llvm_at_all_names_what_to_install(monkeypatch, tmp_path):
 
 
 def test_direct_light_on_the_face_is_exact_to_ten_micrometres(thesis_view):
-    """4 x 4 strata (16 x 16 at edges) against 32 x 32 in every pixel of three strips, two of them with tape: range
-    from the fused phases, on the face away from holes and rim."""
+    """4 x 4 strata (16 x 16 at edges) against 32 x 32 in every pixel of three strips, two of them
+    with tape: range from the fused phases, on the face away from holes and rim."""
     target = build_target(SMALL)
-    lit, lens, region = scene_of(*target.parts), CAMERA.nominal_lens, thesis_view.region
+    lit = scene_of(*target.parts)
+    lens = CAMERA.nominal_lens
+    region = thesis_view.region
     f = np.array(CAMERA.frequencies_hz)[:, None]
     for top in (15, 30, 72):
         rows, cols = (

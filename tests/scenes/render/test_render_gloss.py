@@ -40,7 +40,8 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def test_direct_light_of_a_glossy_plane_is_that_of_the_closed_form():
-    gloss, normal = (0.4, 30.0), np.array([0.0, 0.0, -1.0])
+    gloss = (0.4, 30.0)
+    normal = np.array([0.0, 0.0, -1.0])
     wall = quad("board", [[-2, -2, 1], [2, -2, 1], [2, 2, 1], [-2, 2, 1]], 0.5, gloss)
     lit = lit_scene(load_mitsuba(), [wall], CAMERA.optics)
     lens = CAMERA.nominal_lens
@@ -60,13 +61,16 @@ def test_direct_light_of_a_glossy_plane_is_that_of_the_closed_form():
 
 @pytest.mark.parametrize("exponent", [1.0, 10.0, 200.0])
 def test_no_more_light_leaves_than_the_albedo_says(exponent: float):
-    """The lobe by itself, summed over the hemisphere: all of the light towards the normal, less at an angle."""
+    """The lobe by itself, summed over the hemisphere: all of the light towards the normal, less at
+    an angle."""
     rng = np.random.default_rng(5)
-    radius, turn = np.sqrt(rng.random(400_000)), 2 * np.pi * rng.random(400_000)
+    radius = np.sqrt(rng.random(400_000))
+    turn = 2 * np.pi * rng.random(400_000)
     light = np.stack(
         [radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], axis=-1
     )
-    normal, returned = np.array([0.0, 0.0, 1.0]), []
+    normal = np.array([0.0, 0.0, 1.0])
+    returned = []
     for angle in np.deg2rad([0, 30, 60, 85]):
         viewer = np.array([np.sin(angle), 0.0, np.cos(angle)])
         returned.append(lobe((1.0, exponent), normal, viewer, light).mean())
@@ -75,9 +79,11 @@ def test_no_more_light_leaves_than_the_albedo_says(exponent: float):
 
 
 def test_light_between_glossy_walls_is_that_of_an_independent_monte_carlo():
-    """A corner of two walls, one bounce more than the first; directions drawn evenly over the hemisphere here, by the
-    cosine there. The floor's own lobe, seen from the lens, counts too."""
-    gloss, albedo, rng = (0.6, 8.0), 0.5, np.random.default_rng(3)
+    """A corner of two walls, one bounce more than the first; directions drawn evenly over the
+    hemisphere here, by the cosine there. The floor's own lobe, seen from the lens, counts too."""
+    gloss = (0.6, 8.0)
+    albedo = 0.5
+    rng = np.random.default_rng(3)
     floor = quad(
         "board", [[-1, 0.3, 0.2], [1, 0.3, 0.2], [1, 0.3, 1.2], [-1, 0.3, 1.2]], albedo, gloss
     )
@@ -85,11 +91,9 @@ def test_light_between_glossy_walls_is_that_of_an_independent_monte_carlo():
         "wall", [[-1, -0.7, 1.2], [1, -0.7, 1.2], [1, 0.3, 1.2], [-1, 0.3, 1.2]], albedo, gloss
     )
     lit = lit_scene(load_mitsuba(), [floor, wall], CAMERA.optics)
-    place, up, out = (
-        np.array([0.0, 0.2999, 1.0]),
-        np.array([0.0, -1.0, 0.0]),
-        np.array([0.0, 0.0, -1.0]),
-    )
+    place = np.array([0.0, 0.2999, 1.0])
+    up = np.array([0.0, -1.0, 0.0])
+    out = np.array([0.0, 0.0, -1.0])
     work = PathWork(CAMERA.frequencies_hz, bounces=1, seed=4)
     traced = gather_at_points(lit, place[None], up[None], work, 65536)[:, -1, 0].real
 
@@ -112,7 +116,8 @@ def test_light_between_glossy_walls_is_that_of_an_independent_monte_carlo():
 
     def lit_directly(points: np.ndarray, normal: np.ndarray, viewer: np.ndarray) -> np.ndarray:
         way = EMITTER - points
-        distance, towards = np.linalg.norm(way, axis=-1), unit(way)
+        distance = np.linalg.norm(way, axis=-1)
+        towards = unit(way)
         cone = np.clip((-towards[:, 2] - lit.cos_cutoff) / (lit.cos_full - lit.cos_cutoff), 0, 1)
         return (
             albedo * cone * (towards @ normal) / distance**2 * lobe(gloss, normal, viewer, towards)

@@ -48,6 +48,7 @@ def test_a_gpu_renders_the_same_view(tmp_path):
         views.append(view)
     apart = np.abs(views[0].phasor - views[1].phasor) / np.abs(views[1].phasor).max()
     assert np.median(apart) < 1e-6
-    # a ray that grazes an edge may hit it in one variant only: one of 256 or more sub-rays, or one path, of few pixels
+    # a ray that grazes an edge may hit it in one variant only: one of 256 or more sub-rays, or one
+    # path, of few pixels
     assert np.mean(apart > 1e-4) < 0.01
     assert apart.max() < 0.05

@@ -17,9 +17,10 @@ pytestmark = pytest.mark.slow
 
 
 def test_holes_before_a_backing_are_right_within_a_fifth_of_a_millimetre():
-    """Some 60 pixels in through-holes 50 mm before a backing, 16,384 paths each in the reference: rms error (less the
-    reference's own) below 0.25 mm (0.2 mm over all pixels; a sample of 60 scatters by a tenth), mean within 4 standard
-    errors. The reported noise tells the rms within 40 %."""
+    """Some 60 pixels in through-holes 50 mm before a backing, 16,384 paths each in the reference:
+    rms error (less the reference's own) below 0.25 mm (0.2 mm over all pixels; a sample of 60
+    scatters by a tenth), mean within 4 standard errors. The reported noise tells the rms within 40
+    %."""
     target = build_target(
         ThesisTargetConfig.from_data({"name": "thesis", "backing_distance_mm": 50.0}).declare()
     )
@@ -34,7 +35,8 @@ def test_holes_before_a_backing_are_right_within_a_fifth_of_a_millimetre():
 
 
 def test_the_face_is_right_within_three_micrometres():
-    """Some 30 pixels of the hole-free face, away from tape: 131,072 paths each in the reference, itself 1.5 um."""
+    """Some 30 pixels of the hole-free face, away from tape: 131,072 paths each in the reference,
+    itself 1.5 um."""
     target = build_target(ThesisTargetConfig.from_data({"name": "thesis"}).declare().hole_free())
     optics = load_camera("azure_kinect_nfov").optics
     view = render_view(target, optics, RenderConfig(hole_samples=64, rest_samples=8))

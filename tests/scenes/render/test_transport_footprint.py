@@ -53,7 +53,8 @@ def half_plane(angle_rad: float, edge: float) -> TargetPart:
 
 @pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, 90.0, 133.0])
 def test_a_knife_edge_takes_the_gaussians_cumulative_shares(angle_deg):
-    """Light and coverage of beams around a plate's edge are Phi, in any direction, within 5 sub-rays of 256."""
+    """Light and coverage of beams around a plate's edge are Phi, in any direction, within 5
+    sub-rays of 256."""
     angle = np.deg2rad(angle_deg)
     lit = lit_scene(load_mitsuba(), (half_plane(angle, 0.0),), OPTICS)
     region = Region(143, 157, 193, 207)
@@ -69,7 +70,8 @@ def test_a_knife_edge_takes_the_gaussians_cumulative_shares(angle_deg):
 
 
 def test_an_oblique_beam_is_round_in_angle():
-    """At the field's corner: the spread of directions is the same in every direction across the beam."""
+    """At the field's corner: the spread of directions is the same in every direction across the
+    beam."""
     region = Region(0, 2, 0, 2)
     beams = Beams(LENS, region, DEVIATION_RAD)
     slopes = beams.slopes(np.zeros(1, int), np.zeros(1, int), beams.lattice())[0]
@@ -84,10 +86,8 @@ def test_an_oblique_beam_is_round_in_angle():
 
 
 def test_a_step_between_two_planes_mixes_phasors_by_the_beams_shares():
-    near, far = (
-        half_plane(0.0, 0.0),
-        part("far", [[-3, -3, 1.3], [3, -3, 1.3], [3, 3, 1.3], [-3, 3, 1.3]]),
-    )
+    near = half_plane(0.0, 0.0)
+    far = part("far", [[-3, -3, 1.3], [3, -3, 1.3], [3, 3, 1.3], [-3, 3, 1.3]])
     centred = replace(OPTICS, emitter_m=np.zeros(3))
     region = Region(148, 152, 195, 205)
     slopes = LENS.region_slopes(region)
@@ -111,12 +111,15 @@ def test_a_step_between_two_planes_mixes_phasors_by_the_beams_shares():
 @settings(max_examples=20, deadline=None)
 @given(st.integers(4, 40), st.floats(1e6, 5e7), st.floats(0, 2e8), st.integers(1, 40))
 def test_a_comb_is_summed_as_its_lines_one_by_one(lines, step, offset, m):
-    """In float32, whose unit roundoff is 6e-8: within the rounding of the phase, and of the recurrence. In each of its
-    steps, a complex product errs by at most sqrt(5) units, and the step's own sine and cosine by sqrt(2)."""
+    """In float32, whose unit roundoff is 6e-8: within the rounding of the phase, and of the
+    recurrence. In each of its steps, a complex product errs by at most sqrt(5) units, and the
+    step's own sine and cosine by sqrt(2)."""
     comb = tuple(offset + step * k for k in range(1, lines + 1))
     assert comb_step(comb) == pytest.approx(step, rel=1e-6)
-    rng, mi = np.random.default_rng(lines), load_mitsuba()
-    amplitude, path = (each.astype(np.float32) for each in (rng.random(m), 3 + rng.random(m)))
+    rng = np.random.default_rng(lines)
+    mi = load_mitsuba()
+    amplitude = rng.random(m).astype(np.float32)
+    path = (3 + rng.random(m)).astype(np.float32)
     totals = added([mi.Float(0.0)] * (2 * lines + 1), mi.Float(amplitude), mi.Float(path), comb)
     *parts, intensity = (each.numpy() for each in totals)
     phase = 2 * np.pi * np.array(comb)[:, None] / SPEED_OF_LIGHT_AIR * path
@@ -137,7 +140,8 @@ def test_uneven_frequencies_are_no_comb():
 
 @pytest.mark.slow  # a long reference
 def test_a_whole_view_of_a_comb_agrees_with_its_lines_alone():
-    """Indirect light by the recurrence in float32 against the same paths with separate sines: 1e-5 of the light."""
+    """Indirect light by the recurrence in float32 against the same paths with separate sines: 1e-5
+    of the light."""
     target = build_target(
         TargetConfig.from_data(
             {

@@ -29,7 +29,8 @@ BOTH = pytest.mark.parametrize(
 
 
 def optics_of(width: int, height: int, focal_px: float) -> Optics:
-    """A small lens and an emitter that shines in all directions alike, so that both programs have the same one."""
+    """A small lens and an emitter that shines in all directions alike, so that both programs have
+    the same one."""
     lens = Lens(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     return replace(
         CAMERA.optics,
@@ -53,9 +54,10 @@ def its_phasors(lit, optics, paths, histogram):
 
 
 def assert_agree(ours, theirs, here, largest_error):
-    """Light over pixels, each turned back by our phase: the relative difference at each frequency, in strength (real)
-    and phase (imaginary), lies within 5.4 standard errors (Student's t of 7 degrees of freedom: alpha 1e-3 a number,
-    6e-3 a comparison) and 2e-5, our own noise; and the errors are below ``largest_error``."""
+    """Light over pixels, each turned back by our phase: the relative difference at each frequency,
+    in strength (real) and phase (imaginary), lies within 5.4 standard errors (Student's t of 7
+    degrees of freedom: alpha 1e-3 a number, 6e-3 a comparison) and 2e-5, our own noise; and the
+    errors are below ``largest_error``."""
     back = np.conj(ours[:, here]) / np.abs(ours[:, here])
     mean = (theirs[:, :, here] * back).mean(axis=2) / np.abs(ours[:, here]).mean(axis=1)
     turned = np.ascontiguousarray(mean - 1).view(float)
@@ -131,9 +133,11 @@ def test_inside_a_blind_hole(histogram):
 @pytest.mark.slow
 @BOTH
 def test_the_thesis_scene(histogram):
-    """The board in its room, through-holes before a backing 50 mm behind: the face, and what is seen in the holes.
+    """The board in its room, through-holes before a backing 50 mm behind: the face, and what is
+    seen in the holes.
 
-    Without grain: at this resolution a pixel holds six texels across, of which our sub-rays meet four."""
+    Without grain: at this resolution a pixel holds six texels across, of which our sub-rays meet
+    four."""
     plain = {"name": "thesis", "backing_distance_mm": 50.0, "grain_contrast": 0.0}
     target = build_target(ThesisTargetConfig.from_data(plain).declare())
     optics = optics_of(192, 60, 190.0)

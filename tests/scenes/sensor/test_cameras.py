@@ -104,7 +104,8 @@ def test_a_camera_like_another_states_only_what_differs(tmp_path):
         OWN
         + "photons: {signal_electrons: {value: 600.0, tag: M, source: guess}}\nengine: {edge_threshold: null}\n"
     )
-    own, azure = load_camera(str(path)), load_camera("azure_kinect_nfov")
+    own = load_camera(str(path))
+    azure = load_camera("azure_kinect_nfov")
     assert (own.name, own.title) == ("own", "my own")
     assert (
         own.photons.signal_electrons.value == 600.0 and own.photons.band_nm == azure.photons.band_nm
@@ -347,7 +348,8 @@ def test_a_recordings_own_lens_takes_the_nominal_ones_place(shared_data):
     lens = camera_of(point.config.source.camera).optics.lens
     nominal = load_camera("azure_kinect_nfov").optics.lens
     assert lens.fx == numbers["lens.fx_px"] != nominal.fx
-    # five published units agree to 0.3 px in focal length and scatter by some 10 px in their centre
+    # five published units agree to 0.3 px in focal length and scatter by some 10 px in their
+    # centre
     assert abs(lens.fx - nominal.fx) < 1 and abs(lens.cx - nominal.cx) < 20
     with pytest.raises(UserError, match=r"512 x 424"):
         lens_numbers(recording, ["kinect_v2"])

@@ -15,7 +15,8 @@ from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.unit import frame_errors_m, smooth_field
 
-AZURE, V2 = "azure_kinect_nfov", "kinect_v2"
+AZURE = "azure_kinect_nfov"
+V2 = "kinect_v2"
 NEAR_AXIS = Region(180, 230, 220, 290)
 FINE = {
     "engine.output_step_mm": 1e-3,
@@ -117,9 +118,8 @@ def test_ambient_and_multipath_that_are_off_are_exactly_absent():
 
 def test_noise_keeps_its_draws_when_another_effect_is_switched():
     """So that what an effect costs is its difference and not another draw."""
-    with_offset, without = (
-        frames(unit_of(config(noise=True, unit_offset=on)), 4) for on in (True, False)
-    )
+    with_offset = frames(unit_of(config(noise=True, unit_offset=True)), 4)
+    without = frames(unit_of(config(noise=True, unit_offset=False)), 4)
     assert (with_offset - without).std() < 0.1 * without.std(axis=0).mean()
 
 
@@ -146,7 +146,8 @@ def test_harmonics_are_those_of_a_triangle_seen_at_n_phases(phases, most_mrad):
 
 @pytest.mark.parametrize("camera", [AZURE, V2])
 def test_wiggling_is_the_weighted_sum_of_its_frequencies(camera):
-    """In depth: the sum of metres per turn times the share that is left times each frequency's error of phase."""
+    """In depth: the sum of metres per turn times the share that is left times each frequency's
+    error of phase."""
     for distance_m in (0.62, 0.85, 1.31):
         unit = unit_of(config(camera, wiggling=True), distance_m)
         imager = AmcwImager(unit.camera, unit.config, unit.region, unit.view.slopes[unit.cut])
@@ -208,7 +209,8 @@ def test_drift_decays_and_tilts(minutes):
 
 
 def test_frames_jitter_and_jump_as_a_whole():
-    """Jitter by chi-square at alpha 0.001; of 300 frames, jumps as many as a binomial's 99.9 % interval allows."""
+    """Jitter by chi-square at alpha 0.001; of 300 frames, jumps as many as a binomial's 99.9 %
+    interval allows."""
     unit = unit_of(config(frame_jumps=True, numbers={"unit.jump_rate": 0.05}))
     z = frames(unit, 300)
     shift_mm = (z - frames(unit_of(config()))[0]) * stretch(unit) * 1e3
@@ -217,7 +219,8 @@ def test_frames_jitter_and_jump_as_a_whole():
     jumped = np.abs(mean_mm) > 10
     assert np.abs(mean_mm[jumped]) == pytest.approx(17.0, abs=1.5)
     assert stats.binom.ppf(0.0005, 300, 0.05) <= jumped.sum() <= stats.binom.ppf(0.9995, 300, 0.05)
-    statistic, calm = (mean_mm[~jumped] ** 2).sum() / 0.25**2, (~jumped).sum()
+    statistic = (mean_mm[~jumped] ** 2).sum() / 0.25**2
+    calm = (~jumped).sum()
     assert stats.chi2.ppf(0.0005, calm) < statistic < stats.chi2.ppf(0.9995, calm)
 
 
@@ -225,7 +228,8 @@ def test_frames_jitter_and_jump_as_a_whole():
 
 
 def test_ambient_electrons_by_hand():
-    """Of the emitter's own electrons at 1 m, 2.2 uW/cm2/nm x 20 nm = 0.44 W/m2 by 4 W/m2 is 0.11, times the albedo."""
+    """Of the emitter's own electrons at 1 m, 2.2 uW/cm2/nm x 20 nm = 0.44 W/m2 by 4 W/m2 is 0.11,
+    times the albedo."""
     settings = config(ambient=True).model_copy(update={"ambient_uw_cm2_nm": 2.2})
     for distance_m in (0.7, 2.8):
         unit = unit_of(settings, distance_m, albedo=0.5)
@@ -233,12 +237,14 @@ def test_ambient_electrons_by_hand():
             unit.model.ambient_electrons(unit.view, unit.view.intensity) / unit.model.gathered
         )
         own = unit.camera.photons.signal_electrons.value
-        # 0.998: the plane leans by 3 degrees; 5 %: seen up to 6 degrees more aslant, from an emitter beside the lens
+        # 0.998: the plane leans by 3 degrees; 5 %: seen up to 6 degrees more aslant, from an
+        # emitter beside the lens
         assert electrons == pytest.approx(0.11 * 0.5 * own * 0.998, rel=0.05)
 
 
 def test_ambient_adds_its_shot_noise():
-    """At 2 m and 2.2 uW/cm2/nm the surroundings give 0.11 x 2^2 of the own light: variances in that ratio."""
+    """At 2 m and 2.2 uW/cm2/nm the surroundings give 0.11 x 2^2 of the own light: variances in
+    that ratio."""
     quiet, bright = (
         frames(
             unit_of(
@@ -257,8 +263,9 @@ def test_ambient_adds_its_shot_noise():
 
 
 def test_sunlight_fills_the_wells():
-    """150 uW/cm2/nm are 7.5 times the emitter's light at 1 m: 7,900 electrons on a surface of 0.9, beside the 6,000 of
-    its own light at 0.42 m, leave 2,100 of the wells' 16,000 for samples of up to 0.87 x 6,000."""
+    """150 uW/cm2/nm are 7.5 times the emitter's light at 1 m: 7,900 electrons on a surface of 0.9,
+    beside the 6,000 of its own light at 0.42 m, leave 2,100 of the wells' 16,000 for samples of up
+    to 0.87 x 6,000."""
     sun = {"ambient_uw_cm2_nm": 150.0}
     for saturation, expected in ((True, Reason.SATURATED), (False, Reason.VALID)):
         settings = config(AZURE, ambient=True, saturation=saturation).model_copy(update=sun)
@@ -270,7 +277,8 @@ def test_sunlight_fills_the_wells():
 
 
 def test_near_bright_surfaces_saturate():
-    """White ones do below the least distance of use (0.5 m) and not from it on; with the effect off none does."""
+    """White ones do below the least distance of use (0.5 m) and not from it on; with the effect
+    off none does."""
     numbers = {"engine.min_range_mm": 50.0}
     near = unit_of(config(AZURE, numbers, fine=False, saturation=True), 0.14, albedo=1.0)
     assert (next(iter(near.capture(1, 1).frames())).reason == Reason.SATURATED).all()
@@ -281,8 +289,9 @@ def test_near_bright_surfaces_saturate():
 
 
 def test_an_exposure_that_ends_early_has_the_noise_of_what_it_holds():
-    """A white surface at 1 m would give a Kinect v2 14,000 electrons; the exposure ends at 5,700 of them, so samples
-    keep their size and scatter as if there were so many, and both wells' read noise grows as the scale does."""
+    """A white surface at 1 m would give a Kinect v2 14,000 electrons; the exposure ends at 5,700
+    of them, so samples keep their size and scatter as if there were so many, and both wells' read
+    noise grows as the scale does."""
     photons = load_camera(V2).photons
     for distance_m in (1.0, 2.5):
         unit = unit_of(config(V2, noise=True), distance_m, albedo=1.0)
@@ -306,20 +315,21 @@ def test_multipath_off_sees_the_direct_light_only():
     plain = unit_of(settings)
     lit = {"phasor": detour(plain.view), "intensity": plain.view.intensity * 1.1}
     lengthened = frames(unit_of(settings, **lit))[0] - frames(plain)[0]
-    # a tenth of the light on a way that is 0.15 m longer, one way, at most; less as the filter's phasor is no mean
+    # a tenth of the light on a way that is 0.15 m longer, one way, at most; less as the filter's
+    # phasor is no mean
     assert 2e-3 < lengthened.mean() < 15e-3
     assert np.array_equal(frames(unit_of(config(), **lit)), frames(plain))
     # and its photons are the direct light's alone
-    dim, bright = (
-        unit_of(config(noise=True, multipath=on), **lit).exposure.sigma for on in (False, True)
-    )
+    dim = unit_of(config(noise=True, multipath=False), **lit).exposure.sigma
+    bright = unit_of(config(noise=True, multipath=True), **lit).exposure.sigma
     own = unit_of(config(noise=True, multipath=True)).exposure.sigma
     assert dim == pytest.approx(own, rel=1e-5)
     assert (bright**2 / dim**2).mean() == pytest.approx(1.1, abs=0.01)
 
 
 def test_the_scanner_is_rid_of_all_indirect_light_too():
-    """Twice the light by multipath: with the effect off, noise and saturation are those of the direct part alone."""
+    """Twice the light by multipath: with the effect off, noise and saturation are those of the
+    direct part alone."""
     settings = config("realsense_l515", fine=False, noise=True)
     plain = unit_of(settings)
     lit = unit_of(settings, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity)
@@ -332,14 +342,16 @@ def test_the_scanner_is_rid_of_all_indirect_light_too():
 
 
 def test_saturated_neighbours_do_not_count():
-    """Beside a saturated half of the picture at the same distance a pixel keeps its range and its amplitude."""
+    """Beside a saturated half of the picture at the same distance a pixel keeps its range and its
+    amplitude."""
     settings = config(saturation=True, multipath=True)
     plain = unit_of(settings)
     bright = np.where(np.arange(plain.view.intensity.shape[1]) < 30, 1.0, 2000.0)
     unit = unit_of(
         settings, phasor=plain.view.phasor * bright, intensity=plain.view.intensity * bright
     )
-    one, other = (next(iter(u.capture(1, 1).frames())) for u in (unit, plain))
+    one = next(iter(unit.capture(1, 1).frames()))
+    other = next(iter(plain.capture(1, 1).frames()))
     dark = slice(0, 30 - (unit.region.col0 - unit.view.region.col0))
     assert (one.reason[:, dark.stop :] == Reason.SATURATED).all()
     assert (one.reason[:, dark] == Reason.VALID).all()
@@ -349,10 +361,12 @@ def test_saturated_neighbours_do_not_count():
 
 
 def test_ambient_light_of_a_mixed_pixel_is_that_of_its_nearest_surface():
-    """A rim at 0.7 m whose central ray passes to 2.5 m has half its neighbours' ambient light, not (2.5/0.7)^2 / 2."""
+    """A rim at 0.7 m whose central ray passes to 2.5 m has half its neighbours' ambient light, not
+    (2.5/0.7)^2 / 2."""
     settings = config(ambient=True)
     plain = unit_of(settings, distance_m=0.7)
-    range_m, coverage = plain.view.range_m.copy(), plain.view.coverage.copy()
+    range_m = plain.view.range_m.copy()
+    coverage = plain.view.coverage.copy()
     intensity = plain.view.intensity.copy()
     range_m[20, 30], coverage[20, 30], intensity[20, 30] = 2.5, 0.5, intensity[20, 30] / 2
     unit = unit_of(
@@ -376,7 +390,8 @@ def test_the_drift_goes_on_during_a_capture():
 @pytest.mark.parametrize("length_px", [0.4, 2.0, 12.0])
 def test_smooth_fields_have_unit_variance_at_any_length(length_px):
     field = smooth_field(np.random.default_rng(3).standard_normal((600, 600)), length_px)
-    # 360,000 pixels hold 360,000 / (4 pi (l^2 / 2)) independent ones: 400 at 12 px, whose deviation is known to 3.5 %
+    # 360,000 pixels hold 360,000 / (4 pi (l^2 / 2)) independent ones: 400 at 12 px, whose
+    # deviation is known to 3.5 %
     assert field.std() == pytest.approx(
         1.0, abs=3 * max(0.002, np.sqrt(2 * np.pi * length_px**2 / 720_000))
     )

@@ -1,4 +1,5 @@
-"""The Kinect v2 against what its published engine implies: noise, correlation, steps, edges, unwrapping."""
+"""The Kinect v2 against what its published engine implies: noise, correlation, steps, edges,
+unwrapping."""
 
 from __future__ import annotations
 
@@ -54,8 +55,11 @@ def test_the_window_leaves_a_third_of_the_noise():
     """0.334 by its weights; on the phases of each frequency, deviations over 40 frames within 2 %."""
     view = plane_view(V2, NEAR_AXIS, 1.0, 0.8, 0.05, 0.02)
     imager = AmcwImager(V2, NOISY, NEAR_AXIS, view.slopes)
-    exposure, rng, light = imager.expose(view), random_stream(3), view.phasor.conj()
-    before, after = [], []
+    exposure = imager.expose(view)
+    rng = random_stream(3)
+    light = view.phasor.conj()
+    before = []
+    after = []
     for _ in range(40):
         unit, amplitude, _ = imager.phasors(exposure, rng)
         filtered, _ = imager.filter(unit, amplitude, exposure.shape)
@@ -70,7 +74,8 @@ def test_the_window_leaves_a_third_of_the_noise():
 
 
 def test_noise_correlates_over_three_pixels():
-    """.68 and .32 along an axis, .46 along the diagonal, nothing at 3; without the rounding, which is white."""
+    """.68 and .32 along an axis, .46 along the diagonal, nothing at 3; without the rounding, which
+    is white."""
     settings = NOISY.model_copy(update={"numbers": {"engine.output_step_mm": 1e-3}})
     camera = camera_of(settings)
     region = Region(130, 280, 150, 350)
@@ -85,13 +90,15 @@ def test_noise_correlates_over_three_pixels():
 
 
 def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, float]:
-    """The filter's phasor and edge sum of a pixel of phase 0 and amplitude 500 beside a column of another phase."""
+    """The filter's phasor and edge sum of a pixel of phase 0 and amplitude 500 beside a column of
+    another phase."""
     phases = np.zeros((3, 3))
     phases[:, 0] = phase
     strength = np.full((3, 3), 500.0, f4)
     strength[:, 0] = amplitude
     unit = np.stack([np.cos(phases), np.sin(phases)]).astype(f4)
-    filtered, edge = np.empty((3, 3, 3), f4), np.empty((3, 3), f4)
+    filtered = np.empty((3, 3, 3), f4)
+    edge = np.empty((3, 3), f4)
     settings = kernels.FilterSettings(WINDOW.astype(f4), f4(3.6067), f4(3), True, True, True)
     kernels.filter_image(unit, strength, settings, filtered, edge)
     return complex(filtered[0, 1, 1], filtered[1, 1, 1]), float(edge[1, 1])
@@ -108,7 +115,8 @@ def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, fl
     ],
 )
 def test_weights_across_a_step(step_mm, weights):
-    """The published table: near steps are smoothed as by a box, far ones keep their edge at the high frequencies."""
+    """The published table: near steps are smoothed as by a box, far ones keep their edge at the
+    high frequencies."""
     for frequency_hz, expected in zip(V2.frequencies_hz, weights, strict=True):
         phase = 4 * np.pi * frequency_hz * step_mm * 1e-3 / SPEED_OF_LIGHT_AIR
         phasor, _ = filtered_beside(phase)
@@ -128,7 +136,8 @@ def two_planes(
 ) -> SimulatedUnit:
     """A step between two frontal planes at column 40, whose pixels see ``share`` of the near one."""
     camera = camera_of(config)
-    near, far = (plane_view(camera, NEAR_AXIS, d, 0.5) for d in (near_m, near_m + step_m))
+    near = plane_view(camera, NEAR_AXIS, near_m, 0.5)
+    far = plane_view(camera, NEAR_AXIS, near_m + step_m, 0.5)
     part = np.where(np.arange(NEAR_AXIS.shape[1]) < 40, 1.0, 0.0)
     part[40] = share
     mixed = {
@@ -161,11 +170,13 @@ def gate_open(config: CameraConfig) -> CameraConfig:
     ],
 )
 def test_flying_pixels_die_over_a_far_step_and_live_over_a_near_one(share, step_m, dead):
-    """The rule by hand on the range image without it: more than 50 mm behind, 30 before, 100 either."""
+    """The rule by hand on the range image without it: more than 50 mm behind, 30 before, 100
+    either."""
     unrounded = QUIET.model_copy(update={"numbers": SHARP | {"engine.output_step_mm": 1e-3}})
     z, _ = middle(two_planes(0.8, step_m, share, gate_open(unrounded)))
     assert np.isfinite(z).all()
-    near, far = z[1:-1] - np.minimum(z[:-2], z[2:]), np.maximum(z[:-2], z[2:]) - z[1:-1]
+    near = z[1:-1] - np.minimum(z[:-2], z[2:])
+    far = np.maximum(z[:-2], z[2:]) - z[1:-1]
     rule = 1 + np.flatnonzero((near > 0.05) & (far > 0.03) & (np.maximum(near, far) > 0.1))
     _, reason = middle(two_planes(0.8, step_m, share, unrounded))
     assert np.flatnonzero(reason == Reason.EDGE).tolist() == rule.tolist() == dead
@@ -182,7 +193,8 @@ def test_even_amplitudes_hide_a_flying_pixel():
 
 
 def test_the_edge_flag_needs_half_a_wavelength():
-    """Three neighbours sum 3 (1 - cos dphi)/2 >= 2.5 from 132 degrees on: 457 mm of step at 120 MHz."""
+    """Three neighbours sum 3 (1 - cos dphi)/2 >= 2.5 from 132 degrees on: 457 mm of step at 120
+    MHz."""
     limit_m = np.arccos(-2 / 3) / (4 * np.pi * 120e6) * SPEED_OF_LIGHT_AIR
     assert limit_m == pytest.approx(0.457, abs=0.001)
     only_edges = QUIET.model_copy(update={"numbers": SHARP | {"engine.flying_pixels.most_mm": 1e6}})
@@ -195,22 +207,26 @@ def test_the_edge_flag_needs_half_a_wavelength():
 
 
 def published_range_m(turn: np.ndarray) -> np.ndarray:
-    """The published procedure, step by step, on phases (80, 16, 120 MHz; n) in turns; lengths in c / 480 MHz."""
-    a, b, c = 3 * turn[0], 15 * turn[1], 2 * turn[2]
+    """The published procedure, step by step, on phases (80, 16, 120 MHz; n) in turns; lengths in c
+    / 480 MHz."""
+    a = 3 * turn[0]
+    b = 15 * turn[1]
+    c = 2 * turn[2]
     # 16 MHz says which of its five wraps 80 MHz is in, up to a multiple of 15
     a = a + 3 * np.round((b - a) / 3)
     # 120 MHz repeats every 2: an odd difference means the second half of 30
     odd = np.abs((a - c + 1) % 2) < 0.5
     odd |= np.abs((a - c + 1) % 2 - 2) < 0.5
-    a, b = a + 15 * odd, b + 15 * odd
+    a = a + 15 * odd
+    b = b + 15 * odd
     c = c + 2 * np.round((a - c) / 2)
     mean_of_cycles = (a / 3 + b / 15 + c / 2) / 3
     return mean_of_cycles * SPEED_OF_LIGHT_AIR / (2 * 72e6)
 
 
 def test_unwrapping_is_right_over_the_whole_range_and_equals_the_published_one():
-    """0.5 to 4.5 m: exact without noise, the right wraps with 0.02 turns of it, and with 0.06, where both often fail,
-    the same decisions wherever the residual's gate passes them."""
+    """0.5 to 4.5 m: exact without noise, the right wraps with 0.02 turns of it, and with 0.06,
+    where both often fail, the same decisions wherever the residual's gate passes them."""
     table = unwrap_table(V2.frequencies_hz, "mean")
     assert table.metres_per_turn * 1e3 == pytest.approx([693.8] * 3, abs=0.1)
     range_m = np.linspace(0.5, 4.5, 20_000)
@@ -220,7 +236,8 @@ def test_unwrapping_is_right_over_the_whole_range_and_equals_the_published_one()
             f4
         )
         published = published_range_m(turn.astype(float))
-        half, residual2 = np.empty(range_m.size, f4), np.empty(range_m.size, f4)
+        half = np.empty(range_m.size, f4)
+        residual2 = np.empty(range_m.size, f4)
         ranging.half_path(turn, range_m.size, table, half, residual2)
         if sigma == 0:
             assert np.abs(half - range_m).max() < 5e-6

@@ -39,7 +39,8 @@ def test_a_point_keeps_its_light_and_gets_the_declared_width():
 
 
 def test_stray_light_draws_a_near_patch_towards_its_surroundings():
-    """A tenth of the light from far and wide: the phasor of what is 1.5 times as near and small keeps nine tenths."""
+    """A tenth of the light from far and wide: the phasor of what is 1.5 times as near and small
+    keeps nine tenths."""
 
     def patch(camera):
         near = layered_view(
@@ -55,10 +56,12 @@ def test_stray_light_draws_a_near_patch_towards_its_surroundings():
     def far(camera):
         return plane_view(camera, REGION, 0.7, 0.6)
 
-    clean, stray = (z_of(patch, stray_share=share, stray_px=30.0) for share in (0.0, 0.1))
+    clean = z_of(patch, stray_share=0.0, stray_px=30.0)
+    stray = z_of(patch, stray_share=0.1, stray_px=30.0)
     middle = clean < 0.605
     assert middle.sum() > 20
     drawn = np.nanmedian(stray[middle]) - np.nanmedian(clean[middle])
-    # a tenth of light that is (0.6 / 0.7)^2 as strong and 0.1 m farther, by the smallest and largest frequency's rule
+    # a tenth of light that is (0.6 / 0.7)^2 as strong and 0.1 m farther, by the smallest and
+    # largest frequency's rule
     assert 0.002 < drawn < 0.012
     assert np.abs(z_of(far, stray_share=0.1, stray_px=30.0) - z_of(far)).max() < 0.0011

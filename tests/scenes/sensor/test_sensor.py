@@ -43,7 +43,8 @@ def test_noise_free_range_is_exact_up_to_rounding():
     truth = (unit.view.range_m / np.sqrt(1 + (unit.view.slopes**2).sum(-1)))[unit.cut]
     z = stack(unit, 1)[0]
     assert np.isfinite(z).all()
-    # half a millimetre of rounding, and what a 5x5 window makes of the plane's perspective curvature
+    # half a millimetre of rounding, and what a 5x5 window makes of the plane's perspective
+    # curvature
     assert np.abs(z - truth).max() < 0.5e-3 + 0.05e-3
 
 
@@ -81,16 +82,17 @@ def test_phase_noise_follows_the_closed_form():
 
 
 def expose(means, sigma, normals, knee=256.0, limit=32704.0, gains=(1.0,)):
-    """`kernels.expose` on (f, k, n) samples: unit phasors (2, f, n), amplitudes (f, n), saturated (n,)."""
+    """`kernels.expose` on (f, k, n) samples: unit phasors (2, f, n), amplitudes (f, n), saturated
+    (n,)."""
     f, k, n = means.shape
     steps = 2 * np.pi * np.arange(k) / k
-    unit, amplitude, saturated = (
-        np.empty((2, f, n), f4),
-        np.empty((f, n), f4),
-        np.empty(n, np.uint8),
-    )
-    limits, each = np.full(n, limit, f4), np.array(gains, f4)
-    cosines, sines = np.cos(steps).astype(f4), np.sin(steps).astype(f4)
+    unit = np.empty((2, f, n), f4)
+    amplitude = np.empty((f, n), f4)
+    saturated = np.empty(n, np.uint8)
+    limits = np.full(n, limit, f4)
+    each = np.array(gains, f4)
+    cosines = np.cos(steps).astype(f4)
+    sines = np.sin(steps).astype(f4)
     kernels.expose(
         means, sigma, limits, normals, f4(knee), each, cosines, sines, unit, amplitude, saturated
     )
@@ -98,11 +100,13 @@ def expose(means, sigma, normals, knee=256.0, limit=32704.0, gains=(1.0,)):
 
 
 def test_normals_are_normal():
-    """Kolmogorov-Smirnov at alpha 0.001 on 200,000 draws, against the transform in double precision, and the tails."""
+    """Kolmogorov-Smirnov at alpha 0.001 on 200,000 draws, against the transform in double
+    precision, and the tails."""
     bits = np.random.default_rng(8).integers(0, 2**32, 200_000, dtype=np.uint32)
     out = np.empty(200_000, f4)
     normals_from_bits(bits, out)
-    u, v = ((bits[:100_000] >> 8) + 0.5) / 2**24, (bits[100_000:] >> 8) / 2**24
+    u = ((bits[:100_000] >> 8) + 0.5) / 2**24
+    v = (bits[100_000:] >> 8) / 2**24
     radius = np.sqrt(-2 * np.log(u))
     turned = np.concatenate([radius * np.cos(2 * np.pi * v), radius * np.sin(2 * np.pi * v)])
     np.testing.assert_allclose(out, turned, rtol=0, atol=2e-5)
@@ -112,12 +116,16 @@ def test_normals_are_normal():
 
 @pytest.mark.parametrize("electrons", [40.0, 400.0])
 def test_normal_samples_match_true_poisson_wells(electrons):
-    """The real part of the demodulated phasor: two Poisson wells and two read noises against the kernel's normals.
+    """The real part of the demodulated phasor: two Poisson wells and two read noises against the
+    kernel's normals.
 
     Two-sample Kolmogorov-Smirnov at alpha 0.001 on 40,000 draws each, and variances within 3 %.
     """
     rng = np.random.default_rng(11)
-    n, contrast, phase, read = 40_000, 0.9, 0.7, 3.2
+    n = 40_000
+    contrast = 0.9
+    phase = 0.7
+    read = 3.2
     steps = 2 * np.pi * np.arange(3) / 3
     modulated = contrast * np.cos(phase - steps)[:, None]
     wells = rng.poisson(electrons * (1 + modulated) / 2, (3, n)) - rng.poisson(
@@ -175,9 +183,11 @@ def test_a_saturated_pixel_has_no_phasor():
     [(2, np.inf, False, False), (1, 3.0, True, True)],
 )
 def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, by_amplitude):
-    """Both cameras' variants, on a step of phase, against the formulas in NumPy; one pixel in eight is dim."""
+    """Both cameras' variants, on a step of phase, against the formulas in NumPy; one pixel in
+    eight is dim."""
     rng = np.random.default_rng(2)
-    h, w = 9, 14
+    h = 9
+    w = 14
     phase = np.where(np.arange(w) < 7, 0.3, 1.4) + 0.2 * rng.standard_normal((h, w))
     unit = np.stack([np.cos(phase), np.sin(phase)]).astype(f4)
     amplitude = (
@@ -186,7 +196,8 @@ def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, b
     amplitude[rng.random((h, w)) < 1 / 8] = 5.0
     offset = np.arange(-half, half + 1)
     space = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma_px**2))
-    filtered, edge = np.empty((3, h, w), f4), np.empty((h, w), f4)
+    filtered = np.empty((3, h, w), f4)
+    edge = np.empty((h, w), f4)
     settings = kernels.FilterSettings(
         space.astype(f4), f4(3.6067), f4(24), drop_dim, True, by_amplitude
     )
@@ -194,10 +205,8 @@ def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, b
     phasor = unit[0] + 1j * unit[1]
     for y in range(h):
         for x in range(w):
-            rows, columns = (
-                slice(max(y - half, 0), y + half + 1),
-                slice(max(x - half, 0), x + half + 1),
-            )
+            rows = slice(max(y - half, 0), y + half + 1)
+            columns = slice(max(x - half, 0), x + half + 1)
             near = rows, columns
             gap = 1 - np.real(phasor[near] * np.conj(phasor[y, x]))
             weight = np.ones_like(gap)
@@ -221,7 +230,8 @@ def test_bilateral_filter_equals_brute_force(bright, half, sigma_px, drop_dim, b
 
 
 def test_noise_is_as_smooth_as_a_box_of_five_makes_it():
-    """Correlation .80 .60 .40 .20 0 where phase noise is small; without the rounding, which is white."""
+    """Correlation .80 .60 .40 .20 0 where phase noise is small; without the rounding, which is
+    white."""
     step = CAMERA.engine.output_step_mm.model_copy(update={"value": 1e-3})
     fine = CAMERA.model_copy(
         update={"engine": CAMERA.engine.model_copy(update={"output_step_mm": step})}
@@ -236,11 +246,13 @@ def test_noise_is_as_smooth_as_a_box_of_five_makes_it():
 
 
 def unwrapped(table, half_path):
-    """Half the path (n,) that the kernel finds from exact wrapped phases, and its squared residual."""
+    """Half the path (n,) that the kernel finds from exact wrapped phases, and its squared
+    residual."""
     turn = np.ascontiguousarray(
         ((half_path[:, None] / table.unambiguous_m * table.lattice) % 1).T, f4
     )
-    half, residual2 = np.empty(half_path.size, f4), np.empty(half_path.size, f4)
+    half = np.empty(half_path.size, f4)
+    residual2 = np.empty(half_path.size, f4)
     ranging.half_path(turn, half_path.size, table, half, residual2)
     return half, residual2
 
@@ -260,7 +272,8 @@ def test_unwrapping_recovers_every_distance():
     "frequencies_mhz", [(20.0,), (100.0, 80.0), (80.0, 16.0), (31.0, 30.0, 12.5)]
 )
 def test_unwrapping_of_other_cameras(frequencies_mhz, fusion):
-    """One to three frequencies, up to the range after which all of them repeat: c / 2 by their greatest divisor."""
+    """One to three frequencies, up to the range after which all of them repeat: c / 2 by their
+    greatest divisor."""
     table = unwrap_table(tuple(f * 1e6 for f in frequencies_mhz), fusion)
     repeats_m = {(20.0,): 20, (100.0, 80.0): 20, (80.0, 16.0): 16, (31.0, 30.0, 12.5): 0.5}[
         frequencies_mhz
@@ -281,7 +294,8 @@ def test_emitter_beside_the_lens_is_corrected_for():
     region = Region(240, 280, 110, 150)
     unit = SimulatedUnit(CAMERA, QUIET, plane_view(CAMERA, region, 0.3, 0.3))
     z = stack(unit, 1)[0]
-    # uncorrected, half the path of a point seen 30 degrees off the axis at 0.35 m would be off by some 4 mm
+    # uncorrected, half the path of a point seen 30 degrees off the axis at 0.35 m would be off by
+    # some 4 mm
     assert np.abs(z - 0.3).max() <= 0.5e-3 + 1e-6
 
 
@@ -292,7 +306,8 @@ def test_fixed_pattern_has_the_size_and_length_of_its_facts():
     lens = CAMERA.nominal_lens
     imager = AmcwImager(CAMERA, config, lens.whole, lens.region_slopes(lens.whole))
     pattern = imager.static_error_m
-    smooth, pixel = CAMERA.fixed_pattern.smooth_mm.value, CAMERA.fixed_pattern.pixel_mm.value
+    smooth = CAMERA.fixed_pattern.smooth_mm.value
+    pixel = CAMERA.fixed_pattern.pixel_mm.value
     assert pattern.std() * 1e3 == pytest.approx(np.hypot(smooth, pixel), rel=0.05)
     for lag in (3, 6, 12):
         expected = smooth**2 * np.exp(-(lag**2) / (2 * 6.3**2))
@@ -302,7 +317,8 @@ def test_fixed_pattern_has_the_size_and_length_of_its_facts():
 
 
 def test_fixed_pattern_belongs_to_the_unit_not_to_the_region():
-    small, large = Region(300, 340, 300, 360), Region(290, 350, 280, 380)
+    small = Region(300, 340, 300, 360)
+    large = Region(290, 350, 280, 380)
     views = [plane_view(CAMERA, region, 0.8, 0.6, 0.05, 0.02) for region in (small, large)]
     a, b = (
         SimulatedUnit(
@@ -322,9 +338,8 @@ def test_two_files_that_bear_one_name_have_their_own_pattern():
     config = CameraConfig(effects=NO_EFFECTS.model_copy(update={"fixed_pattern": True}))
     region = CAMERA.nominal_lens.whole
     slopes = CAMERA.nominal_lens.region_slopes(region)
-    own, wider = (
-        AmcwImager(each, config, region, slopes).static_error_m.std() for each in (CAMERA, other)
-    )
+    own = AmcwImager(CAMERA, config, region, slopes).static_error_m.std()
+    wider = AmcwImager(other, config, region, slopes).static_error_m.std()
     assert wider > 1.5 * own
 
 
@@ -336,7 +351,8 @@ def test_a_changed_number_changes_what_follows_from_it():
 
 def test_shorter_captures_are_prefixes_and_streams_are_repeatable():
     unit = unit_at(0.8)
-    long, short = stack(unit, 4), stack(unit, 2)
+    long = stack(unit, 4)
+    short = stack(unit, 2)
     assert np.array_equal(long[:2], short)
     assert not np.array_equal(long[0], long[1])
     assert not np.array_equal(stack(unit, 1, seed=2)[0], long[0])
@@ -359,7 +375,8 @@ def test_each_gate_names_its_reason():
 
 def test_mixed_phasors_are_told_by_residual_ratio_or_edge():
     view = plane_view(CAMERA, NEAR_AXIS, 0.7, 0.6)
-    # a step of 0.6 m is nearly a whole turn of the two higher frequencies, and the gate hardly sees it
+    # a step of 0.6 m is nearly a whole turn of the two higher frequencies, and the gate hardly
+    # sees it
     far = plane_view(CAMERA, NEAR_AXIS, 1.1, 0.6)
     columns = np.arange(NEAR_AXIS.shape[1])
     share = np.clip((columns - 39.5) / 1.0, 0, 1)
@@ -376,7 +393,8 @@ def test_mixed_phasors_are_told_by_residual_ratio_or_edge():
 
 
 def test_more_light_less_noise():
-    """Shot-limited: four times the light halves the deviation (rounding and read noise allow 10 %)."""
+    """Shot-limited: four times the light halves the deviation (rounding and read noise allow 10
+    %)."""
     dim, bright = (
         temporal_sigma_m(with_number(CAMERA, "photons", "signal_electrons", e), 2.5, 0.5, 60, 1)
         for e in (1000, 4000)

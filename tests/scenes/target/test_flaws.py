@@ -1,4 +1,5 @@
-"""Kinds of damage as depths over a frame of their own: volumes, outlines, refusals, families, what counts as a hit."""
+"""Kinds of damage as depths over a frame of their own: volumes, outlines, refusals, families, what
+counts as a hit."""
 
 from __future__ import annotations
 
@@ -96,14 +97,13 @@ def test_volumes_on_bent_boards(board: dict[str, Any]) -> None:
 
 
 def test_a_sheet_pressed_deeper_than_it_is_thick_stays_whole() -> None:
-    """Front and back move by the same depth: the sheet keeps its volume, and its front is displaced as declared."""
+    """Front and back move by the same depth: the sheet keeps its volume, and its front is
+    displaced as declared."""
     sheet = {**BOARD, "thickness_mm": 0.8}
     for kind, sign in (("pressed_dent", -1.0), ("pressed_bump", 1.0)):
         built = build_target(target({**DENT, "kind": kind}, board=sheet))
-        mesh, whole = (
-            board_solid(built.config, built.truth),
-            board_solid(built.config.hole_free(), ()),
-        )
+        mesh = board_solid(built.config, built.truth)
+        whole = board_solid(built.config.hole_free(), ())
         assert mesh.is_watertight
         assert mesh.euler_number == 2
         assert mesh.volume == pytest.approx(whole.volume, rel=1e-6)
@@ -124,10 +124,8 @@ def test_corrosion_has_the_stated_statistics() -> None:
 
 def test_outline_tells_inside_from_outside() -> None:
     (truth,) = truth_of(target({**SLOT, "angle_deg": 90.0}), np.eye(4))
-    x, y = (
-        np.array([20.0, 20.0, 22.0, 20.0, 60.0]) * 1e-3,
-        np.array([10.0, 39.0, 10.0, 41.0, 10.0]) * 1e-3,
-    )
+    x = np.array([20.0, 20.0, 22.0, 20.0, 60.0]) * 1e-3
+    y = np.array([10.0, 39.0, 10.0, 41.0, 10.0]) * 1e-3
     assert truth.within(x, y).tolist() == [True, True, False, False, False]
     assert truth.within(x, y, 1.1e-3).tolist() == [True, True, True, True, False]
     assert (truth.length_m, truth.width_m) == pytest.approx((0.06, 0.003))
@@ -192,7 +190,8 @@ def test_a_rough_board_has_its_deviation_and_every_board_its_own_face() -> None:
     board = {**BOARD, "thickness_mm": 40.0, "shape": {"kind": "rough", "deviation_mm": 0.4}}
     family = target_from_data({"name": "drawn", "damage": damage, "board": board, "apart_mm": 60.0})
     assert isinstance(family, DrawnTargetConfig)
-    first, second = (family.drawn("damaged", number) for number in (0, 1))
+    first = family.drawn("damaged", 0)
+    second = family.drawn("damaged", 1)
     x, y = np.meshgrid(np.linspace(-0.14, 0.14, 200), np.linspace(-0.09, 0.09, 150))
     heights = [face_of(one.board).height_m(x, y) for one in (first, second)]
     assert [each.std() * 1e3 for each in heights] == pytest.approx([0.4, 0.4], rel=0.25)
@@ -245,10 +244,12 @@ def test_every_drawn_board_can_be_built_and_is_drawn_again_alike(damage: dict[st
 
 
 def known_slot() -> KnownCloud:
-    """A flat board seen straight on, a pixel each millimetre, with a slot along x about (20, 10) mm."""
+    """A flat board seen straight on, a pixel each millimetre, with a slot along x about (20, 10)
+    mm."""
     config = target({**SLOT, "angle_deg": 0.0})
     x, y = np.meshgrid(np.arange(-149.5, 150) * 1e-3, np.arange(-99.5, 100) * 1e-3)
-    points, zeros = np.stack([x, y, np.zeros(x.shape)], axis=-1), np.zeros(x.shape, np.uint8)
+    points = np.stack([x, y, np.zeros(x.shape)], axis=-1)
+    zeros = np.zeros(x.shape, np.uint8)
     region = Region(0, x.shape[0], 0, x.shape[1])
     cloud = Cloud(
         points,
@@ -277,8 +278,10 @@ def finding(known: KnownCloud, x_mm: tuple[float, float], y_mm: tuple[float, flo
 def test_what_counts_for_a_slot() -> None:
     """The slot lies from x = -10 to 50 mm at y = 10 mm."""
     known = known_slot()
-    end, middle = finding(known, (38, 50), (8, 12)), finding(known, (0, 20), (8, 12))
-    beside, away = finding(known, (0, 20), (16, 24)), finding(known, (0, 20), (40, 44))
+    end = finding(known, (38, 50), (8, 12))
+    middle = finding(known, (0, 20), (8, 12))
+    beside = finding(known, (0, 20), (16, 24))
+    away = finding(known, (0, 20), (40, 44))
     assert matched(known, [end], 5e-3, None) == (
         {0: 0},
         0,
@@ -288,7 +291,8 @@ def test_what_counts_for_a_slot() -> None:
     # the second piece of a slot is a false call by its centre alone, a part of the slot by overlap
     assert matched(known, [end, middle], 15e-3, None)[1] == 0
     assert matched(known, [end, middle], 15e-3, 0.5)[1] == 1
-    # a wide finding whose centre lies off the line still counts where half of it lies on the slot, and not otherwise
+    # a wide finding whose centre lies off the line still counts where half of it lies on the slot,
+    # and not otherwise
     wide = finding(known, (0, 20), (6, 20))
     assert matched(known, [wide], 1e-3, None) == ({}, 0)
     assert matched(known, [wide], 1e-3, 0.4) == ({0: 0}, 0)
@@ -297,12 +301,14 @@ def test_what_counts_for_a_slot() -> None:
 
 
 def slot_seen(angle_deg: float, length_mm: float, width_mm: float) -> Measurement:
-    """A slot 6 mm deep in a plane at 0.7 m, seen by pixels of 1 mm through a window of 5, with little noise."""
+    """A slot 6 mm deep in a plane at 0.7 m, seen by pixels of 1 mm through a window of 5, with
+    little noise."""
     u, v = np.meshgrid(np.arange(-60, 61) * 1.0, np.arange(-50, 51) * 1.0)
     turn = np.deg2rad(angle_deg)
     fine = np.repeat(np.repeat(np.zeros(u.shape), 4, axis=0), 4, axis=1)
     y, x = (np.indices(fine.shape) + 0.5) / 4 - 0.5 - np.array([50, 60])[:, None, None]
-    s, t = x * np.cos(turn) + y * np.sin(turn), -x * np.sin(turn) + y * np.cos(turn)
+    s = x * np.cos(turn) + y * np.sin(turn)
+    t = -x * np.sin(turn) + y * np.cos(turn)
     inside = (np.abs(s) < length_mm / 2) & (np.abs(t) < width_mm / 2)
     depth = uniform_filter(inside.reshape(101, 4, 121, 4).mean(axis=(1, 3)), 5) * 6e-3
     depth += np.random.default_rng(1).normal(0, 5e-5, depth.shape)
@@ -373,7 +379,8 @@ def test_damage_lies_on_the_front_of_a_mesh(tmp_path: Path) -> None:
         sum(one.volume_m3 * (-1 if one.raised else 1) for one in built.truth), rel=5e-3
     )
     face = face_of(config.board)
-    x, y = np.array([0.0, 60e-3, 0.0]), np.array([0.0, 0.0, 40e-3])
+    x = np.array([0.0, 60e-3, 0.0])
+    y = np.array([0.0, 0.0, 40e-3])
     expected = 50e-3 * (np.sqrt(1 - (x / 0.1) ** 2 - (y / 0.08) ** 2) - 1)
     assert np.allclose(face.height_m(x, y), expected, atol=2e-4)
     assert np.isnan(face.height_m(0.11, 0.0))
@@ -412,11 +419,10 @@ def test_meshes_that_cannot_be_used_are_refused_with_the_place(tmp_path: Path) -
 
 
 def test_crossing_triangles_are_those_that_pierce_each_other() -> None:
-    flat, upright = (
-        np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0.0]]),
-        np.array([[1, 1, -1], [1, 1, 1], [9, 9, 0.0]]),
-    )
-    touching, far = upright + np.array([0, 0, 1]), flat + np.array([20, 0, 0])
+    flat = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0.0]])
+    upright = np.array([[1, 1, -1], [1, 1, 1], [9, 9, 0.0]])
+    touching = upright + np.array([0, 0, 1])
+    far = flat + np.array([20, 0, 0])
     assert crossing(np.stack([flat, far, upright])).tolist() == [0, 2]
     assert not crossing(np.stack([flat, far, touching])).size
     assert not crossing(trimesh.creation.icosphere(subdivisions=3).triangles).size

@@ -46,7 +46,8 @@ def test_thesis_blind_and_without_surroundings() -> None:
 
 
 def test_thesis_tape_is_told_by_its_red_channel() -> None:
-    """Red above mean + 2.6 standard deviations of the face finds the tape and nothing else, as the source demands."""
+    """Red above mean + 2.6 standard deviations of the face finds the tape and nothing else, as the
+    source demands."""
     from scenes.target.mesh import build_target
 
     target = build_target(ThesisTargetConfig().declare())

@@ -1,4 +1,5 @@
-"""Families of boards: every board legal, each quantity from its own stream, sizes uniform, too full boards refused."""
+"""Families of boards: every board legal, each quantity from its own stream, sizes uniform, too
+full boards refused."""
 
 from __future__ import annotations
 
@@ -112,8 +113,8 @@ def test_every_board_can_be_built(
 )
 @pytest.mark.parametrize("kind", ["through", "dent"])
 def test_crowded_boards_of_bent_faces_can_be_built(shape: dict[str, Any], kind: str) -> None:
-    """As near to one another and to the edge as may be declared: holes through boards so thick that their axes come
-    together, dents so shallow that a face that bends away widens them."""
+    """As near to one another and to the edge as may be declared: holes through boards so thick
+    that their axes come together, dents so shallow that a face that bends away widens them."""
     thickness_mm = {"through": 95.0, "dent": 3.0}[kind]
     board = {"width_mm": 304.8, "height_mm": 203.2, "thickness_mm": thickness_mm, "shape": shape}
     damage: dict[str, Any] = {"kind": kind, "per_board": 40, "diameter_mm": [10.0, 10.0]}
@@ -164,10 +165,8 @@ def test_no_two_boards_are_alike() -> None:
 )
 def test_an_axis_keeps_places_sizes_and_tilts(changed: dict[str, Any]) -> None:
     for number in range(3):
-        before, after = (
-            family().drawn("damaged", number),
-            family(**changed).drawn("damaged", number),
-        )
+        before = family().drawn("damaged", number)
+        after = family(**changed).drawn("damaged", number)
         assert places(after) == places(before)
         assert sizes(after) == sizes(before)
         assert after.material.grain_seed == before.material.grain_seed
@@ -181,16 +180,15 @@ def test_an_axis_keeps_places_sizes_and_tilts(changed: dict[str, Any]) -> None:
 
 def test_wider_limits_stretch_the_same_draw() -> None:
     """Tilts of twice the limit are twice the tilts: set-ups of an axis of tilts are paired too."""
-    narrow, wide = (
-        family(tilt_deg=5.0).drawn("damaged", 4),
-        family(tilt_deg=10.0).drawn("damaged", 4),
-    )
+    narrow = family(tilt_deg=5.0).drawn("damaged", 4)
+    wide = family(tilt_deg=10.0).drawn("damaged", 4)
     assert wide.pose.tilt_x_deg == pytest.approx(2 * narrow.pose.tilt_x_deg)
     assert places(wide) == places(narrow)
 
 
 def test_depths_of_one_kind_do_not_move_those_of_another() -> None:
-    """A fixed depth is that depth; a range is covered evenly by each board, apart from the sizes' order."""
+    """A fixed depth is that depth; a range is covered evenly by each board, apart from the sizes'
+    order."""
     assert {
         one.depth_mm for one in family(damage={**BLIND, "depth_mm": [4.0, 4.0]}).declare().holes
     } == {4.0}
@@ -201,7 +199,8 @@ def test_depths_of_one_kind_do_not_move_those_of_another() -> None:
 
 @pytest.mark.parametrize("law", ["uniform", "log"])
 def test_sizes_are_uniform_and_each_board_has_one_of_each_part(law: str) -> None:
-    """Within its part of the range, each size is uniform (Kolmogorov and Smirnov), and no two parts are correlated."""
+    """Within its part of the range, each size is uniform (Kolmogorov and Smirnov), and no two
+    parts are correlated."""
     drawn = family(damage={**THROUGH, "sizes": law})
     quantiles = np.array([sizes(drawn.drawn("damaged", n)) for n in range(300)])
     low, high = (2.0, 12.0) if law == "uniform" else np.log((2.0, 12.0))
@@ -261,14 +260,16 @@ def test_size_does_not_depend_on_place() -> None:
 
 
 def test_a_dent_is_as_deep_as_its_radius_allows() -> None:
-    """At 2 mm wide depths are uniform from 0.5 to 1 mm, at 12 mm from 0.5 to 3 mm: no pile at either limit."""
+    """At 2 mm wide depths are uniform from 0.5 to 1 mm, at 12 mm from 0.5 to 3 mm: no pile at
+    either limit."""
     narrow = family(damage={**DENT, "per_board": 1, "diameter_mm": [2.0, 2.0]})
     depths = [narrow.drawn("damaged", n).dents[0].depth_mm for n in range(200)]
     assert stats.kstest(depths, stats.uniform(0.5, 0.5).cdf).pvalue > ALPHA
 
 
 def test_backing_fills_every_hole_in_every_pose() -> None:
-    """Through any point of the face the camera sees the backing, whatever the pose; at zero tilt that is no news."""
+    """Through any point of the face the camera sees the backing, whatever the pose; at zero tilt
+    that is no news."""
     drawn = family(tilt_deg=25.0, backing={"distance_mm": 150.0})
     config = drawn.declare()
     assert config.backing is not None

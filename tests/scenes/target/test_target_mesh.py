@@ -83,7 +83,8 @@ def removed_m3(config: TargetConfig, sagitta_m: float) -> list[float]:
     return removed
 
 
-# ---- volumes ---------------------------------------------------------------------------------------------------------
+# ---- volumes
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_thesis_board_is_watertight_and_each_hole_has_its_volume() -> None:
@@ -118,10 +119,8 @@ def test_a_chamfer_takes_a_cone_off_the_edge(kind: Any, depth_mm: float | None) 
     )
     config = target(holes=(hole,))
     built = build_target(config)
-    cylinder, cone = (
-        math.pi * 2.5**2 * (depth_mm or 12.7),
-        math.pi * 0.8 * (2.5**2 + 2.5 * 3.3 + 3.3**2) / 3,
-    )
+    cylinder = math.pi * 2.5**2 * (depth_mm or 12.7)
+    cone = math.pi * 0.8 * (2.5**2 + 2.5 * 3.3 + 3.3**2) / 3
     expected = (cylinder + cone - math.pi * 2.5**2 * 0.8) * 1e-9
     assert built.truth[0].volume_m3 == pytest.approx(expected, rel=1e-12)
     assert built.truth[0].diameter_m == 5e-3
@@ -140,7 +139,8 @@ def test_dent_on_a_flat_board_is_a_spherical_cap(diameter_mm: float, depth_mm: f
         dents=(DentConfig(id=1, diameter_mm=diameter_mm, depth_mm=depth_mm, centre_mm=(30, -10)),)
     )
     truth = build_target(config).truth[0]
-    a, h = diameter_mm / 2, depth_mm
+    a = diameter_mm / 2
+    h = depth_mm
     assert truth.volume_m3 * 1e9 == pytest.approx(math.pi * h * (3 * a**2 + h**2) / 6, rel=1e-9)
     assert truth.diameter_m * 1e3 == pytest.approx(diameter_mm, rel=1e-12)
     # 48 rings leave 1 / (3 * 48^2) = 1.4e-4 of a shallow cap, twice that of half a ball.
@@ -151,7 +151,8 @@ def test_dent_on_a_flat_board_is_a_spherical_cap(diameter_mm: float, depth_mm: f
     "shape", [CURVED[0], *(pytest.param(shape, marks=pytest.mark.slow) for shape in CURVED[1:])]
 )
 def test_volumes_on_curved_boards(shape: Any) -> None:
-    """Facets 1 um off the face change a 2 mm dent by 2 * 0.7 um / 2 mm = 0.07 %; the rest is second order."""
+    """Facets 1 um off the face change a 2 mm dent by 2 * 0.7 um / 2 mm = 0.07 %; the rest is
+    second order."""
     config = target(
         shape,
         holes=(
@@ -168,12 +169,14 @@ def test_volumes_on_curved_boards(shape: Any) -> None:
     assert built.parts[0].mesh.is_watertight
     truth = [damage.volume_m3 for damage in built.truth]
     assert removed_m3(config, 1e-6) == pytest.approx(truth, rel=2e-3)
-    # Curvature matters: without its correction the dent of 2 mm would be off by more than that tolerance.
+    # Curvature matters: without its correction the dent of 2 mm would be off by more than that
+    # tolerance.
     assert abs(truth[3] / (math.pi * 2 * (300 + 4) / 6 * 1e-9) - 1) > 5e-3
 
 
 def test_dent_on_a_sphere_is_a_lens_of_two_spheres() -> None:
-    """Ball of 26 mm (a = 10, h = 2) into a sphere of 100 mm: the standard lens of two balls, d = 100 + 26 - 2."""
+    """Ball of 26 mm (a = 10, h = 2) into a sphere of 100 mm: the standard lens of two balls, d =
+    100 + 26 - 2."""
     board = BoardConfig(
         width_mm=60,
         height_mm=60,
@@ -183,7 +186,9 @@ def test_dent_on_a_sphere_is_a_lens_of_two_spheres() -> None:
     config = TargetConfig(
         board=board, dents=(DentConfig(id=1, diameter_mm=20, depth_mm=2, centre_mm=(0, 0)),)
     )
-    big, small, d = 100.0, 26.0, 124.0
+    big = 100.0
+    small = 26.0
+    d = 124.0
     lens = math.pi * (big + small - d) ** 2
     lens *= (d**2 + 2 * d * small - 3 * small**2 + 2 * d * big + 6 * small * big - 3 * big**2) / (
         12 * d
@@ -230,7 +235,8 @@ def test_any_hole_in_a_flat_board(
     assert back == pytest.approx(np.array([x_mm, y_mm, 0]) * 1e-3, abs=1e-12)
 
 
-# ---- frames ----------------------------------------------------------------------------------------------------------
+# ---- frames
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_frames_at_zero_tilt() -> None:
@@ -280,7 +286,8 @@ def test_truth_rows_are_millimetres() -> None:
     assert [row[f"axis_{a}_camera"] for a in "xyz"] == pytest.approx([0, 0, -1])
 
 
-# ---- faces -----------------------------------------------------------------------------------------------------------
+# ---- faces
+# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [FlatConfig(), *CURVED], ids=lambda shape: shape.kind)
@@ -300,7 +307,8 @@ def test_slopes_and_bends_are_the_derivatives(shape: Any) -> None:
 
 
 def test_curvatures_of_round_faces() -> None:
-    x, y = np.array([0.0, 0.1]), np.array([0.0, 0.03])
+    x = np.array([0.0, 0.1])
+    y = np.array([0.0, 0.03])
     ball = face_of(target(SphereConfig(kind="sphere", radius_mm=500)).board)
     assert ball.curvatures(x, y) == pytest.approx(np.full((2, 2), 2.0), rel=1e-6)
     trough = face_of(target(CylinderConfig(kind="cylinder", radius_mm=250, bulge="away")).board)
@@ -341,7 +349,8 @@ def test_back_face_is_parallel() -> None:
     assert np.minimum(np.abs(radii - 0.3), np.abs(radii - 0.2873)).max() < 1e-9
 
 
-# ---- what else stands there ------------------------------------------------------------------------------------------
+# ---- what else stands there
+# ------------------------------------------------------------------------------------------
 
 
 def test_tape_lies_on_the_face_with_its_size_and_angle() -> None:
@@ -353,7 +362,8 @@ def test_tape_lies_on_the_face_with_its_size_and_angle() -> None:
     points = transform_points(invert(built.T_camera_board), strip.mesh.vertices)
     top = points[points[:, 2] > 0]
     assert top[:, 2] == pytest.approx(np.full(4, 0.15e-3), abs=1e-12)
-    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    c = math.cos(math.radians(30))
+    s = math.sin(math.radians(30))
     local = (top[:, :2] - (0.05, 0.01)) @ np.array([[c, -s], [s, c]])
     assert sorted(map(tuple, np.round(local * 1e3, 9))) == [(-20, -6), (-20, 6), (20, -6), (20, 6)]
 
@@ -392,7 +402,8 @@ def test_room_faces_the_light() -> None:
     assert parts["floor"].rgb_at(np.zeros((3, 2))).shape == (3, 3)
 
 
-# ---- textures --------------------------------------------------------------------------------------------------------
+# ---- textures
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_grain_has_mean_contrast_and_direction() -> None:

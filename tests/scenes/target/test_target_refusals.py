@@ -1,4 +1,5 @@
-"""Declarations whose parts do not fit together are refused, each part by name and with its numbers."""
+"""Declarations whose parts do not fit together are refused, each part by name and with its
+numbers."""
 
 from __future__ import annotations
 
@@ -200,7 +201,8 @@ def test_every_problem_is_named_at_once() -> None:
 
 
 def test_holes_that_meet_below_the_face_of_a_bulging_board() -> None:
-    """Two axes 13.1 mm apart on a face bent to 100 mm come 2.6 mm closer 20 mm down, where no web is left."""
+    """Two axes 13.1 mm apart on a face bent to 100 mm come 2.6 mm closer 20 mm down, where no web
+    is left."""
     board = {"width_mm": 100, "height_mm": 100, "thickness_mm": 25}
     shape = {"kind": "cylinder", "radius_mm": 100}
     holes = [hole(1, 12, -6.55, 0, 20), hole(2, 12, 6.55, 0, 20)]
@@ -214,7 +216,8 @@ def test_holes_that_meet_below_the_face_of_a_bulging_board() -> None:
 
 
 def test_hole_that_leaves_through_the_side_of_a_bulging_board() -> None:
-    """The side walls of a bent board lean inwards: 7.3 mm from axis to edge at the face are 5.5 mm at the back."""
+    """The side walls of a bent board lean inwards: 7.3 mm from axis to edge at the face are 5.5 mm
+    at the back."""
     board = {"width_mm": 100, "height_mm": 100, "thickness_mm": 25}
     shape = {"kind": "cylinder", "radius_mm": 100}
     near_edge = [hole(1, 12, 43.5, 0)]

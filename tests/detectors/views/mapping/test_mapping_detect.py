@@ -1,4 +1,5 @@
-"""Detectors on maps: the variance in the score, the hole model in a parallel projection, blur in cells."""
+"""Detectors on maps: the variance in the score, the hole model in a parallel projection, blur in
+cells."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def test_score_is_in_units_of_each_cells_own_deviation() -> None:
     sigma[:, 75:] = 0.4 * MM
     cloud = flat_map(sigma)
     evidence = DETECTOR.analyse(cloud)
-    # the stated deviations are half of the true ones; the scale of the standardised residuals makes up for it
+    # the stated deviations are half of the true ones; the scale of the standardised residuals
+    # makes up for it
     assert float(np.std(evidence.score[:, :75])) == pytest.approx(
         float(np.std(evidence.score[:, 75:])), rel=0.05
     )

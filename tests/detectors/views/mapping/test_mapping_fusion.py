@@ -1,4 +1,5 @@
-"""The fused map: its frame, exactness on planes, noise against views, stated variance, outliers, holes."""
+"""The fused map: its frame, exactness on planes, noise against views, stated variance, outliers,
+holes."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def test_facing_plane_is_mapped_in_the_first_cameras_own_frame() -> None:
     )
     known = found.cloud.valid
     np.testing.assert_allclose(found.cloud.points_m[known][:, 2], DISTANCE_M, atol=1e-12)
-    # cells stand at whole multiples of the pitch, half a pixel off the pixels here: 119 x 159 between them
+    # cells stand at whole multiples of the pitch, half a pixel off the pixels here: 119 x 159
+    # between them
     assert known.all() and known.shape == (119, 159)
 
 
@@ -161,7 +163,8 @@ def test_white_noise_falls_with_the_square_root_of_views() -> None:
     for count in (1, 4, 16):
         found = fused(views[:count], poses[:count])
         spread[count] = float(np.std(deviations(found, plane, count)))
-    # 10,000 cells, neighbours share pixels: 2 % each; views at an angle and interpolation differ by some percent
+    # 10,000 cells, neighbours share pixels: 2 % each; views at an angle and interpolation differ
+    # by some percent
     assert spread[1] / spread[4] == pytest.approx(2.0, rel=0.08)
     assert spread[1] / spread[16] == pytest.approx(4.0, rel=0.08)
 
@@ -186,7 +189,8 @@ def test_registration_error_is_in_the_variance() -> None:
     plane = Plane()
     poses = arc(2, 10.0)
     views = noisy(poses, 3, plane, frames=10)
-    # the second view may be wrong by 0.4 mm along its normal and by 2 mrad about y through the middle
+    # the second view may be wrong by 0.4 mm along its normal and by 2 mrad about y through the
+    # middle
     covariance = np.diag([0.0, 2e-3, 0.0, 0.0, 0.0, 0.4 * MM]) ** 2
     merged = merge(views, [reference(), registered("v1", poses[1], covariance)], FusedMerge())
     known = merged.surface_map
@@ -229,7 +233,8 @@ def test_a_pattern_of_its_own_in_each_view_is_found() -> None:
 
 
 def test_a_pattern_that_belongs_to_the_pixels_does_not_pass_for_independent() -> None:
-    """Views a few pixels apart share a pattern 8 pixels wide: nine of them do not make it three times smaller."""
+    """Views a few pixels apart share a pattern 8 pixels wide: nine of them do not make it three
+    times smaller."""
     import cv2
 
     rng = np.random.default_rng(4)
@@ -349,7 +354,8 @@ def test_a_view_without_a_grid_gives_the_same_map() -> None:
     poses = arc(2, 10.0)
     views = noisy(poses, 7, plane, frames=10)
     flat = [without_grid(view) for view in views]
-    one, other = fused(views, poses, cell_mm=1.4), fused(flat, poses, cell_mm=1.4)
+    one = fused(views, poses, cell_mm=1.4)
+    other = fused(flat, poses, cell_mm=1.4)
     h, w = (min(a, b) for a, b in zip(one.cloud.valid.shape, other.cloud.valid.shape, strict=True))
     gap = (
         one.surface_map.height_m[5 : h - 5, 5 : w - 5]

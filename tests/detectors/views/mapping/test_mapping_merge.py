@@ -1,4 +1,5 @@
-"""The thesis' grid by hand, the volume on planes, which views go in, and the law of a view's noise."""
+"""The thesis' grid by hand, the volume on planes, which views go in, and the law of a view's
+noise."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def points_view(points_mm: list[list[float]], name: str, **fields: object) -> Pr
 
 
 def test_boxes_of_two_clouds_by_hand() -> None:
-    red, blue = ([[(200, 0, 0)] * 3], [[(0, 0, 101)] * 3])
+    red = [[(200, 0, 0)] * 3]
+    blue = [[(0, 0, 101)] * 3]
     fixed = points_view(
         [[-50, 0, 700], [10.0, 10.0, 700.0], [20, 20, 702]], "a", rgb=np.array(red, np.uint8)
     )
@@ -64,7 +66,8 @@ def test_boxes_of_two_clouds_by_hand() -> None:
         variance_m2=np.full((1, 3), 5e-6),
     )
     found = merge([fixed, moving], [reference(), registered("b", np.eye(4))], GridMerge())
-    # the overlap is x 0.04..20, y 0.02..20, z 700.01..702: the pair near (10, 10, 700) has one point below it in z
+    # the overlap is x 0.04..20, y 0.02..20, z 700.01..702: the pair near (10, 10, 700) has one
+    # point below it in z
     points = found.cloud.points_m[0] / MM
     expected = [
         [10.05, 10.02, 700.06],
@@ -166,11 +169,13 @@ def test_volume_of_a_plane_lies_on_it(distortion: tuple[float, ...]) -> None:
     )
     assert not found.cloud.organised and found.cloud.valid.all()
     height = plane_height(found.cloud.points_m[0], found.T_reference_cloud, plane)
-    # depth is looked up up to a quarter of a pixel beside its place along each axis, at incidences up to 35 degrees
+    # depth is looked up up to a quarter of a pixel beside its place along each axis, at incidences
+    # up to 35 degrees
     assert float(np.abs(height).max()) < np.sqrt(2.0) / 4.0 * np.tan(np.deg2rad(35.0)) * PITCH_M
     assert abs(float(height.mean())) < 0.02 * PITCH_M
     np.testing.assert_allclose(found.cloud.rgb[0].mean(axis=0), [200, 100, 50], atol=1.0)
-    one, other = found.cloud.points_m[0][:-1], found.cloud.points_m[0][1:]
+    one = found.cloud.points_m[0][:-1]
+    other = found.cloud.points_m[0][1:]
     assert (one[:, 0] <= other[:, 0]).all()
 
 
@@ -194,7 +199,8 @@ def test_volume_is_the_same_twice_and_noise_falls_with_views() -> None:
 def test_volume_keeps_face_and_floor_apart_from_the_walls_of_a_hole() -> None:
     pytest.importorskip("open3d")
     hole = Hole(25.4 * MM, 12.7 * MM, (0.01, 0.0))
-    plane, poses = Plane(5.0, 5.0, hole), arc(5, 25.0)
+    plane = Plane(5.0, 5.0, hole)
+    poses = arc(5, 25.0)
     views = [seen(plane, T, name=str(i), blur=3) for i, T in enumerate(poses)]
     found = merge(
         views,
@@ -290,7 +296,8 @@ def test_triangles_reproduce_what_is_linear(seed: int, step: float, parts: int) 
     slope = rng.uniform(-2, 2, 2)
     values = places @ slope + 3.0
     grid = CellGrid(1.0, 1.0, step, (int(8 / step), int(8 / step)))
-    flat, valid = places.reshape(1, -1, 2), np.ones(v.shape, dtype=bool)
+    flat = places.reshape(1, -1, 2)
+    valid = np.ones(v.shape, dtype=bool)
     for where, inside, organised in ((places, valid, True), (flat, valid.reshape(1, -1), False)):
         found = raster_between(where, inside, organised, step / parts, grid).at_cells(
             values.reshape(-1)
@@ -382,7 +389,8 @@ def test_noise_law_without_amplitude_goes_with_range_to_the_fourth() -> None:
 
 @pytest.mark.parametrize("frames", [2, 4, 50])
 def test_rounding_stays_in_the_mean_where_nothing_dithers_it(frames: int) -> None:
-    """Frames that repeat each other scatter by nothing, however many they are: the step's q^2 / 12 is left."""
+    """Frames that repeat each other scatter by nothing, however many they are: the step's q^2 / 12
+    is left."""
     quiet = np.full((120, 160), 1e-9)
     cloud = replace(noisy_cloud(None, quiet, frames, 3).view.cloud, z_step_m=1e-3)
     mean, _ = depth_noise(cloud, cloud.valid, np.full(quiet.shape, np.nan))

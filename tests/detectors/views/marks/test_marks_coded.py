@@ -25,7 +25,8 @@ WIDE = replace(LENS, width=400, height=160, cy=79.5)
 
 
 def tags(places: dict[int, tuple[float, float]], codes: dict[int, int] | None = None) -> Paint:
-    """Tags of DICT_6X6_50 with a white rim of one module, on wood; ``codes`` of a tag where not its key."""
+    """Tags of DICT_6X6_50 with a white rim of one module, on wood; ``codes`` of a tag where not
+    its key."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50)
 
     def paint(xy: np.ndarray) -> np.ndarray:
@@ -47,7 +48,8 @@ def tags(places: dict[int, tuple[float, float]], codes: dict[int, int] | None = 
 
 def test_tags_are_read_and_placed_as_well_as_stated():
     rng = random_stream(1, "tags")
-    errors, squares = [], []
+    errors = []
+    squares = []
     for _ in range(5):
         T = board_pose(*rng.uniform(-20, 20, 2), rng.uniform(-15, 15))
         T[:3, 3] += rng.uniform(-2e-3, 2e-3, 3)
@@ -60,7 +62,8 @@ def test_tags_are_read_and_placed_as_well_as_stated():
             errors.append(np.abs(error[:2]).max())
             in_camera = T[:3, :3] @ error
             squares.append(in_camera @ np.linalg.solve(mark.covariance_m2, in_camera) / 3)
-            # a blurred corner is rounded off: its place is found up to half a pixel further in, on all four sides alike
+            # a blurred corner is rounded off: its place is found up to half a pixel further in, on
+            # all four sides alike
             assert mark.area_m2 == pytest.approx(TAG_M**2, rel=0.06)
     assert len(squares) >= 15
     # a tenth of a pixel is 0.14 mm
@@ -89,7 +92,8 @@ def test_tags_that_are_cut_or_lack_range_are_in_doubt():
     cloud = marked_cloud(board_pose(0.0, 0.0), tags(PLACES), samples=3, lens=WIDE)
     whole = {mark.code: mark for mark in find_marks(cloud, cloud.valid, CodedMarks()).marks}
     assert set(whole) == set(PLACES)
-    inside, points = cloud.valid.copy(), cloud.points_m.copy()
+    inside = cloud.valid.copy()
+    points = cloud.points_m.copy()
     columns = whole[3].pixels % 400
     inside[:, : int(np.quantile(columns, 0.25))] = False
     v, u = np.divmod(whole[7].pixels, 400)
@@ -130,7 +134,8 @@ def test_the_real_plate_shows_its_tags(shared_data: Path):
     sides = np.sqrt([mark.area_m2 for mark in coded.trusted])
     assert sides.std() / sides.mean() < 0.02
     blue = find_marks(cloud, inside, ColourMarks())
-    # the ink of most, each about the middle of its tag; one has no range along one side, another shines
+    # the ink of most, each about the middle of its tag; one has no range along one side, another
+    # shines
     near = [
         min(np.linalg.norm(b.centre_m - c.centre_m) for c in coded.trusted) for b in blue.trusted
     ]

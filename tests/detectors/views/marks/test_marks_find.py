@@ -1,4 +1,5 @@
-"""Marks found by colour: all kinds of tape and light, holes that are none, doubts, problems, and stated errors."""
+"""Marks found by colour: all kinds of tape and light, holes that are none, doubts, problems, and
+stated errors."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ EXPECTED = np.column_stack([TAPES, np.zeros(4)])[np.lexsort((TAPES[:, 1], TAPES[
 
 
 def falling_light(scaled: np.ndarray) -> np.ndarray:
-    """A lamp at one end: a factor of three over the board, of a warm colour; nothing is over-exposed."""
+    """A lamp at one end: a factor of three over the board, of a warm colour; nothing is
+    over-exposed."""
     return 0.6 * np.exp(0.5 * np.log(3.0) * scaled[..., :1]) * np.array([1.0, 0.9, 0.7])
 
 
@@ -135,7 +137,9 @@ def test_holes_that_show_a_backing_of_another_colour_are_no_marks(backing):
 @pytest.mark.slow  # a Monte Carlo campaign
 def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg, half_size):
     rng = random_stream(4, "covariance", sigma_m, samples)
-    squares, across, stated = [], [], []
+    squares = []
+    across = []
+    stated = []
     for _ in range(15):
         T = board_pose(*rng.uniform(-15, 15, 2), rng.uniform(-turn_deg, turn_deg))
         T[:3, 3] += rng.uniform(-2e-3, 2e-3, 3)
@@ -209,7 +213,8 @@ def test_a_mark_without_range_in_a_part_is_in_doubt():
 
 
 def test_the_odd_one_out_is_in_doubt():
-    tapes, patch = strips(), strips(np.array([[0.0, 0.0]]), half_size=(0.04, 0.012))
+    tapes = strips()
+    patch = strips(np.array([[0.0, 0.0]]), half_size=(0.04, 0.012))
 
     def paint(xy: np.ndarray) -> np.ndarray:
         return np.where((patch(xy) == RED).all(axis=-1, keepdims=True), RED, tapes(xy)).astype(

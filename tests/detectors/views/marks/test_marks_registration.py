@@ -74,7 +74,8 @@ def wrong_by(
     return error @ T_reference_view
 
 
-FIRST, SECOND = board_pose(3.0, 4.0), board_pose(3.0, 29.0, 5.0)
+FIRST = board_pose(3.0, 4.0)
+SECOND = board_pose(3.0, 29.0, 5.0)
 TRUE = FIRST @ invert(SECOND)
 GUESS = wrong_by(TRUE, FIRST[:3, 3], 5.0, 0.02)
 
@@ -87,7 +88,8 @@ def error_m(T_reference_view: np.ndarray) -> float:
 
 def test_a_turned_set_is_turned_back_exactly():
     rng = random_stream(1, "kabsch")
-    points, weights = rng.standard_normal((5, 7, 3)), rng.uniform(0.5, 2.0, (5, 7))
+    points = rng.standard_normal((5, 7, 3))
+    weights = rng.uniform(0.5, 2.0, (5, 7))
     T = np.tile(np.eye(4), (5, 1, 1))
     T[:, :3, :3] = Rotation.random(5, rng=rng).as_matrix()
     T[:, :3, 3] = rng.standard_normal((5, 3))
@@ -100,7 +102,8 @@ def test_a_turned_set_is_turned_back_exactly():
 
 def test_the_fit_is_the_most_probable_one():
     rng = random_stream(2, "likelihood")
-    ours, theirs = marks_at(UNEVEN, FIRST, rng), marks_at(UNEVEN, SECOND, rng)
+    ours = marks_at(UNEVEN, FIRST, rng)
+    theirs = marks_at(UNEVEN, SECOND, rng)
     spread = [np.stack([mark.covariance_m2 for mark in marks]) for marks in (theirs, ours)]
     centres = [np.stack([mark.centre_m for mark in marks]) for marks in (theirs, ours)]
     placement = place(centres[0], spread[0], centres[1], spread[1])
@@ -117,8 +120,11 @@ def test_the_fit_is_the_most_probable_one():
 
 def test_covariance_and_residuals_are_those_of_repeats():
     rng = random_stream(3, "repeats")
-    squares, residuals, across = [], [], []
-    points, normal = transform_points(FIRST, RECTANGLE), FIRST[:3, 2]
+    squares = []
+    residuals = []
+    across = []
+    points = transform_points(FIRST, RECTANGLE)
+    normal = FIRST[:3, 2]
     for _ in range(150):
         reference = view_of("a", marks_at(RECTANGLE, FIRST, rng), np.eye(4))
         found = register_by_marks(reference, view_of("b", marks_at(RECTANGLE, SECOND, rng), GUESS))
@@ -186,7 +192,8 @@ def test_missing_and_spurious_marks_do_no_harm(seed, marks, missing, spurious):
 def test_forty_marks_with_some_missing_on_both_sides():
     rng = random_stream(4, "forty")
     board = np.array([[x, y, 0.0] for x in np.arange(8) * 0.06 for y in np.arange(5) * 0.05])
-    ours, theirs = np.delete(board, [0, 7, 30], axis=0), np.delete(board, [3, 12, 25, 39], axis=0)
+    ours = np.delete(board, [0, 7, 30], axis=0)
+    theirs = np.delete(board, [3, 12, 25, 39], axis=0)
     pairing = pair_marks(marks_at(ours, FIRST, rng), marks_at(theirs, SECOND, rng), GUESS)
     assert (pairing.problem, len(pairing.pairs)) == ("", 33)
     np.testing.assert_allclose(ours[pairing.pairs[:, 0]], theirs[pairing.pairs[:, 1]])
@@ -299,7 +306,8 @@ def test_held_out_marks_miss_by_what_the_others_allow():
     missed = held_out_error_m(
         view_of("a", marks_at(UNEVEN, FIRST), np.eye(4)), view_of("b", marks_at(off, SECOND), GUESS)
     )
-    # the other three fit exactly without the moved one, which then misses by its 2 mm, and with it they miss too
+    # the other three fit exactly without the moved one, which then misses by its 2 mm, and with it
+    # they miss too
     assert missed is not None
     assert missed > 1e-3
     three = view_of("b", marks_at(UNEVEN[:3], SECOND), GUESS)

@@ -1,4 +1,5 @@
-"""The parts that marks rest on: the lattice's error, the plane under a mark, the target's own colour."""
+"""The parts that marks rest on: the lattice's error, the plane under a mark, the target's own
+colour."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def lattice_within(polygon: np.ndarray) -> np.ndarray:
 
 
 def test_a_whole_number_of_pixels_shifts_by_up_to_half_a_pixel_and_a_half_one_by_a_quarter():
-    # both ends of a whole length are rounded alike: uniform in +-1/2; of a half one they alternate: uniform in +-1/4
+    # both ends of a whole length are rounded alike: uniform in +-1/2; of a half one they
+    # alternate: uniform in +-1/4
     covariance = centroid_covariance_px2(rectangle(30.0, 9.5))
     assert covariance[0, 0] == pytest.approx(1 / 12, rel=0.01)
     assert covariance[1, 1] == pytest.approx(1 / 48, rel=0.1)
@@ -56,7 +58,8 @@ def test_the_lattice_error_is_that_of_random_shifts(length, breadth, turn):
     polygon = rectangle(length, breadth, turn)
     shifts = rng.uniform(-0.5, 0.5, (1000, 2))
     errors = np.array([lattice_within(polygon + shift).mean(axis=0) - shift for shift in shifts])
-    # a variance of 1000 bounded values is known to 4 %; the frequencies left out and the first order cost 12 % more
+    # a variance of 1000 bounded values is known to 4 %; the frequencies left out and the first
+    # order cost 12 % more
     np.testing.assert_allclose(
         np.diag(centroid_covariance_px2(polygon)), errors.var(axis=0), rtol=0.15
     )
@@ -68,7 +71,8 @@ def test_the_lattice_error_is_that_of_random_shifts(length, breadth, turn):
 )
 def test_a_region_known_by_its_pixels_alone_states_its_error_within_a_factor(turn):
     rng = random_stream(2, "regions", turn)
-    errors, stated = [], []
+    errors = []
+    stated = []
     for _ in range(200):
         size = np.array([28.0, 9.0]) + rng.uniform(0.0, 1.0, 2)
         shift = rng.uniform(-0.5, 0.5, 2)
@@ -76,7 +80,8 @@ def test_a_region_known_by_its_pixels_alone_states_its_error_within_a_factor(tur
         errors.append(pixels.mean(axis=0) - shift)
         stated.append(np.diag(region_covariance_px2(pixels)))
     ratio = np.sqrt(np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0))
-    # a slope of one or two steps cannot be told from none, so the error may be stated twice too large
+    # a slope of one or two steps cannot be told from none, so the error may be stated twice too
+    # large
     assert np.all((ratio > 1 / 1.5) & (ratio < 2.0)), ratio
 
 
@@ -97,7 +102,8 @@ def test_rays_meet_the_plane_along_themselves():
     patch = fit_patch(np.column_stack([grid, 0.5 + 0.1 * grid[:, 0]]))
     assert patch is not None
     point = np.array([[0.02, -0.01, 0.6]])
-    central, parallel = patch.cut(point, "central"), patch.cut(point, "parallel")
+    central = patch.cut(point, "central")
+    parallel = patch.cut(point, "parallel")
     np.testing.assert_allclose(central / central[0, 2], point / 0.6)
     np.testing.assert_allclose(patch.above_m(central), 0.0, atol=1e-9)
     np.testing.assert_allclose(parallel, [[0.02, -0.01, 0.502]], atol=1e-9)

@@ -1,4 +1,5 @@
-"""Coherent point drift against a dense implementation written from the paper's figure, and against known transforms."""
+"""Coherent point drift against a dense implementation written from the paper's figure, and against
+known transforms."""
 
 from __future__ import annotations
 
@@ -47,15 +48,20 @@ def dense_cpd(fixed: np.ndarray, moving: np.ndarray, w: float, iterations: int) 
     """Figure 2 of the paper with s = 1, in the normalised units of the module under test."""
     middle = fixed.mean(axis=0)
     scale = np.sqrt(np.mean(np.sum((fixed - middle) ** 2, axis=1)))
-    x, y = (fixed - middle) / scale, (moving - moving.mean(axis=0)) / scale
-    m, n = len(y), len(x)
-    turn, shift = np.eye(3), np.zeros(3)
+    x = (fixed - middle) / scale
+    y = (moving - moving.mean(axis=0)) / scale
+    m = len(y)
+    n = len(x)
+    turn = np.eye(3)
+    shift = np.zeros(3)
     variance = cdist(y, x, "sqeuclidean").sum() / (3 * m * n)
     for _ in range(iterations):
         p = dense_posterior(x, y @ turn.T + shift, variance, w)
         total = p.sum()
-        mean_x, mean_y = x.T @ p.sum(axis=0) / total, y.T @ p.sum(axis=1) / total
-        x0, y0 = x - mean_x, y - mean_y
+        mean_x = x.T @ p.sum(axis=0) / total
+        mean_y = y.T @ p.sum(axis=1) / total
+        x0 = x - mean_x
+        y0 = y - mean_y
         a = x0.T @ p.T @ y0
         u, _, vt = np.linalg.svd(a)
         turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
@@ -71,7 +77,8 @@ def dense_cpd(fixed: np.ndarray, moving: np.ndarray, w: float, iterations: int) 
 @pytest.mark.parametrize("w", [0.0, 0.1, 0.6])
 @pytest.mark.parametrize("variance", [1e-2, 1e-4, 1e-6])
 def test_the_expectation_is_the_papers(w, variance):
-    fixed, moving = cloud(70), cloud(40, 1)
+    fixed = cloud(70)
+    moving = cloud(40, 1)
     background = (2 * np.pi * variance) ** 1.5 * w / (1 - w) * 40 / 70
     moments, objective = posterior_moments(fixed, moving, variance, background)
     # logarithms, because the paper's own form underflows where the kernel's does not
@@ -109,7 +116,8 @@ def test_known_transforms_come_back_through_outliers(turn, shift, seed):
     fixed = cloud(150, seed)
     moving = transform_points(np.linalg.inv(T), fixed)
     random = np.random.default_rng(seed)
-    low, high = fixed.min(axis=0), fixed.max(axis=0)
+    low = fixed.min(axis=0)
+    high = fixed.max(axis=0)
     strays = random.uniform(low, high, (20, 3))
     found = coherent_point_drift(np.concatenate([fixed, strays]), moving, EXACT)
     np.testing.assert_allclose(transform_points(found.T_fixed_moving, moving), fixed, atol=2e-5)
@@ -146,7 +154,8 @@ def test_a_mirrored_cloud_is_not_mirrored_back():
 
 
 def test_only_the_turn_of_the_guess_matters():
-    fixed, moving = cloud(100), transform_points(transform((60, 0, 0), (0, 0, 0)), cloud(100))
+    fixed = cloud(100)
+    moving = transform_points(transform((60, 0, 0), (0, 0, 0)), cloud(100))
     start = transform((-55, 3, 0), (0.0, 0.0, 0.0))
     far = transform((0, 0, 0), (3.0, -2.0, 1.0)) @ start
     near = coherent_point_drift(fixed, moving, EXACT, start).T_fixed_moving
@@ -166,10 +175,8 @@ def test_equal_clouds_end_at_once_and_stay():
 
 def test_a_loose_tolerance_stops_early_and_a_tight_one_runs_on():
     noise = 0.003 * np.random.default_rng(5).standard_normal((100, 3))
-    fixed, moving = (
-        cloud(100),
-        transform_points(transform((5, 0, 0), (0.01, 0, 0)), cloud(100) + noise),
-    )
+    fixed = cloud(100)
+    moving = transform_points(transform((5, 0, 0), (0.01, 0, 0)), cloud(100) + noise)
     loose = coherent_point_drift(fixed, moving, CpdRegistration(tolerance=0.5))
     tight = coherent_point_drift(fixed, moving, CpdRegistration(tolerance=1e-12))
     assert loose.converged and loose.iterations < 5 < tight.iterations
@@ -177,13 +184,16 @@ def test_a_loose_tolerance_stops_early_and_a_tight_one_runs_on():
 
 @pytest.mark.slow
 def test_the_covariance_is_that_of_repeats():
-    """120 repeats of 300 noisy points: the mean of d'C^-1 d over repeats is 6 for a true covariance.
+    """120 repeats of 300 noisy points: the mean of d'C^-1 d over repeats is 6 for a true
+    covariance.
 
-    The clouds' noise is independent from point to point, and each cube of 5 pitches holds one point. The covariance
-    may overstate the variances by a factor of 1.6 (it does so by 1.5), and may not understate them: the upper limit is
-    three standard errors of the mean above 6, so that half the covariance fails.
+    The clouds' noise is independent from point to point, and each cube of 5 pitches holds one
+    point. The covariance may overstate the variances by a factor of 1.6 (it does so by 1.5), and
+    may not understate them: the upper limit is three standard errors of the mean above 6, so that
+    half the covariance fails.
     """
-    truth, noise = cloud(300), 0.001
+    truth = cloud(300)
+    noise = 0.001
     distances = []
     for seed in range(120):
         random = np.random.default_rng(seed)
@@ -205,9 +215,11 @@ def test_the_covariance_is_that_of_repeats():
 
 def test_points_all_over_a_flat_disc_hold_no_turn():
     random = np.random.default_rng(0)
-    radius, angle = 0.1 * np.sqrt(random.uniform(size=3000)), random.uniform(0, 2 * np.pi, 3000)
+    radius = 0.1 * np.sqrt(random.uniform(size=3000))
+    angle = random.uniform(0, 2 * np.pi, 3000)
     disc = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(3000, 0.5)], axis=1)
-    fixed, moving = disc[:1500], disc[1500:]
+    fixed = disc[:1500]
+    moving = disc[1500:]
     drift = coherent_point_drift(fixed, moving, CpdRegistration())
     covariance = drift_covariance(
         fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch_m=0.004

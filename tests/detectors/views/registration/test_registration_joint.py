@@ -1,4 +1,5 @@
-"""The joint adjustment: exact without noise, honest with it, and blind to no error that it claims to hold."""
+"""The joint adjustment: exact without noise, honest with it, and blind to no error that it claims
+to hold."""
 
 from __future__ import annotations
 
@@ -42,15 +43,17 @@ def test_across_it_is_better_than_the_marks_where_noise_is_white():
         for found, view in zip(joint, made[1:], strict=True):
             marks = register_by_marks(made[0].prepared, view.prepared)
             errors.append([across_error(each, made[0], view) for each in (found, marks)])
-    # four marks of 180 pixels against 2000 points: sqrt(720 / 2000) = 0.6 for a level, more for tilts, which the marks
-    # in the corners hold well
+    # four marks of 180 pixels against 2000 points: sqrt(720 / 2000) = 0.6 for a level, more for
+    # tilts, which the marks in the corners hold well
     by_joint, by_marks = np.sqrt(np.mean(np.square(errors), axis=0))
     assert by_joint < 0.9 * by_marks
 
 
 def smooth_error_repeats(repeats: int) -> np.ndarray:
-    """Squared errors across the board over their predicted variance, of views that each have a smooth error."""
-    poses, squares = [*POSES, pose(5, 9), pose(-7, -3, 2)], []
+    """Squared errors across the board over their predicted variance, of views that each have a
+    smooth error."""
+    poses = [*POSES, pose(5, 9), pose(-7, -3, 2)]
+    squares = []
     for seed in range(repeats):
         random = np.random.default_rng(seed)
         errors = random.normal(0, 3e-4, (len(poses), 4, 4)) * (
@@ -73,9 +76,10 @@ def smooth_error_repeats(repeats: int) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_predicted_error_across_holds_smooth_errors_of_views():
-    """Each view errs by a cubic, every term with a deviation of 0.3 mm. The mean square error is the predicted one
-    within a factor of 2.5: six repeats, each with three terms of the reference and fifteen of the others, whose mean is
-    known to a third; a prediction from noise alone would be too small by more than a hundred."""
+    """Each view errs by a cubic, every term with a deviation of 0.3 mm. The mean square error is
+    the predicted one within a factor of 2.5: six repeats, each with three terms of the reference
+    and fifteen of the others, whose mean is known to a third; a prediction from noise alone would
+    be too small by more than a hundred."""
     squares = smooth_error_repeats(6)
     assert 1 / 2.5 < squares.mean() < 2.5
 
@@ -93,7 +97,8 @@ def test_a_view_whose_marks_fail_takes_no_part():
 
 
 def test_points_count_as_fewer_than_they_are():
-    """The covariance across is that of one independent value in 25 pixels: between that of 1/5 and 1/50 of them."""
+    """The covariance across is that of one independent value in 25 pixels: between that of 1/5 and
+    1/50 of them."""
     made = views(POSES[:2], noise_m=1e-3)
     found = register_jointly([each.prepared for each in made])[0]
     _, across = predicted_error_m(
@@ -101,5 +106,6 @@ def test_points_count_as_fewer_than_they_are():
     )
     pixels = made[0].prepared.inside.sum()
     # two views' noise, three unknowns of which each is known to sigma / sqrt(n)
-    least, most = (np.sqrt(2 * 3) * 1e-3 / np.sqrt(pixels / share) for share in (5, 50))
+    least = np.sqrt(2 * 3) * 0.001 / np.sqrt(pixels / 5)
+    most = np.sqrt(2 * 3) * 0.001 / np.sqrt(pixels / 50)
     assert least < across < 3 * most

@@ -1,4 +1,5 @@
-"""`register`: every way in which a registration fails is noticed and said; users' mistakes are refused."""
+"""`register`: every way in which a registration fails is noticed and said; users' mistakes are
+refused."""
 
 from __future__ import annotations
 
@@ -136,17 +137,21 @@ def fine_pair(bend_mm: float, seed: int = 0):
 
 @pytest.mark.parametrize("config", [*BY_MARKS[::2], SLOW_CPD], ids=lambda config: config.method)
 def test_views_that_differ_by_their_own_smooth_errors_are_merged_with_a_note(config):
-    exact, bent = fine_pair(0.0), fine_pair(1.2)
-    found, plain = (register(prepared(pair), config)[1] for pair in (bent, exact))
+    exact = fine_pair(0.0)
+    bent = fine_pair(1.2)
+    found = register(prepared(bent), config)[1]
+    plain = register(prepared(exact), config)[1]
     assert found.failure == plain.failure == ""
     assert not any("beyond what noise explains" in note for note in plain.notes)
     normal = bent[0].T_camera_board[:3, 2]
     points = bent[0].prepared.points_m
-    wider, narrow = (predicted_error_m(each, points, normal)[1] for each in (found, plain))
+    wider = predicted_error_m(found, points, normal)[1]
+    narrow = predicted_error_m(plain, points, normal)[1]
     assert wider > 3 * narrow
     if config.method != "joint":  # whose covariance holds such errors already
         assert any("the covariance is widened" in note for note in found.notes)
-        # root mean square of the bend over the board is 0.7 mm, of which a turn cannot take anything
+        # root mean square of the bend over the board is 0.7 mm, of which a turn cannot take
+        # anything
         assert 0.3e-3 < wider < 1.2e-3
 
 
@@ -157,7 +162,8 @@ def test_views_whose_errors_would_blur_the_map_are_refused():
 
 @pytest.mark.slow
 def test_the_widened_covariance_holds_the_true_errors():
-    """Random bends: true errors across over predicted ones, of 12 pairs, as chi square with 12 degrees."""
+    """Random bends: true errors across over predicted ones, of 12 pairs, as chi square with 12
+    degrees."""
     random = np.random.default_rng(5)
     ratios = []
     for seed in range(12):
@@ -168,7 +174,8 @@ def test_the_widened_covariance_holds_the_true_errors():
             found, pair[0].prepared.points_m, pair[0].T_camera_board[:3, 2]
         )
         ratios.append(target_error_m(found, *pair)[1] / predicted)
-    # chi square of 12 degrees lies below 32.9 with a probability of 0.999: the covariance may be cautious, not too sure
+    # chi square of 12 degrees lies below 32.9 with a probability of 0.999: the covariance may be
+    # cautious, not too sure
     assert np.sum(np.square(ratios)) < 32.9
 
 
@@ -181,7 +188,8 @@ def test_a_wrong_guess_turns_the_board_about():
     turned = register(
         [reference.prepared, replace_guess(other.prepared, half_turn)], CpdRegistration()
     )[1]
-    # the twin fits as well, and nothing in the clouds tells: what the guess says is what is believed
+    # the twin fits as well, and nothing in the clouds tells: what the guess says is what is
+    # believed
     assert not turned.failure and target_error_m(turned, reference, other)[0] > 0.1
     judged = judge(turned, reference.prepared, other.prepared)
     assert judged.failure.startswith("is 180 degrees and ")
@@ -280,14 +288,13 @@ def test_pitch_and_noise_are_those_of_the_view(noise_m):
 
 
 def test_the_predicted_error_is_the_jacobians():
-    """Monte Carlo of small errors (w, t) from the covariance, moved over points: rms within and across a plane."""
+    """Monte Carlo of small errors (w, t) from the covariance, moved over points: rms within and
+    across a plane."""
     random = np.random.default_rng(0)
     root = random.standard_normal((6, 6)) * 1e-3
-    points, centre, normal = (
-        random.standard_normal((20, 3)),
-        np.array([0.1, 0.2, 0.3]),
-        np.array([0.6, 0.0, 0.8]),
-    )
+    points = random.standard_normal((20, 3))
+    centre = np.array([0.1, 0.2, 0.3])
+    normal = np.array([0.6, 0.0, 0.8])
     found = Registration("", "", np.eye(4), root @ root.T, centre, 0.0, 1.0, 0, 0, True, 0.0)
     motions = random.standard_normal((20000, 6)) @ root.T
     errors = np.cross(motions[:, None, :3], points - centre) + motions[:, None, 3:]

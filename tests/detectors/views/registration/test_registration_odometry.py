@@ -1,4 +1,5 @@
-"""Odometry: it follows a textured board, drifts, says when it is lost, and sees through the lens's distortion."""
+"""Odometry: it follows a textured board, drifts, says when it is lost, and sees through the lens's
+distortion."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def test_it_follows_a_walk_and_drifts():
 
 def test_the_same_walk_gives_the_same_bits():
     made = [each.prepared for each in views(WALK[:3], noise_m=2e-4, textured=True)]
-    first, second = register_by_odometry(made), register_by_odometry(made)
+    first = register_by_odometry(made)
+    second = register_by_odometry(made)
     assert [a.T_reference_view.tobytes() for a in first] == [
         b.T_reference_view.tobytes() for b in second
     ]

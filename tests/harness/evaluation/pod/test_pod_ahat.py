@@ -1,4 +1,5 @@
-"""Signal against size: the handbook's printed digits, ordinary regression as a special case, brute force, coverage."""
+"""Signal against size: the handbook's printed digits, ordinary regression as a special case, brute
+force, coverage."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from harness.evaluation.pod.ahat import (
 )
 from harness.vocabulary.errors import UserError
 
-TRUE_MU, TRUE_SIGMA = 1.8, 0.3
+TRUE_MU = 1.8
+TRUE_SIGMA = 0.3
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,8 @@ def example1(shared_data: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def study(seed: int, n: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes and signals y = 0.2 + ln a + 0.3 normal; a decision of 2 makes `TRUE_MU`, `TRUE_SIGMA`."""
+    """Sizes and signals y = 0.2 + ln a + 0.3 normal; a decision of 2 makes `TRUE_MU`,
+    `TRUE_SIGMA`."""
     rng = np.random.default_rng(seed)
     size = rng.uniform(3, 25, n)
     return size, 0.2 + np.log(size) + TRUE_SIGMA * rng.normal(size=n)
@@ -95,7 +98,8 @@ def test_censored_rows_against_brute_force() -> None:
     fit = fit_study(2)
 
     def negative(b: np.ndarray) -> float:
-        line, tau = b[0] + b[1] * fit.x, b[2]
+        line = b[0] + b[1] * fit.x
+        tau = b[2]
         exact = ~(fit.below | fit.above)
         terms = stats.norm.logpdf(fit.y[exact], line[exact], tau).sum()
         terms += (
@@ -130,7 +134,8 @@ def test_censored_rows_against_brute_force() -> None:
 
 def test_censored_values_at_one_place_against_scipy() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 80)
-    below, above = values < 4.0, values > 8.0
+    below = values < 4.0
+    above = values > 8.0
     data = stats.CensoredData(
         uncensored=values[~below & ~above],
         left=np.full(below.sum(), 4.0),
@@ -164,7 +169,9 @@ def test_units_of_size_and_signal_do_not_matter(
 ) -> None:
     size, signal = study(5)
     one = fit_ahat(size, signal, decision=2.0, left=1.5, right=3.1, log_size=log_size)
-    decision, left, right = ((value + offset) * gain for value in (2.0, 1.5, 3.1))
+    decision = (2.0 + offset) * gain
+    left = (1.5 + offset) * gain
+    right = (3.1 + offset) * gain
     other = fit_ahat(
         size * unit,
         (signal + offset) * gain,
@@ -215,8 +222,9 @@ def test_repeats_of_targets_are_not_targets() -> None:
 
 
 def test_coverage_of_the_bound_by_simulation() -> None:
-    """300 studies of 60 targets, about a third censored. The handbook's bound is a first-order one: it covers somewhat
-    less than 95 % in small studies. Binomial limits at alpha = 0.001 about 0.93, seeds fixed."""
+    """300 studies of 60 targets, about a third censored. The handbook's bound is a first-order
+    one: it covers somewhat less than 95 % in small studies. Binomial limits at alpha = 0.001 about
+    0.93, seeds fixed."""
     truth = float(np.exp(TRUE_MU + stats.norm.ppf(0.9) * TRUE_SIGMA))
     covered = sum(ahat_bound(fit_study(1000 + i)).value >= truth for i in range(300))
     low, high = stats.binom.ppf([0.0005, 0.9995], 300, 0.93)

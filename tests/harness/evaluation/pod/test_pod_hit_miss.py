@@ -143,7 +143,8 @@ def test_the_criterion_is_the_handbooks() -> None:
 def test_the_bound_is_the_largest_a90_of_the_likelihood_ratio_set(link: str) -> None:
     sizes, hits = simulated(60, seed=5)
     fit = fit_hit_miss(sizes, hits, link=link)
-    limit, level = bound(fit).value, float(link_ppf(link, np.array(0.9)))
+    limit = bound(fit).value
+    level = float(link_ppf(link, np.array(0.9)))
     slopes = np.geomspace(1e-4, 20.0, 20_000)[:, None]
 
     def ratio(a90: float) -> float:
@@ -178,10 +179,8 @@ def test_a_weak_study_demonstrates_nothing_and_says_why() -> None:
 def test_the_likelihood_ratio_bound_is_infinite_exactly_where_a_flat_curve_is_within_the_criterion() -> (
     None
 ):
-    sizes, hits = (
-        np.tile(np.arange(1.0, 7.0), 3),
-        np.array([0, 0, 0, 1, 1, 1, 0, 0, 1, 0, 1, 1, 0, 1, 0, 1, 0, 1]),
-    )
+    sizes = np.tile(np.arange(1.0, 7.0), 3)
+    hits = np.array([0, 0, 0, 1, 1, 1, 0, 0, 1, 0, 1, 1, 0, 1, 0, 1, 0, 1])
     fit = fit_hit_miss(sizes, hits)
     confidence = float(stats.chi2.cdf(fit.null_deviance - fit.deviance, 1))
     assert bound(fit, confidence=confidence - 1e-4).demonstrated
@@ -192,7 +191,8 @@ def test_the_likelihood_ratio_bound_is_infinite_exactly_where_a_flat_curve_is_wi
 @given(seed=st.integers(0, 10_000), scale=st.floats(1e-3, 1e3))
 def test_a_bound_carries_the_unit_of_the_sizes(seed: int, scale: float) -> None:
     sizes, hits = simulated(50, seed)
-    limit, scaled = (bound(fit_hit_miss(sizes * by, hits)).value for by in (1.0, scale))
+    limit = bound(fit_hit_miss(sizes * 1.0, hits)).value
+    scaled = bound(fit_hit_miss(sizes * scale, hits)).value
     assert scaled == pytest.approx(limit * scale, rel=1e-6)
 
 
@@ -238,7 +238,8 @@ def test_complete_separation_is_fitted_by_firths_penalty() -> None:
     sizes = np.arange(1.0, 13.0)
     fit = fit_hit_miss(sizes, sizes > 6)
     assert fit.method == "Firth" and "separation" in fit.notes[0]
-    # Firth's modified score for the logit: sum of (y - p + h (1/2 - p)) (1, x) = 0, h the leverages.
+    # Firth's modified score for the logit: sum of (y - p + h (1/2 - p)) (1, x) = 0, h the
+    # leverages.
     design = np.column_stack([np.ones(12), sizes])
     p = link_cdf("logit", design @ [fit.b0, fit.b1])
     weight = p * (1.0 - p)
@@ -256,7 +257,8 @@ def test_separated_data_have_finite_curves_and_honest_bounds(link: str, log_size
     fit = fit_hit_miss(sizes, sizes > 6, link=link, log_size=log_size)
     assert 5.0 < fit.curve.size_at(0.5) < 8.0
     limit = bound(fit).value
-    # Six hits in a row alone show no more than POD 0.5^(1/6) of 60 % at 95 %: no 90 % just above the largest miss.
+    # Six hits in a row alone show no more than POD 0.5^(1/6) of 60 % at 95 %: no 90 % just above
+    # the largest miss.
     assert limit > max(9.0, fit.curve.size_at(0.9))
 
 
@@ -276,16 +278,20 @@ def test_separation_is_told_from_overlap(hits: list[int], separated: bool) -> No
     [("cloglog", 28, 55), ("cloglog", 29, 75), ("loglog", 49, 9), ("logit", 28, 55)],
 )
 def test_of_several_penalised_maxima_the_highest_is_taken(link: str, seed: int, n: int) -> None:
-    """Compared with a fine grid of places and slopes, on data of which single starts end in lower maxima."""
+    """Compared with a fine grid of places and slopes, on data of which single starts end in lower
+    maxima."""
     rng = np.random.default_rng(seed)
     assert rng.integers(6, 80) == n
     sizes = rng.choice(rng.uniform(2, 14, n), n) if seed % 2 else rng.uniform(2, 14, n)
     fit = fit_hit_miss(sizes, sizes > rng.uniform(4, 10), link=link)
     assert fit.method == "Firth"
-    b0, b1 = fit.b0 + fit.b1 * fit.centre, fit.b1 * fit.spread
+    b0 = fit.b0 + fit.b1 * fit.centre
+    b1 = fit.b1 * fit.spread
     found = fit.data.hits > 0
-    below, above = fit.data.z[~found].max(), fit.data.z[found].min()
-    slopes, places = np.geomspace(0.2, 3000, 240)[:, None], np.linspace(below - 1, above + 1, 800)
+    below = fit.data.z[~found].max()
+    above = fit.data.z[found].min()
+    slopes = np.geomspace(0.2, 3000, 240)[:, None]
+    places = np.linspace(below - 1, above + 1, 800)
     values = fit.data.value(np.stack([-slopes * places, slopes + 0 * places], axis=-1))
     assert float(fit.data.value(np.array([b0, b1]))) >= values.max()
 
@@ -330,7 +336,8 @@ def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
 
 @pytest.mark.slow
 def test_floor_is_seldom_found_where_there_is_none() -> None:
-    # Size of the test, alpha 5 %: 80 studies, binomial; 11 rejections or more have a chance of 0.3 %.
+    # Size of the test, alpha 5 %: 80 studies, binomial; 11 rejections or more have a chance of 0.3
+    # %.
     rejected = sum(
         floor_ceiling_tests(fit_hit_miss(*simulated(80, seed)))[0].needed for seed in range(80)
     )
@@ -357,7 +364,8 @@ def test_gradient_of_the_bounded_likelihood() -> None:
 
 @pytest.mark.slow
 def test_coverage_of_the_default_is_its_name() -> None:
-    # 300 studies: Monte Carlo standard error 1.3 % at 95 %; 0.91 to 0.99 is 3 of them on either side.
+    # 300 studies: Monte Carlo standard error 1.3 % at 95 %; 0.91 to 0.99 is 3 of them on either
+    # side.
     (by_ratio,) = coverage(300, 60, ("likelihood ratio",), seed=7)
     assert by_ratio.refused == 0
     assert 0.91 <= by_ratio.share <= 0.99
@@ -366,8 +374,8 @@ def test_coverage_of_the_default_is_its_name() -> None:
 
 @pytest.mark.slow
 def test_a_bound_whose_model_the_data_chose_covers_as_used() -> None:
-    """Of a loglog truth: the best model's bound covers 91 %, the largest of those near it 96 % (2.2 % less would be two
-    standard errors of 300 studies)."""
+    """Of a loglog truth: the best model's bound covers 91 %, the largest of those near it 96 %
+    (2.2 % less would be two standard errors of 300 studies)."""
     best, used = coverage(300, 60, ("best of 8", "as used"), truth=TRUTHS[1])
     assert used.share >= 0.935 and used.above > best.above
 
@@ -413,13 +421,16 @@ def test_bounds_that_do_not_exist_are_refused() -> None:
 
 
 def test_a_bound_far_beyond_all_sizes_is_where_the_ratio_says():
-    """Three hits of 72, which hardly grow with size: far out, plain Newton steps end where all chances round to 0."""
+    """Three hits of 72, which hardly grow with size: far out, plain Newton steps end where all
+    chances round to 0."""
     size = np.repeat(np.linspace(11.0, 36.0, 24), 3)
     hit = np.isin(np.arange(72), (53, 64, 71)).astype(float)
     for log_size in (True, False):
         fit = fit_hit_miss(size, hit, link="cloglog", log_size=log_size)
-        found, top = bound(fit), float(fit.data.value(fit.place))
-        level, slopes = float(link_ppf("cloglog", np.array(0.9))), np.geomspace(1e-4, 10.0, 4000)
+        found = bound(fit)
+        top = float(fit.data.value(fit.place))
+        level = float(link_ppf("cloglog", np.array(0.9)))
+        slopes = np.geomspace(1e-4, 10.0, 4000)
         for far in (4.0, 32.0, 64.0, 200.0):
             largest = fit.data.value(np.stack([level - slopes * far, slopes], axis=-1)).max()
             assert profile(fit.data, far, level, 1.0)[0] == pytest.approx(largest, abs=1e-3)

@@ -1,4 +1,5 @@
-"""Chance hits, curves over thresholds, the surface over diameter and depth, POD in a table, and lines over axes."""
+"""Chance hits, curves over thresholds, the surface over diameter and depth, POD in a table, and
+lines over axes."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ from tests.support.synthetic_study import (
 )
 
 LOUD = 20.0
-"""False calls per square metre of a study in which chance hits are frequent enough to be counted."""
+"""False calls per square metre of a study in which chance hits are frequent enough to be counted.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,8 @@ def loud() -> ResultTables:
 
 
 def two_boards(findings: list[tuple[str, int, float, float, str]]) -> ResultTables:
-    """Boards 0 and 1 with a damage at (0, 0) and (50, 0), hole-free board 9; findings (role, board, x, y, hole)."""
+    """Boards 0 and 1 with a damage at (0, 0) and (50, 0), hole-free board 9; findings (role,
+    board, x, y, hole)."""
     place = {"hole": ["a", "b"], "true_x_mm": [0.0, 50.0], "true_y_mm": [0.0, 0.0]}
     holes = pd.DataFrame({"board": [0, 1], "repeat": 0, **place})
     runs = pd.DataFrame(
@@ -50,7 +53,8 @@ def two_boards(findings: list[tuple[str, int, float, float, str]]) -> ResultTabl
 
 class TestChance:
     def test_places_are_laid_over_other_boards_only(self):
-        """a lies near board 1's stray finding and on the hole-free board's; b near neither; b's own is not counted."""
+        """a lies near board 1's stray finding and on the hole-free board's; b near neither; b's
+        own is not counted."""
         tables = two_boards(
             [
                 ("damaged", 1, 3.0, 0.0, ""),
@@ -102,7 +106,8 @@ class TestChance:
 class TestRoc:
     def test_area_is_that_of_the_rank_test(self, loud):
         curve = roc_curve(loud.holes, loud.sites, THRESHOLD)
-        positive, negative = loud.holes["signal"].to_numpy(), loud.sites["signal"].to_numpy()
+        positive = loud.holes["signal"].to_numpy()
+        negative = loud.sites["signal"].to_numpy()
         ranks = stats.mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
         assert curve.area == pytest.approx(ranks, rel=1e-12)
         assert np.trapezoid(curve.true, curve.false) == pytest.approx(ranks, rel=1e-9)
@@ -143,8 +148,11 @@ class TestFreeResponse:
         assert np.array_equal(again.false_calls_per_m2, curve.false_calls_per_m2)
 
     def test_what_folds_back_is_left_out(self):
-        """Calls 0, 2, 1, 2, 3, 1 as the threshold falls from 6 to 1: at 4 and at 1 there are fewer than before."""
-        grid, calls, none = np.arange(1.0, 7.0), np.array([1, 3, 2, 1, 2, 0]), np.zeros(6, int)
+        """Calls 0, 2, 1, 2, 3, 1 as the threshold falls from 6 to 1: at 4 and at 1 there are fewer
+        than before."""
+        grid = np.arange(1.0, 7.0)
+        calls = np.array([1, 3, 2, 1, 2, 0])
+        none = np.zeros(6, int)
         free = pd.DataFrame(
             {
                 "role": "hole_free",
@@ -190,7 +198,8 @@ class TestPixels:
         assert curves.why == ""
 
     def test_by_hand(self):
-        """Two damages of 1 and 9 pixels: at a rate of 0.1 the small one is covered, the large one not; then both."""
+        """Two damages of 1 and 9 pixels: at a rate of 0.1 the small one is covered, the large one
+        not; then both."""
         rows = [
             ("", 100, np.array([50, 10])),
             ("small", 1, np.array([1, 1])),
@@ -242,7 +251,8 @@ class TestSurface:
         record = self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d)
         surface, why = surface_of(record, draws=50)
         assert why == surface.note == "" and surface.interaction_p < 0.05
-        a, d = np.log(record.inspected.diameter_mm), np.log(record.inspected.depth_mm)
+        a = np.log(record.inspected.diameter_mm)
+        d = np.log(record.inspected.depth_mm)
         link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[
             surface.link
         ]
@@ -271,10 +281,10 @@ class TestSurface:
     def test_the_depth_found_holds_the_truth(self):
         """Drawn 15 times from logit = -18 + 9 ln a + 3 ln d: percentiles of so few boards
         hold the truth in some 87 % of studies, so fewer than 11 of 15 in 4 % of such tests."""
-        record, held = (
-            study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[0],
-            0,
-        )
+        record = study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[
+            0
+        ]
+        held = 0
         seen = record.inspected
         chance = special.expit(-18.0 + 9.0 * np.log(seen.diameter_mm) + 3.0 * np.log(seen.depth_mm))
         for seed in range(15):

@@ -54,12 +54,11 @@ def repeated() -> SetUpRecord:
 class TestDepth:
     def test_of_one_diameter_the_limit_is_of_depth(self, small):
         """The same numbers as if the depths were diameters; words and axes say depth."""
-        seen, sizes = small.inspected, small.inspected.diameter_mm
+        seen = small.inspected
+        sizes = small.inspected.diameter_mm
         turned = dataclasses.replace(seen, diameter_mm=np.full(len(sizes), 10.0), depth_mm=sizes)
-        of_depth, of_diameter = (
-            limit_of(dataclasses.replace(small, inspected=turned), draws=20),
-            limit_of(small, draws=20),
-        )
+        of_depth = limit_of(dataclasses.replace(small, inspected=turned), draws=20)
+        of_diameter = limit_of(small, draws=20)
         assert (turned.limit_of, seen.limit_of) == ("depth", "diameter")
         assert of_depth.a90_95 == of_diameter.a90_95 and of_depth.largest_mm == sizes.max()
         assert np.array_equal(of_depth.a90_draws_mm, of_diameter.a90_draws_mm)
@@ -79,7 +78,8 @@ class TestHeadline:
         self,
     ):
         record = set_up(Study(boards=15, hole_free_boards=12, seed=6))
-        limit, seen = limit_of(record), record.inspected
+        limit = limit_of(record)
+        seen = record.inspected
         best, *others = fits = choose_model(seen.diameter_mm, seen.hit)
         near = [best, *(fit for fit in others if fit.deviance - best.deviance <= 2)]
         assert [fit.curve.link for fit in limit.statement.fits] == [fit.curve.link for fit in near]
@@ -89,7 +89,8 @@ class TestHeadline:
         assert limit.why == "" and limit.targets == limit.inspections == 120 and limit.boards == 15
 
     def test_repeats_of_one_damage_are_one_target(self, repeated):
-        limit, seen = limit_of(repeated), repeated.inspected
+        limit = limit_of(repeated)
+        seen = repeated.inspected
         assert limit.targets == 120 and limit.inspections == 360
         assert limit.statement.read.targets == 120
         by_hand = choose_model(
@@ -110,7 +111,8 @@ class TestHeadline:
         assert limit.a50_interval_mm.low < answers.a50_mm < limit.a50_interval_mm.high
 
     def test_same_record_same_bits(self, small):
-        one, other = limit_of(small), limit_of(small)
+        one = limit_of(small)
+        other = limit_of(small)
         assert np.array_equal(one.a90_draws_mm, other.a90_draws_mm)
 
 
@@ -126,7 +128,8 @@ class TestWithoutACurve:
         assert limit.is_at_most and not limit_of(small).is_at_most
 
     def test_boards_that_all_fared_alike_give_no_interval(self, small):
-        """Boards drawn again from them fare so too: an interval without width would say that all is known."""
+        """Boards drawn again from them fare so too: an interval without width would say that all
+        is known."""
         for found in (True, False):
             limit = limit_of(with_hits(small, np.full(120, found)))
             for interval in (limit.a50_interval_mm, limit.a90_interval_mm):
@@ -172,8 +175,8 @@ class TestWithoutACurve:
         "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))]
     )
     def test_apart_too_estimates_lie_inside_their_intervals(self, seed):
-        """Draws are fitted as the study is; with the middle of the gap for a90 its interval lies below it in every one
-        of these."""
+        """Draws are fitted as the study is; with the middle of the gap for a90 its interval lies
+        below it in every one of these."""
         record = set_up(Study(boards=10, hole_free_boards=0, seed=seed))
         limit = limit_of(with_hits(record, record.inspected.diameter_mm > 5.5), draws=200)
         for size, interval in (
@@ -183,7 +186,8 @@ class TestWithoutACurve:
             assert interval.low <= size <= interval.high
 
     def test_few_boards_that_were_all_found_are_no_boards_that_matter(self, small):
-        """20 boards cannot demonstrate what takes 29; that says nothing of what damages of one board share."""
+        """20 boards cannot demonstrate what takes 29; that says nothing of what damages of one
+        board share."""
         limit = limit_of(with_hits(small, np.ones(120, bool)))
         assert (
             np.isinf(limit.over_boards.value)
@@ -269,7 +273,8 @@ class TestBoardsDrawnAgain:
             assert np.array_equal(np.concatenate(joined), row_weights(board, 100, of))
 
     def test_more_boards_need_little_more_memory(self):
-        """Sizes refitted on 250 boards, of 8 damages each, rather than on 100: less than 5 kB for each more."""
+        """Sizes refitted on 250 boards, of 8 damages each, rather than on 100: less than 5 kB for
+        each more."""
         found = []
         for boards in (100, 250):
             seen = set_up(Study(boards=boards, hole_free_boards=0)).inspected
@@ -300,11 +305,12 @@ class TestBoardsDrawnAgain:
     def test_a_draw_whose_hits_and_misses_are_apart_is_the_penalised_fit_of_its_boards(
         self, small, link, repeats
     ):
-        """cloglog and loglog have two maxima in some draws, and the fit as the draw takes the higher one."""
-        size, board = (
-            np.repeat(of, repeats) for of in (small.inspected.diameter_mm, small.inspected.board)
-        )
-        hole, hit = np.repeat(small.inspected.hole, repeats), size > 5.5
+        """cloglog and loglog have two maxima in some draws, and the fit as the draw takes the
+        higher one."""
+        size = np.repeat(small.inspected.diameter_mm, repeats)
+        board = np.repeat(small.inspected.board, repeats)
+        hole = np.repeat(small.inspected.hole, repeats)
+        hit = size > 5.5
         curve = fit_hit_miss(size, hit, link=link).curve
         drawn = refitted_sizes(targets_of(board, hole, size, hit), curve, (0.5, 0.9), 6)
         for k, weight in enumerate(row_weights(board, 6).astype(int)):
@@ -346,8 +352,10 @@ class TestBoardsDrawnAgain:
 
     @pytest.mark.slow
     def test_the_spread_of_draws_is_the_estimates_standard_error(self):
-        """Over 100 studies of 30 boards that matter: the standard deviation of a90 against the mean of the draws'."""
-        estimates, spreads = [], []
+        """Over 100 studies of 30 boards that matter: the standard deviation of a90 against the
+        mean of the draws'."""
+        estimates = []
+        spreads = []
         for seed in range(100):
             seen = set_up(
                 Study((SetUp(boards_mm=1.5),), boards=30, hole_free_boards=0, seed=seed)
@@ -391,9 +399,11 @@ class TestBoardsDrawnAgain:
         assert design_effect(targets, curve, 0.9) == pytest.approx(1.0, rel=1e-12)
 
     def test_design_effect_of_copied_damage_is_the_number_of_copies(self, small):
-        """Every damage eight times on a board of its own: 8, but for G / (G - 1) of 120 boards and of 960 targets."""
+        """Every damage eight times on a board of its own: 8, but for G / (G - 1) of 120 boards and
+        of 960 targets."""
         seen = small.inspected
-        size, hit = np.repeat(seen.diameter_mm, 8), np.repeat(seen.hit, 8)
+        size = np.repeat(seen.diameter_mm, 8)
+        hit = np.repeat(seen.hit, 8)
         targets = targets_of(np.repeat(np.arange(120), 8), np.tile(np.arange(8), 120), size, hit)
         curve = fit_hit_miss(seen.diameter_mm, seen.hit).curve
         assert design_effect(targets, curve, 0.9) == pytest.approx(
@@ -404,7 +414,8 @@ class TestBoardsDrawnAgain:
     @given(st.integers(0, 10_000), st.floats(0.1, 10.0))
     def test_another_unit_of_size_scales_every_draw(self, seed, unit):
         rng = np.random.default_rng(seed)
-        size, board = rng.uniform(1, 10, 60), np.repeat(np.arange(12), 5)
+        size = rng.uniform(1, 10, 60)
+        board = np.repeat(np.arange(12), 5)
         hit = rng.random(60) < 1 / (1 + np.exp(-(size - 5)))
         curve = PodCurve("logit", False, 5.0, 1.0, np.zeros((2, 2)))
         scaled = PodCurve("logit", False, 5.0 * unit, unit, np.zeros((2, 2)))

@@ -1,4 +1,5 @@
-"""A study's file: written and read again it is the same, and whatever is wrong with it is told with its place."""
+"""A study's file: written and read again it is the same, and whatever is wrong with it is told
+with its place."""
 
 from __future__ import annotations
 
@@ -74,10 +75,12 @@ def test_written_and_read_it_is_the_same(tmp_path):
             assert getattr(again, field.name) == getattr(study, field.name)
     for one, other in zip(study.set_ups, again.set_ups, strict=True):
         for field in fields(SetUpRecord):
-            a, b = getattr(one, field.name), getattr(other, field.name)
+            a = getattr(one, field.name)
+            b = getattr(other, field.name)
             if isinstance(a, Inspected | Unflawed | Calibrated):
                 for column in fields(a):
-                    before, now = getattr(a, column.name), getattr(b, column.name)
+                    before = getattr(a, column.name)
+                    now = getattr(b, column.name)
                     if not isinstance(before, np.ndarray):
                         assert now == before
                         continue

@@ -215,7 +215,8 @@ class TestValidity:
 
 
 def test_set_ups_that_lack_a_board_are_not_paired(study):
-    """A board whose trial failed in one set-up is missing there: draws of the rest are draws of other boards."""
+    """A board whose trial failed in one set-up is missing there: draws of the rest are draws of
+    other boards."""
     first, second = study_record(study).set_ups
     kept = second.inspected.board != 3
     told = {
@@ -228,8 +229,7 @@ def test_set_ups_that_lack_a_board_are_not_paired(study):
     lacking = dataclasses.replace(
         second, inspected=dataclasses.replace(second.inspected, **columns)
     )
-    whole, part = (
-        difference(limit_of(first, draws=50), limit_of(one, draws=50)) for one in (second, lacking)
-    )
+    whole = difference(limit_of(first, draws=50), limit_of(second, draws=50))
+    part = difference(limit_of(first, draws=50), limit_of(lacking, draws=50))
     assert first.targets_digest == lacking.targets_digest
     assert whole.paired and not part.paired

@@ -1,4 +1,5 @@
-"""The atlas of limits: surfaces through set-ups of a known law, questions, refusals, and the page's data."""
+"""The atlas of limits: surfaces through set-ups of a known law, questions, refusals, and the
+page's data."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ def law_mm(distance_m: float, frames: float, depth_mm: float | None = None) -> f
 
 
 def limits(seed: int = 1, lost: float = 40.0) -> pd.DataFrame:
-    stream, rows = np.random.default_rng(seed), []
+    stream = np.random.default_rng(seed)
+    rows = []
     for damage in (THROUGH, *BLIND):
         for distance_m in (0.5, 0.75, 1.0, 1.5):
             for frames in (1, 10, 50):
@@ -56,7 +58,8 @@ def limits(seed: int = 1, lost: float = 40.0) -> pd.DataFrame:
 
 
 def test_intervals_of_the_surface_hold_the_law():
-    held, widths = [], []
+    held = []
+    widths = []
     for seed in range(100):
         surface = surfaces_of(limits(seed))[0]
         for place in ({"distance_m": 0.6, "frames": 1}, {"distance_m": 1.2, "frames": 25}):
@@ -67,11 +70,13 @@ def test_intervals_of_the_surface_hold_the_law():
 
 
 def test_a_wrong_surface_states_its_error():
-    smooth, rough = limits(), limits()
+    smooth = limits()
+    rough = limits()
     rough.loc[rough["frames"] == 10, "a90_mm"] *= np.where(
         np.arange((rough["frames"] == 10).sum()) % 2, 1.5, 0.7
     )
-    first, second = (surfaces_of(frame)[0] for frame in (smooth, rough))
+    first = surfaces_of(smooth)[0]
+    second = surfaces_of(rough)[0]
     assert second.error > 3 * first.error
     near = {"distance_m": 0.75, "frames": 10}
     width = [np.log(one.at(**near).high_mm / one.at(**near).low_mm) for one in (first, second)]
@@ -110,7 +115,8 @@ def test_beside_a_set_up_without_a_limit_none_is_stated():
 
 
 def test_a_limit_below_all_sizes_is_no_limit_above_them():
-    """Where the least damage was found too, the set-up has no a90, and larger damage is not called missed."""
+    """Where the least damage was found too, the set-up has no a90, and larger damage is not called
+    missed."""
     rows = limits()
     rows.loc[rows["frames"] == 50, "is_at_most"] = True
     answer = surfaces_of(rows)[0].at(distance_m=1.0, frames=50)
@@ -205,9 +211,8 @@ def test_a_browser_answers_as_the_sliders_move(stored: Path):
 def test_both_ends_of_the_albedo_are_answered_unless_one_is_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    dark, bright = (
-        limits().assign(**{"source.target.material.albedo_850": albedo}) for albedo in (0.2, 0.6)
-    )
+    dark = limits().assign(**{"source.target.material.albedo_850": 0.2})
+    bright = limits().assign(**{"source.target.material.albedo_850": 0.6})
     sizes = ["a90_mm", "a90_low_mm", "a90_high_mm"]
     dark[sizes] *= 2.0
     pd.concat([dark, bright]).to_parquet(tmp_path / "limits.parquet")

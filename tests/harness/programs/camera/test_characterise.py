@@ -1,4 +1,5 @@
-"""One's own camera: known cameras' simulated captures measured, the file that repeats them, real walls, bad input."""
+"""One's own camera: known cameras' simulated captures measured, the file that repeats them, real
+walls, bad input."""
 
 from __future__ import annotations
 
@@ -87,7 +88,8 @@ def recorded(
     keep=True,
     **config,
 ) -> Path:
-    """A capture of a simulated unit before a depth image, as whole millimetres with amplitude and lens."""
+    """A capture of a simulated unit before a depth image, as whole millimetres with amplitude and
+    lens."""
     lens: Lens = camera.nominal_lens
     effects = EffectsConfig(unit_offset=False, warm_up_drift=False, **config)
     unit = SimulatedUnit(
@@ -124,7 +126,8 @@ def figures_of(folder: Path) -> pd.DataFrame:
 @pytest.mark.usefixtures("unsaved")
 @pytest.mark.slow  # a long recording
 def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
-    """Noise law, correlation, dropouts, jitter, jumps and pattern within 10 %, and a file that repeats them."""
+    """Noise law, correlation, dropouts, jitter, jumps and pattern within 10 %, and a file that
+    repeats them."""
     paths = [
         recorded(tmp_path / f"{name}.npz", truth, *wall(truth, distance_m, slope))
         for name, distance_m, slope in (
@@ -191,7 +194,8 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
 
 @pytest.mark.usefixtures("unsaved")
 def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
-    """The gap at a slanted step is found again; what one distance and no amplitude cannot tell is said first."""
+    """The gap at a slanted step is found again; what one distance and no amplitude cannot tell is
+    said first."""
     slopes = truth.nominal_lens.region_slopes(truth.nominal_lens.whole)
     z_m = np.where(slopes @ [1.0, 0.35] < 0.05, 1.0, 1.25)
     path = recorded(

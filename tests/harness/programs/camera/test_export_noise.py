@@ -1,4 +1,5 @@
-"""A camera's noise as a table: its statistics against the full model, and the files that the program writes."""
+"""A camera's noise as a table: its statistics against the full model, and the files that the
+program writes."""
 
 from __future__ import annotations
 
@@ -37,13 +38,15 @@ def statistics(frames: list[np.ndarray]) -> tuple[dict[str, float], float]:
 )
 def test_the_table_has_the_statistics_of_the_full_model(name):
     """Deviation within 5 %, correlations within 0.05, near and far, bright and dark."""
-    camera, table = load_camera(name), table_of(name)
+    camera = load_camera(name)
+    table = table_of(name)
     for distance_m, albedo in ((0.7, 0.6), (1.5, 0.3), (2.5, 0.8)):
         unit = unit_before_plane(camera, distance_m, albedo)
         full = [frame.z_m.astype(float) for frame in unit.capture(2 * PAIRS, 7).frames()]
         cut = unit.region.within(camera.nominal_lens.whole)
         own = {**table, "slopes": table["slopes"][cut], "falloff": table["falloff"][cut]}
-        noise, rng = DepthNoise(own), np.random.default_rng(1)
+        noise = DepthNoise(own)
+        rng = np.random.default_rng(1)
         ideal = np.nanmean(full, axis=0)
         ideal = (
             np.where(np.isfinite(ideal), ideal, np.nanmean(ideal)) - noise.pattern_m / noise.stretch
@@ -62,7 +65,8 @@ def test_the_table_has_the_statistics_of_the_full_model(name):
 @pytest.mark.slow  # a Monte Carlo campaign
 def test_too_little_light_and_ranges_out_of_reach_return_nothing():
     table = table_of("azure_kinect_nfov")
-    noise, rng = DepthNoise(table), np.random.default_rng(1)
+    noise = DepthNoise(table)
+    rng = np.random.default_rng(1)
     far = np.full(noise.shape, 12.0)
     assert np.isnan(noise(far, np.full(noise.shape, 0.01), rng)).all()
     assert np.isnan(noise(np.full(noise.shape, 0.01), np.ones(noise.shape), rng)).all()
@@ -100,8 +104,10 @@ def test_the_program_writes_files_that_stand_alone(tmp_path, capsys, monkeypatch
 def test_torch_has_the_same_statistics():
     torch = pytest.importorskip("torch")
     table = table_of("azure_kinect_nfov")
-    noise, same = TorchDepthNoise(table), DepthNoise(table)
-    z, bright = torch.ones(2 * PAIRS, *noise.stretch.shape), torch.full(noise.stretch.shape, 0.6)
+    noise = TorchDepthNoise(table)
+    same = DepthNoise(table)
+    z = torch.ones(2 * PAIRS, *noise.stretch.shape)
+    bright = torch.full(noise.stretch.shape, 0.6)
     frames = [frame[200:300, 250:400].double().numpy() for frame in noise(z, bright.expand_as(z))]
     rng = np.random.default_rng(1)
     wanted = [

@@ -68,7 +68,9 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
 
 def run(engine: JobEngine, jobs: Iterable[Job]) -> dict[str, Ended]:
     """Each job's end, by name."""
-    waiting, under_way, ended = list(jobs)[::-1], 0, {}
+    waiting = list(jobs)[::-1]
+    under_way = 0
+    ended = {}
     while waiting or under_way:
         while waiting and engine.room(waiting[-1].stage) > 0:
             engine.submit(waiting.pop())
@@ -120,7 +122,8 @@ def test_the_queue_stays_short_whatever_the_plan(cluster):
 
 @pytest.mark.slow  # a campaign; test_engine_processes has the same faults without a cluster
 def test_every_fault_costs_its_own_job_only(cluster):
-    """One job kills its process, one hangs, one stops its whole process in C, one wants too much memory."""
+    """One job kills its process, one hangs, one stops its whole process in C, one wants too much
+    memory."""
     faults = {"killer": kill_own_process, "endless": hang, "stuck": hold_the_interpreter}
     jobs = [
         *squares(60, "before"),
@@ -145,7 +148,8 @@ def test_every_fault_costs_its_own_job_only(cluster):
 
 @pytest.mark.slow  # test_engine_processes has deaths without a cluster
 def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
-    """SIGKILL to a dask worker in the middle of its jobs: they run on the other, and the nanny starts a new one."""
+    """SIGKILL to a dask worker in the middle of its jobs: they run on the other, and the nanny
+    starts a new one."""
     jobs = [
         Job(f"slow {n}", "trials", note_node_and_sleep, (str(tmp_path / f"{n}"), 0.4))
         for n in range(12)
@@ -290,7 +294,8 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tin
         again = run(engine, renders[:1])
         ended = run(engine, loads)
         looks = run(engine, [Job(f"look {n}", "trials", loaded, ()) for n in range(40)])
-    # a node that does not answer in time is asked again, and may find the view that it has rendered
+    # a node that does not answer in time is asked again, and may find the view that it has
+    # rendered
     assert [how.state for how in rendered.values()] == ["done"], rendered
     assert again[renders[0].name].value[0] is True
     assert all(read_view(cache / job.name) is not None for job in renders)
@@ -330,11 +335,9 @@ def sweep_command(experiment: Path, out: str, *arguments: str) -> list[str]:
 
 def test_a_plan_gives_the_same_records_on_a_cluster(cluster, experiment, tiny_out, tmp_path):
     shutil.copytree(tiny_out / ".cache" / "renders", tmp_path / "cache")
-    declared, here_at, there_at = (
-        load_experiment(experiment),
-        tmp_path / "journal here",
-        tmp_path / "journal there",
-    )
+    declared = load_experiment(experiment)
+    here_at = tmp_path / "journal here"
+    there_at = tmp_path / "journal there"
     with engine_at(cluster) as engine:
         there = run_plan(
             plan_of(declared, tmp_path / "cache"), Journal(there_at), engine, lambda _: None

@@ -1,4 +1,5 @@
-"""A cluster's driver and nodes that come and go: dask's client is in the test's hands, without any worker."""
+"""A cluster's driver and nodes that come and go: dask's client is in the test's hands, without any
+worker."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ from harness.vocabulary.provenance import source_digest
 from tests.support.cluster_processes import square
 
 pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs dask.distributed")
-FIRST, SECOND = "tcp://first:1", "tcp://second:1"
+FIRST = "tcp://first:1"
+SECOND = "tcp://second:1"
 CODE = code_of(["thesis"])
 DIGESTS = {stage: source_digest(*which) for stage, which in CODE.items()}
 SEEN = "the driver's mark"
@@ -36,7 +38,8 @@ def facts(*, can_render: bool = True, processes: int = 1) -> NodeFacts:
 
 
 class FakeClient:
-    """Dask's client: nodes are what they are said to be; bundles are kept until the test answers them."""
+    """Dask's client: nodes are what they are said to be; bundles are kept until the test answers
+    them."""
 
     status = "running"
 

@@ -1,4 +1,5 @@
-"""Coverage of a part: limits of patches from what was learnt of damage, and the poses that cover most."""
+"""Coverage of a part: limits of patches from what was learnt of damage, and the poses that cover
+most."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ from harness.runs.run import render_missing
 from harness.trials.trial import TrialTask, run_trial
 from harness.vocabulary.errors import UserError
 
-THRESHOLD, SCATTER = 5.0, 0.15
+THRESHOLD = 5.0
+SCATTER = 0.15
 
 
 def signal_m(size_mm: np.ndarray, seen: Seen) -> np.ndarray:
@@ -42,18 +44,16 @@ def signal_m(size_mm: np.ndarray, seen: Seen) -> np.ndarray:
 
 
 def inspections(count: int, looks: int = 4, growth: float = 1.0) -> ScoredDamage:
-    """Damages of `signal_m`, with a logarithmic scatter of `SCATTER` over a power of the angle's cosine."""
-    rng, damage = np.random.default_rng(3), np.repeat(np.arange(count), looks)
-    size_mm, cosine, range_m = (
-        rng.uniform(0.5, 8, count),
-        rng.uniform(0.4, 1, count),
-        rng.uniform(0.6, 0.9, count),
-    )
+    """Damages of `signal_m`, with a logarithmic scatter of `SCATTER` over a power of the angle's
+    cosine."""
+    rng = np.random.default_rng(3)
+    damage = np.repeat(np.arange(count), looks)
+    size_mm = rng.uniform(0.5, 8, count)
+    cosine = rng.uniform(0.4, 1, count)
+    range_m = rng.uniform(0.6, 0.9, count)
     seen = Seen(rng.uniform(1e-3, 3e-3, count)[damage], cosine[damage], range_m[damage])
-    size_mm, noise = (
-        size_mm[damage],
-        rng.standard_normal(len(damage)) * SCATTER / seen.cosine**growth,
-    )
+    size_mm = size_mm[damage]
+    noise = rng.standard_normal(len(damage)) * SCATTER / seen.cosine**growth
     score = signal_m(size_mm, seen) / seen.deviation_m * np.exp(noise)
     return ScoredDamage("depth", damage, size_mm, seen, np.where(score > THRESHOLD, score, np.nan))
 
@@ -111,7 +111,8 @@ def test_poses_are_taken_by_what_they_add() -> None:
         np.array(one, bool)
         for one in ([1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 1, 0], [1, 1, 0, 0, 0])
     ]
-    assert in_turn(patches, found, 1, 3) == [(0, 0.2, 0.2), (1, 0.6, 0.8)]  # the others add nothing
+    # the others add nothing
+    assert in_turn(patches, found, 1, 3) == [(0, 0.2, 0.2), (1, 0.6, 0.8)]
     assert in_turn(patches, found, 0, 1) == [(1, 0.6, 0.6)]
 
 
@@ -130,12 +131,11 @@ def test_the_program_says_where_the_camera_is_blind(
         "harness.programs.coverage.coverage.TILTS_DEG", (0.0,)
     )  # no other pose to suggest
     (tmp_path / ".cache").symlink_to(study_out / ".cache")  # holds most of the views
-    tiny, one = (
-        str(study_out.parent / "tiny.yaml"),
-        ["--set", "sweep={}", "--serial", "--results", str(tmp_path)],
-    )
+    tiny = str(study_out.parent / "tiny.yaml")
+    one = ["--set", "sweep={}", "--serial", "--results", str(tmp_path)]
     assert main([tiny, *one, "--size", "8mm", "--suggest", "1"]) == 0
-    told, folder = capsys.readouterr().out, tmp_path / "coverage" / "tiny"
+    told = capsys.readouterr().out
+    folder = tmp_path / "coverage" / "tiny"
     assert told.startswith("warning: 0 of 1 pose suggested")  # warnings stand first
     assert "\nDamage with a diameter of 8 mm is found nine times in ten on " in told
     patches, poses = (pd.read_parquet(folder / table.files[1]) for table in COVERAGE_TABLES[:2])
@@ -192,12 +192,15 @@ PLACES_MM = (
 
 
 def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[int, int], float]:
-    """Return a90 at each place, by hits of the experiment's own damage there, on boards in its own random poses."""
+    """Return a90 at each place, by hits of the experiment's own damage there, on boards in its own
+    random poses."""
     (group,) = plan_of(load_experiment(Path("pipe")), cache).groups
-    source, task = group.points[0].config.simulated, survey.task
+    source = group.points[0].config.simulated
+    task = survey.task
     hits: dict[tuple[int, int], list[tuple[float, bool, int]]] = {}
     for number in range(boards):
-        drawn, places = source.target.drawn("damaged", 1000 + number), PLACES_MM[number % 2]
+        drawn = source.target.drawn("damaged", 1000 + number)
+        places = PLACES_MM[number % 2]
         # sizes rise with the damage's id: each place has all of them in turn
         at = {flaw.id: places[(n + number // 2) % 5] for n, flaw in enumerate(drawn.flaws)}
         flaws = tuple(flaw.model_copy(update={"centre_mm": at[flaw.id]}) for flaw in drawn.flaws)
@@ -223,7 +226,8 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
 
 @pytest.mark.slow
 def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
-    experiment, cache = load_experiment(Path("pipe")), tmp_path / "renders"
+    experiment = load_experiment(Path("pipe"))
+    cache = tmp_path / "renders"
     with engine_of(EngineOptions(jobs=2)) as local:
         (survey,) = engine.survey(experiment, [(0.7, 0.0, 0.0)], cache, tmp_path, local)
     limits_mm = survey.found.limits_mm(survey.seen[0.7, 0.0, 0.0])

@@ -1,4 +1,5 @@
-"""``tofpod dataset``: files are as each layout documents them; a killed run goes on with equal bytes."""
+"""``tofpod dataset``: files are as each layout documents them; a killed run goes on with equal
+bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def home(dataset_home: Path) -> Path:
 
 
 def tiff_floats(path: Path) -> np.ndarray:
-    """(h, w, 3) of an uncompressed TIFF of float32, by the tags of the specification (TIFF 6.0) and nothing else."""
+    """(h, w, 3) of an uncompressed TIFF of float32, by the tags of the specification (TIFF 6.0)
+    and nothing else."""
     content = path.read_bytes()
     order = {b"II": "<", b"MM": ">"}[content[:2]]
     (first,) = struct.unpack_from(f"{order}I", content, 4)
@@ -48,7 +50,8 @@ def tiff_floats(path: Path) -> np.ndarray:
 
 
 def test_the_layout_is_that_of_mvtec_3d_ad(home):
-    """As anomalib's loader takes it: every picture is .../split/label/type/file; xyz beside each rgb, gt in test."""
+    """As anomalib's loader takes it: every picture is .../split/label/type/file; xyz beside each
+    rgb, gt in test."""
     folder = home / "set"
     pictures = [path for path in (folder / "tiny").rglob("*") if path.suffix in (".png", ".tiff")]
     parts = sorted(path.relative_to(folder / "tiny").parts for path in pictures)
@@ -58,8 +61,10 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
     colours = [part for part in parts if part[2] == "rgb"]
     assert len(colours) == 10 == len(names_in(folder)) and len(pictures) == 2 * 10 + 5
     for split, label, _, file in colours:
-        place, stem = folder / "tiny" / split / label, Path(file).stem
-        points, name = tiff_floats(place / "xyz" / f"{stem}.tiff"), f"tiny/{split}/{label}/{stem}"
+        place = folder / "tiny" / split / label
+        stem = Path(file).stem
+        points = tiff_floats(place / "xyz" / f"{stem}.tiff")
+        name = f"tiny/{split}/{label}/{stem}"
         arrays = arrays_of(folder, name)
         np.testing.assert_array_equal(points, np.nan_to_num(arrays["points_m"]))
         assert 0.6 < np.median(points[arrays["inspected"], 2]) < 0.8 and np.isfinite(points).all()
@@ -73,15 +78,17 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
 
 
 def test_anomalib_reads_it_unchanged(home):
-    """By anomalib's own loader, where it is installed. Its version 2.7 gives no item of any training split beside
-    pandas 3, where the mask that such items lack is no text: that alone is mended here."""
+    """By anomalib's own loader, where it is installed. Its version 2.7 gives no item of any
+    training split beside pandas 3, where the mask that such items lack is no text: that alone is
+    mended here."""
     loader = pytest.importorskip("anomalib.data.datasets.depth.mvtec_3d").MVTec3DDataset
     for split, count in (("train", 3), ("test", 5)):
         data = loader(root=home / "set", category="tiny", split=split)
         assert len(data) == count
         data.samples["mask_path"] = data.samples["mask_path"].fillna("")
         for item in (data[number] for number in range(count)):
-            folder, stem = Path(item.image_path).parents[1], Path(item.image_path).stem
+            folder = Path(item.image_path).parents[1]
+            stem = Path(item.image_path).stem
             points = tiff_floats(folder / "xyz" / f"{stem}.tiff")
             np.testing.assert_array_equal(np.moveaxis(np.asarray(item.depth_map), 0, -1), points)
             assert np.asarray(item.image).shape == (3, *points.shape[:2]) and item.gt_label == (
@@ -131,11 +138,13 @@ def test_run_lengths_begin_outside():
 def test_truth_depth_and_validity_agree_with_the_cloud(home):
     folder = home / "set"
     name = "tiny/test/through/0002"
-    truth, arrays, place = truth_of(folder, name), arrays_of(folder, name), folder / "boards" / name
-    depth, valid, intensity, mask = (
-        cv2.imread(str(place / f"{file}.png"), cv2.IMREAD_UNCHANGED)
-        for file in ("depth", "valid", "intensity", "mask")
-    )
+    truth = truth_of(folder, name)
+    arrays = arrays_of(folder, name)
+    place = folder / "boards" / name
+    depth = cv2.imread(str(place / f"{'depth'}.png"), cv2.IMREAD_UNCHANGED)
+    valid = cv2.imread(str(place / f"{'valid'}.png"), cv2.IMREAD_UNCHANGED)
+    intensity = cv2.imread(str(place / f"{'intensity'}.png"), cv2.IMREAD_UNCHANGED)
+    mask = cv2.imread(str(place / f"{'mask'}.png"), cv2.IMREAD_UNCHANGED)
     z_m = arrays["points_m"][..., 2]
     np.testing.assert_array_equal(valid > 0, np.isfinite(z_m))
     assert (
@@ -158,7 +167,8 @@ def test_truth_depth_and_validity_agree_with_the_cloud(home):
 
 
 def test_no_unit_and_no_board_is_in_two_splits(home):
-    folder, units = home / "set", dict[str, set[int]]()
+    folder = home / "set"
+    units = dict[str, set[int]]()
     poses = set()
     for name in names_in(folder):
         truth = truth_of(folder, name)

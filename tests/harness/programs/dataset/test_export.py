@@ -1,4 +1,5 @@
-"""``tofpod export``: what is written is read back bit for bit, with the truth beside it, or not at all."""
+"""``tofpod export``: what is written is read back bit for bit, with the truth beside it, or not at
+all."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ from scenes.sensor.source import SimulatedUnit
 from scenes.target.thesis import ThesisTargetConfig
 
 CAMERA = CameraConfig(name="azure_kinect_nfov", unit_seed=1)
-FRONT, BACK = Plane(0.7, 0.1), Plane(0.715, 0.1)
+FRONT = Plane(0.7, 0.1)
+BACK = Plane(0.715, 0.1)
 REGION = Region(260, 340, 250, 370)
 FRAMES = 3
 DECLARED = """
@@ -129,7 +131,8 @@ def simulated(view: NoiseFreeView, number: int) -> FrameSource:
     return SimulatedUnit(camera_of(CAMERA), CAMERA, view).capture(FRAMES, 3, *labels)
 
 
-# ---- bags ------------------------------------------------------------------------------------------------------------
+# ---- bags
+# ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", ("ros2", "mcap"))
@@ -139,10 +142,8 @@ def test_written_read_back_and_detected_is_equal_bit_for_bit(
     out = exports[form]
     for number in (0, 1):
         source = simulated(view, number)
-        expected, got = (
-            average(each, AverageConfig())
-            for each in (source, open_capture([out / f"view_0{number}"]))
-        )
+        expected = average(source, AverageConfig())
+        got = average(open_capture([out / f"view_0{number}"]), AverageConfig())
         inside = got.region.shape, source.region.within(got.region)
         assert inside[0] == (576, 640)
         for name in ("points_m", "count", "variance_m2", "rgb", "amplitude"):
@@ -182,9 +183,8 @@ def test_the_program_finds_the_same_in_either_storage(
         ]
         more += ["--threshold", "8"]
         assert detect.main([str(bag), *more]) == 0
-    first, second = (
-        (tmp_path / f"found_{form}" / "findings.csv").read_text() for form in ("ros2", "mcap")
-    )
+    first = (tmp_path / f"found_{'ros2'}" / "findings.csv").read_text()
+    second = (tmp_path / f"found_{'mcap'}" / "findings.csv").read_text()
     assert first == second and len(first.splitlines()) == 2
 
 
@@ -212,7 +212,8 @@ def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path])
     np.testing.assert_allclose(
         [place.x, place.y, place.z], invert(T_camera_board)[:3, 3], rtol=1e-14
     )
-    info, cloud = got[1][2], got[2][2]
+    info = got[1][2]
+    cloud = got[2][2]
     assert cloud.header.stamp == info.header.stamp and cloud.header.frame_id == pose.child_frame_id
     lens = camera_of(CAMERA).nominal_lens
     assert info.distortion_model == "rational_polynomial"
@@ -263,13 +264,13 @@ def test_without_damage_nothing_is_listed_and_the_noise_is_another(
         experiment, tmp_path / "free", "mcap", "--hole-free", "--views", "1", "--frames", "1"
     )
     assert json.loads((free / "truth.json").read_text())["damages"] == []
-    first, second = (
-        next(open_capture([folder / "view_00"]).frames()).z_m for folder in (free, exports["mcap"])
-    )
+    first = next(open_capture([free / "view_00"]).frames()).z_m
+    second = next(open_capture([exports["mcap"] / "view_00"]).frames()).z_m
     assert not np.array_equal(first, second, equal_nan=True)
 
 
-# ---- TUM -------------------------------------------------------------------------------------------------------------
+# ---- TUM
+# -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_sequence_has_what_the_benchmark_and_rtabmap_read(exports: dict[str, Path]) -> None:
@@ -320,8 +321,8 @@ def test_the_ground_truth_carries_the_camera_to_the_board(exports: dict[str, Pat
 def test_a_sequence_read_back_lies_on_the_planes(
     experiment: Path, tmp_path: Path, view: NoiseFreeView
 ) -> None:
-    """The pinhole's pixels are wrong by half a pixel at most, which on a plane of slope 0.1 is 0.07 mm. One view only:
-    all frames of a sequence are read as one capture."""
+    """The pinhole's pixels are wrong by half a pixel at most, which on a plane of slope 0.1 is
+    0.07 mm. One view only: all frames of a sequence are read as one capture."""
     out = exported(experiment, tmp_path / "out", "tum", "--views", "1")
     recording = open_capture([out])
     assert (
@@ -342,7 +343,8 @@ def test_a_sequence_read_back_lies_on_the_planes(
         & (pixels[:, 1] < cut.row1)
     )
     assert inside.mean() > 0.97
-    rows, columns = pixels[inside, 1] - cut.row0, pixels[inside, 0] - cut.col0
+    rows = pixels[inside, 1] - cut.row0
+    columns = pixels[inside, 0] - cut.col0
     expected = whole.points_m[rows, columns]
     off = cloud.points_m[cloud.valid][inside] - expected
     pitch_m = 0.72 / camera_of(CAMERA).nominal_lens.fx
@@ -383,7 +385,8 @@ def test_the_quaternion_turns_as_the_matrix_does() -> None:
     T_a_b = np.eye(4)
     T_a_b[:3, :3] = rotation_xyz_deg(170.0, 20.0, -75.0)
     x, y, z, w = quaternion_of(T_a_b)
-    vector, axis = np.array([0.3, -0.2, 0.9]), np.array([x, y, z])
+    vector = np.array([0.3, -0.2, 0.9])
+    axis = np.array([x, y, z])
     turned = vector + 2 * np.cross(axis, np.cross(axis, vector) + w * vector)
     np.testing.assert_allclose(turned, transform_points(T_a_b, vector), atol=1e-14)
     assert w >= 0 and x * x + y * y + z * z + w * w == pytest.approx(1, abs=1e-14)
@@ -402,7 +405,8 @@ def test_views_follow_each_other_in_time(view: NoiseFreeView) -> None:
     )
 
 
-# ---- what it refuses -------------------------------------------------------------------------------------------------
+# ---- what it refuses
+# -------------------------------------------------------------------------------------------------
 
 
 def test_mistakes_are_one_message_and_leave_nothing(

@@ -1,4 +1,5 @@
-"""``tofpod score``: limits, AU-PRO and AUROC of given anomaly maps; wrong sets of maps are refused."""
+"""``tofpod score``: limits, AU-PRO and AUROC of given anomaly maps; wrong sets of maps are
+refused."""
 
 from __future__ import annotations
 
@@ -26,10 +27,13 @@ def folder(dataset_home: Path) -> Path:
 
 @pytest.fixture
 def maps(folder: Path, tmp_path: Path) -> Path:
-    """Maps of noise, in which damage stands out on some of its pixels; one map is a TIFF, the others are arrays."""
-    rng, out = np.random.default_rng(1), tmp_path / "maps"
+    """Maps of noise, in which damage stands out on some of its pixels; one map is a TIFF, the
+    others are arrays."""
+    rng = np.random.default_rng(1)
+    out = tmp_path / "maps"
     for name in sorted(names_in(folder)):
-        damage, path = arrays_of(folder, name)["damage"], out / name
+        damage = arrays_of(folder, name)["damage"]
+        path = out / name
         noise = np.round(rng.normal(size=damage.shape), 2) + 6.0 * (damage > 0) * (
             rng.random(damage.shape) < 0.7
         )
@@ -60,9 +64,13 @@ def test_areas_are_those_of_scikit_learn(folder, maps, tmp_path):
     from sklearn.metrics import auc, roc_auc_score, roc_curve
 
     assert run(maps, folder, tmp_path / "out", *RATE) == 0
-    scores, damaged, weights, boards = [], [], [], []
+    scores = []
+    damaged = []
+    weights = []
+    boards = []
     for name in (name for name in names_in(folder) if "/test/" in name):
-        arrays, own = arrays_of(folder, name), map_of(maps, name)
+        arrays = arrays_of(folder, name)
+        own = map_of(maps, name)
         here = arrays["inspected"]
         damage = arrays["damage"][here]
         scores.append(own[here])
@@ -70,7 +78,8 @@ def test_areas_are_those_of_scikit_learn(folder, maps, tmp_path):
         counts = np.bincount(damage)
         weights.append(np.where(damage > 0, 1.0 / counts[damage], 1.0))
         boards.append((own[here].max(), "/good/" not in name))
-    flat, truth = np.concatenate(scores), np.concatenate(damaged)
+    flat = np.concatenate(scores)
+    truth = np.concatenate(damaged)
     found = pd.read_csv(tmp_path / "out" / "scores.csv").iloc[0]
     assert found["pixel_auroc"] == pytest.approx(roc_auc_score(truth, flat), abs=2e-6)
     assert found["board_auroc"] == pytest.approx(

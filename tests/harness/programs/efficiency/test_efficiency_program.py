@@ -42,7 +42,8 @@ def test_detectors_stand_beside_the_ideal_observer(
     tables = [pd.read_parquet(results / table.files[1]) for table in EFFICIENCY_TABLES]
     efficiency, damages = tables
     assert efficiency["frames"].tolist() == [1, 2] and len(damages) == 2 * 4 * 5
-    one, two = (damages[damages["set_up"].str.startswith(name)] for name in ("1 frame", "2 frames"))
+    one = damages[damages["set_up"].str.startswith("1 frame")]
+    two = damages[damages["set_up"].str.startswith("2 frames")]
     # more frames, more signal; damage that shows nothing has none
     assert (two["index"].to_numpy() >= one["index"].to_numpy()).mean() > 0.9
     assert np.corrcoef(np.log(one["diameter_mm"]), np.log(one["index"]))[0, 1] > 0.8

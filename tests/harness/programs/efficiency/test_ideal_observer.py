@@ -1,4 +1,5 @@
-"""The ideal observer against brute force: dense matrices, densities of the normal distribution, drawn fields."""
+"""The ideal observer against brute force: dense matrices, densities of the normal distribution,
+drawn fields."""
 
 from __future__ import annotations
 
@@ -50,12 +51,15 @@ def fields(sums: NoiseSums, count: int, side: int) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_templates_have_the_index_and_the_likelihood_of_brute_force(kind: str) -> None:
-    sums, known = noise_of(kind), rng(kind, "holes").random((SIDE, SIDE)) > 0.2
-    covariance, v = dense(sums, known), np.linspace(-1, 1, SIDE)
+    sums = noise_of(kind)
+    known = rng(kind, "holes").random((SIDE, SIDE)) > 0.2
+    covariance = dense(sums, known)
+    v = np.linspace(-1, 1, SIDE)
     surface = np.stack([np.ones((SIDE, SIDE)), *np.meshgrid(v, v)])
     signals = rng(kind, "signals").standard_normal((3, SIDE, SIDE))
     found = ideal.detectability(signals * known, surface * known, known, sums)
-    s, b = signals[:, known].T, surface[:, known].T
+    s = signals[:, known].T
+    b = surface[:, known].T
     inverse = np.linalg.inv(covariance)
     k = inverse - inverse @ b @ np.linalg.solve(b.T @ inverse @ b, b.T @ inverse)
     assert found == pytest.approx(np.sqrt(np.diag(s.T @ k @ s)), rel=1e-4)
@@ -86,7 +90,8 @@ def test_the_covariance_is_found_in_drawn_noise_with_missing_pixels() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_maxima_are_as_many_as_in_drawn_fields(kind: str) -> None:
-    sums, thresholds = noise_of(kind), np.array([2.0, 2.5, 3.0])
+    sums = noise_of(kind)
+    thresholds = np.array([2.0, 2.5, 3.0])
     drawn = fields(sums, 20, 256)
     peaks = drawn[drawn == ndimage.maximum_filter(drawn, (0, 3, 3), mode="wrap")]
     counted = (peaks[:, None] > thresholds).sum(axis=0)
@@ -126,7 +131,8 @@ def test_detection_is_as_likely_as_in_drawn_fields() -> None:
 
 
 def judged(share: float) -> tuple[SetUpLimit, IdealDamages]:
-    """Return the limit of a linear detector with this efficiency, and the ideal observer on its damages."""
+    """Return the limit of a linear detector with this efficiency, and the ideal observer on its
+    damages."""
     record = study_record().set_ups[0]
     seen = record.inspected
     index = (seen.diameter_mm / 3.0) ** 3
@@ -166,7 +172,8 @@ def test_everything_missed_has_no_efficiency_and_says_so() -> None:
 
 
 def test_expected_sizes_of_hardly_any_hits_or_misses() -> None:
-    x, weights = np.array([1.0, 2.0, 3.0]), np.ones((1, 3))
+    x = np.array([1.0, 2.0, 3.0])
+    weights = np.ones((1, 3))
     assert np.isinf(expected_sizes(x, np.full(3, 0.01), weights)).all()
     assert expected_sizes(x, np.full(3, 0.99), weights)[:, 0].tolist() == [1.0, 1.0]
 

@@ -1,4 +1,5 @@
-"""The gate's program: exit codes, what it says, its baseline; and how often its rule fails without a reason.
+"""The gate's program: exit codes, what it says, its baseline; and how often its rule fails without
+a reason.
 
 The study itself is put in by hand here; `tests/test_check_mutations.py` runs whole ones.
 """
@@ -32,10 +33,13 @@ def record(*set_ups: SetUp) -> StudyRecord:
 
 
 class Program:
-    """`harness.programs.gate.check` on a folder of its own, with a study that finds what it is told to."""
+    """`harness.programs.gate.check` on a folder of its own, with a study that finds what it is
+    told to."""
 
     def __init__(self, home: Path, found: Callable[[StudyRecord, int], None]) -> None:
-        self.baseline, self.home, self._finds = home / "baseline.json", home, found
+        self.baseline = home / "baseline.json"
+        self.home = home
+        self._finds = found
 
     def __call__(self, found: StudyRecord, *arguments: str, code: int = 0) -> int:
         self._finds(found, code)
@@ -176,11 +180,13 @@ def test_the_committed_baseline_is_of_the_committed_study():
     assert all(row.mark == "as good" for row in compare_studies(baseline, baseline).rows)
 
 
-# --- the rule, on whole studies drawn from a model (tests/validation/gate_power.py prints more of them) ---------------
+# --- the rule, on whole studies drawn from a model (tests/validation/gate_power.py prints more of
+# them) ---------------
 
 
 def test_what_the_gate_sees_is_measured_on_studies_as_large_as_its_own(experiment):
-    config, size = experiment.config, Size()
+    config = experiment.config
+    size = Size()
     assert (config.study.boards, config.study.hole_free_boards) == (
         size.boards,
         size.hole_free_boards,
@@ -195,7 +201,8 @@ def test_what_the_gate_sees_is_measured_on_studies_as_large_as_its_own(experimen
 
 @pytest.mark.slow
 def test_another_noise_seldom_fails_the_gate():
-    """Of 150 checks with no cause no more than 6 (4 %) fail: were the rate 1 %, more would with probability 1e-3."""
+    """Of 150 checks with no cause no more than 6 (4 %) fail: were the rate 1 %, more would with
+    probability 1e-3."""
     assert share(Size(set_ups=1), 150) <= 0.04
 
 

@@ -1,8 +1,10 @@
-"""The gate against faults put into detector and camera: each must fail it, another draw of the noise must not.
+"""The gate against faults put into detector and camera: each must fail it, another draw of the
+noise must not.
 
-The program and its rule are those of CI; the study is `experiments/regression.yaml` with fewer boards, sizes about the
-limit, one frame and no reflected light, since five faults and two honest runs of it must fit into a test. Renders are
-shared: they depend on neither detector, nor the sensor's noise, nor its seed.
+The program and its rule are those of CI; the study is `experiments/regression.yaml` with fewer
+boards, sizes about the limit, one frame and no reflected light, since five faults and two honest
+runs of it must fit into a test. Renders are shared: they depend on neither detector, nor the
+sensor's noise, nor its seed.
 """
 
 from __future__ import annotations
@@ -24,14 +26,16 @@ pytestmark = pytest.mark.slow  # a study of twenty boards for each fault
 ROOT = Path(__file__).resolve().parents[4]
 SMALLER = (
     "study.boards=20",
-    "source.target.damage.diameter_mm=[2.5, 6.5]",  # about the limit: the same holes say more of its changes
+    # about the limit: the same holes say more of its changes
+    "source.target.damage.diameter_mm=[2.5, 6.5]",
     "study.hole_free_boards=16",
     "threshold.calibrate.boards=20",
     "source.render.bounces=0",
     "sweep={capture.frames: [1]}",
 )
 DOUBLED_NOISE = (
-    # a quarter of the light doubles the noise of photons, which is all but a few per cent of a frame's
+    # a quarter of the light doubles the noise of photons, which is all but a few per cent of a
+    # frame's
     "source.camera.numbers={photons.signal_electrons: 292.0}",
     "source.camera.fixed_pattern_scale=2.0",
 )
@@ -47,8 +51,8 @@ class Checked:
 
 
 class Gate:
-    """The program with a baseline, results and renders of its own; its trials run in this process, which saves the
-    start of four for each check."""
+    """The program with a baseline, results and renders of its own; its trials run in this process,
+    which saves the start of four for each check."""
 
     def __init__(self, home: Path) -> None:
         self.home = home

@@ -1,4 +1,5 @@
-"""Two studies compared: the tests against enumeration and by hand, the pairing, every mark, the program."""
+"""Two studies compared: the tests against enumeration and by hand, the pairing, every mark, the
+program."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ SMALL = {"boards": 24, "hole_free_boards": 24, "holes": 6}
 
 @pytest.fixture(scope="module", autouse=True)
 def each_limit_once() -> Iterator[None]:
-    """The limit of a set-up that several tests compare is computed once; half of these tests' time went there."""
+    """The limit of a set-up that several tests compare is computed once; half of these tests' time
+    went there."""
     known: dict[bytes, SetUpLimit] = {}
 
     def limit(record: SetUpRecord) -> SetUpLimit:
@@ -84,7 +86,8 @@ def only_row(first: StudyRecord, second: StudyRecord):
     return row
 
 
-# --- tests over boards -----------------------------------------------------------------------------------------------
+# --- tests over boards
+# -----------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=40, deadline=None)
@@ -125,7 +128,8 @@ def inspected(board, hit) -> Inspected:
 def test_boards_are_the_unit_where_damages_are_lost_together():
     """Two boards that lose eight damages each are two losses, not sixteen."""
     board = np.repeat([0, 1, 2], 8)
-    before, now = inspected(board, [True] * 24), inspected(board, [False] * 16 + [True] * 8)
+    before = inspected(board, [True] * 24)
+    now = inspected(board, [False] * 16 + [True] * 8)
     change = hits_change(before, now)
     assert change is not None
     assert (change.only_first, change.only_second, change.boards, change.inspections) == (
@@ -161,14 +165,16 @@ def test_no_shared_inspection_is_no_test():
     assert hits_change(inspected([0], [True]), inspected([7], [True])) is None
 
 
-# --- limits ----------------------------------------------------------------------------------------------------------
+# --- limits
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_paired_draws_make_the_interval_narrower_than_independent_ones():
     one = small(SetUp(boards_mm=1.5, own_noise=0.2)).set_ups[0]
     other = small(SetUp(boards_mm=1.5, own_noise=0.2, variant="other", a50_mm=6.3)).set_ups[0]
     limits = limit_of(one), limit_of(other)
-    paired, apart = (limit_change(*limits, same) for same in (True, False))
+    paired = limit_change(*limits, True)
+    apart = limit_change(*limits, False)
     assert paired.paired and not apart.paired
     assert paired.difference_mm == apart.difference_mm == limits[1].a90_mm - limits[0].a90_mm
     widths = [change.interval_mm.high - change.interval_mm.low for change in (paired, apart)]
@@ -186,7 +192,8 @@ def test_boards_missing_in_one_unpair_the_draws():
     ).paired
 
 
-# --- false calls -----------------------------------------------------------------------------------------------------
+# --- false calls
+# -----------------------------------------------------------------------------------------------------
 
 
 def unflawed(calls: np.ndarray, area_m2: float = 0.07) -> SetUpRecord:
@@ -198,7 +205,8 @@ def unflawed(calls: np.ndarray, area_m2: float = 0.07) -> SetUpRecord:
 
 
 def test_given_thresholds_leave_fishers_exact_test():
-    one, other = (replace(unflawed(np.arange(20) < k), calibration_runs=0) for k in (2, 8))
+    one = replace(unflawed(np.arange(20) < 2), calibration_runs=0)
+    other = replace(unflawed(np.arange(20) < 8), calibration_runs=0)
     change = calls_change(one, other, None)
     assert change is not None and change.calling == (2, 8)
     table = [[8, 12], [2, 18]]
@@ -213,9 +221,10 @@ def test_no_call_anywhere_says_nothing():
 
 
 def test_on_identical_frames_the_signs_of_boards_are_tossed():
-    """All 16 boards call where 5 did: with a threshold that is the second highest of 20 scores such luck has 0.2 %, on
-    identical frames it has 2^-11."""
-    one, other = (replace(unflawed(np.arange(16) < k), calibration_runs=20) for k in (5, 16))
+    """All 16 boards call where 5 did: with a threshold that is the second highest of 20 scores
+    such luck has 0.2 %, on identical frames it has 2^-11."""
+    one = replace(unflawed(np.arange(16) < 5), calibration_runs=20)
+    other = replace(unflawed(np.arange(16) < 16), calibration_runs=20)
     apart = calls_change(one, other, 2.0)
     alike = calls_change(
         replace(one, frames_digest="same"), replace(other, frames_digest="same"), 2.0
@@ -231,9 +240,8 @@ def test_luck_with_the_calibration_is_the_same_only_where_the_threshold_is():
         replace(unflawed(np.arange(16) < k), calibration_runs=20, frames_digest="same")
         for k in (5, 16)
     )
-    signs, both = (
-        calls_change(one, replace(other, threshold=one.threshold * by), 2.0) for by in (1.0, 1.01)
-    )
+    signs = calls_change(one, replace(other, threshold=one.threshold * 1.0), 2.0)
+    both = calls_change(one, replace(other, threshold=one.threshold * 1.01), 2.0)
     given = calls_change(
         *(replace(u, calibration_runs=0) for u in (one, replace(other, threshold=9.0))), None
     )
@@ -245,8 +253,8 @@ def test_luck_with_the_calibration_is_the_same_only_where_the_threshold_is():
 
 @pytest.mark.slow
 def test_two_detectors_on_identical_frames_are_not_called_for_their_luck():
-    """800 pairs of equally good detectors that score independently: signs alone are called at 1 % far oftener; the
-    test that decides no oftener than 1 % (this test's own alpha 1e-4)."""
+    """800 pairs of equally good detectors that score independently: signs alone are called at 1 %
+    far oftener; the test that decides no oftener than 1 % (this test's own alpha 1e-4)."""
     rng = np.random.default_rng(6)
     base = replace(unflawed(np.zeros(240)), frames_digest="same")
     decided = by_signs = 0
@@ -274,8 +282,9 @@ def test_counts_are_compared_by_area():
 
 @pytest.mark.slow
 def test_calibration_draws_are_in_the_false_calls_test_and_not_in_that_of_counts():
-    """2,000 pairs of honest studies, 60 boards to calibrate and 240 to judge: the test that decides is called at 5 % no
-    oftener than 5 % (this test's own alpha 1e-4); that of counts, which takes thresholds as known, four times as often.
+    """2,000 pairs of honest studies, 60 boards to calibrate and 240 to judge: the test that
+    decides is called at 5 % no oftener than 5 % (this test's own alpha 1e-4); that of counts,
+    which takes thresholds as known, four times as often.
     """
     rng = np.random.default_rng(5)
     base = unflawed(np.zeros(240))
@@ -296,7 +305,8 @@ def test_calibration_draws_are_in_the_false_calls_test_and_not_in_that_of_counts
     assert counted > 300
 
 
-# --- pairs -----------------------------------------------------------------------------------------------------------
+# --- pairs
+# -----------------------------------------------------------------------------------------------------------
 
 
 def labels(pairs) -> list[tuple[str | None, str | None]]:
@@ -334,14 +344,17 @@ def test_another_measuring_stick_is_not_compared(study, set_up, word):
 
 
 def test_another_family_of_damage_is_not_compared_and_other_boards_of_the_same_are():
-    one, same, larger = small(), small(seed=2), small(seed=2, sizes_mm=(12.0, 20.0))
+    one = small()
+    same = small(seed=2)
+    larger = small(seed=2, sizes_mm=(12.0, 20.0))
     assert not_comparable(one, same, one.set_ups[0], same.set_ups[0]) == ""
     assert "sizes" in not_comparable(one, larger, one.set_ups[0], larger.set_ups[0])
     deeper = replace(same.set_ups[0].inspected, depth_mm=same.set_ups[0].inspected.depth_mm + 3)
     assert "depths" in only_row(one, first_set_up(same, inspected=deeper)).why
 
 
-# --- verdicts --------------------------------------------------------------------------------------------------------
+# --- verdicts
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_a_study_is_as_good_as_itself():
@@ -355,11 +368,10 @@ def test_a_study_is_as_good_as_itself():
 
 
 def test_worse_one_way_is_better_the_other():
-    one, other = (
-        small(SetUp(a50_mm=5)),
-        small(SetUp(a50_mm=7, detector_version=2, frames_digest="b")),
-    )
-    there, back = only_row(one, other), only_row(other, one)
+    one = small(SetUp(a50_mm=5))
+    other = small(SetUp(a50_mm=7, detector_version=2, frames_digest="b"))
+    there = only_row(one, other)
+    back = only_row(other, one)
     assert (there.mark, back.mark) == ("worse", "better")
     assert there.limit.ratio == pytest.approx(1 / back.limit.ratio)
     assert (there.hits.only_first, there.hits.only_second) == (
@@ -384,9 +396,11 @@ def test_a_larger_limit_that_may_be_chance_is_not_worse():
 
 def test_the_test_of_hits_answers_for_the_limit():
     one = small(SetUp(a50_mm=5))
-    lost, equal = (only_row(one, small(SetUp(a50_mm=a50))) for a50 in (8, 5))
+    lost = only_row(one, small(SetUp(a50_mm=8)))
+    equal = only_row(one, small(SetUp(a50_mm=5)))
     assert lost.mark == "worse"
-    # of Holm's three questions the smaller of two equal p, and of two tests of the limit the stronger
+    # of Holm's three questions the smaller of two equal p, and of two tests of the limit the
+    # stronger
     assert lost.limit_p[0] == pytest.approx(2 * 2 * min(lost.hits.fewer_p, lost.limit.grown_p))
     assert equal.limit_p[0] == 1.0
 
@@ -400,7 +414,8 @@ def test_a_significant_loss_within_the_margin_is_as_good():
 def weaker(study: StudyRecord, by: float, above: float = 1.0, **changed: Any) -> StudyRecord:
     """The study with all signals times ``by``, found from ``above`` times as much on."""
     record = study.set_ups[0]
-    signal, at = by * record.inspected.signal, above * record.threshold
+    signal = by * record.inspected.signal
+    at = above * record.threshold
     return first_set_up(
         study, inspected=replace(record.inspected, signal=signal, hit=signal > at), **changed
     )
@@ -433,7 +448,8 @@ def test_weaker_signals_and_a_higher_threshold_are_worse_though_a90_is_not():
 
 
 def test_the_luck_of_both_calibrations_is_in_the_test_of_signals():
-    """Scores of 48 runs scatter by 7 %, so a threshold that was calibrated anew is known to some per cent only."""
+    """Scores of 48 runs scatter by 7 %, so a threshold that was calibrated anew is known to some
+    per cent only."""
     one = small(boards=20)
     scores = 5.0 * np.exp(0.07 * np.random.default_rng(1).standard_normal(48))
     runs = Calibrated(np.arange(48), np.zeros(48, int), scores, np.zeros(48), np.zeros(48))
@@ -452,16 +468,15 @@ def test_the_luck_of_both_calibrations_is_in_the_test_of_signals():
 
 @pytest.mark.parametrize("slip", [0.0, 0.1])
 def test_signals_under_another_draw_of_the_noise_are_as_rarely_weaker_as_the_test_says(slip):
-    """``slip``: deviation by which hits do not follow the signals, as a score over several pixels does not."""
+    """``slip``: deviation by which hits do not follow the signals, as a score over several pixels
+    does not."""
     random = np.random.default_rng(3)
 
     def drawn(size: gate_power.Size, boards: int, noise: int) -> list[SetUpRecord]:
         records = []
         for record in gate_power.study(size, boards, noise).set_ups:
-            seen, factor = (
-                record.inspected,
-                np.exp(slip * random.standard_normal(len(record.inspected.signal))),
-            )
+            seen = record.inspected
+            factor = np.exp(slip * random.standard_normal(len(record.inspected.signal)))
             hit = seen.signal * factor > record.threshold
             records.append(replace(record, inspected=replace(seen, hit=hit)))
         return records
@@ -478,7 +493,8 @@ def test_signals_under_another_draw_of_the_noise_are_as_rarely_weaker_as_the_tes
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_effective_threshold_is_where_half_of_the_signals_are_found(seed):
-    random, n = np.random.default_rng(seed), 40
+    random = np.random.default_rng(seed)
+    n = 40
     signal = random.lognormal(size=n)
     hit = random.random(n) < 1 / (1 + np.exp(-2 * np.log(signal)))
     record = replace(small().set_ups[0], threshold=1.1)
@@ -535,7 +551,8 @@ def test_everything_found_is_no_failure():
 
 def test_other_boards_are_compared_by_their_limits():
     one = small(SetUp(a50_mm=5))
-    same, worse = (only_row(one, small(SetUp(a50_mm=a50), seed=3)) for a50 in (5, 8))
+    same = only_row(one, small(SetUp(a50_mm=5), seed=3))
+    worse = only_row(one, small(SetUp(a50_mm=8), seed=3))
     assert same.hits is None and worse.hits is None and not worse.limit.paired
     assert (same.mark, worse.mark) == ("as good", "worse") and worse.changed == ("other boards",)
 
@@ -564,7 +581,8 @@ def test_many_set_ups_ask_for_more():
     )
 
 
-# --- pages and the program -------------------------------------------------------------------------------------------
+# --- pages and the program
+# -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -579,7 +597,8 @@ def comparison() -> Comparison:
 
 
 def test_every_row_is_said_in_text_and_on_the_page(comparison):
-    text, page = text_of(compare_parts(comparison)), compare_html(comparison, "tofpod compare a b")
+    text = text_of(compare_parts(comparison))
+    page = compare_html(comparison, "tofpod compare a b")
     assert [row.mark for row in comparison.rows] == [
         "worse",
         "as good",
@@ -611,7 +630,8 @@ def test_the_program_prints_writes_and_returns_0(tmp_path, capsys):
 
 
 def test_nothing_paired_is_said_with_what_there_is(tmp_path, capsys):
-    one, other = small(SetUp("a", 1), SetUp("b", 1, {"x": 1})), small(SetUp("c", 5), SetUp("d", 9))
+    one = small(SetUp("a", 1), SetUp("b", 1, {"x": 1}))
+    other = small(SetUp("c", 5), SetUp("d", 9))
     for name, study in (("one.json", one), ("other.json", other)):
         (tmp_path / name).write_text(record_text(study))
     assert (

@@ -59,7 +59,8 @@ def test_the_plug_in_is_offered_to_pytest():
 
 @pytest.mark.slow
 def test_a_package_guards_its_limit(tmp_path):
-    """Its CI passes with the committed baseline and fails where the detector got blunt, with the reason."""
+    """Its CI passes with the committed baseline and fails where the detector got blunt, with the
+    reason."""
     for name, text in (
         ("site/acme.py", DETECTOR),
         ("tests/limit.yaml", LIMIT),

@@ -1,4 +1,5 @@
-"""`harness.programs.implant.implant`: virtual damage is what the camera would have measured, and the study of it is a study."""
+"""`harness.programs.implant.implant`: virtual damage is what the camera would have measured, and
+the study of it is a study."""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ def board(width_mm: float, pose: custom.PoseConfig, **damage: Any) -> custom.Tar
 def test_implanted_damage_is_what_the_camera_would_have_seen(
     damage: dict, most_mm: float, tmp_path: Path
 ):
-    """The whole board is rendered with its damage, which alone is put into frames of the same board without it."""
+    """The whole board is rendered with its damage, which alone is put into frames of the same
+    board without it."""
     camera = camera_of(NOISE)
     target = board(
         90.0,
@@ -90,19 +92,19 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
     np.testing.assert_allclose(alone.pose.T_camera_board[:3, 2], T[:3, 2], atol=1e-9)
 
     cut = found.region.within(units[0].region)
-    z_m, valid = np.zeros(found.shift_m.shape), np.zeros(found.shift_m.shape)
+    z_m = np.zeros(found.shift_m.shape)
+    valid = np.zeros(found.shift_m.shape)
     for number, plain in enumerate(bare):
-        frame, whole = (
-            Frame("", plain[cut], np.zeros(found.shift_m.shape, np.uint8)),
-            plain[cut].copy(),
-        )
+        frame = Frame("", plain[cut], np.zeros(found.shift_m.shape, np.uint8))
+        whole = plain[cut].copy()
         reason = frame.reason.copy()
         part = Implant(
             Region(0, whole.shape[0], 0, whole.shape[1]), found.shift_m, found.noise_m, found.lost
         )
         part.put_into(frame, number, whole, reason)
         assert np.array_equal(np.isnan(whole), (reason != Reason.VALID) | np.isnan(frame.z_m))
-        z_m, valid = z_m + np.nan_to_num(whole), valid + np.isfinite(whole)
+        z_m = z_m + np.nan_to_num(whole)
+        valid = valid + np.isfinite(whole)
     with np.errstate(invalid="ignore"):
         depth_m = z_m / valid - np.nanmean(seen[:, *cut], axis=0)
         changed = np.abs(found.shift_m) > 1 * MM
@@ -118,7 +120,8 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
 
 @pytest.mark.parametrize(("radius_m", "said"), [(0.3, "the inner"), (None, "")])
 def test_a_rim_that_is_seen_more_steeply_is_told(radius_m: float | None, said: str, tmp_path: Path):
-    """A cylinder that is seen at up to 63 degrees, and a plane: damage keeps off both rims, and one of them matters."""
+    """A cylinder that is seen at up to 63 degrees, and a plane: damage keeps off both rims, and
+    one of them matters."""
     slope = np.broadcast_to((np.arange(200) - 99.5) / 400, (200, 200))
     z_m = np.full((200, 200), 0.8)
     if radius_m is not None:  # the nearer end of the ray in the circle about (0, 0.8 + radius)
@@ -224,7 +227,8 @@ def test_the_program_states_a_limit_of_a_recording(
         assert seen.hit[seen.diameter_mm > 9].all() and not seen.hit[seen.diameter_mm < 2.5].any()
         assert one.unflawed.area_m2[0] == pytest.approx(80 * 110 * (0.6 / 504) ** 2, rel=0.05)
     assert len(record.set_ups[0].unflawed.board) == FRAMES // 2
-    said, page = capsys.readouterr().out, (out / "report.html").read_text()
+    said = capsys.readouterr().out
+    page = (out / "report.html").read_text()
     assert (
         said.startswith("warning: virtual damage may be harder to find than real damage")
         and "7 of 23" in page
@@ -244,7 +248,8 @@ def test_the_program_states_a_limit_of_a_recording(
 
 @pytest.mark.slow
 def test_the_implanted_limit_is_the_simulated_one(tmp_path: Path):
-    """A study of simulated boards, and damage put into the exported frames of one board without any."""
+    """A study of simulated boards, and damage put into the exported frames of one board without
+    any."""
     experiment = Path(__file__).resolve().parents[4] / "experiments" / "detection_limit.yaml"
     common = {name: 0 for name in ("tilt_deg", "offset_mm", "distance_jitter_mm", "roll_deg")}
     common |= {"board.width_mm": 400, "board.height_mm": 300, "seed": 5}
@@ -292,9 +297,7 @@ def test_the_implanted_limit_is_the_simulated_one(tmp_path: Path):
         )
         == 0
     )
-    simulated, implanted = (
-        limit_of(read_record(folder).set_ups[0])
-        for folder in (tmp_path / "sim" / "detection_limit" / "latest", out)
-    )
+    simulated = limit_of(read_record(tmp_path / "sim" / "detection_limit" / "latest").set_ups[0])
+    implanted = limit_of(read_record(out).set_ups[0])
     assert simulated.a90_interval_mm.low < implanted.a90_interval_mm.high
     assert implanted.a90_interval_mm.low < simulated.a90_interval_mm.high

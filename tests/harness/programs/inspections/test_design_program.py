@@ -48,7 +48,8 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# ---- the guess -------------------------------------------------------------------------------------------------------
+# ---- the guess
+# -------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=30, deadline=None)
@@ -71,7 +72,8 @@ def test_logit_by_hand() -> None:
     assert (GUESS.mu, GUESS.sigma) == pytest.approx((5.0, 2.0 / np.log(9.0)))
 
 
-# ---- what is recommended ---------------------------------------------------------------------------------------------
+# ---- what is recommended
+# ---------------------------------------------------------------------------------------------
 
 
 def plans(*told: tuple[int, float]) -> list[StudyPlan]:
@@ -90,7 +92,8 @@ def test_recommends_the_fewest_that_are_sure_of_the_goal() -> None:
     assert recommend(known[:1]) == (known[0], None)
 
 
-# ---- hole-free boards ------------------------------------------------------------------------------------------------
+# ---- hole-free boards
+# ------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=40, deadline=None)
@@ -109,7 +112,8 @@ def test_areas_bound_the_rate_exactly() -> None:
     assert found.silent_boards == 10
 
 
-# ---- the program -----------------------------------------------------------------------------------------------------
+# ---- the program
+# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -128,7 +132,8 @@ def test_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixture[str]) -> None:
-    """The 90 % quantile comes nearer to a90 = 7 as one over the root of the targets: by hand from the plan's."""
+    """The 90 % quantile comes nearer to a90 = 7 as one over the root of the targets: by hand from
+    the plan's."""
     said = answered(capsys, *TOLD, *FEW, "--goal", "7.2")
     assert "no plan listed is sure to show the 7.2 mm" in said["recommendation"]
     (high,) = (one["high"] for one in said["plans"] if one["recommended"])
@@ -160,7 +165,8 @@ def test_files_are_repeatable_and_whole(tmp_path: Path, capsys: pytest.CaptureFi
     )
     assert first[1] == second[1]
     assert first[1].startswith(b"\x89PNG")
-    page, other = (one[2].decode() for one in (first, second))
+    page = first[2].decode()
+    other = second[2].decode()
     assert page.replace(str(tmp_path / "a"), str(tmp_path / "b")) == other
     assert page.count("<details") == 2
     assert "Make 60 targets" in page and "http" not in page.replace("http://www.w3.org", "")

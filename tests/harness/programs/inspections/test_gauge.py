@@ -1,4 +1,5 @@
-"""A gauge board: its template is true to scale, and a capture of the drilled board gives hits and misses."""
+"""A gauge board: its template is true to scale, and a capture of the drilled board gives hits and
+misses."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ CAMERA = "azure_kinect_nfov"
 LENS = Lens(width=640, height=480, fx=700.0, fy=700.0, cx=320.3, cy=239.2)
 GIVEN = ["--diameters", "2:12", "--a50", "5", "--a90", "7", "--targets", "24"]
 DEPTH_M = 0.02
-NEVER_FOUND_MM, NOISE_MM = 3.5, 0.4
+NEVER_FOUND_MM = 3.5
+NOISE_MM = 0.4
 THRESHOLD = 8
 
 
@@ -61,7 +63,8 @@ def test_the_truth_holds_what_was_designed(made: Path):
 
 
 def test_the_template_is_true_to_scale(made: Path):
-    """The SVG states its size; the drawing, in pixels of 0.2 mm, shows the codes where the truth has them."""
+    """The SVG states its size; the drawing, in pixels of 0.2 mm, shows the codes where the truth
+    has them."""
     from matplotlib.figure import Figure
 
     found = read_gauge(made / "gauge.json")
@@ -128,14 +131,16 @@ def picture(truth: Gauge, place_mm: np.ndarray, hidden: tuple[int, ...] = ()) ->
 
 
 def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
-    """The drilled board as a camera without a model would see it: holes above a size are steps, with noise."""
+    """The drilled board as a camera without a model would see it: holes above a size are steps,
+    with noise."""
     (board,) = truth.boards
     T = np.eye(4)
     T[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_xyz_deg(6.0, -9.0, 3.0)
     T[:3, 3] = 0.01, -0.005, 0.42
     slopes = LENS.region_slopes(LENS.whole)
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    normal, centre = T[:3, 2], T[:3, 3]
+    normal = T[:3, 2]
+    centre = T[:3, 3]
     z_m = (centre @ normal) / (rays @ normal)
     place = transform_points(invert(T), rays * z_m[..., None])[..., :2] / MM
     on_board = (np.abs(place) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)
@@ -200,7 +205,8 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
 def seen_by(
     config: CameraConfig, truth: Gauge, tilt_deg: tuple[float, float], seed: int, folder: Path
 ) -> Path:
-    """Write a frame of the board, rendered 0.5 m before this camera, as a capture of depth with a picture; its path."""
+    """Write a frame of the board, rendered 0.5 m before this camera, as a capture of depth with a
+    picture; its path."""
     (board,) = truth.boards
     holes = tuple(
         custom.HoleConfig(
@@ -229,12 +235,15 @@ def seen_by(
     )
     unit = SimulatedUnit(camera, config, view)
     (frame,) = unit.capture(1, seed, "gauge").frames()
-    T, slopes = target.pose.T_camera_board, unit.view.slopes[unit.cut]
+    T = target.pose.T_camera_board
+    slopes = unit.view.slopes[unit.cut]
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     on_board = rays * ((T[:3, 3] @ T[:3, 2]) / (rays @ T[:3, 2]))[..., None]
     place_mm = transform_points(invert(T), on_board)[..., :2] / MM
-    whole, cut = camera.nominal_lens.whole, unit.region.within(camera.nominal_lens.whole)
-    depth, colour = np.zeros(whole.shape, np.uint16), np.full((*whole.shape, 3), 90, np.uint8)
+    whole = camera.nominal_lens.whole
+    cut = unit.region.within(camera.nominal_lens.whole)
+    depth = np.zeros(whole.shape, np.uint16)
+    colour = np.full((*whole.shape, 3), 90, np.uint8)
     depth[cut], colour[cut] = np.rint(np.nan_to_num(frame.z_m) / MM), picture(truth, place_mm)
     for name, image in (("depth", depth), ("color", colour)):
         (folder / "seen" / name).mkdir(parents=True)
@@ -244,10 +253,11 @@ def seen_by(
 
 @pytest.mark.slow
 def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wrong(tmp_path: Path):
-    """The real camera has five times the fixed pattern of the study's, whose limit is too small. Holes of a rendered
-    gauge board before the real camera correct it, in three campaigns of 24 holes. The truth is the same study with the
-    real camera: of the same detector, threshold, hit radius, material and distance. Its holes keep as clear of the edge
-    as the gauge's, as the crop takes those near it; so no false call (all of them lie on the rim) counts as a hit."""
+    """The real camera has five times the fixed pattern of the study's, whose limit is too small.
+    Holes of a rendered gauge board before the real camera correct it, in three campaigns of 24
+    holes. The truth is the same study with the real camera: of the same detector, threshold, hit
+    radius, material and distance. Its holes keep as clear of the edge as the gauge's, as the crop
+    takes those near it; so no false call (all of them lie on the rim) counts as a hit."""
     numbers = {"fixed_pattern.smooth_mm": 3.0, "fixed_pattern.pixel_mm": 4.0}
     experiment = Path(__file__).resolve().parents[4] / "experiments" / "detection_limit.yaml"
     judged = {"crop": {"kind": "auto"}, "surface": {"shape": "auto"}}  # as harness.detect has them

@@ -1,4 +1,5 @@
-"""Model-assisted POD: real hits and misses correct a simulated curve, also one of a camera that is wrong."""
+"""Model-assisted POD: real hits and misses correct a simulated curve, also one of a camera that is
+wrong."""
 
 from __future__ import annotations
 
@@ -51,8 +52,10 @@ def test_without_real_targets_the_prior_remains():
 
 @pytest.mark.slow  # a Monte Carlo campaign
 def test_agreement_is_as_rare_as_it_says():
-    """P-values of campaigns whose truth is the simulated curve: 5 % and fewer lie below 0.05 (binomial, 3 sigma)."""
-    curve, size = simulated(), np.linspace(2.0, 12.0, 20)
+    """P-values of campaigns whose truth is the simulated curve: 5 % and fewer lie below 0.05
+    (binomial, 3 sigma)."""
+    curve = simulated()
+    size = np.linspace(2.0, 12.0, 20)
     random = np.random.default_rng(3)
     below = sum(
         campaign(size, random.random(20) < curve.pod(size), curve).agreement(seed) < 0.05
@@ -92,7 +95,8 @@ def test_the_program_corrects_a_study(
 ):
     record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
     (tmp_path / "study.json").write_text(record_text(record))
-    truth, size = curve_through(6.0, 7.6), even_sizes(24, (2.0, 12.0))
+    truth = curve_through(6.0, 7.6)
+    size = even_sizes(24, (2.0, 12.0))
     hit = np.random.default_rng(2).random(24) < truth.pod(size)
     rows = [
         f"{a:.3f},{'hit' if h else 'miss'},{'AB'[n % 2]}"
@@ -103,10 +107,8 @@ def test_the_program_corrects_a_study(
     given = [str(table), "--size", "size", "--hit", "found", "--unit", "mm"]
     prior = ["--prior", str(tmp_path), "--board", "board", "--out", str(tmp_path / "out")]
     assert pod.main([*given, *prior]) == 0
-    said, printed = (
-        json.loads((tmp_path / "out" / "mapod.json").read_text()),
-        capsys.readouterr().out,
-    )
+    said = json.loads((tmp_path / "out" / "mapod.json").read_text())
+    printed = capsys.readouterr().out
     assert printed.startswith("warning:") and "real.csv does not state" in printed.splitlines()[0]
     assert "simulated" in printed and "measured" in printed and "combined" in printed
     assert [step["board"] for step in said["after_each_board"]] == ["none", "A", "B"]

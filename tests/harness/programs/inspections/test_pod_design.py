@@ -25,7 +25,8 @@ def test_rate_per_area_by_poisson() -> None:
 
 
 def test_threshold_of_a_hundred_runs_by_hand() -> None:
-    """99 runs, wanted P(call) = 1 - exp(-0.07) = 0.0676: six of a hundred may lie above, so five of the 99 do."""
+    """99 runs, wanted P(call) = 1 - exp(-0.07) = 0.0676: six of a hundred may lie above, so five
+    of the 99 do."""
     found = threshold_for_rate(
         np.random.default_rng(3).permutation(99.0 * np.arange(99)), 0.07, 1.0
     )
@@ -35,11 +36,14 @@ def test_threshold_of_a_hundred_runs_by_hand() -> None:
 
 
 def test_threshold_keeps_the_rate_on_new_runs() -> None:
-    """Calls on boards are Poisson with rate 6 per m2 at score > 0 and exponential scores: rate(t) = 6 exp(-t). Over
-    300 calibrations the mean probability of a call on a new run is (k + 1) / (n + 1); normal limits, alpha = 0.001."""
+    """Calls on boards are Poisson with rate 6 per m2 at score > 0 and exponential scores: rate(t)
+    = 6 exp(-t). Over 300 calibrations the mean probability of a call on a new run is (k + 1) / (n
+    + 1); normal limits, alpha = 0.001."""
     rng = np.random.default_rng(4)
-    area, runs = 0.07, 40
-    probability, wanted = [], []
+    area = 0.07
+    runs = 40
+    probability = []
+    wanted = []
     for _ in range(300):
         highest = [
             rng.exponential(size=count).max(initial=-np.inf)

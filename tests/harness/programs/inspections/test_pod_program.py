@@ -1,4 +1,5 @@
-"""The program `tofpod pod`: what it reads, what it says, what it writes, and the mistakes it explains."""
+"""The program `tofpod pod`: what it reads, what it says, what it writes, and the mistakes it
+explains."""
 
 from __future__ import annotations
 
@@ -38,14 +39,16 @@ def stated(folder: Path) -> dict[str, Any]:
     return dict(json.loads((folder / "pod.json").read_text()))
 
 
-# ---- what it says ----------------------------------------------------------------------------------------------------
+# ---- what it says
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_handbooks_hits_and_misses(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """MIL-HDBK-1823A example 3, logit on the size as it is: a50 .1156, a90 .1709, a90/95 .1974, deviance 77."""
+    """MIL-HDBK-1823A example 3, logit on the size as it is: a50 .1156, a90 .1709, a90/95 .1974,
+    deviance 77."""
     file = str(shared_data / "pod" / "example3_hitmiss.csv")
     asked = [
         "--hit",
@@ -59,7 +62,8 @@ def test_the_handbooks_hits_and_misses(
         "--no-log",
     ]
     assert main([file, *asked, "--out", str(tmp_path)]) == 0
-    said, printed = stated(tmp_path), capsys.readouterr().out
+    said = stated(tmp_path)
+    printed = capsys.readouterr().out
     assert said["results_version"] == RESULTS_VERSION
     assert (said["a50"], said["a90"]) == pytest.approx((0.1156, 0.1709), abs=5e-5)
     assert said["a90_95"]["size"] == pytest.approx(0.1974, abs=5e-5)
@@ -103,11 +107,13 @@ def test_without_a_choice_the_least_deviance_decides(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_limit_is_the_largest_of_the_models_that_fit_about_as_well(tmp_path: Path) -> None:
-    """The curve is the best model's, the limit that of all within 2 of its deviance; a model asked for is alone."""
+    """The curve is the best model's, the limit that of all within 2 of its deviance; a model asked
+    for is alone."""
     sizes = np.linspace(0.5, 10.0, 400)
     file = str(table(tmp_path / "a.csv", size=sizes, hit=hits(sizes)))
     assert main([file, "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
-    said, page = stated(tmp_path), (tmp_path / "pod.html").read_text()
+    said = stated(tmp_path)
+    page = (tmp_path / "pod.html").read_text()
     near = [row for row in said["models"] if row["deviance"] <= said["models"][0]["deviance"] + 2]
     assert (
         1 < len(near) < len(said["models"])
@@ -234,7 +240,8 @@ def signals(sizes: np.ndarray) -> np.ndarray:
 
 @pytest.mark.usefixtures("unsaved")
 def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same signal four times over is one signal: same curve, same limit; and the wrong one beside it."""
+    """The same signal four times over is one signal: same curve, same limit; and the wrong one
+    beside it."""
     sizes = np.linspace(1, 10, 50)
     once = state_signals(
         read_inspections(
@@ -276,14 +283,16 @@ def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.usefixtures("unsaved")
 def test_unflawed_sites_give_the_probability_of_a_false_positive(tmp_path: Path) -> None:
-    """2,000 sites with noise of 150 +- 100 and a decision at 400, censored at 50: PFP = 1 - F(2.5) = 0.62 %."""
+    """2,000 sites with noise of 150 +- 100 and a decision at 400, censored at 50: PFP = 1 - F(2.5)
+    = 0.62 %."""
     noise = np.random.default_rng(3).normal(150, 100, 2000)
     sizes = np.concatenate([np.linspace(1, 10, 50), np.zeros(2000)])
     both = np.concatenate([signals(np.linspace(1, 10, 50)), noise])
     file = table(tmp_path / "a.csv", size=sizes, signal=both, hit=(both > 400).astype(int))
     asked = ["--ahat", "signal", "--decision", "400", "--left", "50", "--no-log", "--no-log-signal"]
     assert main([str(file), "--size", "size", *asked, "--out", str(tmp_path)]) == 0
-    numbers, calls = stated(tmp_path)["numbers"], int((noise > 400).sum())
+    numbers = stated(tmp_path)["numbers"]
+    calls = int((noise > 400).sum())
     assert (numbers["unflawed sites"], numbers["false positives"]) == (2000, calls)
     assert numbers["PFP by the noise's normal law"] == pytest.approx(0.0062, rel=0.2)
     assert numbers["PFP"] == calls / 2000 < numbers["PFP's 95 % upper bound"] < 0.012
@@ -329,7 +338,8 @@ def test_small_studies_and_separation_are_noted(
     assert "1 of 12 inspections are of unflawed sites" in " ".join(printed.split())
 
 
-# ---- what it writes --------------------------------------------------------------------------------------------------
+# ---- what it writes
+# --------------------------------------------------------------------------------------------------
 
 
 def test_same_input_same_bytes(tmp_path: Path) -> None:
@@ -375,7 +385,8 @@ def test_drawn_sizes_hold_data_and_near_marks() -> None:
     assert np.all(drawn_sizes(np.array([0.01, 5.0]), True, ()) > 0)
 
 
-# ---- what it reads ---------------------------------------------------------------------------------------------------
+# ---- what it reads
+# ---------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
@@ -410,7 +421,8 @@ TRUE = [0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 1234.5]
 
 
 def written(head: str, sizes: str, misses_and_hits: str, between: str = ",") -> str:
-    """A table whose sizes are written by the format ``sizes``; misses and hits in turn, as these two words."""
+    """A table whose sizes are written by the format ``sizes``; misses and hits in turn, as these
+    two words."""
     words = misses_and_hits.split()
     rows = (sizes.format(size) + between + words[k % 2] for k, size in enumerate(TRUE))
     return f"{head}größe{between}hit\n" + "\n".join(rows)
@@ -460,8 +472,10 @@ def test_a_mark_that_may_part_thousands_is_told(tmp_path: Path) -> None:
 def test_inspectors_in_columns_with_gaps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The handbook's layout: a row for each flaw, a column for each inspector; a flaw is one target."""
-    first, second = hits(seed=4), hits(seed=5).astype(object)
+    """The handbook's layout: a row for each flaw, a column for each inspector; a flaw is one
+    target."""
+    first = hits(seed=4)
+    second = hits(seed=5).astype(object)
     second[[3, 10]] = ["NA", ""]
     wide = table(tmp_path / "wide.csv", size=SIZES, A=first, B=second)
     read = read_inspections(wide, "size", ["A", "B"])

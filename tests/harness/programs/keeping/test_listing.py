@@ -1,4 +1,5 @@
-"""Result folders and stored renders, listed and removed: nothing that is not tofpod's, nothing in use, no way out."""
+"""Result folders and stored renders, listed and removed: nothing that is not tofpod's, nothing in
+use, no way out."""
 
 from __future__ import annotations
 
@@ -151,7 +152,8 @@ def test_neither_links_nor_other_folders_are_results(tmp_path, capsys):
 
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
-    """Three renders used 1, 10 and 40 days ago, the last one damaged, and a file that a killed process left."""
+    """Three renders used 1, 10 and 40 days ago, the last one damaged, and a file that a killed
+    process left."""
     folder = tmp_path / ".cache" / "renders"
     view = plane_view(load_camera("azure_kinect_nfov"), Region(200, 210, 300, 310), 0.8, 0.5)
     for letter, days in (("a", 1), ("b", 10), ("c", 40)):

@@ -69,7 +69,8 @@ def refusal(folder: Path, old: str, new: str) -> str:
     return str(caught.value)
 
 
-# ---- the file of figures ---------------------------------------------------------------------------------------------
+# ---- the file of figures
+# ---------------------------------------------------------------------------------------------
 
 
 def test_the_projects_figures_are_legal_and_every_camera_has_blind_figures():
@@ -166,7 +167,8 @@ def test_a_negative_tolerance_is_refused():
         Published.from_data({"value": 1.0, "tolerance": -0.1})
 
 
-# ---- the judgement ---------------------------------------------------------------------------------------------------
+# ---- the judgement
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_verdicts(tmp_path):
@@ -237,7 +239,8 @@ def test_numbers_have_three_digits(value, text):
     assert number(value) == text
 
 
-# ---- measuring -------------------------------------------------------------------------------------------------------
+# ---- measuring
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
@@ -259,13 +262,16 @@ def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
         assert repr(one[request]) == repr(two[request]), request
 
 
-# ---- the program -----------------------------------------------------------------------------------------------------
+# ---- the program
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
-    """Two figures, few frames: files and exit 0; a figure that fails without a reason: exit 1, naming it."""
+    """Two figures, few frames: files and exit 0; a figure that fails without a reason: exit 1,
+    naming it."""
     monkeypatch.setattr(program, "FULL", QUICK)
-    figures, out = written(tmp_path), tmp_path / "out"
+    figures = written(tmp_path)
+    out = tmp_path / "out"
     options = ["--jobs", "1", "--camera", AZURE]
     options += ["--figures", str(figures), "--out", str(out)]
     assert main(options) == 0

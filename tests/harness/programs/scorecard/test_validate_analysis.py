@@ -33,7 +33,8 @@ PINHOLE = camera_of(
 """An Azure Kinect whose pixels are evenly spaced, so that widths can be worked out by hand."""
 
 
-# ---- temporal noise --------------------------------------------------------------------------------------------------
+# ---- temporal noise
+# --------------------------------------------------------------------------------------------------
 
 
 def white(frames: int, shape: tuple[int, int], sigma: float, seed: int = 3) -> np.ndarray:
@@ -41,7 +42,8 @@ def white(frames: int, shape: tuple[int, int], sigma: float, seed: int = 3) -> n
 
 
 def test_deviation_of_white_noise_and_of_nothing():
-    """4,000 values of 3,800 degrees of freedom: the deviation is known to 1.2 %, asserted at four of that."""
+    """4,000 values of 3,800 degrees of freedom: the deviation is known to 1.2 %, asserted at four
+    of that."""
     z = white(20, (20, 10), 2e-3)
     everywhere = np.ones((20, 10), bool)
     assert temporal_sigma_m(z, everywhere) == pytest.approx(2e-3, rel=0.05)
@@ -56,7 +58,8 @@ def test_pixels_valid_in_less_than_half_of_the_frames_do_not_count():
 
 @pytest.mark.parametrize(("lag_x", "lag_y"), [(1, 0), (0, 3), (1, 1), (5, 0)])
 def test_correlation_of_a_boxed_field_is_the_overlap_of_the_boxes(lag_x, lag_y):
-    """(5 - |dx|)(5 - |dy|) / 25; 60 frames of 100 x 100 pixels have 24,000 boxes: 0.02 is three deviations."""
+    """(5 - |dx|)(5 - |dy|) / 25; 60 frames of 100 x 100 pixels have 24,000 boxes: 0.02 is three
+    deviations."""
     z = ndimage.uniform_filter(white(60, (100, 100), 1.0), (1, 5, 5), mode="wrap")
     expected = max(5 - lag_x, 0) * max(5 - lag_y, 0) / 25
     assert correlation_at(z, np.ones((100, 100), bool), lag_x, lag_y) == pytest.approx(
@@ -65,11 +68,13 @@ def test_correlation_of_a_boxed_field_is_the_overlap_of_the_boxes(lag_x, lag_y):
 
 
 def test_jackknife_interval_covers_as_stated():
-    """200 captures: 95 % coverage fails this binomial test with probability below 1e-4 on either side."""
+    """200 captures: 95 % coverage fails this binomial test with probability below 1e-4 on either
+    side."""
     rng = np.random.default_rng(5)
     hits = 0
     for _ in range(200):
-        # all pixels share half of the variance, so an interval from independent pixels would be far too narrow
+        # all pixels share half of the variance, so an interval from independent pixels would be
+        # far too narrow
         z = rng.standard_normal((30, 4, 4)) + rng.standard_normal((30, 1, 1))
         found = jackknifed(z, lambda s: temporal_sigma_m(s, np.ones((4, 4), bool)))
         hits += found.interval.low <= np.sqrt(2) <= found.interval.high
@@ -88,13 +93,16 @@ def test_estimates_without_repeats_have_no_interval():
     )
 
 
-# ---- edges -----------------------------------------------------------------------------------------------------------
+# ---- edges
+# -----------------------------------------------------------------------------------------------------------
 
 
 def ideal_step(step: float = 0.1, columns: int = 40) -> tuple[np.ndarray, ...]:
-    """A stack (3, 10, columns) with the edge between the middle columns, both surfaces' z, and signed distances."""
+    """A stack (3, 10, columns) with the edge between the middle columns, both surfaces' z, and
+    signed distances."""
     from_edge = np.tile(np.arange(columns) - columns / 2 + 0.5, (10, 1))
-    front, back = np.full(from_edge.shape, 1.0), np.full(from_edge.shape, 1.0 + step)
+    front = np.full(from_edge.shape, 1.0)
+    back = np.full(from_edge.shape, 1.0 + step)
     z = np.repeat(np.where(from_edge < 0, front, back)[None], 3, axis=0)
     return z, front, back, from_edge
 
@@ -107,7 +115,8 @@ def test_an_ideal_step_has_no_gap_and_no_flying_pixel():
 
 
 def test_widths_by_hand():
-    """Two columns of the back vanish, one of the front flies, and half of the lines lose another pixel."""
+    """Two columns of the back vanish, one of the front flies, and half of the lines lose another
+    pixel."""
     z, front, back, from_edge = ideal_step()
     z[:, :, 20:22] = np.nan
     z[:, :, 19] = 1.05
@@ -137,7 +146,8 @@ def test_surfaces_that_noise_makes_one_are_not_told_apart(sigma_m, step_m):
         assert np.isnan(edge_widths(z, front, back, from_edge, tolerance, 15, 2)["flying"]).all()
 
 
-# ---- planes ----------------------------------------------------------------------------------------------------------
+# ---- planes
+# ----------------------------------------------------------------------------------------------------------
 
 
 def two_walls(noise_m: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -184,7 +194,8 @@ def test_a_plane_is_fitted_exactly(distance_m, slope_x, slope_y):
     )
 
 
-# ---- views of steps --------------------------------------------------------------------------------------------------
+# ---- views of steps
+# --------------------------------------------------------------------------------------------------
 
 REGION = Region(300, 330, 280, 360)
 
@@ -195,7 +206,8 @@ def half(edge_slope: float, sign: float = 1.0):  # type: ignore[no-untyped-def]
 
 def test_a_front_that_is_everywhere_or_nowhere_is_a_plane():
     """Averaging over the footprint turns the light by what z bends within a pixel: far below 1e-4."""
-    front, back = Plane(0.8, 0.1), Plane(1.1)
+    front = Plane(0.8, 0.1)
+    back = Plane(1.1)
     for covers, plane in (
         (lambda s: np.ones(s.shape[:-1], bool), front),
         (lambda s: s[..., 0] > 9, back),
@@ -208,9 +220,11 @@ def test_a_front_that_is_everywhere_or_nowhere_is_a_plane():
 
 
 def test_an_edge_within_a_pixel_mixes_phasors_by_area():
-    """The edge a quarter into column 320: a quarter of the front's light and three of the back's, to 1/12 pixel."""
+    """The edge a quarter into column 320: a quarter of the front's light and three of the back's,
+    to 1/12 pixel."""
     edge = (320 - 0.25 - 320.0) / PINHOLE.nominal_lens.fx
-    front, back = Plane(0.75), Plane(0.95)
+    front = Plane(0.75)
+    back = Plane(0.95)
     view = layered_view(PINHOLE, REGION, front, back, half(edge, sign=-1.0), 0.6)
     alone = [plane_view(PINHOLE, REGION, plane.distance_m, 0.6).phasor for plane in (front, back)]
     column = 320 - REGION.col0
@@ -221,11 +235,14 @@ def test_an_edge_within_a_pixel_mixes_phasors_by_area():
 
 
 def test_the_shadow_is_as_wide_as_the_emitter_says():
-    """The line from the emitter by the edge ends the shadow on the back; on the other side of the front is none.
+    """The line from the emitter by the edge ends the shadow on the back; on the other side of the
+    front is none.
 
-    The edge lies between two columns, so that no pixel is partly front; sub-rays tell the shadow's end to 1/12 pixel.
+    The edge lies between two columns, so that no pixel is partly front; sub-rays tell the shadow's
+    end to 1/12 pixel.
     """
-    front, back = Plane(0.75), Plane(0.95)
+    front = Plane(0.75)
+    back = Plane(0.95)
     lit = plane_view(PINHOLE, REGION, 0.95, 0.6).intensity
     lens, (e_x, _, e_z) = PINHOLE.nominal_lens, PINHOLE.optics.emitter_m
     edge = 0.5 / lens.fx
@@ -239,7 +256,8 @@ def test_the_shadow_is_as_wide_as_the_emitter_says():
     assert x_end / 0.95 * lens.fx > 2.4
 
 
-# ---- the bench -------------------------------------------------------------------------------------------------------
+# ---- the bench
+# -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -270,11 +288,10 @@ def test_what_the_camera_does_not_see_has_no_number(bench):
 
 
 def test_a_shadow_is_a_gap_of_its_width(bench):
-    """80 mm aside, a step of 500 mm at 0.75 m: 32 mm at 1.25 m, 15.6 px; the filter takes up to two on each side, the
-    lens's blur half of one."""
+    """80 mm aside, a step of 500 mm at 0.75 m: 32 mm at 1.25 m, 15.6 px; the filter takes up to
+    two on each side, the lens's blur half of one."""
     v2 = Bench("kinect_v2", bench.effort)
-    lit, shadowed = (
-        value(v2, "edge_gap_px", step_mm=500, shadow=shadow) for shadow in (False, True)
-    )
+    lit = value(v2, "edge_gap_px", step_mm=500, shadow=False)
+    shadowed = value(v2, "edge_gap_px", step_mm=500, shadow=True)
     assert lit < 0.5 and 10.6 < shadowed < 15.6
     assert value(bench, "edge_gap_px", step_mm=20) == 0

@@ -45,7 +45,8 @@ COLOUR = Lens(480, 270, 230.0, 230.0, 239.5, 134.5)
 
 
 def aligned(z_m: np.ndarray, camera, T_colour_depth: np.ndarray) -> np.ndarray:
-    """A depth image as it is seen by the colour camera: its points moved and interpolated in the other image."""
+    """A depth image as it is seen by the colour camera: its points moved and interpolated in the
+    other image."""
     slopes = camera.nominal_lens.region_slopes(camera.nominal_lens.whole)
     points = (
         np.concatenate([slopes, np.ones((*z_m.shape, 1))], axis=-1)[np.isfinite(z_m)]
@@ -58,8 +59,8 @@ def aligned(z_m: np.ndarray, camera, T_colour_depth: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory) -> Path:
-    """Frames of a board with holes of 6 mm by another unit, aligned to a small colour camera, as PNGs; the second frame
-    is displaced by 17 mm."""
+    """Frames of a board with holes of 6 mm by another unit, aligned to a small colour camera, as
+    PNGs; the second frame is displaced by 17 mm."""
     home = tmp_path_factory.mktemp("plate")
     (home / "known.yaml").write_text(BOARD)
     (point,) = (p for p in load_experiment(home / "known.yaml").points if p.label.endswith("6.0"))

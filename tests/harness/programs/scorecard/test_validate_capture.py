@@ -1,4 +1,5 @@
-"""A capture beside its simulation: captures whose truth is known, real ones where they are at hand, refusals."""
+"""A capture beside its simulation: captures whose truth is known, real ones where they are at
+hand, refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ FRAMES = 8
 
 
 def recorded(folder: Path, view, frames: int = FRAMES) -> Path:
-    """Frames of a view as 16-bit PNGs of the whole sensor, whole millimetres, 0 where there is nothing."""
+    """Frames of a view as 16-bit PNGs of the whole sensor, whole millimetres, 0 where there is
+    nothing."""
     folder.mkdir()
     unit = SimulatedUnit(AZURE, CameraConfig(unit_seed=9, effects=NOISE), view)
     place = unit.region.within(AZURE.nominal_lens.whole)
@@ -48,9 +50,11 @@ def pick(rows: list[dict[str, str]], figure: str, where: str = "") -> tuple[floa
 
 @pytest.fixture(scope="module")
 def step(tmp_path_factory) -> list[dict[str, str]]:
-    """A board 300 mm before a wall, both tilted, the edge slanted, compared with what the program makes of it."""
+    """A board 300 mm before a wall, both tilted, the edge slanted, compared with what the program
+    makes of it."""
     folder = tmp_path_factory.mktemp("step")
-    front, back = Plane(0.8, 0.08, 0.03), Plane(1.1, 0.05, -0.04)
+    front = Plane(0.8, 0.08, 0.03)
+    back = Plane(1.1, 0.05, -0.04)
     view = layered_view(
         AZURE, REGION, front, back, lambda s: s[..., 0] - 0.03 * s[..., 1] < 0.004, 0.8
     )
@@ -79,7 +83,8 @@ def step(tmp_path_factory) -> list[dict[str, str]]:
 
 
 def test_noise_of_a_simulated_recording_is_found_again(step):
-    """8 frames of some 600 windows: the deviation is known to 1.5 %, correlation to 0.02; four of these."""
+    """8 frames of some 600 windows: the deviation is known to 1.5 %, correlation to 0.02; four of
+    these."""
     for surface in ("surface 1", "surface 2"):
         measured, simulated = pick(step, "temporal noise", surface)
         assert simulated / measured == pytest.approx(1.0, abs=0.06)
@@ -89,8 +94,9 @@ def test_noise_of_a_simulated_recording_is_found_again(step):
 
 
 def test_the_edge_is_found_and_its_widths_agree(step):
-    """The edge is placed by the middle of its gap, half of each pixel along it on either side; what the recording has
-    beside that is the emitter's shadow behind the front, 2.4 pixels wide here, which narrows the gap."""
+    """The edge is placed by the middle of its gap, half of each pixel along it on either side;
+    what the recording has beside that is the emitter's shadow behind the front, 2.4 pixels wide
+    here, which narrows the gap."""
     for figure, most in (("gap at an edge", 1.0), ("flying pixels", 0.5)):
         measured, simulated = pick(step, figure)
         assert simulated == pytest.approx(measured, abs=most)
@@ -180,12 +186,14 @@ def test_nothing_flat_is_refused(tmp_path, capsys):
     assert "shows no flat surface" in refused([*options, str(mask)], capsys)
 
 
-# ---- real captures ---------------------------------------------------------------------------------------------------
+# ---- real captures
+# ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_real_walls_are_found_and_the_simulation_follows_them(shared_data, tmp_path):
-    """Both walls of the Azure Kinect's capture, without being told where they are; ratios as in docs/azure_walls.md."""
+    """Both walls of the Azure Kinect's capture, without being told where they are; ratios as in
+    docs/azure_walls.md."""
     lens = {
         key: getattr(AZURE.nominal_lens, key)
         for key in ("width", "height", "fx", "fy", "distortion")

@@ -31,13 +31,15 @@ def checks(shared_data: Path) -> list[WallCheck]:
     return check_folder(folder)
 
 
-# ---------------------------------------------------------------- the analysis on numbers that are known
+# ---------------------------------------------------------------- the analysis on numbers that are
+# known
 
 
 def patterned_stack(
     smooth: float, length: float, pixel: float, frames: int = 20
 ) -> tuple[np.ndarray, ...]:
-    """A tilted plane with a planted pattern (metres) behind a box of five, and temporal noise of 1 mm behind it."""
+    """A tilted plane with a planted pattern (metres) behind a box of five, and temporal noise of 1
+    mm behind it."""
     rng = np.random.default_rng(4)
     shape = (200, 240)
     slopes = np.stack(
@@ -65,8 +67,8 @@ def patterned_stack(
     ],
 )
 def test_a_planted_fixed_pattern_is_found_again(smooth_mm, pixel_mm):
-    """Within 0.04 mm: three deviations of a field of some 400 patches of (2 l)^2 pixels. The surface takes the longest
-    waves with it, which shortens the correlation by half a pixel."""
+    """Within 0.04 mm: three deviations of a field of some 400 patches of (2 l)^2 pixels. The
+    surface takes the longest waves with it, which shortens the correlation by half a pixel."""
     found = fixed_pattern(*patterned_stack(smooth_mm * 1e-3, 6.0, pixel_mm * 1e-3))
     assert found.std_m * 1e3 == pytest.approx(np.hypot(smooth_mm, pixel_mm), abs=0.04)
     assert max(white_before_m(found), 0) * 1e3 == pytest.approx(pixel_mm, abs=0.04)
@@ -108,14 +110,16 @@ def test_a_plane_is_exact_and_outliers_do_not_move_it():
     assert not robust_inverse_fit(basis, bent.ravel())[1].reshape(z.shape)[:6, :8].any()
 
 
-# ---------------------------------------------------------------- the camera model against the walls
+# ---------------------------------------------------------------- the camera model against the
+# walls
 
 
 @pytest.mark.slow
 def test_temporal_deviation_follows_the_walls(checks):
     """In the lit cone the simulated deviation is 0.75 to 1 of the measured one, in every bin.
 
-    What is unknown is of this size: the light falls as the root, so an albedo of 0.55 in place of 0.8 gives 0.83.
+    What is unknown is of this size: the light falls as the root, so an albedo of 0.55 in place of
+    0.8 gives 0.83.
     """
     for check in checks:
         assert len(check.by_range_inner) >= 3
@@ -125,7 +129,8 @@ def test_temporal_deviation_follows_the_walls(checks):
 
 @pytest.mark.slow
 def test_temporal_deviation_grows_with_range_as_on_the_walls(checks):
-    """Each wall's ratios lie within 10 % of their mean: the growth with range is the model's, not the gain's."""
+    """Each wall's ratios lie within 10 % of their mean: the growth with range is the model's, not
+    the gain's."""
     for check in checks:
         ratios = np.array([part.ratio for part in check.by_range_inner])
         assert np.abs(ratios / ratios.mean() - 1).max() < 0.1
@@ -133,14 +138,16 @@ def test_temporal_deviation_grows_with_range_as_on_the_walls(checks):
 
 @pytest.mark.slow
 def test_whole_walls_are_never_simulated_noisier_than_measured(checks):
-    """Towards the edge of the lit field the real light falls off and the closed-form plane's does not."""
+    """Towards the edge of the lit field the real light falls off and the closed-form plane's does
+    not."""
     for check in checks:
         assert all(0.45 < part.ratio < 1.0 for part in check.by_range)
 
 
 @pytest.mark.slow
 def test_temporal_noise_is_as_smooth_as_on_the_walls(checks):
-    """Within 0.1 at lags 1 to 5, along x and y, without what a frame's pixels have in common (not modelled).
+    """Within 0.1 at lags 1 to 5, along x and y, without what a frame's pixels have in common (not
+    modelled).
 
     With it the left wall's lag 5 differs by 0.103, all others by less than 0.1.
     """
@@ -154,7 +161,8 @@ def test_temporal_noise_is_as_smooth_as_on_the_walls(checks):
 
 @pytest.mark.slow
 def test_real_frames_jitter_as_a_whole(checks):
-    """The camera's file has 0.25 mm from these frames; 22 simulated ones tell it to 15 % (one deviation)."""
+    """The camera's file has 0.25 mm from these frames; 22 simulated ones tell it to 15 % (one
+    deviation)."""
     for check in checks:
         measured, simulated = check.jitter_m
         assert 0.15e-3 < measured < 0.35e-3
@@ -174,7 +182,8 @@ def test_the_files_fixed_pattern_is_that_of_the_walls(checks):
 
 @pytest.mark.slow
 def test_simulated_fixed_pattern_through_the_same_analysis(checks):
-    """The file's pixel part is found again within 0.03 mm; the whole is 0.85 to 1.15 of the measured."""
+    """The file's pixel part is found again within 0.03 mm; the whole is 0.85 to 1.15 of the
+    measured."""
     for check in checks:
         # along the ray in the file, along the axis here
         planted = (

@@ -47,8 +47,8 @@ def test_verdicts_where_every_hole_is_sure(azure, v2, l515, expected):
 
 
 def unsure(camera: str):
-    """At 1 m this camera finds hole 3 in 6 of 12 repeats, and all larger ones; every camera finds 4 to 11 there, and
-    at 0.5 m Azure is ahead."""
+    """At 1 m this camera finds hole 3 in 6 of 12 repeats, and all larger ones; every camera finds
+    4 to 11 there, and at 0.5 m Azure is ahead."""
     sure = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (5, 4), "realsense_l515": (5, 4)})
     name = set_up_name(camera, 1.0)
     half = World(repeats=12, rate=lambda hole, frames: 0.5 if hole == 3 else float(hole >= 4))
@@ -74,7 +74,8 @@ def test_an_undecided_hole_of_another_camera_leaves_the_claim_undecided():
 
 
 def test_an_undecided_hole_that_can_change_nothing_does_not_matter():
-    # Azure finds 3 to 11 at 0.5 m; at 1 m it is behind L515 whatever becomes of v2's undecided hole
+    # Azure finds 3 to 11 at 0.5 m; at 1 m it is behind L515 whatever becomes of v2's undecided
+    # hole
     found = cameras({"azure_kinect_nfov": (3, 5), "kinect_v2": (5, 5), "realsense_l515": (5, 4)})
     name = set_up_name("kinect_v2", 1.0)
     half = World(repeats=12, rate=lambda hole, frames: 0.5 if hole == 4 else float(hole >= 5))

@@ -72,7 +72,8 @@ def registered(icp, cpd, **others):
     ("world", "expected"),
     [
         (registered((1.5, 0.1), (0.4, 0.1)), "borne out"),
-        (registered((0.4, 0.1), (1.5, 0.1)), "not borne out"),  # ICP is the better within the plane
+        # ICP is the better within the plane
+        (registered((0.4, 0.1), (1.5, 0.1)), "not borne out"),
         (
             registered((1.5, 0.5), (0.4, 0.1)),
             "not borne out",
@@ -102,7 +103,8 @@ def test_c7_needs_both_methods():
 
 
 def sized(large, small, threshold, first=4):
-    """|size error| of two views: that of one view, 1 mm, changed by so much for large and for small holes."""
+    """|size error| of two views: that of one view, 1 mm, changed by so much for large and for
+    small holes."""
 
     def bias(diameter, views, method, merge):
         return 1.0 + (views == 2) * (large if diameter >= LARGE_MM - 1e-9 else small)
@@ -190,8 +192,8 @@ def test_c10_without_a_slam_map_is_not_judged():
 
 
 def mapped(noise, size, first=4, exposures=None):
-    """Nine fused views against one: factor of noise, change of |size error|, smallest hole; and of one view of nine
-    times the frames its noise."""
+    """Nine fused views against one: factor of noise, change of |size error|, smallest hole; and of
+    one view of nine times the frames its noise."""
 
     def many(views, merge):
         return views == 9 and merge == "fusion"

@@ -110,7 +110,8 @@ def test_c6_is_undecided_without_a_cloud_or_with_mixed_holes() -> None:
     assert verdict("C6").verdict == "undecided"
     one_frame = score_claims(tables(), examples=[example(1)])
     assert next(v for v in one_frame if v.claim == "C6").verdict == "undecided"
-    round_, flat = example(50, "bowl"), example(50, "cylinder")
+    round_ = example(50, "bowl")
+    flat = example(50, "cylinder")
     mixed = round_.residual_mm.copy()
     mixed[:, 250:] = flat.residual_mm[:, 250:]
     scored = score_claims(tables(), examples=[dataclasses.replace(round_, residual_mm=mixed)])
@@ -176,7 +177,8 @@ def test_the_table_of_claims_has_a_row_for_each_verdict() -> None:
 
 def test_rank_test_is_the_exact_permutation_test() -> None:
     rng = np.random.default_rng(2)
-    x, y = rng.normal(size=6), rng.normal(size=6)
+    x = rng.normal(size=6)
+    y = rng.normal(size=6)
     rho, p = falling_rank(x, y)
     assert rho == pytest.approx(spearmanr(x, y).statistic)
     every = [spearmanr(x, np.array(order)).statistic for order in permutations(y)]
@@ -189,7 +191,8 @@ def test_rank_test_is_the_exact_permutation_test() -> None:
 
 
 def test_scatter_ratio_by_hand() -> None:
-    place, size = [1.0, 3.0, 5.0, np.nan], [1.0, 2.0, 3.0, 9.0]
+    place = [1.0, 3.0, 5.0, np.nan]
+    size = [1.0, 2.0, 3.0, 9.0]
     rows = pd.DataFrame(
         {"repeat": range(4), "hole": "5", "extent_offset_mm": place, "extent_diameter_mm": size}
     )

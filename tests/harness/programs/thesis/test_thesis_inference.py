@@ -1,4 +1,5 @@
-"""The posterior over set-ups on tables of known answer, its sentence and its page, and the random draw of set-ups."""
+"""The posterior over set-ups on tables of known answer, its sentence and its page, and the random
+draw of set-ups."""
 
 from __future__ import annotations
 
@@ -23,16 +24,15 @@ PATHS = list(AXES)
 
 @pytest.fixture(scope="module")
 def found():
-    """22 set-ups; those 4 mm deep find hole 3 and all larger ones in every repeat, the others as the thesis did."""
+    """22 set-ups; those 4 mm deep find hole 3 and all larger ones in every repeat, the others as
+    the thesis did."""
     everything = World(repeats=4, rate=lambda hole, frames: float(hole >= 3))
     parts = []
     for depth in AXES[PATHS[0]]:
         for distance in AXES[PATHS[1]]:
             world = World(repeats=4) if depth == 2.0 else everything
-            part, place = (
-                tables(world, (1, 50), f"{depth} at {distance:.2f}"),
-                {PATHS[0]: depth, PATHS[1]: distance},
-            )
+            part = tables(world, (1, 50), f"{depth} at {distance:.2f}")
+            place = {PATHS[0]: depth, PATHS[1]: distance}
             placed = {
                 name: getattr(part, name).assign(**place)
                 for name in ("holes", "runs", "probes", "noise")
@@ -47,11 +47,13 @@ def found():
 
 
 def test_the_posterior_by_hand(found):
-    """A hole found 4 of 4 times has 0.9; other set-ups miss by hole 3 with 50 frames and by 3 and 4 with one frame."""
+    """A hole found 4 of 4 times has 0.9; other set-ups miss by hole 3 with 50 frames and by 3 and
+    4 with one frame."""
     table = posterior_of(summarise_holes(found.holes, PATHS), PATHS)
     set_ups = table[table["axis"] == SET_UP]
     assert len(set_ups) == 22 and set_ups["posterior_share"].sum() == pytest.approx(1)
-    right, wrong = 0.9**22, 0.9**19 * 0.1**3
+    right = 0.9**22
+    wrong = 0.9**19 * 0.1**3
     assert set_ups["likelihood"].tolist() == pytest.approx([right] * 11 + [wrong] * 11)
     depth = table[table["value"].str.startswith("2") & (table["axis"] != SET_UP)].iloc[0]
     assert (depth["prior_share"], depth["likelihood"]) == (pytest.approx(0.5), pytest.approx(right))
@@ -66,7 +68,8 @@ def test_the_posterior_by_hand(found):
 
 
 def test_a_depth_of_blind_holes_says_nothing_of_through_holes(found):
-    """Only set-ups 2 mm deep agree. If they are the through-holes, whose depth is no depth, nothing is said of it."""
+    """Only set-ups 2 mm deep agree. If they are the through-holes, whose depth is no depth,
+    nothing is said of it."""
     summary = summarise_holes(found.holes, PATHS)
     shallow = summary[PATHS[0]] == 2.0
     for agree, others in (("blind", "through"), ("through", "blind")):
@@ -80,7 +83,8 @@ def test_a_depth_of_blind_holes_says_nothing_of_through_holes(found):
     )
     table = posterior_of(near, [*PATHS, KIND])
     depths = table[table["axis"] == "blind depth of blind holes"]
-    right, wrong = 0.9**22, 0.9**19 * 0.1**3
+    right = 0.9**22
+    wrong = 0.9**19 * 0.1**3
     assert depths["prior_share"].tolist() == [0.5, 0.5]
     assert depths["posterior_share"].tolist() == pytest.approx(
         [right / (right + wrong), wrong / (right + wrong)]
@@ -116,9 +120,8 @@ def test_set_ups_that_fill_no_grid_stand_one_below_the_other(found):
 
 
 def test_set_ups_are_drawn_at_random_and_alike_ones_once():
-    few, more = (
-        load_experiment("experiments/thesis_inference.yaml", [f"draws={n}"]) for n in (20, 24)
-    )
+    few = load_experiment("experiments/thesis_inference.yaml", [f"draws={20}"])
+    more = load_experiment("experiments/thesis_inference.yaml", [f"draws={24}"])
     names = [{point.variant for point in each.points} for each in (few, more)]
     assert names[0] < names[1] and 20 < len(names[1]) <= 24
     assert len(few.points) == 2 * len(names[0])

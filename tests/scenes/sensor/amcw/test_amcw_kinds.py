@@ -25,8 +25,9 @@ def fact(value: Any) -> dict[str, Any]:
 
 
 def fourth_camera(**changes: Any) -> dict[str, Any]:
-    """A small imager: one frequency, four phases, a linear converter, no lens distortion, no gate that can be left
-    out; ``changes`` are dotted paths (with double underscores for dots) to other facts, or None for none."""
+    """A small imager: one frequency, four phases, a linear converter, no lens distortion, no gate
+    that can be left out; ``changes`` are dotted paths (with double underscores for dots) to other
+    facts, or None for none."""
     data = copy.deepcopy(load_camera("azure_kinect_nfov").to_data())
     data |= {"name": "fourth", "title": "A fourth camera"}
     optional = (
@@ -100,7 +101,8 @@ def test_noise_free_range_is_exact(changes, distance_m, tmp_path):
     frame = next(iter(unit.capture(1, 1).frames()))
     truth = (unit.view.range_m / np.sqrt(1 + (unit.view.slopes**2).sum(-1)))[unit.cut]
     assert (frame.reason == Reason.VALID).all()
-    # the output's half millimetre, the converter's rounding (1 in 3,000 at 6.7 m, 1.2 m a radian) and the window
+    # the output's half millimetre, the converter's rounding (1 in 3,000 at 6.7 m, 1.2 m a radian)
+    # and the window
     assert np.abs(frame.z_m - truth).max() < 0.5e-3 + (0.05e-3 if distance_m < 6 else 0.2e-3)
 
 
@@ -114,13 +116,15 @@ def test_no_wrap_counts_is_no_range_though_the_camera_has_no_gate_on_the_lattice
     unit = SimulatedUnit(camera, quiet(noise=True), plane_view(camera, MIDDLE, reach_m - 0.02, 0.6))
     frame = next(iter(unit.capture(1, 1).frames()))
     assert (frame.reason == Reason.UNWRAP).mean() > 0.1
-    # noise that carries both phases beyond the reach makes a short range, as in a real camera; nothing lies between
+    # noise that carries both phases beyond the reach makes a short range, as in a real camera;
+    # nothing lies between
     valid = frame.z_m[frame.reason == Reason.VALID]
     assert ((valid > 0.5) & (valid < reach_m - 0.2)).mean() < 0.002
 
 
 def test_noise_follows_the_closed_form_for_any_number_of_phases(tmp_path):
-    """sigma_z = c / 4 pi f sqrt(2/N) sqrt(Ns + 2 s^2) / (C Ns), by 3 for the box of 3x3; 60 frames: 3 %."""
+    """sigma_z = c / 4 pi f sqrt(2/N) sqrt(Ns + 2 s^2) / (C Ns), by 3 for the box of 3x3; 60
+    frames: 3 %."""
     for phases in (3, 4, 7):
         camera = read(fourth_camera(modulation__phases=phases, engine__concentration=0.0), tmp_path)
         unit = SimulatedUnit(

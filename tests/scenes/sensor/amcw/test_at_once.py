@@ -1,8 +1,10 @@
-"""Averages drawn at once against averages of single frames, in distribution: every number of a capture's cloud.
+"""Averages drawn at once against averages of single frames, in distribution: every number of a
+capture's cloud.
 
-Captures are independent, so each statistic of a capture (a mean over a group of pixels of z, of its square, of products
-with neighbours, of what lies beyond some deviations, of the count) is compared between many captures of either kind by
-the two-sample t test; 5 standard errors is one false alarm in 2 million.
+Captures are independent, so each statistic of a capture (a mean over a group of pixels of z, of
+its square, of products with neighbours, of what lies beyond some deviations, of the count) is
+compared between many captures of either kind by the two-sample t test; 5 standard errors is one
+false alarm in 2 million.
 """
 
 from __future__ import annotations
@@ -47,8 +49,9 @@ CAPTURES = 60
 FRAMES = 8
 SURE = 5.0
 SURE_OF_FLOOR = 6.0
-"""Far behind a hole the light is dim, and means drawn at once scatter some 7 % less than those of frames: 13 to 15 % of
-the variance of eight frames, measured with 60 captures of either kind, whose standard error is 3 %."""
+"""Far behind a hole the light is dim, and means drawn at once scatter some 7 % less than those of
+frames: 13 to 15 % of the variance of eight frames, measured with 60 captures of either kind, whose
+standard error is 3 %."""
 
 
 def test_noise_from_bytes_has_the_variance_and_kurtosis_of_a_normal() -> None:
@@ -61,12 +64,14 @@ def test_noise_from_bytes_has_the_variance_and_kurtosis_of_a_normal() -> None:
 @pytest.fixture(autouse=True)
 def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(averages, "FEWEST_FRAMES", FEWEST_FRAMES)
-    # a limit of cost: with nothing behind the holes 31 % of these small pictures are simulated one by one
+    # a limit of cost: with nothing behind the holes 31 % of these small pictures are simulated one
+    # by one
     monkeypatch.setattr(sums_of_frames, "MOST_LISTED", 0.4)
 
 
 def numbers_of(name: str) -> dict[str, float]:
-    """A Kinect v2 with a finer converter: by its own, dark pixels' noise hides no steps and frames are drawn singly."""
+    """A Kinect v2 with a finer converter: by its own, dark pixels' noise hides no steps and frames
+    are drawn singly."""
     return (
         {"photons.electrons_per_unit": 3.0, "scatter.blur_px": 0.0}
         if name.startswith("kinect")
@@ -76,7 +81,8 @@ def numbers_of(name: str) -> dict[str, float]:
 
 @lru_cache
 def unit_before_hole(name: str, behind_mm: float, jump_rate: float | None = None) -> SimulatedUnit:
-    """A unit before a plate with a round hole of 24 mm, one of 8 mm and a straight edge, and a plane behind it."""
+    """A unit before a plate with a round hole of 24 mm, one of 8 mm and a straight edge, and a
+    plane behind it."""
     numbers = numbers_of(name) | ({} if jump_rate is None else {"unit.jump_rate": jump_rate})
     config = CameraConfig(
         name=name, effects=STILL if jump_rate is None else EffectsConfig(), numbers=numbers
@@ -86,10 +92,12 @@ def unit_before_hole(name: str, behind_mm: float, jump_rate: float | None = None
         camera.optics.margin_px, camera.nominal_lens.height, camera.nominal_lens.width
     )
     slopes = camera.nominal_lens.region_slopes(REGIONS[name])
-    middle, reach = slopes.reshape(-1, 2).mean(axis=0), np.ptp(slopes[..., 0]) / 2
+    middle = slopes.reshape(-1, 2).mean(axis=0)
+    reach = np.ptp(slopes[..., 0]) / 2
 
     def covers(at: np.ndarray) -> np.ndarray:
-        x, y = at[..., 0] - middle[0], at[..., 1] - middle[1]
+        x = at[..., 0] - middle[0]
+        y = at[..., 1] - middle[1]
         holes = (np.hypot(x + 0.3 * reach, y) < 0.017) | (np.hypot(x - 0.3 * reach, y) < 0.0057)
         return np.isfinite(at[..., 0]) & ~holes & (x < 0.8 * reach)
 
@@ -113,13 +121,12 @@ def clouds_before(unit: SimulatedUnit) -> tuple[list[Cloud], list[Cloud]]:
 
 
 def groups_of(unit: SimulatedUnit) -> dict[str, np.ndarray]:
-    """Pixels (h, w) bool of the face, the floor (or what is behind) and the rims between them, those that there are."""
+    """Pixels (h, w) bool of the face, the floor (or what is behind) and the rims between them,
+    those that there are."""
     face = (unit.view.surface == 0)[unit.cut]
     square = np.ones((7, 7), bool)
-    inner, outer = (
-        ndimage.binary_erosion(face, square, border_value=1),
-        ndimage.binary_dilation(face, square),
-    )
+    inner = ndimage.binary_erosion(face, square, border_value=1)
+    outer = ndimage.binary_dilation(face, square)
     floor = ~face & ~ndimage.binary_dilation(face, np.ones((5, 5)))
     groups = {"face": inner, "rim": outer & ~inner, "floor": floor}
     return {name: pixels for name, pixels in groups.items() if pixels.any()}
@@ -128,8 +135,9 @@ def groups_of(unit: SimulatedUnit) -> dict[str, np.ndarray]:
 def statistics_of(
     z_m: np.ndarray, count: np.ndarray, group: np.ndarray, both: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """(captures,) each: statistics over a group's pixels (h, w); ``z_m`` and ``count`` (captures, h, w). ``both``
-    (captures', h, w): z of all captures, which gives the common mean and deviation."""
+    """(captures,) each: statistics over a group's pixels (h, w); ``z_m`` and ``count`` (captures,
+    h, w). ``both`` (captures', h, w): z of all captures, which gives the common mean and
+    deviation."""
     known = group & (np.isfinite(both).mean(axis=0) > 0.5)
     if known.sum() < 12:
         return {"count": count[:, group].mean(axis=1)}
@@ -188,7 +196,8 @@ def test_averages_drawn_at_once_have_the_distribution_of_those_of_frames(
     "name", ["azure_kinect_nfov", pytest.param("kinect_v2_libfreenect2", marks=pytest.mark.slow)]
 )
 def test_so_have_those_of_a_dim_and_distant_face(name: str):
-    """Phase noise of 0.06 to 0.1 rad in the noisiest frequency: there the filter's weights hang on the noise."""
+    """Phase noise of 0.06 to 0.1 rad in the noisiest frequency: there the filter's weights hang on
+    the noise."""
     config = CameraConfig(name=name, effects=STILL, numbers=numbers_of(name))
     camera = camera_of(config)
     assert isinstance(camera, AmcwCamera)
@@ -230,13 +239,15 @@ def assert_alike(unit: SimulatedUnit, exact: list[Cloud], at_once: list[Cloud]) 
     reasons = [
         np.stack([cloud.reason for cloud in clouds])[:, never] for clouds in (exact, at_once)
     ]
-    # which of two gates stops a pixel first may be decided frame by frame, where the commonest of ten may be either
+    # which of two gates stops a pixel first may be decided frame by frame, where the commonest of
+    # ten may be either
     assert (stats.mode(reasons[0]).mode != stats.mode(reasons[1]).mode).sum() <= 0.02 * never.sum()
 
 
 @pytest.mark.parametrize("name", REGIONS)
 def test_single_pixels_agree_in_mean_and_in_how_often_they_have_a_range(name: str):
-    """At a hole before 200 mm: mean z and count of every pixel that is not certain; the largest of thousands."""
+    """At a hole before 200 mm: mean z and count of every pixel that is not certain; the largest of
+    thousands."""
     exact, at_once = clouds_of(name, 200.0)
     count = [
         np.stack([cloud.count for cloud in clouds]).astype(float) for clouds in (exact, at_once)
@@ -256,7 +267,8 @@ def test_single_pixels_agree_in_mean_and_in_how_often_they_have_a_range(name: st
 
 
 def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
-    """Every pixel that some frame loses and another does not is on the list; few others, and no even face."""
+    """Every pixel that some frame loses and another does not is on the list; few others, and no
+    even face."""
     unit = unit_before_hole("azure_kinect_nfov", 200.0)
     z_m = np.stack([frame.z_m for frame in unit.capture(100, 7).frames()])
     valid = np.isfinite(z_m).mean(axis=0)
@@ -272,7 +284,8 @@ def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
 
 def test_prefixes_nest_and_do_not_hang_on_what_else_is_asked_for():
     unit = unit_before_hole("azure_kinect_nfov", 200.0)
-    products, squares = [], []
+    products = []
+    squares = []
     for number in range(30):
         capture = unit.capture(80, 3, number)
         together = averages_of(capture, [1, 20, 40, 80], PLAIN, exact=False)
@@ -285,20 +298,22 @@ def test_prefixes_nest_and_do_not_hang_on_what_else_is_asked_for():
     centred = [each - each.mean(axis=0) for each in (first, ten, forty)]
     # a mean of 40 contains half of the first twenty's noise: cov(20, 40) = var(40), and so on
     for inner, outer in ((centred[0], centred[1]), (centred[1], centred[2])):
-        products, squares = (inner * outer).mean(axis=1), (outer**2).mean(axis=1)
+        products = (inner * outer).mean(axis=1)
+        squares = (outer**2).mean(axis=1)
         assert abs(compared(products, squares)) < SURE
         assert (outer**2).mean() < 0.6 * (inner**2).mean()
 
 
 def test_frames_that_jump_are_left_out_as_frames_are():
-    """The same captures, whose frames are displaced alike: 20 of 30 frames of which some jump by 17 mm."""
+    """The same captures, whose frames are displaced alike: 20 of 30 frames of which some jump by
+    17 mm."""
     unit = unit_before_hole("azure_kinect_nfov", 9.5, jump_rate=0.12)
-    left_out, drawn_at_once = 0, 0
+    left_out = 0
+    drawn_at_once = 0
     for number in range(20):
         capture = unit.capture(30, 5, number)
-        exact, at_once = (
-            averages_of(capture, [20, 30], PLAIN, exact=exact) for exact in (True, False)
-        )
+        exact = averages_of(capture, [20, 30], PLAIN, exact=True)
+        at_once = averages_of(capture, [20, 30], PLAIN, exact=False)
         drawn_at_once += not np.array_equal(
             at_once[30].points_m, exact[30].points_m, equal_nan=True
         )
@@ -329,8 +344,9 @@ def trial(
 
 @pytest.mark.slow
 def test_a_detector_finds_as_often_and_calls_as_often_falsely():
-    """A shallow hole near the limit, 200 trials each way: detection at a threshold that half the trials pass, the quiet
-    threshold's distribution (Kolmogorov and Smirnov), and false calls at the threshold that one in five passes."""
+    """A shallow hole near the limit, 200 trials each way: detection at a threshold that half the
+    trials pass, the quiet threshold's distribution (Kolmogorov and Smirnov), and false calls at
+    the threshold that one in five passes."""
     name = "azure_kinect_nfov"
     camera = camera_of(CameraConfig(name=name))
     outer = REGIONS[name].grown(
@@ -360,9 +376,11 @@ def test_a_detector_finds_as_often_and_calls_as_often_falsely():
 def test_listed_pixels_go_through_the_same_chain_as_frames():
     """The filter on a list against the filter on the picture, from the same phasors."""
     unit = unit_before_hole("kinect_v2_libfreenect2", 200.0)
-    summer, imager = unit.at_once, unit.model
+    summer = unit.at_once
+    imager = unit.model
     assert summer is not None and isinstance(imager, AmcwImager)
-    light, places = summer.light, summer.list
+    light = summer.light
+    places = summer.list
     words = random_stream(1).integers(2**32, size=(len(places.halo), 3, LANES), dtype=np.uint32)
     planes = np.empty((len(places.halo) // kernels.BESIDE + 2, 3, 3, kernels.STRIDE), np.float32)
     noise = np.empty((len(places.halo), LANES), np.float32)
@@ -378,17 +396,13 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     by_plane = by_plane[: len(places.halo)]
     for lane in (0, LANES - 1):
         shape = unit.exposure.shape
-        phasors, amplitude = (
-            np.zeros((2, 3, np.prod(shape)), np.float32),
-            np.full((3, np.prod(shape)), -1, np.float32),
-        )
+        phasors = np.zeros((2, 3, np.prod(shape)), np.float32)
+        amplitude = np.full((3, np.prod(shape)), -1, np.float32)
         phasors[:, :, places.halo] = by_plane[:, :, :2, lane].transpose(2, 1, 0)
         amplitude[:, places.halo] = by_plane[:, :, 2, lane].T
         whole, whole_edge = imager.filter(phasors, amplitude, shape)
-        wanted, wanted_edge = (
-            whole.reshape(3, 3, -1)[:, :, places.range],
-            whole_edge.reshape(3, -1)[:, places.range],
-        )
+        wanted = whole.reshape(3, 3, -1)[:, :, places.range]
+        wanted_edge = whole_edge.reshape(3, -1)[:, places.range]
         near = np.maximum(1e-4 * np.abs(wanted), 1e-2)
         assert (np.abs(filtered[..., lane] - wanted) <= near).all()
         np.testing.assert_allclose(edge[..., lane], wanted_edge, rtol=0, atol=1e-4)
@@ -398,22 +412,20 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
 def test_other_means_and_exact_captures_are_drawn_frame_by_frame(method: str):
     capture = unit_before_hole("azure_kinect_nfov", 9.5).capture(8, 1)
     for config, exact in ((AverageConfig(method=method), False), (PLAIN, True)):
-        ours, frames = (
-            averages_of(capture, [8], config, exact=exact)[8],
-            prefix_averages(capture, [8], config)[8],
-        )
+        ours = averages_of(capture, [8], config, exact=exact)[8]
+        frames = prefix_averages(capture, [8], config)[8]
         assert np.array_equal(ours.points_m, frames.points_m, equal_nan=True)
     few = FEWEST_FRAMES - 1
-    ours, frames = (
-        averages_of(capture, [few], PLAIN, exact=False)[few],
-        prefix_averages(capture, [few], PLAIN)[few],
-    )
+    ours = averages_of(capture, [few], PLAIN, exact=False)[few]
+    frames = prefix_averages(capture, [few], PLAIN)[few]
     assert np.array_equal(ours.points_m, frames.points_m, equal_nan=True)
 
 
 def test_what_no_model_can_draw_at_once_is_drawn_frame_by_frame():
-    """A lidar; a camera without noise, whose rounding nothing dithers; one whose samples may saturate or may not."""
-    lidar, azure = camera_of(CameraConfig(name="realsense_l515")), camera_of(CameraConfig())
+    """A lidar; a camera without noise, whose rounding nothing dithers; one whose samples may
+    saturate or may not."""
+    lidar = camera_of(CameraConfig(name="realsense_l515"))
+    azure = camera_of(CameraConfig())
     quiet = CameraConfig(effects=EffectsConfig(noise=False))
     narrow = CameraConfig(numbers={"converter.full_scale_units": 820})
     units = (

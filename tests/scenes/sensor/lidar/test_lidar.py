@@ -38,8 +38,9 @@ from tests.support.lidar_units import (
 @pytest.mark.parametrize("distance_m", [0.27, 0.5, 0.75, 1.0, 2.3, 6.4])
 @pytest.mark.parametrize("region", [PATCH, Region(40, 80, 60, 110)], ids=["axis", "corner"])
 def test_range_on_planes_is_exact_without_noise(distance_m, region):
-    """With the receiver 20 mm beside the transmitter; what is left is the plane's perspective curvature across the
-    smoothing, some 13 square pixels of half a curvature: 0.01 mm a metre, more in the corner."""
+    """With the receiver 20 mm beside the transmitter; what is left is the plane's perspective
+    curvature across the smoothing, some 13 square pixels of half a curvature: 0.01 mm a metre,
+    more in the corner."""
     camera = changed({**FINE, "engine.confidence_electrons": 1.0})
     unit = SimulatedUnit(camera, QUIET, plane_view(camera, region, distance_m, 0.6, 0.1, 0.05))
     assert np.abs(z_of(unit)[0] - true_z_m(unit)).max() < 0.01e-3 + 0.025e-3 * distance_m
@@ -72,7 +73,8 @@ def test_output_is_whole_quarters_of_a_millimetre():
     far_wins=st.booleans(),
 )
 def test_two_separate_returns_are_two_peaks_in_order_of_their_light(near, gap, ratio, far_wins):
-    """Each at its place and height, but for 4 % of the other's light (side lobes, and the mean, which is filtered)."""
+    """Each at its place and height, but for 4 % of the other's light (side lobes, and the mean,
+    which is filtered)."""
     half_m = np.array([near, near + gap])
     light = np.array([ratio, 1.0]) if far_wins else np.array([1.0, ratio])
     peaks = strongest_peaks(comb_phasors(CAMERA, half_m[:, None], light[:, None]), CAMERA.weights)
@@ -82,16 +84,19 @@ def test_two_separate_returns_are_two_peaks_in_order_of_their_light(near, gap, r
 
 
 def test_peaks_are_ordered_by_height_even_where_samples_are_not():
-    """Returns that differ by 1 %, at 200 places within a sample, where the samples' order is often the other one."""
+    """Returns that differ by 1 %, at 200 places within a sample, where the samples' order is often
+    the other one."""
     near = 1.0 + np.linspace(0, 0.15, 200)
-    half_m, light = np.stack([near, near + 1.03]), np.outer([0.99, 1.0], np.ones(200))
+    half_m = np.stack([near, near + 1.03])
+    light = np.outer([0.99, 1.0], np.ones(200))
     peaks = strongest_peaks(comb_phasors(CAMERA, half_m, light), CAMERA.weights)
     assert (peaks.height[0] > peaks.height[1]).all()
     assert peaks.delay[0] * CAMERA.unambiguous_m == pytest.approx(half_m[1], abs=2e-3)
 
 
 def test_a_lone_return_has_the_pulse_of_the_file():
-    """Height 1 at the return, half of it half a width away; curvature of the bandwidth that the bound uses."""
+    """Height 1 at the return, half of it half a width away; curvature of the bandwidth that the
+    bound uses."""
     half_m = np.array([[1.234]])
     peaks = strongest_peaks(comb_phasors(CAMERA, half_m, np.ones((1, 1))), CAMERA.weights)
     assert peaks.delay[0, 0] * CAMERA.unambiguous_m == pytest.approx(1.234, abs=1e-6)
@@ -110,9 +115,12 @@ def test_a_lone_return_has_the_pulse_of_the_file():
 
 
 def test_noise_of_a_peak_meets_the_bound_in_brute_force():
-    """White noise through the matched filter on the whole correlation: deviation of place (the Cramer-Rao bound) and
-    of height, and no correlation between them; 4,000 draws have 1.1 % of each deviation, held at 4 sigma."""
-    rng, n, ratio = np.random.default_rng(4), 4000, 20.0
+    """White noise through the matched filter on the whole correlation: deviation of place (the
+    Cramer-Rao bound) and of height, and no correlation between them; 4,000 draws have 1.1 % of
+    each deviation, held at 4 sigma."""
+    rng = np.random.default_rng(4)
+    n = 4000
+    ratio = 20.0
     w = CAMERA.weights
     noise = rng.standard_normal((2, len(w), n)) * np.sqrt(w / w.sum())[:, None] / ratio
     phasor = comb_phasors(CAMERA, np.full((1, n), 1.5), np.ones((1, n)))
@@ -125,8 +133,11 @@ def test_noise_of_a_peak_meets_the_bound_in_brute_force():
 
 
 def test_highest_maximum_of_noise_follows_rices_count():
-    """Quantiles of 4,000 brute-force correlations of noise alone against the formula; it holds for high maxima."""
-    rng, n, w = np.random.default_rng(6), 4000, CAMERA.weights
+    """Quantiles of 4,000 brute-force correlations of noise alone against the formula; it holds for
+    high maxima."""
+    rng = np.random.default_rng(6)
+    n = 4000
+    w = CAMERA.weights
     noise = rng.standard_normal((2, len(w), n)) * np.sqrt(w / w.sum())[:, None]
     highest = strongest_peaks((noise[0] + 1j * noise[1]) * (w.sum() / w)[:, None], w).height[0]
     rate = CAMERA.bandwidth_rad_s * CAMERA.period_s / (2 * np.pi)
@@ -140,7 +151,8 @@ def test_highest_maximum_of_noise_follows_rices_count():
 
 
 def smoothing_factor(camera: ScannedLidar) -> float:
-    """Deviation after the linear smoothing of noise that overlapping integrations correlate along columns."""
+    """Deviation after the linear smoothing of noise that overlapping integrations correlate along
+    columns."""
     along, across = camera.smoothing_taps
     rho = max(0.0, 1 - 1 / camera.integration_points)
     return float(
@@ -152,9 +164,11 @@ def smoothing_factor(camera: ScannedLidar) -> float:
     ("distance_m", "albedo"), [(0.5, 0.95), (1.0, 0.5), (1.5, 0.95), (2.0, 0.6)]
 )
 def test_output_noise_is_the_bound_times_the_smoothing(distance_m, albedo):
-    """sigma = c / (2 B) sqrt(F (S + A) + a^2) / S, S = signal albedo / d^2, where all neighbours join.
+    """sigma = c / (2 B) sqrt(F (S + A) + a^2) / S, S = signal albedo / d^2, where all neighbours
+    join.
 
-    160 frames of 64 x 64 pixels, of which some 110 share their noise, tell it to 1.1 % at one sigma."""
+    160 frames of 64 x 64 pixels, of which some 110 share their noise, tell it to 1.1 % at one
+    sigma."""
     camera = changed({**UNIFORM, **FINE})
     photons = camera.photons
     signal = photons.signal_electrons.value * albedo / distance_m**2
@@ -170,7 +184,8 @@ def test_output_noise_is_the_bound_times_the_smoothing(distance_m, albedo):
 
 
 def correlations(camera: ScannedLidar, frames: int = 60) -> np.ndarray:
-    """(7, 7) noise correlation at lags 0..6 along columns (rows of the result) and along rows (its columns)."""
+    """(7, 7) noise correlation at lags 0..6 along columns (rows of the result) and along rows (its
+    columns)."""
     unit = SimulatedUnit(
         camera, ONLY_NOISE, plane_view(camera, Region(340, 460, 460, 600), 1.0, 0.6)
     )
@@ -182,8 +197,9 @@ def correlations(camera: ScannedLidar, frames: int = 60) -> np.ndarray:
 
 
 def test_noise_is_alike_along_sweeps_and_not_across_them():
-    """Before smoothing: 1 - 1/p along a column for integrations of p points, nothing along a row. One estimate has
-    a deviation of 0.001 (a million pairs); 0.006 allows for it and for the taps' own 0.3 %."""
+    """Before smoothing: 1 - 1/p along a column for integrations of p points, nothing along a row.
+    One estimate has a deviation of 0.001 (a million pairs); 0.006 allows for it and for the taps'
+    own 0.3 %."""
     found = correlations(changed({**RAW, **UNIFORM, **FINE}))
     share = 1 - 1 / CAMERA.integration_points
     expected = np.zeros((7, 7))
@@ -192,8 +208,9 @@ def test_noise_is_alike_along_sweeps_and_not_across_them():
 
 
 def test_smoothing_correlates_as_its_weights_say():
-    """The weights' own correlation, the one along columns blurred by the overlap. The means of 60 frames take nothing
-    off at this tolerance; neighbouring means share most of their noise, hence its size."""
+    """The weights' own correlation, the one along columns blurred by the overlap. The means of 60
+    frames take nothing off at this tolerance; neighbouring means share most of their noise, hence
+    its size."""
     share = 1 - 1 / CAMERA.integration_points
     column, row = (np.correlate(taps, taps, "full") for taps in CAMERA.smoothing_taps)
     along_column = np.convolve(column, [share, 1, share])[len(column) // 2 + 1 :][:7]
@@ -203,12 +220,13 @@ def test_smoothing_correlates_as_its_weights_say():
 
 @pytest.mark.parametrize("along_rows", [False, True])
 def test_smoothing_of_more_columns_than_a_chunk_meets_brute_force(along_rows: bool):
-    """Of steps and noise that the gates let through in part, for both axes, and beyond the picture's border."""
+    """Of steps and noise that the gates let through in part, for both axes, and beyond the
+    picture's border."""
     random = np.random.default_rng(1)
     taps, (h, w), r = np.float32([0.05, 0.2, 0.5, 0.2, 0.05]), (6, CHUNK + 37), 2
-    half_m, share, height = (
-        np.full((h + 2 * r, w + 2 * r), beyond, np.float32) for beyond in (NOWHERE_M, 0, 0)
-    )
+    half_m = np.full((h + 2 * r, w + 2 * r), NOWHERE_M, np.float32)
+    share = np.full((h + 2 * r, w + 2 * r), 0, np.float32)
+    height = np.full((h + 2 * r, w + 2 * r), 0, np.float32)
     inner = slice(r, -r), slice(r, -r)
     half_m[inner] = (
         1 + 0.02 * random.integers(0, 2, (h, w)) + 0.005 * random.standard_normal((h, w))
@@ -223,7 +241,8 @@ def test_smoothing_of_more_columns_than_a_chunk_meets_brute_force(along_rows: bo
         near = slice(r + down, r + down + h), slice(r + right, r + right + w)
         off = half_m[near] - half_m[inner]
         weight = tap * (np.abs(off) <= gate_m)
-        moved, total = moved + weight * share[near] * off, total + weight * share[near]
+        moved = moved + weight * share[near] * off
+        total = total + weight * share[near]
         heights = heights + weight * height[near]
     np.testing.assert_allclose(
         found, [half_m[inner] + moved / total, total, heights], rtol=0, atol=1e-6
@@ -231,7 +250,8 @@ def test_smoothing_of_more_columns_than_a_chunk_meets_brute_force(along_rows: bo
 
 
 def test_noise_of_range_and_of_strength_are_independent():
-    """As the brute force above has it; 50,000 pairs, half of them alike along columns, held at 4 sigma."""
+    """As the brute force above has it; 50,000 pairs, half of them alike along columns, held at 4
+    sigma."""
     unit = SimulatedUnit(
         changed({**RAW, **UNIFORM, **FINE}), ONLY_NOISE, plane_view(CAMERA, PATCH, 1.0, 0.6)
     )
@@ -270,7 +290,8 @@ def test_ambient_light_adds_noise_and_its_switch_takes_it_away():
 
 
 def test_ambient_electrons_by_hand():
-    """0.4 uW/cm2/nm is 4e-3 W/m2/nm; times 30 nm, albedo 0.5 and the foreshortened solid angle, over 0.24 W."""
+    """0.4 uW/cm2/nm is 4e-3 W/m2/nm; times 30 nm, albedo 0.5 and the foreshortened solid angle,
+    over 0.24 W."""
     by_hand = CAMERA.photons.signal_electrons.value * 4e-3 * 30 * 0.5 * CAMERA.field_sr / 0.24
     assert CAMERA.ambient_electrons(0.4) == pytest.approx(by_hand)
     # 70 x 55 degrees: tan 35 x tan 27.5 x 4 = 1.46 before foreshortening

@@ -25,7 +25,8 @@ from tests.support.lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, changed, 
 
 
 def two_returns(share: float, effects: EffectsConfig) -> tuple[SimulatedUnit, np.ndarray]:
-    """A unit without smoothing whose beams see 1 m and, with ``share`` of equal light, 2 m; and its z."""
+    """A unit without smoothing whose beams see 1 m and, with ``share`` of equal light, 2 m; and
+    its z."""
     camera = changed(RAW)
     near = plane_view(camera, PATCH, 1.0, 0.6)
     far = plane_view(camera, PATCH, 2.0, 2.4)
@@ -36,8 +37,8 @@ def two_returns(share: float, effects: EffectsConfig) -> tuple[SimulatedUnit, np
 
 
 def test_the_stronger_of_two_returns_wins_and_equal_ones_flip():
-    """Share of frames that show the far return: Phi((far - near) / (sqrt 2 noise)), to 4 sigma of 60,000 draws that
-    overlap along columns."""
+    """Share of frames that show the far return: Phi((far - near) / (sqrt 2 noise)), to 4 sigma of
+    60,000 draws that overlap along columns."""
     for share, quiet in ((0.4, 1.0), (0.6, 2.0)):
         _, z = two_returns(share, QUIET.effects)
         assert np.abs(z - quiet).max() < 5e-3
@@ -63,7 +64,8 @@ def test_shot_noise_is_that_of_all_light_in_the_beam():
 
 
 def test_a_footprint_across_a_small_step_reads_between_by_light():
-    """Returns 30 mm apart merge: a tenth of the pulse's 0.3 m, so the peak is their mean by light, within 2 %."""
+    """Returns 30 mm apart merge: a tenth of the pulse's 0.3 m, so the peak is their mean by light,
+    within 2 %."""
     near = plane_view(CAMERA, PATCH, 1.0, 0.6)
     far = plane_view(CAMERA, PATCH, 1.03, 0.6 * 1.03**2)
     for share in (0.25, 0.5, 0.75):
@@ -94,7 +96,8 @@ def test_multipath_lengthens_range_and_its_switch_takes_it_away():
 
 def stepped(step_m: float) -> NoiseFreeView:
     """The left half at 1 m, the right half farther, no beam across the edge."""
-    near, far = (plane_view(CAMERA, PATCH, d, 0.6) for d in (1.0, 1.0 + step_m))
+    near = plane_view(CAMERA, PATCH, 1.0, 0.6)
+    far = plane_view(CAMERA, PATCH, 1.0 + step_m, 0.6)
     return mixed(near, far, (np.arange(PATCH.shape[1]) >= 30).astype(float))
 
 
@@ -111,7 +114,8 @@ def test_smoothing_keeps_a_step_of_30_mm_and_blurs_one_of_4_mm():
 
 
 def test_integration_smears_along_the_sweep_only():
-    """A bright row in the dark: neighbours above and below get the hat's share of its light, those beside nothing."""
+    """A bright row in the dark: neighbours above and below get the hat's share of its light, those
+    beside nothing."""
     view = plane_view(CAMERA, PATCH, 1.0, 0.6)
     row = (np.arange(PATCH.shape[0]) == 25).astype(float)[:, None]
     lit = mixed(replace(view, phasor=0 * view.phasor, intensity=0 * view.intensity), view, row)
@@ -161,7 +165,8 @@ def test_each_gate_names_its_reason():
 
 def test_five_pixels_in_a_row_are_invalid_and_three_by_three_are_not():
     """They hold 0.08 and 0.15 of the weights; a tenth is asked for."""
-    view, other = plane_view(CAMERA, PATCH, 1.0, 0.6), plane_view(CAMERA, PATCH, 1.8, 1.9)
+    view = plane_view(CAMERA, PATCH, 1.0, 0.6)
+    other = plane_view(CAMERA, PATCH, 1.8, 1.9)
     share = np.zeros(PATCH.shape)
     share[20, 20:25] = share[30:33, 20:23] = 1.0
     camera = changed({"code.integration_ns": 1e-3})
@@ -174,8 +179,8 @@ def test_five_pixels_in_a_row_are_invalid_and_three_by_three_are_not():
 
 
 def test_dark_beams_do_not_pass_for_returns():
-    """Noise alone: maxima would have to agree, and to exceed the threshold in the mean over all neighbours. With
-    both gates off they do pass."""
+    """Noise alone: maxima would have to agree, and to exceed the threshold in the mean over all
+    neighbours. With both gates off they do pass."""
     unit = SimulatedUnit(CAMERA, ONLY_NOISE, plane_view(CAMERA, PATCH, 1.0, 0.0))
     assert not np.isfinite(z_of(unit, 20)).any()
     open_gates = {"engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
@@ -205,10 +210,8 @@ def test_ripples_have_the_size_and_length_of_their_facts():
     ripples = LidarScanner(
         CAMERA, config, lens.whole, lens.region_slopes(lens.whole)
     ).static_error_m
-    size, length = (
-        CAMERA.fixed_pattern.smooth_mm.value * 1e-3,
-        CAMERA.fixed_pattern.smooth_length_px.value,
-    )
+    size = CAMERA.fixed_pattern.smooth_mm.value * 1e-3
+    length = CAMERA.fixed_pattern.smooth_length_px.value
     # some 2,700 independent patches: 1.4 % at one sigma
     assert ripples.std() == pytest.approx(size, rel=0.05)
     for lag in (6, 12, 24):
@@ -224,7 +227,8 @@ def test_shorter_captures_are_prefixes_and_streams_are_repeatable():
     unit = SimulatedUnit(
         CAMERA, CameraConfig(name=CAMERA.name), plane_view(CAMERA, PATCH, 3.5, 0.5)
     )
-    long, short = z_of(unit, 4), z_of(unit, 2)
+    long = z_of(unit, 4)
+    short = z_of(unit, 2)
     assert np.array_equal(long[:2], short, equal_nan=True)
     assert not np.array_equal(long[0], long[1], equal_nan=True)
     assert not np.array_equal(z_of(unit, 1, seed=2)[0], long[0], equal_nan=True)
@@ -235,7 +239,8 @@ def test_single_precision_views_change_nothing_that_counts():
     single = replace(
         view, phasor=view.phasor.astype(np.complex64), intensity=view.intensity.astype(np.float32)
     )
-    a, b = (SimulatedUnit(CAMERA, QUIET, v).exposure.half_m[0] for v in (view, single))
+    a = SimulatedUnit(CAMERA, QUIET, view).exposure.half_m[0]
+    b = SimulatedUnit(CAMERA, QUIET, single).exposure.half_m[0]
     assert np.abs(a - b).max() < 2e-6
 
 
@@ -244,14 +249,16 @@ def test_single_precision_views_change_nothing_that_counts():
 
 @pytest.mark.parametrize("fwhm_mrad", [0.7, 1.37, 2.0])
 def test_share_of_a_resting_beam_is_the_gaussians(fwhm_mrad):
-    """1 - 2^-(D / w)^2 for a disc of diameter D under a round Gaussian of full width w, without the smear."""
+    """1 - 2^-(D / w)^2 for a disc of diameter D under a round Gaussian of full width w, without
+    the smear."""
     camera = changed({"beam.fwhm_mrad": fwhm_mrad, "code.integration_ns": 1e-6})
     expected = 1 - 2 ** -((3.2 / (fwhm_mrad * 0.75)) ** 2)
     assert share_in_disc(camera, 3.2e-3, 0.75) == pytest.approx(expected, rel=1e-6)
 
 
 def test_wider_beams_see_small_holes_shallower():
-    """A blind hole of 3/32 in, 5 mm deep, at 1 m, in beams of the nuisance range; a large one does not care."""
+    """A blind hole of 3/32 in, 5 mm deep, at 1 m, in beams of the nuisance range; a large one does
+    not care."""
     widths = (0.7, 1.37, 2.0)
     small = [hole_depth_seen_m(changed({"beam.fwhm_mrad": w}), 2.4e-3, 5e-3, 1.0) for w in widths]
     large = [hole_depth_seen_m(changed({"beam.fwhm_mrad": w}), 25e-3, 5e-3, 1.0) for w in widths]
@@ -261,8 +268,8 @@ def test_wider_beams_see_small_holes_shallower():
 
 
 def test_the_closed_form_hole_is_the_one_of_a_sampled_view():
-    """At the hole's centre, through sub-rays, smear and peak; to 5 % (100 sub-rays). The receiver stands in the beam,
-    so that the rim throws no shadow."""
+    """At the hole's centre, through sub-rays, smear and peak; to 5 % (100 sub-rays). The receiver
+    stands in the beam, so that the rim throws no shadow."""
     camera = changed({"receiver.position_mm": [0.0, 0.0, 0.0], **RAW, **FINE})
     lens = camera.nominal_lens
     region = Region(396, 411, 520, 537)
