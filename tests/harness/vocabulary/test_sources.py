@@ -11,11 +11,11 @@ from harness.vocabulary.provenance import reached_sources, source_digest
 
 FILES = {
     "harness/__init__.py": "",
-    "harness/trial.py": "import numpy\nfrom harness.engine import (\n    judge,  # why\n)\n",
+    "harness/trial.py": "import numpy\nfrom harness.trials import (\n    judge,  # why\n)\n",
     "harness/page.py": "from harness.trial import run\n",
-    "harness/engine/__init__.py": "",
+    "harness/trials/__init__.py": "",
     "harness/trials/judge.py": "def run():\n    from scenes.board import Board\n    import detectors.methods.thesis as t\n",
-    "harness/engine/other.py": "",
+    "harness/trials/other.py": "",
     "scenes/__init__.py": "",
     "scenes/board.py": "class Board: ...\n",
     "detectors/__init__.py": "",
@@ -53,7 +53,7 @@ def test_what_a_module_reaches_counts_and_nothing_else(project: Path) -> None:
     forget()
     assert reached == set(FILES) - {
         "harness/page.py",
-        "harness/engine/other.py",
+        "harness/trials/other.py",
         "detectors/blind.py",
     }
     for name in FILES:
