@@ -7,6 +7,7 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
+from harness import __version__
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import shipped
 
@@ -69,9 +70,7 @@ def _run(name: str, rest: list[str]) -> int:
         print('\nshell completion: eval "$(tofpod completion bash)"')
         return 0
     if name == "--version":
-        from importlib.metadata import version
-
-        print(f"tofpod {version('tofpod')}")
+        print(f"tofpod {__version__}")
         return 0
     if name == "completion":
         if rest not in (["bash"], ["zsh"]):
