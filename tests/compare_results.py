@@ -34,18 +34,26 @@ ABSENT = "(absent)"
 class ExpectedDifference:
     """What may differ between two folders although their results are equal."""
 
-    # "file": whole files; "value": columns of tables and keys of JSON; "text": parts of other files
+    # "file": whole files; "value": columns of tables and keys of JSON; "text": parts of any text
     kind: Literal["file", "value", "text"]
     # pattern of paths, in which * stands for any characters
     files: str
-    # pattern of a column or of a dotted key; regular expression of a text; empty for whole files
+    # pattern of a column or of a dotted key; regular expression of a text; nothing for whole files
     what: str
     # why it is no result
     reason: str
 
 
+PROGRAM = (
+    "ask|characterise|check|clean|compare|coverage|dataset|design|detect|efficiency|export_noise"
+    "|export|flatfield|gauge|implant|ls|merge|pod|prepare|score|sweep|target|validate"
+)
+PROVENANCE_ROWS = (
+    "stage|commit|dirty|started|machine|renders|trials|peak mb|versions|renders .not cached."
+    "|frames .all workers, resumed trials too.|detection and measurement .likewise.|this run in all"
+)
 EXCEPTIONS = (
-    ExpectedDifference("file", "renders/*", "", "stored renders: names hold digests of the code"),
+    ExpectedDifference("file", "*renders/*", "", "stored renders: names hold digests of the code"),
     ExpectedDifference("file", "*/journal/*", "", "trials in order of time; keys hold digests"),
     ExpectedDifference("file", "*.lock*", "", "locks have no content"),
     ExpectedDifference("file", "times.txt", "", "durations of the runs to compare"),
@@ -54,6 +62,41 @@ EXCEPTIONS = (
     ExpectedDifference("value", "*", "*dirty", "the state of the checkout"),
     ExpectedDifference("value", "*", "*started", "the time of the run"),
     ExpectedDifference("value", "*", "*command", "the words by which a program was called"),
+    ExpectedDifference("value", "*", "*versions.tofpod", "the version of the code"),
+    ExpectedDifference(
+        "value", "*provenance.json", "renders.*", "stored renders are not made anew"
+    ),
+    ExpectedDifference("value", "*provenance.json", "peak_mb", "memory of the code"),
+    ExpectedDifference(
+        "text",
+        "*.html",
+        f'<th scope="row">({PROVENANCE_ROWS})</th><td[^>]*>[^<]*</td>',
+        "the origin on a page: durations, the code and the time",
+    ),
+    ExpectedDifference(
+        "text",
+        "*.html",
+        "<h3>Command</h3>\n<pre>[^<]*</pre>",
+        "the words by which a program was called",
+    ),
+    ExpectedDifference(
+        "text", "*.stderr", r"(?m)(?:^renders \d+/\d+, trials .*\n)+", "progress, every 10 s"
+    ),
+    ExpectedDifference(
+        "text",
+        "*.stderr",
+        r"(?m)^\S+[.]py:\d+: \w+Warning:.*\n.*\n",
+        "warnings quote lines of code",
+    ),
+    ExpectedDifference(
+        "text", "help/*", r"\s+", "lines are broken according to the length of a program's name"
+    ),
+    ExpectedDifference(
+        "text",
+        "*",
+        rf"(python[\s…]-m[\s…]harness[.\s…]|\btofpod[\s…]|\bharness\.)(?=({PROGRAM})\b)",
+        "a program has several names: tofpod sweep, python -m harness.sweep",
+    ),
 )
 
 
@@ -63,7 +106,7 @@ class Comparison:
 
     # lines that state the differences, by path
     differences: dict[str, list[str]] = field(default_factory=dict)
-    # number of files in which an exception was needed
+    # number of files that differ and to which an exception applies
     exceptions_used: Counter[ExpectedDifference] = field(default_factory=Counter)
     # number of files in both folders that no exception leaves out
     compared: int = 0
@@ -77,16 +120,22 @@ class Expectations:
 
     # those whose pattern the file's path matches
     exceptions: Sequence[ExpectedDifference]
-    # those that were needed so far
+    # those that were applied so far
     used: set[ExpectedDifference] = field(default_factory=set)
 
     def cover(self, name: str) -> bool:
-        """Return whether a column or key that differs may do so."""
+        """Return whether a column or key may differ."""
         for exception in self.exceptions:
             if exception.kind == "value" and fnmatchcase(name, exception.what):
                 self.used.add(exception)
                 return True
         return False
+
+    def differ(self, name: str, old: str, new: str) -> bool:
+        """Return whether two values of a column or key differ although they should not."""
+        if old == new or self.cover(name):
+            return False
+        return self.without_expected(old) != self.without_expected(new)
 
     def without_expected(self, text: str) -> str:
         """Return a text in which parts that may differ are replaced by an ellipsis."""
@@ -104,13 +153,16 @@ class Expectations:
 def compare_folders(
     old_folder: Path,
     new_folder: Path,
+    parts: Sequence[str] = (),
     exceptions: Sequence[ExpectedDifference] = EXCEPTIONS,
 ) -> Comparison:
-    """Compare all files of two folders, and of the folders in them."""
+    """Compare all files of two folders, or only those in folders named ``parts`` in both."""
     comparison = Comparison()
     old_files = result_files(old_folder)
     new_files = result_files(new_folder)
     for path in sorted(old_files.keys() | new_files.keys()):
+        if parts and path.partition("/")[0] not in parts:
+            continue
         matching = [item for item in exceptions if fnmatchcase(path, item.files)]
         left_out = [item for item in matching if item.kind == "file"]
         if left_out:
@@ -225,8 +277,8 @@ def table_differences(old: Table, new: Table, expected: Expectations) -> Iterato
         if column not in new.columns:
             continue
         pairs = list(zip_longest(old.columns[column], new.columns[column], fillvalue=ABSENT))
-        changed = [row for row, (old_cell, new_cell) in enumerate(pairs) if old_cell != new_cell]
-        if changed and not expected.cover(column):
+        changed = [row for row, pair in enumerate(pairs) if expected.differ(column, *pair)]
+        if changed:
             old_cell, new_cell = pairs[changed[0]]
             rows = f"{len(changed)} of {len(pairs)} rows differ, first row {changed[0]}"
             yield f"column {column}: {rows}: {excerpts(old_cell, new_cell)}"
@@ -278,7 +330,7 @@ def mapping_differences(
     """Yield the differences of two mappings: keys and their order, values."""
     yield from key_differences("key", old, new, expected)
     for key in old:
-        if key in new and old[key] != new[key] and not expected.cover(key):
+        if key in new and expected.differ(key, old[key], new[key]):
             yield f"key {key}: {excerpts(old[key], new[key])}"
 
 
@@ -306,7 +358,7 @@ def array_differences(old: bytes, new: bytes, expected: Expectations) -> Iterato
             continue
         old_text = _array_text(old_arrays[name])
         new_text = _array_text(new_arrays[name])
-        if old_text != new_text and not expected.cover(name):
+        if expected.differ(name, old_text, new_text):
             yield f"array {name}: {excerpts(old_text, new_text)}"
 
 
@@ -367,7 +419,7 @@ def report_lines(comparison: Comparison, shown: int | None) -> Iterator[str]:
         if shown is not None and len(differences) > shown:
             yield f"    and {len(differences) - shown} more"
     if comparison.exceptions_used:
-        yield "exceptions that were needed:"
+        yield "exceptions that were applied:"
     for exception, count in comparison.exceptions_used.most_common():
         what = f" {exception.what}" if exception.what else ""
         yield f"    {count} files: {exception.files}{what} ({exception.reason})"
@@ -383,12 +435,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("old", type=Path, help="folder of results")
     parser.add_argument("new", type=Path, help="folder of results to compare with it")
+    only = "compare only these folders in OLD and NEW"
+    parser.add_argument("--only", nargs="+", metavar="FOLDER", default=[], help=only)
     parser.add_argument("--all", action="store_true", help="list all differences of each file")
     options = parser.parse_args(arguments)
     for folder in (options.old, options.new):
-        if not folder.is_dir():
-            parser.error(f"{folder}: no such folder")
-    comparison = compare_folders(options.old, options.new)
+        for part in ("", *options.only):
+            if not (folder / part).is_dir():
+                parser.error(f"{folder / part}: no such folder")
+    comparison = compare_folders(options.old, options.new, options.only)
     for line in report_lines(comparison, None if options.all else SHOWN_DIFFERENCES):
         print(line)
     return 1 if comparison.differences or not comparison.compared else 0

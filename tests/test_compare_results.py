@@ -172,9 +172,28 @@ def test_an_exception_of_text_hides_only_its_part(old: Path, new: Path) -> None:
     exception = compare_results.ExpectedDifference("text", "*.html", "[0-9]+ of", "a test")
     report = results_in(new) / "report.html"
     report.write_text(report.read_text().replace("5 of 11", "6 of 11"))
-    assert not compare_results.compare_folders(old, new, [exception]).differences
+    assert not compare_results.compare_folders(old, new, [], [exception]).differences
     report.write_text(report.read_text().replace("6 of 11", "6 of 12"))
-    assert compare_results.compare_folders(old, new, [exception]).differences
+    assert compare_results.compare_folders(old, new, [], [exception]).differences
+
+
+def test_an_exception_of_text_holds_in_values_too(old: Path, new: Path) -> None:
+    change_json(results_in(old), note="see python -m harness.merge")
+    change_json(results_in(new), note="see tofpod merge")
+    assert differences_of(old, new) == {}
+    change_json(results_in(new), note="see tofpod pod")
+    assert differences_of(old, new).keys() == {"provenance.json"}
+
+
+def test_parts_limit_the_comparison_to_folders(old: Path, new: Path) -> None:
+    for folder in (old, new):
+        (folder / "pod").mkdir()
+        (folder / "pod" / "a90.txt").write_text(folder.name)
+    assert compare_results.main([str(old), str(new), "--only", "results"]) == 0
+    assert compare_results.main([str(old), str(new), "--only", "results", "pod"]) == 1
+    assert compare_results.main([str(old), str(new)]) == 1
+    with pytest.raises(SystemExit, match="2"):
+        compare_results.main([str(old), str(new), "--only", "nowhere"])
 
 
 def test_every_exception_has_a_reason() -> None:
