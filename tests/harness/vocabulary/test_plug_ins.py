@@ -266,7 +266,10 @@ def test_everything_is_listed_with_where_it_comes_from(acme_camera, capsys):
         if line and "(entry" not in line and not line.startswith("name ")
     }
     assert set(lines) == {*OWN_DETECTORS, *camera_names()}
-    assert f"tofpod {__version__}" in lines["thesis"] and f" {ThesisDetector.version} " in lines["thesis"]
+    assert (
+        f"tofpod {__version__}" in lines["thesis"]
+        and f" {ThesisDetector.version} " in lines["thesis"]
+    )
     assert "acme-cameras 1.2" in lines["acme_tof"] and "512 x 424" in lines["acme_tof"]
     assert "0.5 to 4.5 m" in lines["acme_tof"] and "860 nm" in lines["acme_tof"]
 
