@@ -160,17 +160,17 @@ complete -o filenames -F _tofpod tofpod
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command. Returns the program's exit code, or 2 for an unknown program."""
-    given = sys.argv[1:] if arguments is None else arguments
-    name, *rest = given or [""]
+    words = sys.argv[1:] if arguments is None else arguments
+    name, *program_arguments = words or [""]
     if name in MODULES:
-        sys.argv[1:] = rest
+        sys.argv[1:] = program_arguments
         return int(
-            importlib.import_module(MODULES[name]).main(rest if arguments is not None else None)
+            importlib.import_module(MODULES[name]).main(program_arguments if arguments is not None else None)
         )
-    return exit_code_of(lambda: _run(name, rest))
+    return exit_code_of(lambda: _run(name, program_arguments))
 
 
-def _run(name: str, rest: list[str]) -> int:
+def _run(name: str, program_arguments: list[str]) -> int:
     if name in ("", "-h", "--help"):
         wide = max(len(program.name) for program in PROGRAMS)
         print("How small a damage can a time-of-flight depth camera detect?\n")
@@ -185,13 +185,13 @@ def _run(name: str, rest: list[str]) -> int:
         print(f"tofpod {__version__}")
         return 0
     if name == "completion":
-        if rest not in (["bash"], ["zsh"]):
+        if program_arguments not in (["bash"], ["zsh"]):
             raise UserError(
-                f"completion {shlex.join(rest)}: no such shell",
+                f"completion {shlex.join(program_arguments)}: no such shell",
                 legal="tofpod completion bash, or zsh",
             )
         print(
-            ("autoload -U bashcompinit && bashcompinit\n" if rest == ["zsh"] else "")
+            ("autoload -U bashcompinit && bashcompinit\n" if program_arguments == ["zsh"] else "")
             + _completion(),
             end="",
         )
