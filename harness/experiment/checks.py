@@ -132,7 +132,7 @@ def _target_problems(
         return
     if unseen := _unseen(simulated.camera, simulated.views, simulated.target):
         path, mistake = unseen
-        yield Problem(mistake.unseen, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
+        yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
