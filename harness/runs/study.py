@@ -30,13 +30,14 @@ from harness.report.study_page import study_html, study_parts
 from harness.report.summaries import as_files, is_thesis, summaries
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
+from harness.runs.job_batches import pictures_from, render_missing, values_of
 from harness.runs.jobs import STATES, Failure, Job, JobEngine, Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
 from harness.runs.pictures import shown_in, study_examples
 from harness.runs.plan import PACKAGES, Group, SweepPlan, plan_of
 from harness.runs.results_folder import point_to
-from harness.runs.run import pictures_from, render_missing, run_plan, values_of
+from harness.runs.run import run_plan
 from harness.runs.shards import locked
 from harness.runs.tables import tables_of, write_tables
 from harness.tables.study import study_tables
@@ -198,7 +199,9 @@ def _write_study(
 def title_of(experiment: Experiment) -> str:
     """Return the title of an experiment's page: its own title, and the axes."""
     axes = list(names_of(experiment.data.get("sweep") or {}).values())
-    axes_text = ", by " + " and ".join(filter(None, (", ".join(axes[:-1]), axes[-1]))) if axes else ""
+    axes_text = (
+        ", by " + " and ".join(filter(None, (", ".join(axes[:-1]), axes[-1]))) if axes else ""
+    )
     return (experiment.config.title or in_words(experiment.config.name)) + axes_text
 
 
@@ -230,7 +233,11 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
         print(f"{bug.why}\n{summary}", file=sys.stderr)
         return 1
     failures = [failure for failure in outcome.failures if failure.state != "skipped"]
-    why = failures[0].why if len({failure.in_short for failure in failures}) == 1 else _reasons(outcome)
+    why = (
+        failures[0].why
+        if len({failure.in_short for failure in failures}) == 1
+        else _reasons(outcome)
+    )
     outcome_text = "trial was judged" if outcome.finished else "trial succeeded"
     again = "once the cause is corrected, run the same command with --retry-failed: it runs these trials again"
     is_old = failures and not outcome.trials.done and "to do:" not in why
@@ -447,7 +454,9 @@ def failures_by_point(
     """Return the failed trials of each point, by its digest."""
     by_key = {failure.what: failure for failure in failures}
     found = dict[str, list[Failure]]()
-    keyed_batches = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
+    keyed_batches = (
+        [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
+    )
     for group, batch in keyed_batches:
         for key, task in group.trials(batch, thresholds if batch in group.then else {}):
             for point in task.points if key in by_key else ():
@@ -466,15 +475,23 @@ def without_limit(
     judged_set_ups = {(set_up.variant, set_up.frames) for set_up in judged}
     by_cause = dict[str, list[str]]()
     for point in (
-        point for point in points if (point.variant, point.config.capture.frames) not in judged_set_ups
+        point
+        for point in points
+        if (point.variant, point.config.capture.frames) not in judged_set_ups
     ):
-        point_failures = [failure for failure in failed.get(point.digest, ()) if failure.state != "skipped"]
+        point_failures = [
+            failure for failure in failed.get(point.digest, ()) if failure.state != "skipped"
+        ]
         causes = [failure.in_short for failure in point_failures]
         causes = causes or [
-            failure.in_short for failure in outcome.failures if failure.what == f"threshold of {point.label}"
+            failure.in_short
+            for failure in outcome.failures
+            if failure.what == f"threshold of {point.label}"
         ]
         why = Counter([*causes, "its trials did not finish"]).most_common(1)[0][0]
-        if point_failures and all(failure.state == "failed" and not failure.is_bug for failure in point_failures):
+        if point_failures and all(
+            failure.state == "failed" and not failure.is_bug for failure in point_failures
+        ):
             why = f"the camera sees no part of the board that can be judged ({why})"
         by_cause.setdefault(why, []).append(in_words(point.label))
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in by_cause.items()]
