@@ -98,12 +98,12 @@ EXCEPTIONS = (
     ExpectedDifference("text", "*.stdout", r"\b[\d.]+ [kM]iB\b", "sizes on disk, with journals"),
     ExpectedDifference("text", "*", r"\b20\d\d-\d\d-\d\d\b", "dates of the runs"),
     ExpectedDifference(
-        "text", "help/*", r"\s+", "lines are broken according to the length of a program's name"
+        "text", "help/*", r"[\s-]+", "lines are broken by the length of a program's name"
     ),
     ExpectedDifference(
         "text",
         "*",
-        rf"(python[\s…]-m[\s…]harness[.\s…]|\btofpod[\s…]|\bharness\.)(?=({PROGRAM})\b)",
+        rf"(python[\s…-]+m[\s…]harness[.\s…]|\btofpod[\s…]|\bharness\.)(?=({PROGRAM})\b)",
         "a program has several names: tofpod sweep, python -m harness.sweep",
     ),
 )
