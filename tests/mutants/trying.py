@@ -1,0 +1,244 @@
+"""Runs the tests of a room on a mutant, in a copy of the tree that is thrown away."""
+
+import ast
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from mutants.draw import PRODUCT, product_modules
+from mutants.kinds import Mutant
+
+EXTRA_S, FACTOR = 60.0, 3.0
+"""A mutant may take so many seconds more than this multiple of the time of the unchanged tests: kernels are compiled
+anew, and other programs run."""
+PYTEST = ("-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0")
+NO_TESTS = 5  # pytest's exit code if all tests are deselected
+OWN = "tests/mutants/"  # not copied: a further equivalent mutant changes no test
+COPIED = (*PRODUCT, "tests")  # folders with compiled files
+COMPILED = ("*.nbi", "*.nbc")  # files in which numba keeps kernels
+
+
+@dataclass(frozen=True)
+class TestRun:
+    """A run of some test files."""
+
+    __test__ = False
+
+    state: str
+    """``passed``, ``failed`` or ``timed out``."""
+    test: str
+    """The first test that failed."""
+    seconds: float
+
+
+class BrokenTests(Exception):
+    """The tests fail without any fault."""
+
+
+class Tree:
+    """A copy of a checkout in which the unchanged tests have passed, so that bytecode and kernels are compiled."""
+
+    def __init__(self, root: Path, home: Path) -> None:
+        """Make or update the copy below ``home``."""
+        self.folder = home / "tree"
+        self._record = home / "baseline.json"
+        files = _files(root)
+        digest = hashlib.sha256()
+        for name in files:
+            digest.update(name.encode() + b"\0" + (root / name).read_bytes())
+        self._digest = digest.hexdigest()
+        self._seconds: dict[str, dict[str, float]] = {}
+        stored = json.loads(self._record.read_text()) if self._record.exists() else {}
+        if stored.get("digest") == self._digest:
+            self._seconds = stored["rooms"]
+            return
+        shutil.rmtree(self.folder, ignore_errors=True)
+        for name in files:
+            target = self.folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, target)
+        # compiled files stay valid, as the copies keep the times of their sources
+        for cache in sorted(path for room in COPIED for path in (root / room).rglob("__pycache__")):
+            relative = cache.relative_to(root)
+            if (self.folder / relative.parent).is_dir():
+                shutil.copytree(cache, self.folder / relative)
+
+    def seconds(self, files: list[str]) -> dict[str, float]:
+        """Return the time of each of the test files of a room on the unchanged product, and of all together by the
+        name "all". Raises BrokenTests if one of them fails."""
+        room = " ".join(sorted(files))
+        if room not in self._seconds:
+            report = self.folder.parent / "report.xml"
+            run = run_tests(self.folder, files, 3600.0, f"--junitxml={report}")
+            if run.state != "passed":
+                raise BrokenTests(
+                    f"{run.test or run.state}: the tests fail on the unchanged product"
+                )
+            self._seconds[room] = {"all": run.seconds, **_seconds_of_files(report, files)}
+            record = {"digest": self._digest, "rooms": self._seconds}
+            self._record.write_text(json.dumps(record, indent=1))
+        return self._seconds[room]
+
+
+def _files(root: Path) -> list[str]:
+    """Return the files of a checkout that Git does not ignore, but those of this tool."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    listed = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout
+    names = [name for name in listed.split("\0") if name and not name.startswith(OWN)]
+    return sorted(name for name in names if (root / name).is_file())
+
+
+def _seconds_of_files(report: Path, files: list[str]) -> dict[str, float]:
+    """Return the seconds of each test file in a report in JUnit's format."""
+    seconds = dict.fromkeys(files, 0.0)
+    module_of = {file.removesuffix(".py").replace("/", "."): file for file in files}
+    for case in ElementTree.parse(report).iter("testcase"):
+        classname = case.get("classname", "")
+        for module, file in module_of.items():
+            if classname == module or classname.startswith(f"{module}."):
+                seconds[file] += float(case.get("time", "0"))
+    return seconds
+
+
+def run_tests(tree: Path, files: list[str], limit_s: float, *options: str) -> TestRun:
+    """Run test files until the first failure."""
+    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="mutant-tests-", ignore_cleanup_errors=True) as scratch:
+        output = Path(scratch) / "output.txt"
+        command = [sys.executable, *PYTEST, "-x", f"--basetemp={scratch}/base", *options, *files]
+        with output.open("w") as stream:
+            process = subprocess.Popen(
+                command,
+                cwd=tree,
+                env=environment,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        try:
+            code = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            return TestRun("timed out", "", time.monotonic() - began)
+        finally:
+            _end(process)
+        seconds = time.monotonic() - began
+        if code in (0, NO_TESTS):
+            return TestRun("passed", "", seconds)
+        failure = re.search(
+            r"^(?:FAILED|ERROR) (\S+)", output.read_text(errors="replace"), re.MULTILINE
+        )
+        return TestRun("failed", failure.group(1) if failure else f"exit code {code}", seconds)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process with all that it has started."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+    process.wait()
+
+
+def imported(path: Path) -> set[str]:
+    """Return the modules, and the names in modules, that a file imports anywhere."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return names
+
+
+def module_name(file: str) -> str:
+    """Return the dotted name of a module by its path in the checkout."""
+    return file.removesuffix(".py").replace("/", ".")
+
+
+def tests_of(tree: Path, file: str) -> tuple[list[str], list[str]]:
+    """Return the test files of a module's room: those that import the module, and the others. The room's tests stand in
+    the folder of ``tests`` with the module's path, or else in the nearest folder around it that has tests."""
+    folder = tree / "tests" / Path(file).parent
+    while not list(folder.glob("test_*.py")):
+        folder = folder.parent
+    paths = sorted(folder.glob("test_*.py"))
+    names = {path: imported(path) for path in paths}
+    direct = [path for path in paths if module_name(file) in names[path]]
+    further = [path for path in paths if path not in direct]
+    if folder == tree / "tests":
+        # all tests in one folder: only those that import something of the module's package count
+        package = module_name(str(Path(file).parent))
+        in_room = [
+            path for path in further if any(name.startswith(package) for name in names[path])
+        ]
+        further = [] if direct else in_room
+    relative = [
+        [path.relative_to(tree).as_posix() for path in group] for group in (direct, further)
+    ]
+    return relative[0], relative[1]
+
+
+def tried(mutant: Mutant, tree: Tree) -> TestRun:
+    """Return the outcome of the room's tests on a mutant: first of the files that import the module, and in both
+    groups the fastest file first."""
+    direct, further = tests_of(tree.folder, mutant.file)
+    seconds = tree.seconds([*direct, *further])
+    limit_s = EXTRA_S + FACTOR * seconds["all"]
+    total_s = 0.0
+    with tempfile.TemporaryDirectory(prefix="mutant-", ignore_cleanup_errors=True) as scratch:
+        copy = Path(scratch) / "tree"
+        shutil.copytree(tree.folder, copy)
+        put_in(mutant, copy)
+        for group in (direct, further):
+            if not group:
+                continue
+            run = run_tests(copy, sorted(group, key=lambda file: seconds[file]), limit_s - total_s)
+            total_s += run.seconds
+            if run.state != "passed":
+                return TestRun(run.state, run.test, total_s)
+    return TestRun("passed", "", total_s)
+
+
+def put_in(mutant: Mutant, tree: Path) -> None:
+    """Write a mutant into a copy of the tree, and remove what was compiled from the module or with it."""
+    path = tree / mutant.file
+    path.write_bytes(mutant.applied(path.read_bytes()))
+    _remove(path.parent.glob(f"__pycache__/{path.stem}.*"))
+    for user in users_of_kernels(tree, mutant.file):
+        for pattern in COMPILED:
+            _remove(user.parent.glob(f"__pycache__/{user.stem}.{pattern}"))
+
+
+def users_of_kernels(tree: Path, file: str) -> list[Path]:
+    """Return the modules with kernels that contain functions or constants of a module: numba keeps these with the
+    kernel, and notices changes of the kernel's own file only."""
+    with_kernels = [path for path in product_modules(tree) if b"njit" in path.read_bytes()]
+    names = {path: imported(path) for path in with_kernels}
+    changed = {module_name(file)}
+    users: list[Path] = []
+    grows = True
+    while grows:
+        fresh = [path for path in with_kernels if path not in users and names[path] & changed]
+        users += fresh
+        changed.update(module_name(path.relative_to(tree).as_posix()) for path in fresh)
+        grows = bool(fresh)
+    return users
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in list(paths):
+        path.unlink()
