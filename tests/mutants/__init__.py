@@ -1,1 +1,1 @@
-"""Mutants: small faults put into the numeric modules, which the tests of a module's room must notice."""
+"""Mutants: small faults of the numeric modules, which the tests of a room must notice."""

@@ -1,7 +1,7 @@
-"""Put small faults into the numeric modules, run the tests of their rooms, and print the page of survivors.
+"""Put small faults into the numeric modules, run the tests of their rooms, and print the page of
+survivors.
 
-Results are appended to mutants.jsonl in --home, and what stands there is not tried again.
-"""
+Results are appended to mutants.jsonl in --home, and what stands there is not tried again."""
 
 import argparse
 import json
@@ -13,7 +13,8 @@ from pathlib import Path
 from mutants.draw import Equivalents, all_mutants, drawn, named
 from mutants.kinds import Mutant
 from mutants.page import Trial, page
-from mutants.trying import BrokenTests, Tree, tests_of, tried
+from mutants.rooms import room_tests
+from mutants.trying import BrokenTests, Tree, tried
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -91,7 +92,7 @@ def main() -> int:
     missing = [mutant for mutant in mutants if mutant.key not in records]
     try:
         for mutant in missing:
-            direct, further = tests_of(tree.folder, mutant.file)
+            direct, further = room_tests(tree.folder, mutant.file)
             tree.seconds([*direct, *further])
     except BrokenTests as error:
         print(error, file=sys.stderr)
@@ -108,7 +109,7 @@ def main() -> int:
     print(text)
     if arguments.page is not None:
         arguments.page.write_text(text)
-    for line in equivalents.stale(all_mutants(tree.folder, "*")):
+    for line in equivalents.stale(tree.folder):
         print(f"equivalent.yaml: no longer in the code: {line}", file=sys.stderr)
     return 0
 
@@ -123,12 +124,11 @@ def _chosen(root: Path, arguments: argparse.Namespace) -> tuple[list[Mutant], li
 
 def _print_list(mutants: Sequence[Mutant]) -> None:
     for mutant in mutants:
-        direct, further = tests_of(ROOT, mutant.file)
+        direct, further = room_tests(ROOT, mutant.file)
         print(f"{mutant.file} {mutant.function} ({mutant.kind})")
         print(f"    - {mutant.original}\n    + {mutant.mutant}")
-        print(
-            f"    {' '.join(Path(file).stem for file in direct)}; then {len(further)} files of the room"
-        )
+        names = " ".join(Path(file).stem for file in direct)
+        print(f"    {names}; then {len(further)} further files of the room")
 
 
 def _report_named(trials: Sequence[Trial], lost: Sequence[str]) -> int:

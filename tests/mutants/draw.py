@@ -1,4 +1,5 @@
-"""Which mutants are tried: the numeric modules, a draw that depends on content alone, and the listed faults."""
+"""Which mutants are tried: the numeric modules, a draw that depends on content alone, and the
+listed faults."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatch
@@ -59,8 +60,8 @@ def product_modules(root: Path) -> list[Path]:
 def drawn(mutants: Sequence[Mutant], number: int, seed: int) -> list[Mutant]:
     """Return so many of the mutants, at most one of an expression, in the order of the files.
 
-    The rank of a mutant depends on the seed, its file's name, its function and its text, so that changes elsewhere
-    and moves of files leave the draw as it is."""
+    The rank of a mutant depends on the seed, its file's name, its function and its text, so that
+    changes elsewhere and moves of files leave the draw as it is."""
 
     def rank(mutant: Mutant) -> bytes:
         content = (str(seed), Path(mutant.file).name, *mutant.key[1:])
@@ -88,8 +89,8 @@ def entries(path: Path) -> list[dict[str, Any]]:
 
 
 def named(root: Path, path: Path) -> tuple[list[Mutant], list[str]]:
-    """Return the faults listed in a YAML file, and a sentence on each that the code no longer has. A fault whose file
-    has moved is sought in all modules."""
+    """Return the faults listed in a YAML file, and a sentence on each that the code no longer has.
+    A fault whose file has moved is sought in all modules."""
     mutants: list[Mutant] = []
     lost: list[str] = []
     for entry in entries(path):
@@ -124,10 +125,18 @@ class Equivalents:
 
     def reason(self, mutant: Mutant) -> str | None:
         """Return why a mutant is no fault, or None."""
-        key = (Path(mutant.file).name, mutant.function, mutant.original, mutant.mutant)
-        return self._reasons.get(key)
+        return self._reasons.get(_texts(mutant))
 
-    def stale(self, mutants: Sequence[Mutant]) -> list[str]:
-        """Return the entries that are none of the mutants, as lines of text."""
-        present = {(Path(m.file).name, m.function, m.original, m.mutant) for m in mutants}
+    def stale(self, root: Path) -> list[str]:
+        """Return the entries that are no mutants of the code any more, as lines of text."""
+        names = {key[0] for key in self._reasons}
+        present: set[tuple[str, ...]] = set()
+        for file in numeric_modules(root):
+            if Path(file).name in names:
+                mutants = mutants_of(file, (root / file).read_bytes())
+                present.update(_texts(mutant) for mutant in mutants)
         return [" | ".join(key) for key in self._reasons if key not in present]
+
+
+def _texts(mutant: Mutant) -> tuple[str, ...]:
+    return (Path(mutant.file).name, mutant.function, mutant.original, mutant.mutant)

@@ -1,7 +1,8 @@
-"""The kinds of small faults, found on the syntax tree and written by position, so that the formatting stays.
+"""The kinds of small faults, found on the syntax tree and written by position, so that the
+formatting stays.
 
-Docstrings, messages, f-strings, annotations, decorators, raised errors and the options of programs are left alone.
-"""
+Docstrings, messages, f-strings, annotations, decorators, raised errors and the options of programs
+are left alone."""
 
 import ast
 import re
@@ -10,7 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 GUARD = 1e-6
-"""A constant up to this size only prevents a division by zero: doubled or 0, it is no fault that a test could see."""
+"""A constant up to this size only prevents a division by zero: doubled or 0, it is no fault that a
+test could see."""
 OUTSIDE = "<module>"  # the function of a statement outside of all functions
 SKIPPED_FUNCTIONS = {"_options"}  # the options of a program
 SKIPPED_CALLS = {"UserError", "add_argument", "print", "warn", "subplots", "figure", "savefig"}
@@ -68,7 +70,8 @@ class Mutant:
     file: str
     """Path in the checkout."""
     function: str
-    """Name of the function or class, with those around it; `OUTSIDE` for a statement of the module."""
+    """Name of the function or class, with those around it; `OUTSIDE` for a statement of the
+    module."""
     kind: str
     """Name of a rule of `RULES`, or "named"."""
     original: str
@@ -140,7 +143,8 @@ def _whole(source: Source, node: ast.AST, text: str) -> Edit:
 
 
 def _between(source: Source, left: ast.AST, right: ast.AST, old: str, new: str) -> Iterator[Edit]:
-    """Yield the replacement of an operator between two operands, unless a comment makes it unclear."""
+    """Yield the replacement of an operator between two operands, unless a comment makes it
+    unclear."""
     start = source.end(left)
     gap = source.data[start : source.start(right)].decode()
     position = gap.find(old)
@@ -188,8 +192,9 @@ def _signs(source: Source, node: ast.AST) -> Iterator[Edit]:
     elif isinstance(node, ast.BinOp) and type(node.op) in SIGNS and not _is_sequence(node):
         yield from _between(source, node.left, node.right, *SIGNS[type(node.op)])
     elif isinstance(node, ast.AugAssign) and type(node.op) in SIGNS:
-        if not _is_sequence(node.value):
-            yield from _between(source, node.target, node.value, *SIGNS[type(node.op)])
+        if _is_sequence(node.value):
+            return
+        yield from _between(source, node.target, node.value, *SIGNS[type(node.op)])
 
 
 def _dropped_terms(source: Source, node: ast.AST) -> Iterator[Edit]:
@@ -333,8 +338,8 @@ def mutants_of(file: str, data: bytes) -> list[Mutant]:
 def named_mutant(
     file: str, data: bytes, function: str, original: str, replaced: str
 ) -> Mutant | None:
-    """Return the fault that replaces ``original``, a text that occurs once in a function; else None. White space in
-    the text stands for any white space."""
+    """Return the fault that replaces ``original``, a text that occurs once in a function; else
+    None. White space in the text stands for any white space."""
     source = Source(data)
     ranges = [(0, len(data))] if function == OUTSIDE else []
     for node, name in _nodes(source.tree, OUTSIDE):

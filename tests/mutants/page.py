@@ -10,9 +10,10 @@ from mutants.kinds import RULES, Mutant
 
 HEAD = """# Mutants: small faults that the tests must notice
 
-Written by `make mutants` (options: `--help`); not edited by hand. {number} small faults of the numeric modules are drawn
-with the seed {seed}, at most one of an expression. Each is put into a copy of the tree, where the tests of its room
-run without the slow ones. A fault is killed if a test fails or takes much too long.
+Written by `make mutants`, not edited by hand. {number} small faults of the numeric modules are
+drawn with the seed {seed}, at most one of an expression. Each is put into a copy of the tree, where
+the tests of its room run without the slow ones. A fault is killed if a test fails or takes much too
+long.
 """
 
 

@@ -1,10 +1,12 @@
 """Runs the tests of a room on a mutant, in a copy of the tree that is thrown away."""
 
-import ast
+import contextlib
 import hashlib
 import json
+import math
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -18,11 +20,16 @@ from pathlib import Path
 
 from mutants.draw import PRODUCT, product_modules
 from mutants.kinds import Mutant
+from mutants.rooms import imported, module_name, room_tests
 
-EXTRA_S, FACTOR = 60.0, 3.0
-"""A mutant may take so many seconds more than this multiple of the time of the unchanged tests: kernels are compiled
-anew, and other programs run."""
+EXTRA_S = 60.0
+FACTOR = 3.0
+"""The tests of a mutant may take so many processor seconds more than this multiple of those of the
+unchanged tests, as kernels are compiled anew."""
+PATIENCE = 10.0
+"""Real seconds per processor second of this limit after which a process waits in vain."""
 PYTEST = ("-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0")
+FAILURE = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 NO_TESTS = 5  # pytest's exit code if all tests are deselected
 OWN = "tests/mutants/"  # not copied: a further equivalent mutant changes no test
 COPIED = (*PRODUCT, "tests")  # folders with compiled files
@@ -47,7 +54,8 @@ class BrokenTests(Exception):
 
 
 class Tree:
-    """A copy of a checkout in which the unchanged tests have passed, so that bytecode and kernels are compiled."""
+    """A copy of a checkout in which the unchanged tests have passed, so that bytecode and kernels
+    are compiled."""
 
     def __init__(self, root: Path, home: Path) -> None:
         """Make or update the copy below ``home``."""
@@ -75,17 +83,18 @@ class Tree:
                 shutil.copytree(cache, self.folder / relative)
 
     def seconds(self, files: list[str]) -> dict[str, float]:
-        """Return the time of each of the test files of a room on the unchanged product, and of all together by the
-        name "all". Raises BrokenTests if one of them fails."""
+        """Return the seconds of each of the test files of a room on the unchanged product, and the
+        processor seconds of all together by the name "all". Raises BrokenTests if one fails."""
         room = " ".join(sorted(files))
         if room not in self._seconds:
             report = self.folder.parent / "report.xml"
+            before = _processor_seconds()
             run = run_tests(self.folder, files, 3600.0, f"--junitxml={report}")
+            spent = _processor_seconds() - before
             if run.state != "passed":
-                raise BrokenTests(
-                    f"{run.test or run.state}: the tests fail on the unchanged product"
-                )
-            self._seconds[room] = {"all": run.seconds, **_seconds_of_files(report, files)}
+                what = run.test or run.state
+                raise BrokenTests(f"{what}: the tests fail on the unchanged product")
+            self._seconds[room] = {"all": spent, **_seconds_of_files(report, files)}
             record = {"digest": self._digest, "rooms": self._seconds}
             self._record.write_text(json.dumps(record, indent=1))
         return self._seconds[room]
@@ -111,8 +120,20 @@ def _seconds_of_files(report: Path, files: list[str]) -> dict[str, float]:
     return seconds
 
 
+def _processor_seconds() -> float:
+    """Return the processor time of all processes that have been started and have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
 def run_tests(tree: Path, files: list[str], limit_s: float, *options: str) -> TestRun:
-    """Run test files until the first failure."""
+    """Run test files until the first failure, or until a process has used ``limit_s`` processor
+    seconds, which do not depend on what else the machine does."""
+    limit = math.ceil(limit_s)
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
+
     environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     began = time.monotonic()
@@ -127,105 +148,68 @@ def run_tests(tree: Path, files: list[str], limit_s: float, *options: str) -> Te
                 stdout=stream,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
+                preexec_fn=limited,
             )
         try:
-            code = process.wait(limit_s)
+            code = process.wait(PATIENCE * limit_s)
         except subprocess.TimeoutExpired:
             return TestRun("timed out", "", time.monotonic() - began)
         finally:
             _end(process)
         seconds = time.monotonic() - began
+        if code in (-signal.SIGXCPU, -signal.SIGKILL):
+            return TestRun("timed out", "", seconds)
         if code in (0, NO_TESTS):
             return TestRun("passed", "", seconds)
-        failure = re.search(
-            r"^(?:FAILED|ERROR) (\S+)", output.read_text(errors="replace"), re.MULTILINE
-        )
+        failure = FAILURE.search(output.read_text(errors="replace"))
         return TestRun("failed", failure.group(1) if failure else f"exit code {code}", seconds)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """End a process with all that it has started."""
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     process.wait()
 
 
-def imported(path: Path) -> set[str]:
-    """Return the modules, and the names in modules, that a file imports anywhere."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            names.add(node.module)
-            names.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return names
-
-
-def module_name(file: str) -> str:
-    """Return the dotted name of a module by its path in the checkout."""
-    return file.removesuffix(".py").replace("/", ".")
-
-
-def tests_of(tree: Path, file: str) -> tuple[list[str], list[str]]:
-    """Return the test files of a module's room: those that import the module, and the others. The room's tests stand in
-    the folder of ``tests`` with the module's path, or else in the nearest folder around it that has tests."""
-    folder = tree / "tests" / Path(file).parent
-    while not list(folder.glob("test_*.py")):
-        folder = folder.parent
-    paths = sorted(folder.glob("test_*.py"))
-    names = {path: imported(path) for path in paths}
-    direct = [path for path in paths if module_name(file) in names[path]]
-    further = [path for path in paths if path not in direct]
-    if folder == tree / "tests":
-        # all tests in one folder: only those that import something of the module's package count
-        package = module_name(str(Path(file).parent))
-        in_room = [
-            path for path in further if any(name.startswith(package) for name in names[path])
-        ]
-        further = [] if direct else in_room
-    relative = [
-        [path.relative_to(tree).as_posix() for path in group] for group in (direct, further)
-    ]
-    return relative[0], relative[1]
-
-
 def tried(mutant: Mutant, tree: Tree) -> TestRun:
-    """Return the outcome of the room's tests on a mutant: first of the files that import the module, and in both
-    groups the fastest file first."""
-    direct, further = tests_of(tree.folder, mutant.file)
+    """Return the outcome of the room's tests on a mutant: first of the files that import the
+    module, and in both groups the fastest file first."""
+    direct, further = room_tests(tree.folder, mutant.file)
     seconds = tree.seconds([*direct, *further])
     limit_s = EXTRA_S + FACTOR * seconds["all"]
+    compiled_in = users_of_kernels(tree.folder, mutant.file)
     total_s = 0.0
     with tempfile.TemporaryDirectory(prefix="mutant-", ignore_cleanup_errors=True) as scratch:
         copy = Path(scratch) / "tree"
         shutil.copytree(tree.folder, copy)
-        put_in(mutant, copy)
+        put_in(mutant, copy, compiled_in)
         for group in (direct, further):
             if not group:
                 continue
-            run = run_tests(copy, sorted(group, key=lambda file: seconds[file]), limit_s - total_s)
+            files = sorted(group, key=lambda file: seconds[file])
+            run = run_tests(copy, files, limit_s)
             total_s += run.seconds
             if run.state != "passed":
                 return TestRun(run.state, run.test, total_s)
     return TestRun("passed", "", total_s)
 
 
-def put_in(mutant: Mutant, tree: Path) -> None:
-    """Write a mutant into a copy of the tree, and remove what was compiled from the module or with it."""
+def put_in(mutant: Mutant, tree: Path, compiled_in: Iterable[str]) -> None:
+    """Write a mutant into a copy of the tree, and remove what was compiled from the module, and the
+    kernels of the modules ``compiled_in``, which contain it."""
     path = tree / mutant.file
     path.write_bytes(mutant.applied(path.read_bytes()))
     _remove(path.parent.glob(f"__pycache__/{path.stem}.*"))
-    for user in users_of_kernels(tree, mutant.file):
+    for user in compiled_in:
+        module = tree / user
         for pattern in COMPILED:
-            _remove(user.parent.glob(f"__pycache__/{user.stem}.{pattern}"))
+            _remove(module.parent.glob(f"__pycache__/{module.stem}.{pattern}"))
 
 
-def users_of_kernels(tree: Path, file: str) -> list[Path]:
-    """Return the modules with kernels that contain functions or constants of a module: numba keeps these with the
-    kernel, and notices changes of the kernel's own file only."""
+def users_of_kernels(tree: Path, file: str) -> list[str]:
+    """Return the modules with kernels that contain functions or constants of a module: numba keeps
+    these with the kernel, and notices changes of the kernel's own file only."""
     with_kernels = [path for path in product_modules(tree) if b"njit" in path.read_bytes()]
     names = {path: imported(path) for path in with_kernels}
     changed = {module_name(file)}
@@ -236,7 +220,7 @@ def users_of_kernels(tree: Path, file: str) -> list[Path]:
         users += fresh
         changed.update(module_name(path.relative_to(tree).as_posix()) for path in fresh)
         grows = bool(fresh)
-    return users
+    return [path.relative_to(tree).as_posix() for path in users]
 
 
 def _remove(paths: Iterable[Path]) -> None:
