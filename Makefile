@@ -22,24 +22,24 @@ lint: .venv/.installed
 	$(BIN)/mypy
 
 smoke: .venv/.ready
-	$(BIN)/python -m harness.sweep experiments/smoke.yaml
+	$(BIN)/tofpod sweep experiments/smoke.yaml
 
 validate: .venv/.ready
-	$(BIN)/python -m harness.validate
+	$(BIN)/python -m harness validate
 
 check: .venv/.ready
-	$(BIN)/python -m harness.check experiments/regression.yaml
+	$(BIN)/python -m harness check experiments/regression.yaml
 
 benchmarks: .venv/.ready
 	$(BIN)/python tests/benchmarks/performance.py
 
 # Recordings of many kinds of scene with known truth, answered by the default command: right, warned or wrong.
 strangers: .venv/.ready
-	PYTHONPATH=tests OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m strangers
+	OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m tests.strangers
 
 # The documentation as a site that needs no network: site/index.html.
 docs: .venv/.ready
-	$(BIN)/python -m harness.ls keys > docs/reference.md
+	$(BIN)/python -m harness ls keys > docs/reference.md
 	cp README.md docs/index.md
 	sed -i "s#](docs/#](#g; s#](CONTRIBUTING.md)#](contributing.md)#g" docs/index.md
 	sed "s#](docs/#](#g" CONTRIBUTING.md > docs/contributing.md
@@ -61,7 +61,7 @@ lock: .venv/.ready
 
 .venv/.ready: .venv/.installed
 	@echo "Setting up .venv: compile the inner loops (3 of 3) ..."
-	$(BIN)/python -m harness.prepare
+	$(BIN)/python -m harness prepare
 	touch $@
 
 clean:

@@ -1,6 +1,8 @@
-"""The path from frames to findings; it runs on real captures without Mitsuba and does not import scenes.
+"""The path from frames to findings; it runs on real captures without Mitsuba and does not import
+scenes.
 
-Detectors are found by name: the built-in ones below, others through the entry point group ``tofpod.detectors``."""
+Detectors are found by name: the built-in ones below, others through the entry point group
+``tofpod.detectors``."""
 
 from __future__ import annotations
 
@@ -15,15 +17,16 @@ if TYPE_CHECKING:
     from harness.vocabulary.config import Config
 
 GROUP = "tofpod.detectors"
-"""Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and ``C(settings)`` a Detector."""
+"""Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and
+``C(settings)`` a Detector."""
 
 BUILT_IN = {
-    "fpfh_memory": "detectors.peers:FpfhMemoryDetector",
-    "local": "detectors.local:LocalDetector",
-    "m3c2": "detectors.peers:M3c2Detector",
-    "matched": "detectors.matched:MatchedDetector",
-    "plane_ransac": "detectors.peers:PlaneRansacDetector",
-    "thesis": "detectors.thesis:ThesisDetector",
+    "fpfh_memory": "detectors.methods.peers:FpfhMemoryDetector",
+    "local": "detectors.methods.local:LocalDetector",
+    "m3c2": "detectors.methods.peers:M3c2Detector",
+    "matched": "detectors.methods.matched:MatchedDetector",
+    "plane_ransac": "detectors.methods.peers:PlaneRansacDetector",
+    "thesis": "detectors.methods.thesis:ThesisDetector",
 }
 
 NEEDED = {"m3c2": "py4dgeo"}  # packages of the extra `peers`, by detector
@@ -37,19 +40,24 @@ def detector_names() -> tuple[str, ...]:
 
 
 def detector_type(name: str) -> Any:
-    """Return the class behind a name; its ``settings_type`` is the Config that validates its settings. Raises UserError
-    on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is not a detector."""
+    """Return the class behind a name; its ``settings_type`` is the Config that validates its
+    settings. Raises UserError on an unknown name, a name taken twice, a package that is not
+    installed, and a plug-in that is not a detector."""
     from harness.vocabulary.config import Config
 
     offer = DETECTORS.offer(name)
     package = NEEDED.get(name) if offer.built_in else None
     if package is not None and find_spec(package) is None:
         fix = "pip install 'tofpod[peers]'"
-        raise UserError(f"detector {name!r} needs the package {package}, which is not installed: {fix}", fix=fix)
+        raise UserError(
+            f"detector {name!r} needs the package {package}, which is not installed: {fix}", fix=fix
+        )
     kind = DETECTORS.load(offer)
     settings_type = getattr(kind, "settings_type", None)
     if not (isinstance(settings_type, type) and issubclass(settings_type, Config)):
-        raise DETECTORS.broken(offer, "it has no `settings_type` that is a harness.vocabulary.config.Config")
+        raise DETECTORS.broken(
+            offer, "it has no `settings_type` that is a harness.vocabulary.config.Config"
+        )
     called = getattr(kind, "name", None)
     if isinstance(called, str) and called != name:
         # results use the detector's own name, experiments that of its entry point
@@ -58,10 +66,12 @@ def detector_type(name: str) -> Any:
 
 
 def load_detector(name: str, settings: dict[str, Any]) -> Detector:
-    """Return the detector of that name with these settings (plain data, as YAML holds it). Raises UserError as
-    `detector_type`, and if the settings are not legal (every problem at once)."""
+    """Return the detector of that name with these settings (plain data, as YAML holds it). Raises
+    UserError as `detector_type`, and if the settings are not legal (every problem at once)."""
     from harness.vocabulary.declaration.diagnose import settings_of
 
     kind = detector_type(name)
     settings_type = cast("type[Config]", kind.settings_type)
-    return cast("Detector", kind(settings_of(settings_type, settings, f"settings of detector {name!r}")))
+    return cast(
+        "Detector", kind(settings_of(settings_type, settings, f"settings of detector {name!r}"))
+    )

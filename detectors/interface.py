@@ -1,4 +1,5 @@
-"""The interface of a detector: it turns a cloud into scored evidence; the caller sets the threshold."""
+"""The interface of a detector: it turns a cloud into scored evidence; the caller sets the
+threshold."""
 
 from __future__ import annotations
 
@@ -15,12 +16,14 @@ from harness.vocabulary.geometry import Cloud
 class Evidence:
     """A detector's result for each pixel of a cloud, before any threshold is applied.
 
-    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector does not judge.
-    ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted surface, ``surface_z_m``
-    (h, w). ``scale_m``: standard deviation that corresponds to one unit of score. ``warnings``: full sentences on
-    reasons why these numbers are unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score
-    indicates something behind the surface; None: the residual's sign does. ``unit``: the unit of score in words, if
-    scores are not residuals over a deviation; ``scale_m`` is then its least value at a typical point."""
+    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector
+    does not judge. ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-)
+    the fitted surface, ``surface_z_m`` (h, w). ``scale_m``: standard deviation that corresponds to
+    one unit of score. ``warnings``: full sentences on reasons why these numbers are unreliable;
+    every program shows them first. ``behind`` (h, w) bool: whether the score indicates something
+    behind the surface; None: the residual's sign does. ``unit``: the unit of score in words, if
+    scores are not residuals over a deviation; ``scale_m`` is then its least value at a typical
+    point."""
 
     score: np.ndarray
     residual_m: np.ndarray
@@ -34,10 +37,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Detection:
-    """A finding. ``score``: the lowest threshold at which it is no longer found. ``pixels`` (n,): flat indices into the
-    cloud's (h, w) grid, ascending. ``centre_m`` (3,): its place in the cloud's frame, by which it is matched with
-    damage. ``kind``: "depth" for points that depart from the surface; "no return" for connected pixels without return
-    (then invalid) inside the target's outline; "object" for an object on the target."""
+    """A finding. ``score``: the lowest threshold at which it is no longer found. ``pixels`` (n,):
+    flat indices into the cloud's (h, w) grid, ascending. ``centre_m`` (3,): its place in the
+    cloud's frame, by which it is matched with damage. ``kind``: "depth" for points that depart
+    from the surface; "no return" for connected pixels without return (then invalid) inside the
+    target's outline; "object" for an object on the target."""
 
     score: float
     pixels: np.ndarray
@@ -49,11 +53,12 @@ class Detection:
 class MissingReturns:
     """Pixels without a return inside the target's ``outline`` (h, w) bool.
 
-    ``unseen`` (h, w): share of the frames (of a map: 0 or 1) in which a pixel returned nothing. ``blind``: share of the
-    outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: smallest
-    cluster that is a finding; ``expected``: number of such clusters by chance. ``detections``: kind "no return",
-    largest first. Their score is the Gaussian deviation with the same probability as the expected number of chance
-    clusters of that size, at most 37."""
+    ``unseen`` (h, w): share of the frames (of a map: 0 or 1) in which a pixel returned nothing.
+    ``blind``: share of the outline's pixels without any return. ``dropouts``: rate of scattered
+    missing pixels. ``least_points``: smallest cluster that is a finding; ``expected``: number of
+    such clusters by chance. ``detections``: kind "no return", largest first. Their score is the
+    Gaussian deviation with the same probability as the expected number of chance clusters of that
+    size, at most 37."""
 
     outline: np.ndarray
     unseen: np.ndarray
@@ -65,7 +70,8 @@ class MissingReturns:
 
     @property
     def blind_text(self) -> str:
-        """Return a sentence on the blind share of the target, and the part of it that chance explains."""
+        """Return a sentence on the blind share of the target, and the part of it that chance
+        explains."""
         places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
         chance = f"{self.expected:.1g} expected by chance; scattered dropouts {100 * self.dropouts:.2g} %"
         places += f" of {self.least_points} connected pixels and more ({chance})"
@@ -80,12 +86,14 @@ class MissingReturns:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Size and place of one detection, camera frame, metres; NaN where an estimate is impossible (``model_note``).
+    """Size and place of one detection, camera frame, metres; NaN where an estimate is impossible
+    (``model_note``).
 
-    ``length_m``, ``width_m``, ``along`` (3,): sides of the rectangle with the second moments of the residual, less the
-    camera's blur, and the direction of the longer one. For a slot these are its sides; for a round hole of diameter d,
-    0.87 d each. ``extent_*``: the thesis' measure, from the extreme points. ``model_*``: from the model of a blurred
-    hole, with standard errors. ``depth_m``: along the viewing axis from the fitted surface, positive behind it."""
+    ``length_m``, ``width_m``, ``along`` (3,): sides of the rectangle with the second moments of
+    the residual, less the camera's blur, and the direction of the longer one. For a slot these are
+    its sides; for a round hole of diameter d, 0.87 d each. ``extent_*``: the thesis' measure, from
+    the extreme points. ``model_*``: from the model of a blurred hole, with standard errors.
+    ``depth_m``: along the viewing axis from the fitted surface, positive behind it."""
 
     u_px: float
     v_px: float
@@ -108,8 +116,8 @@ class Measurement:
 
 @dataclass(frozen=True)
 class TrueDamage:
-    """A true damage, given to detectors that test the harness: centre (3,) on the face in the cloud's frame, diameter,
-    and the flat indices of the pixels that see into it."""
+    """A true damage, given to detectors that test the harness: centre (3,) on the face in the
+    cloud's frame, diameter, and the flat indices of the pixels that see into it."""
 
     centre_m: np.ndarray
     diameter_m: float
@@ -118,7 +126,8 @@ class TrueDamage:
 
 @runtime_checkable
 class NeedsTruth(Protocol):
-    """A detector that receives the truth in order to test the harness; no real detector implements this."""
+    """A detector that receives the truth in order to test the harness; no real detector implements
+    this."""
 
     def with_truth(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
@@ -127,22 +136,26 @@ class NeedsTruth(Protocol):
 
 @runtime_checkable
 class Calibratable(Protocol):
-    """A detector that learns from hole-free clouds before it judges, such as the noise's spectrum, its tails, or a
-    memory of the undamaged face. The result is plain arrays named by identifiers, so that it can be stored and sent."""
+    """A detector that learns from hole-free clouds before it judges, such as the noise's spectrum,
+    its tails, or a memory of the undamaged face. The result is plain arrays named by identifiers,
+    so that it can be stored and sent."""
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return what was learned from the clouds, as arrays without objects; empty if there is nothing to learn. The
-        clouds show targets without damage and were taken like those to be judged (camera, frames, average). Neither the
-        detector nor the clouds change. Raises UserError if clouds cannot be judged or are too few."""
+        """Return what was learned from the clouds, as arrays without objects; empty if there is
+        nothing to learn. The clouds show targets without damage and were taken like those to be
+        judged (camera, frames, average). Neither the detector nor the clouds change. Raises
+        UserError if clouds cannot be judged or are too few."""
         ...
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
-        """Return the detector, with the same name and version, that uses the result of `calibrate`."""
+        """Return the detector, with the same name and version, that uses the result of
+        `calibrate`."""
         ...
 
 
 class Detector(Protocol):
-    """A detector receives a cloud and never the truth. Its settings are a `harness.vocabulary.config.Config`."""
+    """A detector receives a cloud and never the truth. Its settings are a
+    `harness.vocabulary.config.Config`."""
 
     @property
     def name(self) -> str: ...
@@ -152,7 +165,8 @@ class Detector(Protocol):
         ...
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few points)."""
+        """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few
+        points)."""
         ...
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:

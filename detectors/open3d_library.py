@@ -1,4 +1,5 @@
-"""Access to Open3D for files of points, odometry and volumes. Only this module imports it: that takes seconds."""
+"""Access to Open3D for files of points, odometry and volumes. Only this module imports it: that
+takes seconds."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,7 +7,12 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-DEBIAN_PACKAGES = {"libGL": "libgl1", "libgomp": "libgomp1", "libX11": "libx11-6", "libudev": "libudev1"}
+DEBIAN_PACKAGES = {
+    "libGL": "libgl1",
+    "libgomp": "libgomp1",
+    "libX11": "libx11-6",
+    "libudev": "libudev1",
+}
 """Debian's packages of the system libraries that Open3D's wheel expects."""
 
 
@@ -15,14 +21,18 @@ class MissingLibrary(UserError):
 
 
 def load_open3d() -> Any:
-    """Return the module open3d. Raises MissingLibrary with the Debian package of a missing system library."""
+    """Return the module open3d. Raises MissingLibrary with the Debian package of a missing system
+    library."""
     try:
         import open3d
     except (ImportError, OSError) as error:
-        package = next((package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None)
+        package = next(
+            (package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None
+        )
         if package is None:
             raise
-        what, legal = f"this needs Open3D, which cannot start: {error}", ", ".join(DEBIAN_PACKAGES.values())
+        what = f"this needs Open3D, which cannot start: {error}"
+        legal = ", ".join(DEBIAN_PACKAGES.values())
         legal = f"a system with the libraries of the Debian packages {legal}"
         raise MissingLibrary(what, legal=legal, fix=f"apt install {package}") from error
     return open3d
@@ -30,7 +40,8 @@ def load_open3d() -> Any:
 
 @contextmanager
 def open3d_on_one_thread() -> Iterator[Any]:
-    """Give the module open3d, silent and on one OpenMP thread within the block: the same bits on any machine."""
+    """Give the module open3d, silent and on one OpenMP thread within the block: the same bits on
+    any machine."""
     import threadpoolctl
 
     o3d = load_open3d()

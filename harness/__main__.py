@@ -1,21 +1,145 @@
-"""The command ``tofpod PROGRAM ...`` runs every program; ``tofpod`` alone lists the most common tasks."""
+"""The command ``tofpod PROGRAM ...`` runs every program; ``tofpod`` alone lists the most common
+tasks."""
 
-import ast
 import importlib
 import shlex
 import sys
-from functools import lru_cache
-from pathlib import Path
+from typing import NamedTuple
 
+from harness import __version__
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import shipped
 
-PART_OF_SET_UP = "prepare"
+
+class Listed(NamedTuple):
+    """A program of the list below: what a user types, where it is, and what it does."""
+
+    name: str
+    module: str
+    sentence: str
+
+
+PROGRAMS = (
+    Listed(
+        "ask",
+        "harness.programs.atlas.ask",
+        "which camera finds a damage, at which distance, with how many frames, by stored limits",
+    ),
+    Listed(
+        "characterise",
+        "harness.programs.camera.characterise",
+        "measures your own camera on static captures, as a page and a camera file",
+    ),
+    Listed(
+        "check",
+        "harness.programs.gate.check",
+        "a gate that fails if a detection limit has become worse",
+    ),
+    Listed(
+        "clean",
+        "harness.programs.keeping.clean",
+        "removes stored renders or results folders, after confirmation",
+    ),
+    Listed(
+        "compare",
+        "harness.programs.gate.compare",
+        "compares two studies of detection limits, set-up by set-up, with paired tests",
+    ),
+    Listed(
+        "coverage",
+        "harness.programs.coverage.coverage",
+        "where on a part damage is missed, and which poses cover most of it",
+    ),
+    Listed(
+        "dataset",
+        "harness.programs.dataset.dataset",
+        "writes boards with masks to train and score on",
+    ),
+    Listed(
+        "design",
+        "harness.programs.inspections.design",
+        "predicts what a planned study of detection limits can demonstrate",
+    ),
+    Listed(
+        "detect",
+        "harness.detect",
+        "finds the damage in a real capture, prints a table and, with --out, writes files",
+    ),
+    Listed(
+        "efficiency",
+        "harness.programs.efficiency.efficiency",
+        "compares every detector of a study with the ideal observer",
+    ),
+    Listed(
+        "export",
+        "harness.programs.dataset.export",
+        "exports an experiment's simulated views, with truth, for other mapping programs",
+    ),
+    Listed(
+        "export_noise",
+        "harness.programs.camera.export_noise",
+        "writes a camera's noise as a table and a file of code",
+    ),
+    Listed(
+        "flatfield",
+        "harness.programs.camera.flatfield",
+        "measures a unit's fixed pattern on captures of a flat surface",
+    ),
+    Listed(
+        "gauge",
+        "harness.programs.inspections.gauge",
+        "designs boards with holes to check a detection limit: drilling template and truth",
+    ),
+    Listed(
+        "implant",
+        "harness.programs.implant.implant",
+        "states your camera's detection limit on your part, by virtual damage in captures",
+    ),
+    Listed(
+        "ls",
+        "harness.programs.keeping.ls",
+        "lists detectors and cameras with their settings, results folders, and stored renders",
+    ),
+    Listed(
+        "merge",
+        "harness.programs.cluster.merge",
+        "joins the journals of shards and machines in one results folder",
+    ),
+    Listed(
+        "pod",
+        "harness.programs.inspections.pod",
+        "fits the probability of detection to the user's own inspections (MIL-HDBK-1823A)",
+    ),
+    Listed(
+        "score",
+        "harness.programs.dataset.score",
+        "states the detection limit of a method's anomaly maps",
+    ),
+    Listed("sweep", "harness.sweep", "runs an experiment and writes its report"),
+    Listed(
+        "target",
+        "harness.target",
+        "builds a target, prints its truth, and writes its mesh and truth",
+    ),
+    Listed(
+        "validate",
+        "harness.programs.scorecard.validate",
+        "compares the simulated cameras with published figures, or with a real capture",
+    ),
+)
+PART_OF_SET_UP = Listed(
+    "prepare", "harness.programs.keeping.prepare", "compiles the inner loops once"
+)
+"""It runs as the others do and is not listed, because `make` calls it once."""
+MODULES = {listed.name: listed.module for listed in (*PROGRAMS, PART_OF_SET_UP)}
 TASKS = (
     ("run an experiment and read its report", "tofpod sweep averaging"),
     ("state the smallest hole that a camera finds", "tofpod sweep detection_limit"),
     ("find the damage in your own capture", "tofpod detect captures/board --out findings"),
-    ("state the limit of your own inspections", "tofpod pod inspections.csv --size length --hit found"),
+    (
+        "state the limit of your own inspections",
+        "tofpod pod inspections.csv --size length --hit found",
+    ),
     ("list cameras and detectors with all their settings", "tofpod ls"),
 )
 COMPLETION = """\
@@ -38,66 +162,69 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command. Returns the program's exit code, or 2 for an unknown program."""
     given = sys.argv[1:] if arguments is None else arguments
     name, *rest = given or [""]
-    if name in programs():
+    if name in MODULES:
         sys.argv[1:] = rest
-        return int(importlib.import_module(f"harness.{name}").main(rest if arguments is not None else None))
+        return int(
+            importlib.import_module(MODULES[name]).main(rest if arguments is not None else None)
+        )
     return exit_code_of(lambda: _run(name, rest))
-
-
-@lru_cache
-def programs() -> dict[str, str]:
-    """Return the programs by name, with the first sentence of each description."""
-    found = {}
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        # reading the source is faster than importing it, so that the list appears at once
-        source = path.read_text(encoding="utf-8")
-        if "\ndef main(" in source and path.stem not in ("__main__", PART_OF_SET_UP):
-            text = ast.get_docstring(ast.parse(source)) or ""
-            found[path.stem] = text.splitlines()[0].split(": ", 1)[-1].rstrip(".")
-    return found
 
 
 def _run(name: str, rest: list[str]) -> int:
     if name in ("", "-h", "--help"):
-        wide = max(map(len, programs()))
+        wide = max(len(program.name) for program in PROGRAMS)
         print("How small a damage can a time-of-flight depth camera detect?\n")
         for task, command in TASKS:
             print(f"  {command:56}{task}")
         print("\nprograms (tofpod PROGRAM --help):\n")
-        for program, text in programs().items():
-            print(f"  {program:{wide}}  {text}")
+        for program in PROGRAMS:
+            print(f"  {program.name:{wide}}  {program.sentence}")
         print('\nshell completion: eval "$(tofpod completion bash)"')
         return 0
     if name == "--version":
-        from importlib.metadata import version
-
-        print(f"tofpod {version('tofpod')}")
+        print(f"tofpod {__version__}")
         return 0
     if name == "completion":
         if rest not in (["bash"], ["zsh"]):
-            raise UserError(f"completion {shlex.join(rest)}: no such shell", legal="tofpod completion bash, or zsh")
-        print(("autoload -U bashcompinit && bashcompinit\n" if rest == ["zsh"] else "") + _completion(), end="")
+            raise UserError(
+                f"completion {shlex.join(rest)}: no such shell",
+                legal="tofpod completion bash, or zsh",
+            )
+        print(
+            ("autoload -U bashcompinit && bashcompinit\n" if rest == ["zsh"] else "")
+            + _completion(),
+            end="",
+        )
         return 0
     from harness.vocabulary.declaration.diagnose import nearest
 
-    near = nearest(name, programs())
-    fix = f"did you mean {near}?" if near else "tofpod --help describes each program"
-    raise UserError(f"there is no program {name!r}", legal=", ".join(programs()), fix=fix)
+    names = [program.name for program in PROGRAMS]
+    nearest_name = nearest(name, names)
+    fix = (
+        f"did you mean {nearest_name}?" if nearest_name else "tofpod --help describes each program"
+    )
+    raise UserError(f"there is no program {name!r}", legal=", ".join(names), fix=fix)
 
 
 def _completion() -> str:
-    """Return a shell script that completes programs, options, experiments and cameras, and otherwise file names."""
+    """Return a shell script that completes programs, options, experiments and cameras, and
+    otherwise file names."""
     from scenes.sensor.camera import camera_names
 
-    experiments, cases = sorted(path.stem for path in shipped("experiments").glob("*.yaml")), []
-    for program in programs():
-        actions = importlib.import_module(f"harness.{program}").main.parser()._actions
+    experiments = sorted(path.stem for path in shipped("experiments").glob("*.yaml"))
+    cases = []
+    for program in PROGRAMS:
+        actions = importlib.import_module(program.module).main.parser()._actions
         words = [option for action in actions for option in action.option_strings]
         takes = {action.dest for action in actions}
         words += experiments if "experiment" in takes else []
         words += camera_names() if "camera" in takes else []
-        cases.append(f'    {program}) COMPREPLY=($(compgen -W "{" ".join(words)}" -- "$word"));;')
-    return COMPLETION.format(programs=" ".join(programs()), options="\n".join(cases))
+        cases.append(
+            f'    {program.name}) COMPREPLY=($(compgen -W "{" ".join(words)}" -- "$word"));;'
+        )
+    return COMPLETION.format(
+        programs=" ".join(program.name for program in PROGRAMS), options="\n".join(cases)
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """tofpod from Python, as ``import tofpod`` (or ``harness.api``): a facade over the programs.
 
-Build a target, render what a camera sees of it, draw noisy frames, average them, and search for damage:
+Build a target, render what a camera sees of it, draw noisy frames, average them, and search for
+damage:
 
     >>> import tofpod
     >>> board = tofpod.target(
@@ -17,8 +18,9 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     (1, 'hole')
     >>> figure = tofpod.plot(found)  # a Matplotlib Figure
 
-The examples below continue this one. For a real capture, start with `load`; `sweep` runs whole experiments. A program's
-error message is raised as a `UserError`. Units are SI unless a name states another unit.
+The examples below continue this one. For a real capture, start with `load`; `sweep` runs whole
+experiments. A program's error message is raised as a `UserError`. Units are SI unless a name
+states another unit.
 """
 
 from __future__ import annotations
@@ -30,10 +32,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from detectors import load_detector
-from detectors.average import AverageConfig
-from detectors.average import average as averaged
+from detectors.averages.average import AverageConfig
+from detectors.averages.average import average as averaged
 from detectors.recordings import open_capture
-from harness.engine.work import EngineOptions
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
@@ -41,6 +42,7 @@ from harness.inspection.arguments import DEFAULT_DETECTOR
 from harness.inspection.run import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_page import draw_overlay
+from harness.runs.options import EngineOptions
 from harness.target import declared
 from harness.vocabulary.declaration.diagnose import settings_of
 from harness.vocabulary.errors import UserError
@@ -61,9 +63,12 @@ __all__ = [
 ]  # fmt: skip
 
 
-def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False) -> TargetConfig:
-    """Return a target by its name, from a YAML or JSON file, or from a declaration as plain data. ``board`` selects a
-    damaged board of a family (``name: drawn``). Raises UserError with every mistake in the declaration.
+def target(
+    what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False
+) -> TargetConfig:
+    """Return a target by its name, from a YAML or JSON file, or from a declaration as plain data.
+    ``board`` selects a damaged board of a family (``name: drawn``). Raises UserError with every
+    mistake in the declaration.
 
     >>> len(tofpod.target("thesis").damages), len(tofpod.target("thesis", hole_free=True).damages)
     (11, 0)
@@ -76,24 +81,34 @@ def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: b
 
 
 def render(
-    target: TargetConfig, camera: str, *, unit_seed: int = 1, cache: str | Path = "results/.cache/renders", **work: Any
+    target: TargetConfig,
+    camera: str,
+    *,
+    unit_seed: int = 1,
+    cache: str | Path = "results/.cache/renders",
+    **work: Any,
 ) -> SimulatedUnit:
-    """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
-    ``cache`` is the folder for stored renders; ``work`` holds settings of `scenes.optics.RenderConfig`, such as
-    ``bounces``. Raises UserError if the camera is unknown or does not see the target.
+    """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the
+    unit's fixed pattern; ``cache`` is the folder for stored renders; ``work`` holds settings of
+    `scenes.optics.RenderConfig`, such as ``bounces``. Raises UserError if the camera is unknown or
+    does not see the target.
 
     >>> unit = tofpod.render(board, "kinect_v2", bounces=0)
     >>> unit.region.shape[1] > 50
     True
     """
     config = settings_of(CameraConfig, {"name": camera, "unit_seed": unit_seed}, "camera")
-    facts, settings = camera_of(config), settings_of(RenderConfig, work, "render")
-    view, _ = cached_view(target.at_wavelength(facts.optics.wavelength_nm), facts.optics, settings, Path(cache))
+    facts = camera_of(config)
+    settings = settings_of(RenderConfig, work, "render")
+    view, _ = cached_view(
+        target.at_wavelength(facts.optics.wavelength_nm), facts.optics, settings, Path(cache)
+    )
     return SimulatedUnit(facts, config, view)
 
 
 def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
-    """Return ``count`` simulated frames, which are drawn while they are read. ``seed`` draws the noise.
+    """Return ``count`` simulated frames, which are drawn while they are read. ``seed`` draws the
+    noise.
 
     >>> [frame.z_m.shape == unit.region.shape for frame in tofpod.frames(unit, 2).frames()]
     [True, True]
@@ -104,14 +119,16 @@ def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
 
 
 def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
-    """Open a real capture (files or a folder) of any format that ``python -m harness.detect`` reads. ``unit`` is that
-    of the stored depth, such as ``mm`` or ``4000/m``, if the files do not state it. Raises UserError."""
+    """Open a real capture (files or a folder) of any format that ``tofpod detect``
+    reads. ``unit`` is that of the stored depth, such as ``mm`` or ``4000/m``, if the files do not
+    state it. Raises UserError."""
     return open_capture([Path(path) for path in paths], unit=unit)
 
 
 def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud:
-    """Average all frames to a cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN where invalid.
-    ``settings`` are those of `detectors.average.AverageConfig`. Raises UserError.
+    """Average all frames to a cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN
+    where invalid. ``settings`` are those of `detectors.averages.average.AverageConfig`. Raises
+    UserError.
 
     >>> tofpod.average(tofpod.frames(unit, 3), "median").n_frames
     3
@@ -119,11 +136,14 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
     return averaged(frames, settings_of(AverageConfig, {"method": method, **settings}, "average"))
 
 
-def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any) -> Judged:
-    """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's own noise sets it, as
-    in ``python -m harness.detect``; ``evidence.warnings`` of the result say if that is not reliable. ``settings`` are
-    those of the detector; the default detector chooses the shape of its surface by evidence unless they state it.
-    Raises UserError if the cloud cannot be judged.
+def detect(
+    cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any
+) -> Judged:
+    """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's
+    own noise sets it, as in ``tofpod detect``; ``evidence.warnings`` of the result say
+    if that is not reliable. ``settings`` are those of the detector; the default detector chooses
+    the shape of its surface by evidence unless they state it. Raises UserError if the cloud cannot
+    be judged.
 
     >>> tofpod.detect(cloud, "thesis", threshold=-1)
     Traceback (most recent call last):
@@ -141,14 +161,17 @@ def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | No
 
 
 def findings_table(found: Judged) -> pd.DataFrame:
-    """Return the findings of `detect` as a DataFrame, strongest first; the columns are the fields of `Finding`.
+    """Return the findings of `detect` as a DataFrame, strongest first; the columns are the fields
+    of `Finding`.
 
     >>> tofpod.findings_table(found)[["kind", "size_from"]].values.tolist()
     [['hole', 'model']]
     """
     import pandas as pd
 
-    return pd.DataFrame([asdict(finding) for finding in found.findings], columns=[*Finding.__dataclass_fields__])
+    return pd.DataFrame(
+        [asdict(finding) for finding in found.findings], columns=[*Finding.__dataclass_fields__]
+    )
 
 
 def plot(found: Judged, title: str = "") -> Figure:
@@ -156,40 +179,54 @@ def plot(found: Judged, title: str = "") -> Figure:
     return findings_figure(found.cloud, found.evidence, found.detections, title)
 
 
-def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Path:
-    """Run an experiment, or its missing trials, and return its results folder. ``changes`` are those of ``--set``, such
-    as ``"repeats=5"``. With ``jobs`` above 1 it starts processes, so that a script needs ``if __name__ ==
-    "__main__":``. Raises UserError for a wrong experiment, or if trials failed.
+def sweep(
+    experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1
+) -> Path:
+    """Run an experiment, or its missing trials, and return its results folder. ``changes`` are
+    those of ``--set``, such as ``"repeats=5"``. With ``jobs`` above 1 it starts processes, so that
+    a script needs ``if __name__ == "__main__":``. Raises UserError for a wrong experiment, or if
+    trials failed.
 
     >>> tofpod.sweep("averaging", "repeats=0")
     Traceback (most recent call last):
     ...
     harness.vocabulary.declaration.yaml_source.DeclarationError: ...
     """
-    from harness.engine.study import run_study  # imports pandas
+    from harness.runs.study import run_study  # imports pandas
 
-    found, out = load_experiment(Path(experiment), changes), Path(out)
-    code = run_study(found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})")
+    found = load_experiment(Path(experiment), changes)
+    out = Path(out)
+    code = run_study(
+        found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
+    )
     if code == 130:
         raise KeyboardInterrupt
     if code:
-        raise UserError(f"{experiment}: trials failed, as printed above", fix="correct the cause and run it again")
+        raise UserError(
+            f"{experiment}: trials failed, as printed above",
+            fix="correct the cause and run it again",
+        )
     return found.folder(out)
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:
-    """Read a table of a results folder (`results/README.md` describes them). Raises UserError if it is missing."""
+    """Read a table of a results folder (`results/README.md` describes them). Raises UserError if
+    it is missing."""
     import pandas as pd
 
     tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}
     if name not in tables:
-        raise UserError(f"{folder}: has no table {name!r}", legal=", ".join(tables) or "a folder that a sweep wrote")
+        raise UserError(
+            f"{folder}: has no table {name!r}",
+            legal=", ".join(tables) or "a folder that a sweep wrote",
+        )
     return pd.read_parquet(tables[name])
 
 
 def limits(folder: str | Path) -> tuple[SetUpLimit, ...]:
-    """Return the detection limits of a study, such as ``results/detection_limit/latest``, with ``a90_mm``, ``a90_95``,
-    ``statement`` (the curve) and so on. Raises UserError if the folder holds no study."""
+    """Return the detection limits of a study, such as ``results/detection_limit/latest``, with
+    ``a90_mm``, ``a90_95``, ``statement`` (the curve) and so on. Raises UserError if the folder
+    holds no study."""
     return tuple(limit_of(record) for record in read_record(Path(folder)).set_ups)
 
 

@@ -1,4 +1,5 @@
-"""``python -m harness.detect``: finds the damage in a real capture, prints a table and, with --out, writes files."""
+"""``tofpod detect``: finds the damage in a real capture, prints a table and, with
+--out, writes files."""
 
 import argparse
 from pathlib import Path
@@ -14,26 +15,47 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch a height map"
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
-    add("--out", type=Path, metavar="DIR", help="folder for tables, pictures and clouds (docs/recordings.md)")
+    add(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for tables, pictures and clouds (docs/recordings.md)",
+    )
     cli.add_reading(add)
     crop = f"the target: {cli.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)
-    target = "with --crop auto: inspect surface N of the list that a run prints and targets.png shows"
+    target = (
+        "with --crop auto: inspect surface N of the list that a run prints and targets.png shows"
+    )
     add("--target", type=whole_number(10**9), metavar="N", help=target)
-    add("--detector", default=cli.DEFAULT_DETECTOR, help=f"name of the detector (default: {cli.DEFAULT_DETECTOR})")
+    add(
+        "--detector",
+        default=cli.DEFAULT_DETECTOR,
+        help=f"name of the detector (default: {cli.DEFAULT_DETECTOR})",
+    )
     setting = "a setting of the detector by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     mesh = "mesh of the undamaged part, registered to the cloud; --set surface.reference.unit=m, .front=-y"
     add("--reference", metavar="MESH", help=mesh)
     averages = ("mean", "median", "clipped")
-    add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
+    add(
+        "--average",
+        choices=averages,
+        default="mean",
+        help="how frames are averaged (default: mean)",
+    )
     add("--max-frames", type=whole_number(10**9), metavar="N", help="use only the first N frames")
     calls = f"expected number of false calls, by the noise towards the camera (default: {cli.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
-    add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
-    flat = "subtract this unit's fixed pattern, measured by harness.flatfield, from each capture"
+    add(
+        "--threshold",
+        type=float,
+        metavar="K",
+        help="threshold in units of score, instead of --false-calls",
+    )
+    flat = "subtract this unit's fixed pattern, measured by tofpod flatfield, from each capture"
     add("--flat-field", type=Path, metavar="FILE.npz", help=flat)
-    gauge = "find the boards of this gauge.json (harness.gauge) by their marks; write hits and misses to gauge.csv"
+    gauge = "find the boards of this gauge.json (tofpod gauge) by their marks; write hits and misses to gauge.csv"
     add("--gauge", type=Path, metavar="FILE.json", help=gauge)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
@@ -44,8 +66,18 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd use the whole target"
         " instead of the points of the marks).",
     ).add_argument
-    add("--register", choices=cli.METHODS, metavar="METHOD", help=f"register the views by {', '.join(cli.METHODS)}")
-    add("--merge", choices=cli.MERGES, metavar="KIND", help=f"merge them by {', '.join(cli.MERGES)} (default: fusion)")
+    add(
+        "--register",
+        choices=cli.METHODS,
+        metavar="METHOD",
+        help=f"register the views by {', '.join(cli.METHODS)}",
+    )
+    add(
+        "--merge",
+        choices=cli.MERGES,
+        metavar="KIND",
+        help=f"merge them by {', '.join(cli.MERGES)} (default: fusion)",
+    )
     marks = "marks: colour (separate coloured strips; default), red (the thesis' rule), coded (ArUco, AprilTag)"
     add("--marks", choices=cli.MARKS, metavar="KIND", help=marks)
     poses = "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
@@ -56,8 +88,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "Find damage in a real capture: average its frames, fit the surface, and list what deviates from it."
     " With --register, each PATH is one view of the same target, and all views are merged into one cloud.",
-    epilog="examples: python -m harness.detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
-    "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
+    epilog="examples: tofpod detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
+    "; tofpod detect left.mcap right.mcap --register marks --merge fusion --out found/",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

@@ -1,22 +1,33 @@
-"""``python -m harness.sweep experiments/averaging.yaml``: runs an experiment and writes its report."""
+"""``python -m harness.sweep experiments/averaging.yaml``: runs an experiment and writes its
+report."""
 
 import argparse
 from pathlib import Path
 
-from harness.engine.work import add_engine_options, engine_options
+from harness.runs.options import add_engine_options, engine_options
 from harness.vocabulary.program import program
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, such as averaging")
+    add(
+        "experiment",
+        type=Path,
+        help="a YAML file, or the name of one that comes with tofpod, such as averaging",
+    )
     help = "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
     help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
     add("--calibration", type=Path, metavar="FILE", help=help)
     help = "a first look: at most 5 repeats, a third of a study's boards, no sensitivity; wider intervals"
     add("--quick", action="store_true", help=help)
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
+    add(
+        "--out",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="folder of results (default: results)",
+    )
     add("--dry-run", action="store_true", help="validate and print what would be run; run nothing")
     add_engine_options(parser)
 
@@ -30,22 +41,24 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if trials failed, 2 for a user's mistake, 130 after Ctrl-C."""
     run_options = engine_options(options)
     if not (options.dry_run or run_options.serial or run_options.scheduler):
-        from harness.engine.processes import start_server
+        from harness.runs.processes import start_server
 
         start_server()
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import CaptureSource
 
-    experiment = load_experiment(options.experiment, options.overrides, options.calibration, quick=options.quick)
+    experiment = load_experiment(
+        options.experiment, options.overrides, options.calibration, quick=options.quick
+    )
     if isinstance(experiment.config.source, CaptureSource) and not options.dry_run:
-        from harness.engine.captures import judge_captures
+        from harness.runs.captures import judge_captures
 
         return judge_captures(experiment, options.out, command)
     if options.dry_run:
-        from harness.engine.estimate import dry_run
+        from harness.runs.estimate import dry_run
 
         return dry_run(experiment, options.out, run_options)
-    from harness.engine.study import run_study
+    from harness.runs.study import run_study
 
     return run_study(experiment, options.out, run_options, command)
 

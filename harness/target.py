@@ -1,4 +1,4 @@
-"""``python -m harness.target``: builds a target, prints its truth, and writes its mesh and truth."""
+"""``tofpod target``: builds a target, prints its truth, and writes its mesh and truth."""
 
 from __future__ import annotations
 
@@ -18,23 +18,32 @@ NAMED_TARGETS = ("thesis",)
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("target", help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one")
+    add(
+        "target",
+        help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one",
+    )
     add("--out", type=Path, metavar="MESH", help="file for the mesh: .glb (textured) or .ply")
     add("--truth", type=Path, metavar="JSON", help="file for each damage's size, place and axis")
-    add("--board", type=int, default=0, metavar="N", help="number of the damaged board of a family (default: 0)")
+    add(
+        "--board",
+        type=int,
+        default=0,
+        metavar="N",
+        help="number of the damaged board of a family (default: 0)",
+    )
     add("--hole-free", action="store_true", help="leave out all damage")
 
 
 @program(
     _options,
     "Build a target with damage from its declaration, print its truth, and write its mesh.",
-    epilog="example: python -m harness.target thesis --out board.glb --truth truth.json",
+    epilog="example: tofpod target thesis --out board.glb --truth truth.json",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake."""
     config = declared(arguments.target, arguments.board)
 
-    from harness.tables.text import Grid, show
+    from harness.vocabulary.text import Grid, show
     from scenes.target.mesh import build_target, write_mesh, write_truth
 
     target = build_target(config.hole_free() if arguments.hole_free else config)
@@ -53,7 +62,8 @@ def main(arguments: argparse.Namespace, command: str) -> int:
 
 
 def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
-    """Return a target by name, from a file or from a declaration; of a family, the ``board``. Raises UserError."""
+    """Return a target by name, from a file or from a declaration; of a family, the ``board``.
+    Raises UserError."""
     from harness.vocabulary.declaration.diagnose import read_as, settings_of
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.drawn import DrawnTargetConfig
@@ -62,10 +72,15 @@ def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
     what = {"name": what} if what in NAMED_TARGETS else what
     if isinstance(what, Mapping):
         if what.get("name") not in TARGETS:
-            raise UserError(f"there is no target {what.get('name')!r}", legal=f"name: {', '.join(TARGETS)}")
+            raise UserError(
+                f"there is no target {what.get('name')!r}", legal=f"name: {', '.join(TARGETS)}"
+            )
         config = settings_of(TARGETS[what["name"]], what, "target")
     elif not Path(what).exists():
-        raise UserError(f"{what}: there is no such file or named target", legal=f"{', '.join(NAMED_TARGETS)} or a file")
+        raise UserError(
+            f"{what}: there is no such file or named target",
+            legal=f"{', '.join(NAMED_TARGETS)} or a file",
+        )
     else:
         config = read_as(TARGETS, "name", read_yaml(Path(what)))
     if isinstance(config, DrawnTargetConfig):
@@ -73,7 +88,9 @@ def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
             raise UserError(f"board {board}: is not a number from 0 upwards")
         return config.drawn("damaged", board)
     if board:
-        raise UserError(f"board {board}: the target is a single board, not a family", legal="board 0")
+        raise UserError(
+            f"board {board}: the target is a single board, not a family", legal="board 0"
+        )
     return config.declare()
 
 

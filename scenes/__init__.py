@@ -1,1 +1,2 @@
-"""The simulation up to a frame: target, light transport, camera models. It does not import detectors."""
+"""The simulation up to a frame: target, light transport, camera models. It does not import
+detectors."""

@@ -1,4 +1,5 @@
-"""Cameras as the renderer sees them (lens, light, footprints), and the view that a sensor gets. Slopes: x/z, y/z."""
+"""Cameras as the renderer sees them (lens, light, footprints), and the view that a sensor gets.
+Slopes: x/z, y/z."""
 
 from __future__ import annotations
 
@@ -17,14 +18,16 @@ FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian
 
 @dataclass(frozen=True)
 class Optics:
-    """The geometry of a camera's light, in the camera's frame. An imager looks through ``lens`` and is lit by a point
-    at ``emitter_m`` (3,), of uniform intensity within a cone about the axis with a linear roll-off between two half
-    angles. A scanner sends its beam from the origin and receives at ``emitter_m``: by Helmholtz' reciprocity it is an
-    imager whose pixels are beams and whose emitter is the receiver. ``beam_fwhm_rad``: full width at half maximum of
-    the beam, a round Gaussian in angle about the pixel's central ray; None for an imager, whose pixel is evenly
-    weighted between its corners. ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond a region
-    whose light reaches it through the camera's own filter. The camera gives no range below ``nearest_m`` or beyond
-    ``farthest_m``, along its rays or its axis; they change no render."""
+    """The geometry of a camera's light, in the camera's frame. An imager looks through ``lens``
+    and is lit by a point at ``emitter_m`` (3,), of uniform intensity within a cone about the axis
+    with a linear roll-off between two half angles. A scanner sends its beam from the origin and
+    receives at ``emitter_m``: by Helmholtz' reciprocity it is an imager whose pixels are beams and
+    whose emitter is the receiver. ``beam_fwhm_rad``: full width at half maximum of the beam, a
+    round Gaussian in angle about the pixel's central ray; None for an imager, whose pixel is
+    evenly weighted between its corners. ``frequencies_hz``: where phasors are wanted.
+    ``margin_px``: pixels beyond a region whose light reaches it through the camera's own filter.
+    The camera gives no range below ``nearest_m`` or beyond ``farthest_m``, along its rays or its
+    axis; they change no render."""
 
     title: str
     lens: Lens
@@ -42,7 +45,9 @@ class Optics:
     def cone(self, slopes: np.ndarray) -> np.ndarray:
         """Return the emitter's light along rays from it (..., 2) relative to the axis."""
         full, cutoff = np.cos(np.radians([self.full_half_angle_deg, self.cutoff_half_angle_deg]))
-        return np.clip((1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0)
+        return np.clip(
+            (1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0
+        )
 
     def content(self) -> dict[str, Any]:
         """Return all data that can change a render; they are equal for cameras that share renders."""
@@ -64,30 +69,44 @@ def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
 
 COARSE = 4  # sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm
 FINE = 256  # sub-rays where a footprint meets an edge: one of them is 0.4 % of a step
-BEAM_REACH = 3.0  # deviations of a beam within which edges are considered: 1 % of the light lies beyond
+BEAM_REACH = (
+    3.0  # deviations of a beam within which edges are considered: 1 % of the light lies beyond
+)
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals:
     """Return the footprints of a region's pixels: beams if the camera has a beam width."""
-    return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
+    return (
+        Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION)
+        if beam_fwhm_rad
+        else Quadrilaterals(lens, region)
+    )
 
 
 class Quadrilaterals:
-    """An imager's pixels: the areas between their corners, evenly weighted; slopes are linear within, to 1e-7. Fine
-    sub-rays form a golden lattice, so that an edge along rows or columns crosses them one by one."""
+    """An imager's pixels: the areas between their corners, evenly weighted; slopes are linear
+    within, to 1e-7. Fine sub-rays form a golden lattice, so that an edge along rows or columns
+    crosses them one by one."""
 
-    reach_px = 0  # distance from an edge within which footprints contain a part of it, besides the edge's own pixels
+    # distance from an edge within which footprints contain a part of it, besides the edge's own
+    # pixels
+    reach_px = 0
 
     def __init__(self, lens: Lens, region: Region) -> None:
         # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
-        self.corner = lens.region_slopes(Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1), -0.5)
+        self.corner = lens.region_slopes(
+            Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1), -0.5
+        )
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Return (n, 3, k): a pixel's sub-rays are these vectors, weighted by `grid` or `lattice`; z is 1."""
+        """Return (n, 3, k): a pixel's sub-rays are these vectors, weighted by `grid` or `lattice`;
+        z is 1."""
         c00, c01, c10, c11 = (self.corner[rows + i, cols + j] for i in (0, 1) for j in (0, 1))
         axes = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
-        return np.concatenate([axes, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))], axis=1)
+        return np.concatenate(
+            [axes, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))], axis=1
+        )
 
     def grid(self, side: int = COARSE) -> np.ndarray:
         """Return weights (k, side^2) of the centres of side x side cells of a pixel, row by row."""
@@ -97,7 +116,8 @@ class Quadrilaterals:
     def lattice(self, count: int = FINE) -> np.ndarray:
         """Return weights (k, count) of sub-rays where a footprint meets an edge."""
         number = np.arange(count) + 0.5
-        fx, fy = number / count, (number * GOLDEN) % 1
+        fx = number / count
+        fy = (number * GOLDEN) % 1
         return np.stack([np.ones(count), fx, fy, fx * fy])
 
     def slopes(self, rows: np.ndarray, cols: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -107,16 +127,20 @@ class Quadrilaterals:
 
 
 class Beams(Quadrilaterals):
-    """A scanner's beams: round Gaussians in angle about the pixels' central rays. Fine sub-rays lie on a sunflower's
-    spiral (Vogel, Mathematical Biosciences 44, 1979) at radii of equal shares: a knife edge cuts off its share of the
-    Gaussian to 0.02. The coarse grid has the Gaussian's second moments. Angles are approximated by tangents."""
+    """A scanner's beams: round Gaussians in angle about the pixels' central rays. Fine sub-rays
+    lie on a sunflower's spiral (Vogel, Mathematical Biosciences 44, 1979) at radii of equal
+    shares: a knife edge cuts off its share of the Gaussian to 0.02. The coarse grid has the
+    Gaussian's second moments. Angles are approximated by tangents."""
 
     def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
         super().__init__(lens, region)
-        self._slopes, self._deviation_rad = lens.region_slopes(region), deviation_rad
+        self._slopes = lens.region_slopes(region)
+        self._deviation_rad = deviation_rad
         # away from the axis, an angle spans a larger slope, and so more pixels, by 1 + slope^2
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
-        self.reach_px = 1 + int(np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)))
+        self.reach_px = 1 + int(
+            np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy))
+        )
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): the central ray and two axes across it, for angles."""
@@ -144,14 +168,16 @@ class Beams(Quadrilaterals):
 
 @dataclass(frozen=True)
 class NoiseFreeView:
-    """Noise-free light of a view on a region of the sensor. ``phasor`` (f, h, w) complex64 (its rounding turns 200 MHz
-    by 10 nm): per modulation frequency the light of all paths, sum over paths of a * exp(+i 2 pi f L / c), L the
-    full path length; amplitudes in units of an unoccluded albedo-1 Lambertian plane facing emitter and camera at 1 m on
-    the axis (=1). ``phasor_direct`` (f, h, w): the part without interreflection. ``intensity`` (h, w): the same sum at
-    frequency 0. ``indirect_noise_m`` (h, w): one standard deviation of range that the Monte Carlo part leaves in a
-    pixel. ``range_m`` (h, w): true distance from the lens along the pixel's central ray, NaN where it meets nothing.
-    ``surface`` (h, w) int16: index into ``surface_names`` at the central ray, -1 for nothing. ``coverage`` (h, w):
-    fraction of the footprint on that surface. ``rgb`` (h, w, 3) float32 albedo. ``slopes`` (h, w, 2): x/z, y/z."""
+    """Noise-free light of a view on a region of the sensor. ``phasor`` (f, h, w) complex64 (its
+    rounding turns 200 MHz by 10 nm): per modulation frequency the light of all paths, sum over
+    paths of a * exp(+i 2 pi f L / c), L the full path length; amplitudes in units of an unoccluded
+    albedo-1 Lambertian plane facing emitter and camera at 1 m on the axis (=1). ``phasor_direct``
+    (f, h, w): the part without interreflection. ``intensity`` (h, w): the same sum at frequency 0.
+    ``indirect_noise_m`` (h, w): one standard deviation of range that the Monte Carlo part leaves
+    in a pixel. ``range_m`` (h, w): true distance from the lens along the pixel's central ray, NaN
+    where it meets nothing. ``surface`` (h, w) int16: index into ``surface_names`` at the central
+    ray, -1 for nothing. ``coverage`` (h, w): fraction of the footprint on that surface. ``rgb``
+    (h, w, 3) float32 albedo. ``slopes`` (h, w, 2): x/z, y/z."""
 
     region: Region
     frequencies_hz: tuple[float, ...]
@@ -172,10 +198,17 @@ class NoiseFreeView:
 class RenderConfig(Config):
     """Effort for the simulation of indirect light. ``bounces: 0`` leaves direct light only."""
 
-    bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
+    bounces: int = Field(
+        10,
+        ge=0,
+        le=32,
+        description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10",
+    )
     face_spacing_mm: float = Field(80.0, gt=0, description="spacing of the nodes on the face")
     face_samples: int = Field(8192, ge=8, description="light paths for each node on the face")
-    hole_noise_mm: float = Field(0.1, gt=0, description="aim for the noise of range in pixels off the face")
+    hole_noise_mm: float = Field(
+        0.1, gt=0, description="aim for the noise of range in pixels off the face"
+    )
     hole_samples: int = Field(8192, ge=8, description="most light paths for each of those pixels")
     rest_samples: int = Field(16, ge=8, description="light paths for each pixel around the board")
     seed: int = Field(1, ge=0, le=1_000_000)

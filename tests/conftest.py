@@ -12,11 +12,14 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`); not in
-    the process that only hands out tests, which should import nothing of tofpod. Nothing that imports and collection
-    create is garbage: looking for some would take a fifth of their time."""
+    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use
+    (`scenes.render.scene`); not in the process that only hands out tests, which should import
+    nothing of tofpod. Nothing that imports and collection create is garbage: looking for some
+    would take a fifth of their time."""
     gc.disable()
     if "PYTEST_XDIST_WORKER" in os.environ or config.getoption("dist", "no") == "no":
         from scenes.render.scene import load_mitsuba
@@ -28,16 +31,25 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _share_compilation(number: int, count: int) -> None:
-    """Import all test files, each process from another one on: it finds compiled what the others had before it."""
-    files = sorted(Path(__file__).parent.glob("test_*.py"))
+    """Import all test files, each process from another one on: it finds compiled what the others
+    had before it."""
+    files = sorted(Path(__file__).parent.rglob("test_*.py"))
     first = len(files) * number // count
     for file in (*files[first:], *files[:first]):
         with suppress(Exception, pytest.skip.Exception):  # the collection reports it
-            import_module(file.stem)
+            import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
 
 
 LONGEST = (
-    *("engine_cluster", "engine", "detect_program", "detect_views", "engine_learning", "study_page", "pod_program"),
+    *(
+        "engine_cluster",
+        "engine",
+        "detect_program",
+        "detect_views",
+        "engine_learning",
+        "study_page",
+        "pod_program",
+    ),
     *(
         "compare",
         "experiment_files",
@@ -49,7 +61,8 @@ LONGEST = (
         "peers",
     ),
 )
-"""Files of tests of 20 processor seconds and more: processes that begin with these end at about the same time."""
+"""Files of tests of 20 processor seconds and more: processes that begin with these end at about
+the same time."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -58,7 +71,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude what imports and collection have created from garbage collection, which saves 2 % of processor time."""
+    """Exclude what imports and collection have created from garbage collection, which saves 2 % of
+    processor time."""
     gc.enable()
     gc.collect()
     gc.freeze()
@@ -66,7 +80,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call() -> Generator[None, object, object]:
-    """A test that needs Open3D skips, and says which package is missing, where the system lacks a library of it."""
+    """A test that needs Open3D skips, and says which package is missing, where the system lacks a
+    library of it."""
     from detectors.open3d_library import MissingLibrary
 
     try:
@@ -85,7 +100,8 @@ def shared_data() -> Path:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A folder of the session that the first process to need it makes; the other processes of the session wait."""
+    """A folder of the session that the first process to need it makes; the other processes of the
+    session wait."""
     base = factory.getbasetemp()
     home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"shared-{name}"
     home.mkdir(exist_ok=True)
@@ -102,21 +118,22 @@ def control_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """The detectors ``oracle`` and ``blind``, which test the harness, by their names."""
     from detectors import BUILT_IN
 
-    monkeypatch.setitem(BUILT_IN, "oracle", "control_detectors:Oracle")
-    monkeypatch.setitem(BUILT_IN, "blind", "control_detectors:BlindDetector")
+    monkeypatch.setitem(BUILT_IN, "oracle", "tests.support.control_detectors:Oracle")
+    monkeypatch.setitem(BUILT_IN, "blind", "tests.support.control_detectors:BlindDetector")
 
 
 @pytest.fixture
 def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the files that a detection writes the pictures take longest: left empty by tests that look at the others."""
+    """Of the files that a detection writes the pictures take longest: left empty by tests that
+    look at the others."""
     monkeypatch.setattr("harness.report.findings._figure", lambda *_: None)
     monkeypatch.setattr("harness.report.findings._save", lambda path, _: path.write_bytes(b""))
 
 
 @pytest.fixture
 def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are drawn but not written, which is most of a page's time, for tests that look at the words about them;
-    ``monkeypatch.undo()`` in one that looks at figures too."""
+    """Figures are drawn but not written, which is most of a page's time, for tests that look at
+    the words about them; ``monkeypatch.undo()`` in one that looks at figures too."""
 
     def save(_figure: object, target: object, **_how: object) -> None:
         target.write_bytes(b"") if isinstance(target, Path) else target.write("<svg></svg>")  # type: ignore[attr-defined]
@@ -126,24 +143,30 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it; not to be changed."""
-    from tiny_sweep import TINY, finished
+    """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it;
+    not to be changed."""
+    from tests.support.tiny_sweep import TINY, finished
 
-    return made_once(tmp_path_factory, "sweep", lambda home: finished(home, TINY, "--jobs", "1")) / "out"
+    return (
+        made_once(tmp_path_factory, "sweep", lambda home: finished(home, TINY, "--jobs", "1"))
+        / "out"
+    )
 
 
 @pytest.fixture(scope="session")
 def study_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished study of random boards, by one process, likewise."""
-    from tiny_sweep import STUDY, finished
+    from tests.support.tiny_sweep import STUDY, finished
 
-    return made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY, "--serial")) / "out"
+    return (
+        made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY, "--serial")) / "out"
+    )
 
 
 @pytest.fixture(scope="session")
 def dataset_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished data set of ten boards, ``set``; not to be changed."""
-    from tiny_dataset import write
+    from tests.support.tiny_dataset import write
 
     def make(home: Path) -> None:
         assert write(home, "set") == 0

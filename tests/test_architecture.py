@@ -16,10 +16,15 @@ ALLOWED = {
     "scenes": ("harness.vocabulary", "scenes"),
     "detectors": ("harness.vocabulary", "detectors"),
     "harness/experiment": ("harness.vocabulary", "harness.experiment", "scenes", "detectors"),
-    "harness/exchange": ("harness.vocabulary", "harness.exchange"),
+    "harness/exchange": ("harness.vocabulary", "harness.programs.dataset.exchange"),
     "harness/tables": ("harness.vocabulary", "harness.evaluation", "harness.tables"),
-    "harness/evaluation": ("harness.vocabulary", "harness.evaluation", "harness.tables.trials"),
-    "harness/thesis": ("harness.vocabulary", "harness.evaluation", "harness.tables", "harness.thesis"),
+    "harness/evaluation": ("harness.vocabulary", "harness.evaluation", "harness.records.trials"),
+    "harness/thesis": (
+        "harness.vocabulary",
+        "harness.evaluation",
+        "harness.tables",
+        "harness.thesis",
+    ),
     "harness/report": (
         "harness.vocabulary",
         "harness.evaluation",
@@ -32,10 +37,41 @@ ALLOWED = {
 }
 """Imports inside functions count as well, but for a version number that a leaf may ask for."""
 FRAGMENTS = {
-    *("Of", "For", "With", "By", "In", "At", "On", "To", "As", "From", "Into", "Without", "Beyond", "Between", "Under"),
-    *("What", "How", "Where", "Whether", "That", "Which", "Why", "When", "Per", "Among", "Within", "Because"),
+    *(
+        "Of",
+        "For",
+        "With",
+        "By",
+        "In",
+        "At",
+        "On",
+        "To",
+        "As",
+        "From",
+        "Into",
+        "Without",
+        "Beyond",
+        "Between",
+        "Under",
+    ),
+    *(
+        "What",
+        "How",
+        "Where",
+        "Whether",
+        "That",
+        "Which",
+        "Why",
+        "When",
+        "Per",
+        "Among",
+        "Within",
+        "Because",
+    ),
 }
-PROGRAMS = [path.stem for path in sorted((ROOT / "harness").glob("*.py")) if "@program(" in path.read_text()]
+PROGRAMS = [
+    path.stem for path in sorted((ROOT / "harness").glob("*.py")) if "@program(" in path.read_text()
+]
 
 
 def sources() -> list[Path]:
@@ -56,24 +92,36 @@ def imported(path: Path) -> set[str]:
             assert node.level == 0, f"{path}: relative import"
             names.add(node.module or "")
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return {name for name in names if name.split(".")[0] in ROOMS and name not in ("harness", "harness.__version__")}
+    return {
+        name
+        for name in names
+        if name.split(".")[0] in ROOMS and name not in ("harness", "harness.__version__")
+    }
 
 
 def test_imports_go_one_way():
     wrong = []
     for path in sources():
         here = path.relative_to(ROOT).as_posix()
-        allowed = next(rule for prefix, rule in ALLOWED.items() if here.startswith((f"{prefix}/", f"{prefix}.py")))
+        allowed = next(
+            rule
+            for prefix, rule in ALLOWED.items()
+            if here.startswith((f"{prefix}/", f"{prefix}.py"))
+        )
         for name in imported(path):
-            if not any(rule == "" or name == rule or name.startswith(rule + ".") for rule in allowed):
+            if not any(
+                rule == "" or name == rule or name.startswith(rule + ".") for rule in allowed
+            ):
                 wrong.append(f"{here}: {name}")
     assert not wrong
 
 
 def test_the_rule_sees_a_forbidden_import(tmp_path):
     path = tmp_path / "wrong.py"
-    path.write_text("from scenes.optics import NoiseFreeView\ndef f():\n    import detectors.average\n")
-    assert {"scenes.optics", "detectors.average"} <= imported(path)
+    path.write_text(
+        "from scenes.optics import NoiseFreeView\ndef f():\n    import detectors.averages.average\n"
+    )
+    assert {"scenes.optics", "detectors.averages.average"} <= imported(path)
 
 
 def test_no_further_code_folder():
@@ -103,7 +151,7 @@ def test_detectors_and_their_program_never_import_mitsuba():
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] in ('mitsuba', 'drjit'): raise ImportError(name)\n"
         "sys.meta_path.insert(0, Wall())\n"
-        "import detectors, detectors.average, detectors.measure, detectors.thesis\n"
+        "import detectors, detectors.averages.average, detectors.findings.measure, detectors.methods.thesis\n"
         "import detectors.recordings, harness.detect\n"
         "assert 'mitsuba' not in sys.modules\n"
     )

@@ -1,4 +1,5 @@
-"""Every command and every block of Python in README and docs runs, in its document's order, on small inputs."""
+"""Every command and every block of Python in README and docs runs, in its document's order, on
+small inputs."""
 
 from __future__ import annotations
 
@@ -19,28 +20,32 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import marked_board
 import numpy as np
 import pandas as pd
 import pytest
-import tiny_dataset
 import trimesh
-from marked_boards import LENS, board_pose, marked_cloud, strips
-from recorded_plane import calibration, write_mkv
-from test_marks_coded import PLACES, tags
-from test_reference import casting
-from test_reference import seen as casting_seen
-from tiny_sweep import STUDY
 
 import tofpod
-from harness.__main__ import main, programs
+from harness.__main__ import MODULES, main
 from harness.experiment.load import load_experiment
 from harness.vocabulary.geometry import MM, Cloud, Lens
+from tests.detectors.surfaces.test_reference import casting
+from tests.detectors.surfaces.test_reference import seen as casting_seen
+from tests.detectors.views.marks.test_marks_coded import PLACES, tags
+from tests.support import marked_board, tiny_dataset
+from tests.support.marked_boards import LENS, board_pose, marked_cloud, strips
+from tests.support.recorded_plane import calibration, write_mkv
+from tests.support.tiny_sweep import STUDY
 
 ROOT = Path(__file__).resolve().parents[1]
 MADE = {"index.md", "reference.md", "contributing.md"}  # by make docs
-TEXTS = [ROOT / "README.md", *(path for path in sorted((ROOT / "docs").glob("*.md")) if path.name not in MADE)]
-COMMANDS = re.compile(r"(?:^ {4,}|`)(?:tofpod |python -m harness\.)([a-z_]+ [^`#\n]*)", re.MULTILINE)
+TEXTS = [
+    ROOT / "README.md",
+    *(path for path in sorted((ROOT / "docs").glob("*.md")) if path.name not in MADE),
+]
+COMMANDS = re.compile(
+    r"(?:^ {4,}|`)(?:tofpod |python -m harness\.)([a-z_]+ [^`#\n]*)", re.MULTILINE
+)
 ONLY_PARSED = {
     "coverage pipe": "takes minutes; test_coverage runs the program on a smaller part",
     "--set-up": "needs a study with a curve; test_gauge and test_mapod run the chain",
@@ -58,14 +63,14 @@ def commands_in(path: Path) -> Iterator[list[str]]:
     """Yield the programs' commands in a document, each once, as words."""
     for command in dict.fromkeys(COMMANDS.findall(path.read_text().replace("\\\n", " "))):
         words = shlex.split(command)
-        if words[0] in programs() and words[1:] and "..." not in command:
+        if words[0] in MODULES and words[1:] and "..." not in command:
             yield words
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
 def test_every_command_is_understood(path: Path):
     for name, *given in commands_in(path):
-        assert importlib.import_module(f"harness.{name}").main.parser().parse_args(given), given
+        assert importlib.import_module(MODULES[name]).main.parser().parse_args(given), given
 
 
 def block_of(document: str, first_line: str) -> str:
@@ -79,15 +84,20 @@ def block_of(document: str, first_line: str) -> str:
 def test_the_taste_of_the_readme_is_what_the_program_prints(capsys):
     """Numbers may change with the stored limits; every line must still be there."""
     shown = block_of(
-        "README.md", "$ tofpod ask --damage hole --size 7mm --distance 1m --camera azure_kinect_nfov --albedo 0.6"
+        "README.md",
+        "$ tofpod ask --damage hole --size 7mm --distance 1m --camera azure_kinect_nfov --albedo 0.6",
     )
     command, *lines = shown.strip().splitlines()
     assert main(shlex.split(command)[2:]) == 0
 
     def form(line: str) -> str:
-        return " ".join(re.sub(r"\b(yes|no|undecided)$", "?", re.sub(r"[0-9.]+", "0", line)).split())
+        return " ".join(
+            re.sub(r"\b(yes|no|undecided)$", "?", re.sub(r"[0-9.]+", "0", line)).split()
+        )
 
-    assert [form(line) for line in lines] == [form(line) for line in capsys.readouterr().out.splitlines()]
+    assert [form(line) for line in lines] == [
+        form(line) for line in capsys.readouterr().out.splitlines()
+    ]
 
 
 def test_the_readme_is_short():
@@ -111,16 +121,29 @@ def test_the_documented_gate_is_a_valid_study(tmp_path):
     compile(block_of("docs/ci_gate.md", "# tests/test_limit.py"), "test_limit.py", "exec")
 
 
-# ---- small experiments -----------------------------------------------------------------------------------------------
+# ---- small experiments
+# -----------------------------------------------------------------------------------------------
 
 BOARD = "source.target.board={width_mm: 190, height_mm: 130, thickness_mm: 12.7}"
 SMALL_STUDY = (
-    *("study.boards=4", "study.hole_free_boards=2", "threshold.calibrate={boards: 4, false_calls_per_m2: 20}"),
+    *(
+        "study.boards=4",
+        "study.hole_free_boards=2",
+        "threshold.calibrate={boards: 4, false_calls_per_m2: 20}",
+    ),
     *(BOARD, "source.render={bounces: 0}", "sweep={capture.frames: [1, 50]}"),
 )
-SMALL_REPEATS = ("repeats=2", "threshold.calibrate.repeats=2", "source.render={bounces: 0}", "sensitivity=null")
+SMALL_REPEATS = (
+    "repeats=2",
+    "threshold.calibrate.repeats=2",
+    "source.render={bounces: 0}",
+    "sensitivity=null",
+)
 SMALL = {
-    "detection_limit": (*SMALL_STUDY, "source.target.damage={kind: through, per_board: 4, diameter_mm: [2, 12]}"),
+    "detection_limit": (
+        *SMALL_STUDY,
+        "source.target.damage={kind: through, per_board: 4, diameter_mm: [2, 12]}",
+    ),
     "detectors": (*SMALL_STUDY, "sweep={detector.name: [thesis, matched]}"),
     "today": (
         *SMALL_STUDY[:3],
@@ -130,7 +153,12 @@ SMALL = {
     "pipe": (*SMALL_STUDY[:3], "source.render={bounces: 0}"),
     "averaging": (*SMALL_REPEATS, "sweep={capture.frames: [1, 5]}"),
     "cameras": (*SMALL_REPEATS, "sweep={source.camera.name: [azure_kinect_nfov, kinect_v2]}"),
-    "anatomy": ("repeats=2", "threshold.calibrate.repeats=2", "capture.exact=false", "sweep={capture.frames: [1]}"),
+    "anatomy": (
+        "repeats=2",
+        "threshold.calibrate.repeats=2",
+        "capture.exact=false",
+        "sweep={capture.frames: [1]}",
+    ),
     "perspectives": (*SMALL_REPEATS, "capture.frames=5", "sweep={mapping.views: [1, 2]}"),
 }
 IN_RESULTS = ("sweep", "efficiency", "coverage", "ask", "design", "ls")
@@ -144,36 +172,57 @@ MORE = {
 
 
 def shrunk(name: str, given: list[str]) -> list[str]:
-    """Return a command's arguments with those that make it small; what the document states comes later and counts."""
-    small = SMALL.get(Path(given[0]).stem, ()) if name in ("sweep", "export", "dataset", "coverage") else ()
+    """Return a command's arguments with those that make it small; what the document states comes
+    later and counts."""
+    small = (
+        SMALL.get(Path(given[0]).stem, ())
+        if name in ("sweep", "export", "dataset", "coverage")
+        else ()
+    )
     settings = [word for change in small for word in ("--set", change)]
     return [given[0], *settings, *given[1:], *MORE.get(name, ())]
 
 
-# ---- small recordings ------------------------------------------------------------------------------------------------
+# ---- small recordings
+# ------------------------------------------------------------------------------------------------
 
 
-def write_capture(folder: Path, depth_m: list[np.ndarray], lens: Lens, rgb: np.ndarray | None = None) -> None:
-    """Depth pictures in millimetres, colour where there is some, and the lens, as Open3D's recorder stores them."""
+def write_capture(
+    folder: Path, depth_m: list[np.ndarray], lens: Lens, rgb: np.ndarray | None = None
+) -> None:
+    """Depth pictures in millimetres, colour where there is some, and the lens, as Open3D's
+    recorder stores them."""
     pictures = [("depth", [np.rint(np.nan_to_num(z_m) / MM).astype(np.uint16) for z_m in depth_m])]
-    pictures += [] if rgb is None else [("color", len(depth_m) * [np.ascontiguousarray(rgb[..., ::-1])])]
+    pictures += (
+        [] if rgb is None else [("color", len(depth_m) * [np.ascontiguousarray(rgb[..., ::-1])])]
+    )
     for name, images in pictures:
         (folder / name).mkdir(parents=True)
         for number, image in enumerate(images):
             assert cv2.imwrite(str(folder / name / f"{number:05d}.png"), image)
-    sizes = {"width": lens.width, "height": lens.height, "intrinsic_matrix": lens.matrix.T.ravel().tolist()}
+    sizes = {
+        "width": lens.width,
+        "height": lens.height,
+        "intrinsic_matrix": lens.matrix.T.ravel().tolist(),
+    }
     (folder / "intrinsic.json").write_text(json.dumps(sizes))
 
 
-def simulated(home: Path, place: str, distance_m: float, offset_mm: float, hole_mm: float = 0.0) -> None:
+def simulated(
+    home: Path, place: str, distance_m: float, offset_mm: float, hole_mm: float = 0.0
+) -> None:
     """50 frames of an Azure Kinect before a small board; one with a hole stands before a wall."""
     holes = [{"id": 1, "diameter_mm": hole_mm, "centre_mm": [10, 5]}] if hole_mm else []
     board = {"width_mm": 190, "height_mm": 150, "thickness_mm": 12.7}
     pose = {"distance_m": distance_m, "tilt_x_deg": 4, "tilt_y_deg": 3, "offset_x_mm": offset_mm}
     target = tofpod.target({"name": "custom", "board": board, "holes": holes, "pose": pose})
-    unit = tofpod.render(target, "azure_kinect_nfov", bounces=0, cache=home / "results" / ".cache" / "renders")
+    unit = tofpod.render(
+        target, "azure_kinect_nfov", bounces=0, cache=home / "results" / ".cache" / "renders"
+    )
     lens = unit.camera.nominal_lens
-    cut, rng, whole = unit.region.within(lens.whole), np.random.default_rng(len(place)), []
+    cut = unit.region.within(lens.whole)
+    rng = np.random.default_rng(len(place))
+    whole = []
     for frame in tofpod.frames(unit, 50, seed=int(rng.integers(99))).frames():
         z_m = rng.normal(1.3, 2 * MM, lens.whole.shape) * bool(holes)
         z_m[cut] = np.where(np.isfinite(frame.z_m), frame.z_m, z_m[cut])
@@ -184,7 +233,9 @@ def simulated(home: Path, place: str, distance_m: float, offset_mm: float, hole_
 def seen_at(cloud: Cloud, count: int = 5) -> list[np.ndarray]:
     """Frames (h, w) of z with noise."""
     rng = np.random.default_rng(1)
-    return [cloud.points_m[..., 2] + rng.normal(0, 0.5 * MM, cloud.valid.shape) for _ in range(count)]
+    return [
+        cloud.points_m[..., 2] + rng.normal(0, 0.5 * MM, cloud.valid.shape) for _ in range(count)
+    ]
 
 
 WALLS = [
@@ -215,12 +266,16 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud = casting_seen(flat, T, 0.0, dent_mm=3.0)
     write_capture(home / "captures" / "casting", seen_at(cloud), cloud.lens)
     turned = trimesh.load(flat)  # its front towards -y, as the document has it
-    turned.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])).export(home / "casting.stl")
+    turned.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])).export(
+        home / "casting.stl"
+    )
 
-    codes, tapes = tags({key: (x, y + 0.02) for key, (x, y) in PLACES.items()}), strips(marked_board.STRIPS_M)
+    codes = tags({key: (x, y + 0.02) for key, (x, y) in PLACES.items()})
+    tapes = strips(marked_board.STRIPS_M)
 
     def paint(xy: np.ndarray) -> np.ndarray:
-        over, under = codes(xy), tapes(xy)
+        over = codes(xy)
+        under = tapes(xy)
         return np.where((over == codes(np.full_like(xy, 9.0))), under, over)
 
     wide = replace(LENS, width=480, height=260, cx=239.5, cy=129.5)
@@ -231,13 +286,17 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         marked_board.write_view(home / name, marked_board.T_camera_board(turn_deg), seed=1)
 
     wall_mm = (np.random.default_rng(number).normal(700, 2, (576, 640)) for number in range(6))
-    pictures = [{"DEPTH": mm.astype(np.uint16), "IR": np.full(mm.shape, 900, np.uint16)} for mm in wall_mm]
+    pictures = [
+        {"DEPTH": mm.astype(np.uint16), "IR": np.full(mm.shape, 900, np.uint16)} for mm in wall_mm
+    ]
     write_mkv(home / "recording.mkv", pictures, attached=calibration())
 
     rng = np.random.default_rng(4)
     size = rng.uniform(1, 9, 80)
     found = rng.random(80) < 1 / (1 + np.exp(-2 * (size - 4)))
-    table = pd.DataFrame({"length": size, "length_mm": size, "diameter_mm": size, "hit": found.astype(int)})
+    table = pd.DataFrame(
+        {"length": size, "length_mm": size, "diameter_mm": size, "hit": found.astype(int)}
+    )
     table = table.assign(found=table["hit"], inspector_A=table["hit"], inspector_B=table["hit"])
     table = table.assign(hole=range(80), board=[f"b{n // 20}" for n in range(80)])
     table = table.assign(depth=0.2 * size + rng.normal(0, 0.1, 80))
@@ -249,19 +308,24 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def already_run() -> set[str]:
-    """Commands that write into the results that all documents share: the next document need not run them again."""
+    """Commands that write into the results that all documents share: the next document need not
+    run them again."""
     return set()
 
 
-# ---- the commands ----------------------------------------------------------------------------------------------------
+# ---- the commands
+# ----------------------------------------------------------------------------------------------------
 
 
 def filled(words: list[str], home: Path) -> list[str]:
-    """Return words as a shell and a reader would fill them in: patterns of names, and the digests of results."""
+    """Return words as a shell and a reader would fill them in: patterns of names, and the digests
+    of results."""
     whole = []
     for word in words:
         pattern = re.sub(r"<\w+>|\bDIGEST\b", "*", word)
-        names = sorted(name for name in glob.glob(pattern, root_dir=home) if not name.endswith("/latest"))
+        names = sorted(
+            name for name in glob.glob(pattern, root_dir=home) if not name.endswith("/latest")
+        )
         if "<another>" in word:
             names = names[1:]
         if pattern == word and "*" not in word:
@@ -281,21 +345,31 @@ def prepare(command: str, home: Path) -> None:
             path = home / "maps" / f"{name}.npy"
             path.parent.mkdir(parents=True, exist_ok=True)
             if "/train/" not in name:
-                np.save(path, np.random.default_rng(1).normal(size=damage.shape) + 6.0 * (damage > 0))
+                np.save(
+                    path, np.random.default_rng(1).normal(size=damage.shape) + 6.0 * (damage > 0)
+                )
     if command.startswith("compare scores_a"):
         for name in ("scores_a", "scores_b"):
             shutil.copytree(home / "scores", home / name)
     if command == "compare A B":
-        for name, run in zip("AB", sorted(home.glob("results/detection_limit/*[!t]")), strict=False):
+        for name, run in zip(
+            "AB", sorted(home.glob("results/detection_limit/*[!t]")), strict=False
+        ):
             shutil.rmtree(home / name)
             (home / name).symlink_to(run)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [path for path in TEXTS if any(commands_in(path))], ids=lambda path: path.name)
-def test_every_command_runs(path: Path, inputs: Path, already_run: set[str], tmp_path: Path, monkeypatch, capfd):
+@pytest.mark.parametrize(
+    "path", [path for path in TEXTS if any(commands_in(path))], ids=lambda path: path.name
+)
+def test_every_command_runs(
+    path: Path, inputs: Path, already_run: set[str], tmp_path: Path, monkeypatch, capfd
+):
     home = tmp_path / "home"
-    shutil.copytree(inputs, home, symlinks=True, copy_function=os.link, ignore=lambda *_: ["results"])
+    shutil.copytree(
+        inputs, home, symlinks=True, copy_function=os.link, ignore=lambda *_: ["results"]
+    )
     (inputs / "results").mkdir(exist_ok=True)
     (home / "results").symlink_to(inputs / "results")
     for name, text in re.findall(r"\n    # (\w+\.yaml)\n((?:    .*\n)+)", path.read_text()):
@@ -316,7 +390,9 @@ def test_the_python_of_the_documents_runs(inputs: Path, tmp_path: Path, monkeypa
     monkeypatch.chdir(tmp_path)
     (tmp_path / "results").symlink_to(inputs / "results")
     run = tofpod.sweep
-    monkeypatch.setattr(tofpod, "sweep", lambda name, *changes: run(name, *changes, *SMALL["detection_limit"]))
+    monkeypatch.setattr(
+        tofpod, "sweep", lambda name, *changes: run(name, *changes, *SMALL["detection_limit"])
+    )
     exec(block_of("docs/python.md", "import tofpod"), {})
     assert {path.name for path in tmp_path.iterdir()} == {"results", "found.png", "pod.png"}
 

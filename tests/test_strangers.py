@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from strangers.__main__ import made
-from strangers.kinds import KINDS
-from strangers.recording import recorded
-from strangers.score import scored
+
+from tests.strangers.__main__ import made
+from tests.strangers.kinds import KINDS
+from tests.strangers.recording import recorded
+from tests.strangers.score import scored
 
 
 def rows_of(truths):
@@ -19,7 +20,12 @@ def rows_of(truths):
         x, y, z = (1e3 * v for v in truth.centre_m)
         depth = 1e3 * truth.depth_m[0] if math.isfinite(truth.depth_m[0]) else 0.0
         rows.append({"kind": truth.kind, "x_mm": f"{x}", "y_mm": f"{y}", "z_mm": f"{z}"})
-        rows[-1] |= {"diameter_mm": f"{1e3 * truth.diameter_m[1]}", "depth_mm": f"{depth}", "u_px": "0", "v_px": "0"}
+        rows[-1] |= {
+            "diameter_mm": f"{1e3 * truth.diameter_m[1]}",
+            "depth_mm": f"{depth}",
+            "u_px": "0",
+            "v_px": "0",
+        }
     return rows
 
 
@@ -59,7 +65,9 @@ def test_wrong_answers_are_wrong(board):
 
 
 def test_a_refusal_is_a_warning_and_a_traceback_is_not(board):
-    assert scored(*board, 2, "error: no unit is known\n  fix: pass --unit\n", []).verdict == "warned"
+    assert (
+        scored(*board, 2, "error: no unit is known\n  fix: pass --unit\n", []).verdict == "warned"
+    )
     assert scored(*board, 1, "Traceback ...\nKeyError\n", []).verdict == "wrong"
 
 
@@ -76,7 +84,11 @@ QUICK = ("before_wall", "pipe_outside")
 
 @pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize(
-    ("kind", "seed"), [pytest.param(*each, marks=[] if each[0] in QUICK else [pytest.mark.slow]) for each in ANSWERED]
+    ("kind", "seed"),
+    [
+        pytest.param(*each, marks=[] if each[0] in QUICK else [pytest.mark.slow])
+        for each in ANSWERED
+    ],
 )
 def test_no_answer_is_wrong_without_a_word(kind, seed, tmp_path):
     score = made(kind, seed, tmp_path)

@@ -1,9 +1,11 @@
-"""Captures from files of arrays: which array holds the distances, and what its axes mean; height maps; bare numbers.
+"""Captures from files of arrays: which array holds the distances, and what its axes mean; height
+maps; bare numbers.
 
-The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
-A height map's pixels are a stated pitch apart. It becomes a cloud in parallel projection: x and y count from its
-middle; z points away from the viewer and is `DISTANCE_M` at the median height. If no unit is stated, the program takes
-micrometres, millimetres or metres, whichever makes the relief a plausible share of the extent."""
+The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need
+pickle, are refused. A height map's pixels are a stated pitch apart. It becomes a cloud in parallel
+projection: x and y count from its middle; z points away from the viewer and is `DISTANCE_M` at the
+median height. If no unit is stated, the program takes micrometres, millimetres or metres,
+whichever makes the relief a plausible share of the extent."""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ LEGAL_RAW = (
     "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
     "BYTES before the first frame"
 )
-LEGAL_PICTURES = "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
+LEGAL_PICTURES = (
+    "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
+)
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The MATLAB line that saves a point cloud ``pc`` as arrays."""
 
@@ -48,7 +52,8 @@ def load_npy(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name. Raises UserError if it is broken, too large, or has objects."""
+    """Return the arrays of an ``.npz`` file by name. Raises UserError if it is broken, too large,
+    or has objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
@@ -59,17 +64,23 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_mat(path: Path) -> dict[str, np.ndarray]:
-    """Return the numeric arrays of a ``.mat`` file by name; (h, w, 3, k) has its frames moved first. Raises UserError
-    for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file."""
+    """Return the numeric arrays of a ``.mat`` file by name; (h, w, 3, k) has its frames moved
+    first. Raises UserError for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken
+    file."""
     import scipy.io
 
     fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
     with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
-            # cells and structs hold no frames, and deeply nested ones end the process without a message
-            flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
+            # cells and structs hold no frames, and deeply nested ones end the process without a
+            # message
+            flat = [
+                name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")
+            ]
         except TypeError as error:
-            raise ValueError("it holds a MATLAB object, which cannot be read outside MATLAB") from error
+            raise ValueError(
+                "it holds a MATLAB object, which cannot be read outside MATLAB"
+            ) from error
         loaded = scipy.io.loadmat(path, variable_names=flat)
     arrays = {}
     for name, value in loaded.items():
@@ -83,9 +94,12 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_picture(path: Path) -> dict[str, np.ndarray]:
-    """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files and pictures."""
+    """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files
+    and pictures."""
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the messages below replace its output
+    cv2.utils.logging.setLogLevel(
+        cv2.utils.logging.LOG_LEVEL_SILENT
+    )  # the messages below replace its output
     try:
         with read_errors(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
@@ -96,23 +110,48 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{stack.shape[3]} channels of {stack.dtype}, which is a picture")
     finally:
         cv2.utils.logging.setLogLevel(level)
-    return {"": stack[..., ::-1] if stack.ndim == 4 else stack}  # OpenCV gives the last channel first
+    return {
+        "": stack[..., ::-1] if stack.ndim == 4 else stack
+    }  # OpenCV gives the last channel first
 
 
 SENSOR_SIZES = (
-    *((640, 576), (320, 288), (512, 512), (1024, 1024), (640, 480), (512, 424), (320, 240), (224, 172), (224, 171)),
-    *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
+    *(
+        (640, 576),
+        (320, 288),
+        (512, 512),
+        (1024, 1024),
+        (640, 480),
+        (512, 424),
+        (320, 240),
+        (224, 172),
+        (224, 171),
+    ),
+    *(
+        (256, 192),
+        (160, 120),
+        (240, 180),
+        (1024, 768),
+        (1280, 720),
+        (848, 480),
+        (1280, 960),
+        (1280, 1024),
+    ),
 )  # (width, height) of the depth images of usual cameras
-SAME_SCENE, SEVERAL = 0.05, 8
-"""Largest relative difference of the median pixel between successive frames, and number of frames examined."""
+SAME_SCENE = 0.05
+SEVERAL = 8
+"""Largest relative difference of the median pixel between successive frames, and number of frames
+examined."""
 NEIGHBOURS = 0.1
-"""Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
+"""Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a
+wrong layout by 100 %."""
 
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Whole frames of ``width`` x ``height`` numbers, row by row, from byte ``offset`` of a file on. ``step``: bytes
-    from pixel to pixel, more than a number's if brightness and confidence lie between."""
+    """Whole frames of ``width`` x ``height`` numbers, row by row, from byte ``offset`` of a file
+    on. ``step``: bytes from pixel to pixel, more than a number's if brightness and confidence lie
+    between."""
 
     width: int
     height: int
@@ -123,7 +162,9 @@ class RawLoader:
     @classmethod
     def stated(cls, text: str) -> RawLoader:
         """Parse WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]. Raises UserError for anything else."""
-        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text)
+        match = re.fullmatch(
+            r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text
+        )
         if match is None:
             raise UserError(f"--raw {text}: is not a layout", legal=LEGAL_RAW)
         width, height, kind, step, offset = match.groups()
@@ -131,35 +172,62 @@ class RawLoader:
         kind = kind or "u2"
         own = np.dtype(kind).itemsize
         if int(step or own) < own:
-            raise UserError(f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW)
-        return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(step or own), int(offset or 0))
+            raise UserError(
+                f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW
+            )
+        return cls(
+            int(width),
+            int(height),
+            kind if kind[0] in "<>" else f"<{kind}",
+            int(step or own),
+            int(offset or 0),
+        )
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
         """Map the frames (n, h, w). Raises UserError if there is none."""
-        kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
+        kind = np.dtype(self.kind)
+        size = path.stat().st_size - self.offset
         frame = self.width * self.height * self.step
         if size < frame:
             needs = f"a frame of {self.width} x {self.height} numbers in steps of {self.step} bytes needs {frame}"
-            raise UserError(f"{path}: has {size} bytes from byte {self.offset} on, but {needs}", legal=LEGAL_RAW)
+            raise UserError(
+                f"{path}: has {size} bytes from byte {self.offset} on, but {needs}", legal=LEGAL_RAW
+            )
         content = np.memmap(path, np.uint8, "r", self.offset, (size // frame * frame,))
         strides = (frame, self.width * self.step, self.step)
-        return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
+        return {
+            "": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)
+        }
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
-        """Return the number of bytes after the last frame. Raises UserError if neighbours differ too much."""
+        """Return the number of bytes after the last frame. Raises UserError if neighbours differ
+        too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
-            what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
-            raise UserError(f"{path}: {what}: this layout is wrong", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
+            what = (
+                f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
+            )
+            raise UserError(
+                f"{path}: {what}: this layout is wrong",
+                legal=LEGAL_RAW,
+                fix=raw_layout_of(path).fix,
+            )
         return (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
 
 
 def raw_layout_of(path: Path) -> UserError:
-    """Return the error for a file of bare numbers, with the layouts of common cameras that fit its size."""
+    """Return the error for a file of bare numbers, with the layouts of common cameras that fit its
+    size."""
     size = path.stat().st_size
-    layouts = {f"{w}x{h}": size // (w * h) for w, h in SENSOR_SIZES if size % (w * h) == 0 and size >= 2 * w * h}
+    layouts = {
+        f"{w}x{h}": size // (w * h)
+        for w, h in SENSOR_SIZES
+        if size % (w * h) == 0 and size >= 2 * w * h
+    }
     ranked = sorted(layouts, key=lambda wh: layouts[wh] != 2)[:4]
-    fitting = " or ".join(f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked)
+    fitting = " or ".join(
+        f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked
+    )
     fix = "state the layout" + (f"; its size fits {fitting}" if fitting else "")
     return UserError(f"{path}: the layout of its {size} bytes is unknown", legal=LEGAL_RAW, fix=fix)
 
@@ -174,14 +242,17 @@ AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
 FEWEST_ROWS = 8  # of an image; an array with fewer rows is a table of points
 FRAMES_OF_POINTS = 20
-"""(a, b, 3) counts as a frames of b points, not as a grid, from b = 20 a on: no sensor is that wide."""
+"""(a, b, 3) counts as a frames of b points, not as a grid, from b = 20 a on: no sensor is that
+wide."""
 
 Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
-"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a note on the axes."""
+"""Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a
+note on the axes."""
 
 
 def open_arrays(path: Path, given: Given) -> Recording:
-    """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array or several fit."""
+    """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array
+    or several fit."""
     load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
     if given.pitch is not None:
         return _open_height_map(path, load, given)
@@ -194,7 +265,9 @@ def open_arrays(path: Path, given: Given) -> Recording:
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
         hint = "; for a height map, state the distance between its pixels: --pitch 0.5mm"
-        lens, files = lens_for(str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint)
+        lens, files = lens_for(
+            str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint
+        )
     scale_m = given.scale_m or default_metres(distances.dtype)
 
     def read() -> Iterator[Frame]:
@@ -210,7 +283,8 @@ def open_arrays(path: Path, given: Given) -> Recording:
 
 
 def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording:
-    """Open files of arrays of one kind as one capture, in the order given. Raises UserError as `open_arrays` does."""
+    """Open files of arrays of one kind as one capture, in the order given. Raises UserError as
+    `open_arrays` does."""
     first = open_arrays(paths[0], given)
 
     def read() -> Iterator[Frame]:
@@ -221,8 +295,11 @@ def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording
 
 
 def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
-    """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y, colour or amplitude."""
-    changed = [each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)]
+    """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y,
+    colour or amplitude."""
+    changed = [
+        each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)
+    ]
     worst = max(changed, default=0.0)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
         more = f" and {left_over} bytes more" * bool(left_over)
@@ -233,13 +310,16 @@ def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int
 
 
 def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
-    """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis first."""
+    """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis
+    first."""
     arrays = load(path)
     name, array = _named_array(str(path), arrays, DISTANCE_NAMES, given.array)
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     note = ""
-    if array.ndim == 4 and 1 in array.shape[1::2]:  # (n, 1, h, w) or (n, h, w, 1), as networks take images
+    if (
+        array.ndim == 4 and 1 in array.shape[1::2]
+    ):  # (n, 1, h, w) or (n, h, w, 1), as networks take images
         array = array.squeeze(axis=1 if array.shape[1] == 1 else 3)
     if _frames_are_last(array):
         note = f"{name} {array.shape}: the frames are assumed to lie along the last axis"
@@ -252,21 +332,27 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
         found = next((beside[key] for key in names if key in beside), None)
         return found if found is not None and found.size == size else None
 
-    rgb, amplitude = named(COLOUR_NAMES, 3 * math.prod(shape)), named(AMPLITUDE_NAMES, math.prod(shape))
+    rgb = named(COLOUR_NAMES, 3 * math.prod(shape))
+    amplitude = named(AMPLITUDE_NAMES, math.prod(shape))
     if rgb is not None:
         if rgb.dtype.kind == "f":
-            rgb = np.nan_to_num(np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255))
+            rgb = np.nan_to_num(
+                np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255)
+            )
         rgb = rgb.astype(np.uint8).reshape(*shape, 3)
     amplitude = None if amplitude is None else amplitude.reshape(shape).astype(np.float32)
     return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised, note
 
 
 def _frames_are_last(array: np.ndarray) -> bool:
-    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks them. With three
-    planes, the content decides: x, y and z of points are not nearly equal everywhere, repeated distances are."""
+    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks
+    them. With three planes, the content decides: x, y and z of points are not nearly equal
+    everywhere, repeated distances are."""
     if not _is_deep(array):
         return False
-    return array.shape[2] != 3 or all(_apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1))
+    return array.shape[2] != 3 or all(
+        _apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1)
+    )
 
 
 def _is_deep(array: np.ndarray) -> bool:
@@ -276,12 +362,16 @@ def _is_deep(array: np.ndarray) -> bool:
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
     """Return the median relative difference where both have a number; infinity if there is none."""
     both = (first > 0) & (second > 0)
-    before, after = (plane[both].astype(np.float64) for plane in (first, second))
+    before = first[both].astype(np.float64)
+    after = second[both].astype(np.float64)
     return float(np.median(np.abs(before - after) / before)) if both.any() else float("inf")
 
 
-def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | None) -> tuple[str, np.ndarray]:
-    """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else the only one."""
+def _named_array(
+    name: str, arrays: Arrays, usual: Sequence[str], given: str | None
+) -> tuple[str, np.ndarray]:
+    """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else
+    the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (given or "").partition(":")
     if not key:
@@ -289,24 +379,41 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | N
         found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
         if len(found) != 1:
             what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
-            fix = f"choose one, for instance --array {found[0]} (add --pitch for a height map)" if found else None
-            raise UserError(what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix)
+            fix = (
+                f"choose one, for instance --array {found[0]} (add --pitch for a height map)"
+                if found
+                else None
+            )
+            raise UserError(
+                what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix
+            )
         (key,) = found
     if key not in arrays:
-        raise UserError(f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}")
-    array, name = arrays[key], f"{name}: {key}" if key else name
+        raise UserError(
+            f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}"
+        )
+    array = arrays[key]
+    name = f"{name}: {key}" if key else name
     if number:
         array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
-            raise UserError(f"--array {given}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 onwards")
-        array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
+            raise UserError(
+                f"--array {given}: no such part of {name} {array.shape}",
+                legal="NAME, or NAME:0 onwards",
+            )
+        array = array[int(number)]
+        name = f"{name if key else name + ': '}:{number}"
     refuse_narrow(name, array.dtype)
     return name, array
 
 
-def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, tuple[int, int, int], bool]:
+def _axes(
+    name: str, shape: tuple[int, ...], lens: Lens | None
+) -> tuple[bool, tuple[int, int, int], bool]:
     """Return (holds points, (n, h, w), has a pixel grid) of an array's shape."""
-    is_lists = shape[-1:] == (3,) and (len(shape) == 2 or (len(shape) == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0]))
+    is_lists = shape[-1:] == (3,) and (
+        len(shape) == 2 or (len(shape) == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0])
+    )
     if is_lists:
         frames, points = (1, *shape[:-1])[-2:]
         if lens is not None and points == lens.width * lens.height:
@@ -316,20 +423,31 @@ def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, t
     n, *grid = (1, 1, *(shape[:-1] if has_points else shape))[-3:]
     is_table = len(shape) == 2 and min(shape) < FEWEST_ROWS
     if (len(shape) == 4 and not has_points) or len(shape) not in (2, 3, 4) or is_table:
-        fix = "if rows hold more numbers than x, y and z, save only these: array[:, :3]" if is_table else None
+        fix = (
+            "if rows hold more numbers than x, y and z, save only these: array[:, :3]"
+            if is_table
+            else None
+        )
         raise UserError(f"{name}: a shape of {shape} is not a capture", legal=LEGAL_AXES, fix=fix)
     return has_points, (n, grid[0], grid[1]), True
 
 
 HEIGHT_NAMES = ("height", "heights", "heightmap", "height_map", "elevation", "dem", "map", "h", "z")
-DOWN_NAMES = ("depth", "distance", "range", "z_depth")  # names of arrays whose numbers grow away from the viewer
+DOWN_NAMES = (
+    "depth",
+    "distance",
+    "range",
+    "z_depth",
+)  # names of arrays whose numbers grow away from the viewer
 DISTANCE_M = 1.0
 RELIEF = (5e-4, 0.5)
-"""Plausible relief (1st to 99th percentile) over the map's shorter side: of two units, 1000 apart, only one fits."""
+"""Plausible relief (1st to 99th percentile) over the map's shorter side: of two units, 1000 apart,
+only one fits."""
 
 
 def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
-    """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be determined."""
+    """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be
+    determined."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
@@ -338,27 +456,41 @@ def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
     name, heights = _map_in(path, load, given.array)
     known = heights[np.isfinite(heights)].astype(np.float64)
     if known.size == 0:
-        raise UserError(f"{name}: has no finite height", legal="numbers, and NaN where there is no height")
+        raise UserError(
+            f"{name}: has no finite height", legal="numbers, and NaN where there is no height"
+        )
     relief = float(np.ptp(np.quantile(known, (0.01, 0.99))))
     height, width = heights.shape
     side_m = min(height, width) * pitch_m
-    plausible = (UNITS_M[u] for u in ("mm", "m", "um") if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1])
+    plausible = (
+        UNITS_M[u]
+        for u in ("mm", "m", "um")
+        if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1]
+    )
     scale_m = next(plausible, None) if given.scale_m is None else given.scale_m
     if scale_m is None:
         what = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
         raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
-    direction = "grow away from the viewer, as its name says" if is_down else "grow towards the viewer: holes are low"
+    direction = (
+        "grow away from the viewer, as its name says"
+        if is_down
+        else "grow towards the viewer: holes are low"
+    )
     z_step_m = 0.0 if (known % 1).any() else scale_m  # whole numbers were rounded, others were not
     read = partial(_map_frames, path, load, given.array, pitch_m, scale_m if is_down else -scale_m)
     note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
     notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
     origin = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
-    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin)
+    found = Recording(
+        path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin
+    )
     return replace(found, projection="parallel")
 
 
-def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float) -> Iterator[Frame]:
+def _map_frames(
+    path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float
+) -> Iterator[Frame]:
     """Yield the map as a frame. If ``scale_m`` is below 0, heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)
     known = np.isfinite(heights)
@@ -366,14 +498,18 @@ def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: floa
     z_m += DISTANCE_M - (np.median(z_m[known]) if known.any() else 0.0)
     z_m[~known] = np.nan
     v, u = np.mgrid[: heights.shape[0], : heights.shape[1]]
-    xy_m = np.stack([u - (heights.shape[1] - 1) / 2, v - (heights.shape[0] - 1) / 2], axis=-1) * pitch_m
+    xy_m = (
+        np.stack([u - (heights.shape[1] - 1) / 2, v - (heights.shape[0] - 1) / 2], axis=-1)
+        * pitch_m
+    )
     xy_m[~known] = np.nan
     reason = np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
     yield Frame(name, z_m.astype(np.float32), reason, xy_m=xy_m)
 
 
 def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.ndarray]:
-    """Return the name and the map (h, w). Raises UserError for several maps, which are not frames of one capture."""
+    """Return the name and the map (h, w). Raises UserError for several maps, which are not frames
+    of one capture."""
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
     values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
     if values.ndim == 3:

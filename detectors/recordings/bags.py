@@ -1,8 +1,9 @@
-"""ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2 as captures.
+"""ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2
+as captures.
 
-``rosbags`` unpacks whole chunks, so it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
-driver publishes with it. If the rays of a CameraInfo pass through a cloud's points, z and that lens are used: a pixel's
-ray is then the same in all frames."""
+``rosbags`` unpacks whole chunks, so it runs within `files.limited_memory`. A depth image needs the
+CameraInfo that its driver publishes with it. If the rays of a CameraInfo pass through a cloud's
+points, z and that lens are used: a pixel's ray is then the same in all frames."""
 
 from __future__ import annotations
 
@@ -48,15 +49,18 @@ class Bag:
     def topics(self) -> dict[str, str]:
         """Return the message type of each topic, sorted; for a topic with several types, the last."""
         with self._opened() as reader:
-            return dict(sorted((connection.topic, connection.msgtype) for connection in reader.connections))
+            return dict(
+                sorted((connection.topic, connection.msgtype) for connection in reader.connections)
+            )
 
     def first(self, topic: str) -> Any:
         """Return the first message of a topic, None if it has none."""
         return next(self.messages(topic), ("", None))[1]
 
     def messages(self, topic: str) -> Iterator[tuple[str, Any]]:
-        """Yield (name, message) of a topic in the order of their times within each file, one held at a time. Raises
-        UserError if a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
+        """Yield (name, message) of a topic in the order of their times within each file, one held
+        at a time. Raises UserError if a file is damaged or a message is larger than
+        `MAX_MESSAGE_BYTES`."""
         types = _types(self._is_ros1)
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
@@ -70,7 +74,9 @@ class Bag:
                         break
                     if len(item[2]) > MAX_MESSAGE_BYTES:
                         most = f"{MAX_MESSAGE_BYTES >> 20} MiB"
-                        raise UserError(f"{name}: has more than {most}", legal=f"messages up to {most}")
+                        raise UserError(
+                            f"{name}: has more than {most}", legal=f"messages up to {most}"
+                        )
                     message = decode(item[2], item[0].msgtype)
                 yield name, message
 
@@ -79,9 +85,13 @@ class Bag:
         return self.path.suffix.lower() == ROS1_SUFFIX
 
     def _readable(self) -> AbstractContextManager[None]:
-        mend = f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
+        mend = (
+            f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
+        )
         what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is not a bag"
-        return read_errors(what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}")
+        return read_errors(
+            what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}"
+        )
 
     @contextmanager
     def _opened(self) -> Iterator[Reader | Ros1Reader]:
@@ -97,7 +107,8 @@ class Bag:
 
 @lru_cache
 def _types(is_ros1: bool) -> Any:
-    """Return the message types. They are kept, because the code that reads a type is made when it is first used."""
+    """Return the message types. They are kept, because the code that reads a type is made when it
+    is first used."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
@@ -111,29 +122,38 @@ def is_bag(path: Path) -> bool:
         if any(_holds_messages(inside) for inside in path.iterdir()):
             return True
         metadata = path / METADATA
-        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.open("rb").read(MAX_BYTES)
+        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.open("rb").read(
+            MAX_BYTES
+        )
     except OSError:
         return False
 
 
 def find_bag(path: Path) -> Bag:
-    """Return a folder or file as a bag. Raises UserError if its description or one of its files is missing."""
+    """Return a folder or file as a bag. Raises UserError if its description or one of its files is
+    missing."""
     if path.is_file():
         return Bag(path, (path,))
     metadata = path / METADATA
     if not metadata.is_file():
         held = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
         what = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}"
-        raise UserError(what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex")
+        raise UserError(
+            what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex"
+        )
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
-    with read_errors(f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
+    with read_errors(
+        f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix
+    ):
         info = read_yaml(metadata).data["rosbag2_bagfile_information"]
         files = tuple(path / Path(name).name for name in info["relative_file_paths"])
         mode = str(info.get("compression_mode") or "none").lower()
     if mode == "file":
         fix = f"unpack it (zstd -d {files[0] if files else path}) and name the unpacked file"
         raise UserError(f"{path}: its files are compressed as a whole", legal=LEGAL_BAG, fix=fix)
-    absent = [file.name for file in files if not (file.is_file() and file.suffix.lower() in BAG_SUFFIXES)]
+    absent = [
+        file.name for file in files if not (file.is_file() and file.suffix.lower() in BAG_SUFFIXES)
+    ]
     if absent or not files:
         what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is missing or is not a file that can be read"
         raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
@@ -150,22 +170,29 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
 RAY_TOLERANCE_PX = 0.01
-"""A lens fits if each point lies within this distance of its pixel's ray: far more than the error of float32."""
+"""A lens fits if each point lies within this distance of its pixel's ray: far more than the error
+of float32."""
 
 
 def open_bag(path: Path, given: Given) -> Recording:
-    """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens does not fit."""
+    """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens
+    does not fit."""
     bag = find_bag(path)
     chosen, note = _chosen_topic(bag, given)
     if bag.first(chosen) is None:
-        raise UserError(f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again")
-    recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(bag, chosen, given)
+        raise UserError(
+            f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again"
+        )
+    recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(
+        bag, chosen, given
+    )
     files = (*bag.files, *filter(None, (bag.metadata, given.intrinsics)))
     return replace(recording, files=files, notes=(note, *recording.notes))
 
 
 def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Frame]:
-    """Yield the images or clouds of one topic, one frame per message. ``by_lens``: x and y come from the lens."""
+    """Yield the images or clouds of one topic, one frame per message. ``by_lens``: x and y come
+    from the lens."""
     for name, message in bag.messages(topic):
         frame = frame_of_message(name, message, scale_m)
         yield replace(frame, xy_m=None) if by_lens else frame
@@ -189,12 +216,19 @@ def _open_clouds(bag: Bag, topic: str, given: Given) -> Recording:
         note = NO_GRID
     else:
         messages = (bag.first(name) for name, kind in bag.topics.items() if kind == INFO_TYPE)
-        found = (lens_of_info(message, (height, width)) for message in messages if message is not None)
-        fitting = (each for each in found if isinstance(each, Lens) and _off_ray_px(each, first) <= RAY_TOLERANCE_PX)
+        found = (
+            lens_of_info(message, (height, width)) for message in messages if message is not None
+        )
+        fitting = (
+            each
+            for each in found
+            if isinstance(each, Lens) and _off_ray_px(each, first) <= RAY_TOLERANCE_PX
+        )
         lens = next(fitting, None)
         if lens is None:
             note = "no CameraInfo in the bag fits the points; each frame's own x and y are averaged"
-    read, unit_from = partial(_frames, bag, topic, scale_m, lens is not None), "ROS, whose clouds are in metres"
+    read = partial(_frames, bag, topic, scale_m, lens is not None)
+    unit_from = "ROS, whose clouds are in metres"
     more = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
     return Recording.begun(bag.path.name, read, scale_m, **more)
 
@@ -211,12 +245,17 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
     for name, kind in bag.topics.items():
         # RealSense's viewer states the unit with a sensor's streams
         sensor, _, option = name.partition("/option/")
-        is_stated = kind == UNIT_TYPE and option.startswith("Depth_Units") and topic.startswith(sensor + "/")
+        is_stated = (
+            kind == UNIT_TYPE
+            and option.startswith("Depth_Units")
+            and topic.startswith(sensor + "/")
+        )
         if scale_m is None and is_whole and is_stated:
             message = bag.first(name)
             if message is not None and 1e-6 <= message.data <= 1:
                 # the option is a float32: 0.00025 is stored as 0.00025000001
-                scale_m, unit_from = float(f"{message.data:.6g}"), name
+                scale_m = float(f"{message.data:.6g}")
+                unit_from = name
     scale_m = scale_m or default_metres(stored.dtype)
     read = partial(_frames, bag, topic, scale_m, by_lens=False)
     return Recording.begun(bag.path.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
@@ -224,7 +263,8 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
 
 def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
     """Return the topic to read, and a note on the other topics."""
-    path, topics = bag.path, bag.topics
+    path = bag.path
+    topics = bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     images = _depth_topics(bag)
     both = ", ".join([*clouds, *images])
@@ -233,12 +273,16 @@ def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
     if given.topic is not None:
         name = given.topic if given.topic in topics else f"/{given.topic}"
         if name not in topics:
-            raise UserError(f"{path}: no topic {given.topic}; its topics: {held}", legal=both or LEGAL_BAG)
+            raise UserError(
+                f"{path}: no topic {given.topic}; its topics: {held}", legal=both or LEGAL_BAG
+            )
         if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
         return name, ""
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
-    if len(images) == 1 and (not clouds or given.intrinsics or given.lens or _infos_of(bag, images[0])):
+    if len(images) == 1 and (
+        not clouds or given.intrinsics or given.lens or _infos_of(bag, images[0])
+    ):
         also = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
         return images[0], f"the depth images on {images[0]} are read{also}" if clouds else ""
     if len(usual) == 1:
@@ -246,22 +290,35 @@ def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
         return usual[0], f"the clouds on {usual[0]} are read{also}" if images else ""
     if not both:
         fix = "record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info"
-        raise UserError(f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}", legal=kinds, fix=fix)
+        raise UserError(
+            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}",
+            legal=kinds,
+            fix=fix,
+        )
     own = next((topic for topic in images if _infos_of(bag, topic)), "")
-    found = f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
+    found = (
+        f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
+    )
     fix = f"choose one, for instance --topic {own or (images or clouds)[0]}"
     raise UserError(f"{path}: {found}", legal=both, fix=fix)
 
 
 def _depth_topics(bag: Bag) -> list[str]:
-    """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and no copies."""
+    """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and
+    no copies."""
     found = []
-    for topic in (name for name, kind in bag.topics.items() if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)):
+    for topic in (
+        name
+        for name, kind in bag.topics.items()
+        if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)
+    ):
         message = bag.first(topic)
         encoding = encoding_of(message) if message is not None else ""
         if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
             found.append(topic)
-    return [topic for topic in found if _of_pictures(topic) == topic or _of_pictures(topic) not in found]
+    return [
+        topic for topic in found if _of_pictures(topic) == topic or _of_pictures(topic) not in found
+    ]
 
 
 def _of_pictures(topic: str) -> str:
@@ -271,12 +328,17 @@ def _of_pictures(topic: str) -> str:
 def _infos_of(bag: Bag, topic: str) -> list[str]:
     """Return the CameraInfo topics that belong to a picture by name."""
     folder = _of_pictures(topic).rpartition("/")[0]
-    names = (f"{folder}/camera_info", f"{folder.rpartition('/')[0]}/info/camera_info", f"{topic}/camera_info")
+    names = (
+        f"{folder}/camera_info",
+        f"{folder.rpartition('/')[0]}/info/camera_info",
+        f"{topic}/camera_info",
+    )
     return [name for name in names if bag.topics.get(name) == INFO_TYPE]
 
 
 def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
-    """Return the lens of depth images. Raises UserError if the bag has none for them, or one of another model."""
+    """Return the lens of depth images. Raises UserError if the bag has none for them, or one of
+    another model."""
     every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
@@ -286,32 +348,51 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
         if isinstance(lens, Lens):
             return lens
         why.append(f"{info} {lens}")
-    reason = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+    reason = (
+        "; ".join(why)
+        or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+    )
     what = f"{bag.path}: {reason}: the lens of these depth images is unknown; without it they give no points"
     fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
     raise UserError(what, legal=LEGAL_LENS, fix=fix)
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A rectified image has the
-    lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are accounted for."""
-    d, k, p = (np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float) for key in ("d", "k", "p"))
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A
+    rectified image has the lens P and no distortion. K and P are of the whole sensor: binning and
+    the region of interest are accounted for."""
+    d, k, p = (
+        np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float)
+        for key in ("d", "k", "p")
+    )
     d = np.zeros(0) if is_rectified or not d.any() else d
     model = str(message.distortion_model)
-    across, down = max(1, int(message.binning_x)), max(1, int(message.binning_y))
+    across = max(1, int(message.binning_x))
+    down = max(1, int(message.binning_y))
     roi = message.roi
-    width, height = (int(roi.width), int(roi.height)) if roi.width and roi.height else (message.width, message.height)
+    width, height = (
+        (int(roi.width), int(roi.height))
+        if roi.width and roi.height
+        else (message.width, message.height)
+    )
     if (height // down, width // across) != tuple(shape):
         return f"is for images of {width // across} x {height // down} pixels, not {shape[1]} x {shape[0]}"
-    if d.size and (model.lower() not in KNOWN_MODELS or d.size not in (4, 5, 8, 12, 14) or d[8:].any()):
+    if d.size and (
+        model.lower() not in KNOWN_MODELS or d.size not in (4, 5, 8, 12, 14) or d[8:].any()
+    ):
         return f"has the distortion model {model or '(none)'} with {d.size} numbers, which is not supported"
-    fx, fy, cx, cy = p[[0, 5, 2, 6]] if is_rectified and p.size == 12 and p[0] > 0 else k[[0, 4, 2, 5]]
+    fx, fy, cx, cy = (
+        p[[0, 5, 2, 6]] if is_rectified and p.size == 12 and p[0] > 0 else k[[0, 4, 2, 5]]
+    )
     if not np.isfinite([*d, fx, fy, cx, cy]).all() or not (fx > 0 and fy > 0):
         return f"states the focal length {fx:g}, {fy:g}, as an uncalibrated camera does"
     # pixel positions count from the first pixel's centre, which lies half a pixel inside
-    cx, cy = (cx - roi.x_offset + 0.5) / across - 0.5, (cy - roi.y_offset + 0.5) / down - 0.5
+    cx = (cx - roi.x_offset + 0.5) / across - 0.5
+    cy = (cy - roi.y_offset + 0.5) / down - 0.5
     distortion = tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8))))
-    return Lens(shape[1], shape[0], float(fx / across), float(fy / down), float(cx), float(cy), distortion)
+    return Lens(
+        shape[1], shape[0], float(fx / across), float(fy / down), float(cx), float(cy), distortion
+    )
 
 
 def _off_ray_px(lens: Lens, frame: Frame) -> float:
@@ -319,6 +400,9 @@ def _off_ray_px(lens: Lens, frame: Frame) -> float:
     assert frame.xy_m is not None
     valid = np.isfinite(frame.z_m)
     slopes = lens.region_slopes(lens.whole)[valid]
-    off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (lens.fx, lens.fy)
+    off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (
+        lens.fx,
+        lens.fy,
+    )
     worst = float(off.max()) if valid.any() else float("inf")
     return worst if np.isfinite(worst) else float("inf")

@@ -1,9 +1,11 @@
-"""Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv, .asc, .pts).
+"""Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv,
+.asc, .pts).
 
-Open3D drops the grid and fills a truncated PLY with zeros, so the header is read here: a PCD is organised if HEIGHT >
-1, a PLY if it states num_cols and num_rows. A list has one point per line: x y z, then an intensity, or red green blue,
-or both, unless a line of names says otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-given by a lens with as many pixels, or by a common sensor size on which x/z and y/z rise evenly."""
+Open3D drops the grid and fills a truncated PLY with zeros, so the header is read here: a PCD is
+organised if HEIGHT > 1, a PLY if it states num_cols and num_rows. A list has one point per line: x
+y z, then an intensity, or red green blue, or both, unless a line of names says otherwise. Its grid
+is stated by a comment or a first line of two whole numbers, or given by a lens with as many
+pixels, or by a common sensor size on which x/z and y/z rise evenly."""
 
 import codecs
 import io
@@ -28,22 +30,30 @@ from harness.vocabulary.geometry import Frame, Lens
 CLOUDS = (".ply", ".pcd")
 POINT_LISTS = (".xyz", ".asc", ".pts", ".txt", ".csv")
 RASTER_CORRELATION = 0.999
-"""Correlation of x/z with the column and y/z with the row on a true pixel grid; a distorted lens reduces it by 1 %."""
+"""Correlation of x/z with the column and y/z with the row on a true pixel grid; a distorted lens
+reduces it by 1 %."""
 
 
 def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
     """Open clouds in the order given, one frame each. Raises UserError for a broken file."""
     scale_m = given.scale_m or UNITS_M["m"]
     is_list = paths[0].suffix.lower() in POINT_LISTS
-    read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, given.lens, scale_m)
+    read = partial(
+        _frames, tuple(paths), _read_list if is_list else _read_cloud, given.lens, scale_m
+    )
     recording = Recording.begun(name, read, scale_m, files=tuple(paths))
     height, width = recording.shape
-    note = NO_GRID if height == 1 else f"the points fill a grid of {width} x {height} pixels" * is_list
+    note = (
+        NO_GRID if height == 1 else f"the points fill a grid of {width} x {height} pixels" * is_list
+    )
     return replace(recording, organised=height > 1, notes=(note,))
 
 
-def _frames(paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: float) -> Iterator[Frame]:
-    """Yield one cloud per file, (h, w), or (1, n) without a grid. ``lens`` only tells if a list fills a pixel grid."""
+def _frames(
+    paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: float
+) -> Iterator[Frame]:
+    """Yield one cloud per file, (h, w), or (1, n) without a grid. ``lens`` only tells if a list
+    fills a pixel grid."""
     for path in paths:
         points, grid, rgb, amplitude = reader(path, lens)
         amplitude = None if amplitude is None else amplitude.astype(np.float32).reshape(grid)
@@ -70,13 +80,17 @@ def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
         if width * height == count and valid.sum() >= 100:
             v, u = np.divmod(np.arange(count), width)
             slopes = points[valid, :2] / points[valid, 2, None]
-            turns = [np.corrcoef(slopes[:, axis], at[valid])[0, 1] for axis, at in enumerate((u, v))]
+            turns = [
+                np.corrcoef(slopes[:, axis], at[valid])[0, 1] for axis, at in enumerate((u, v))
+            ]
             if min(map(abs, turns)) > RASTER_CORRELATION:
                 return height, width
     return 1, count
 
 
-LEGAL_CLOUD = "PLY (ASCII or binary) or PCD (ASCII, binary or compressed) with x, y, z for each point"
+LEGAL_CLOUD = (
+    "PLY (ASCII or binary) or PCD (ASCII, binary or compressed) with x, y, z for each point"
+)
 PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8} | {
     "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8,
 }  # fmt: skip
@@ -87,12 +101,16 @@ PCD_NUMBERS = 10_000  # numbers in one point; published clouds have descriptors 
 LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent at most 264
 
 
-def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
+def _read_cloud(
+    path: Path, _: Lens | None
+) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
     """Read one PLY or PCD. Raises UserError if it has no header, holds no points, or is truncated."""
     o3d = load_open3d()
     with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)
-    width, height, data_bytes = (_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(path, content)
+    width, height, data_bytes = (_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(
+        path, content
+    )
     if width * height < 1:
         raise UserError(f"{path}: holds no points", legal=LEGAL_CLOUD)
     refuse_pixels(f"{path}: its cloud", width, height)
@@ -101,26 +119,35 @@ def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int]
         raise UserError(what, legal="a whole file", fix="copy or export it again")
     # Open3D prints warnings to the terminal; their causes are checked here and reported once
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
+        cloud = o3d.t.io.read_point_cloud(
+            str(path), remove_nan_points=False, remove_infinite_points=False
+        )
     read = len(cloud.point.positions) if "positions" in cloud.point else 0
     if read != width * height:
         what = f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
         raise UserError(what, legal=LEGAL_CLOUD, fix="copy or export it again")
     attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
-    points, rgb = attributes["positions"], attributes.get("colors")
+    points = attributes["positions"]
+    rgb = attributes.get("colors")
     if rgb is not None and rgb.dtype != np.uint8:  # floating-point colours run from 0 to 1
         rgb = np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
-    grey = (attributes[key] for key in ("intensity", "intensities", "amplitude") if key in attributes)
+    grey = (
+        attributes[key] for key in ("intensity", "intensities", "amplitude") if key in attributes
+    )
     return points, (height, width) if height > 1 else _grid_of(points), rgb, next(grey, None)
 
 
 def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return width, height (1 without a grid) and the least number of bytes of a file with this header."""
+    """Return width, height (1 without a grid) and the least number of bytes of a file with this
+    header."""
     end = re.search(rb"end_header\r?\n", content)
     if not content.startswith(b"ply") or end is None:
         raise UserError(f"{path}: is not a PLY file, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
-    points, bytes_each, element, names = 0, 0, "", list[str]()
+    points = 0
+    bytes_each = 0
+    element = ""
+    names = list[str]()
     for words in (line.split() for line in lines if line.strip()):
         if words[0] == "element" and len(words) == 3:
             if words[1] == "vertex" and points:
@@ -135,7 +162,9 @@ def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
     is_ascii = any(line.split()[:2] == ["format", "ascii"] for line in lines)
     # Each number of an ASCII line takes at least a digit and a separator.
     least = end.end() + (points * 2 * len(names) - 1 if is_ascii else points * bytes_each)
-    columns, rows = _stated_size([line for line in lines if line.startswith(("obj_info", "comment"))])
+    columns, rows = _stated_size(
+        [line for line in lines if line.startswith(("obj_info", "comment"))]
+    )
     return (columns, rows, least) if columns * rows == points and rows > 1 else (points, 1, least)
 
 
@@ -145,7 +174,11 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
     if end is None:
         raise UserError(f"{path}: is not a PCD file, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
-    fields = {words[0]: words[1:] for line in lines if (words := line.split()) and not line.startswith("#")}
+    fields = {
+        words[0]: words[1:]
+        for line in lines
+        if (words := line.split()) and not line.startswith("#")
+    }
 
     def count(text: str) -> int:
         if not COUNT.fullmatch(text):
@@ -153,10 +186,13 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
         return int(text)
 
     with read_errors(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
-        width, height = count(fields["WIDTH"][0]), count(fields["HEIGHT"][0])
+        width = count(fields["WIDTH"][0])
+        height = count(fields["HEIGHT"][0])
         points = count(fields["POINTS"][0]) if "POINTS" in fields else width * height
         sizes = [count(text) for text in fields["SIZE"]]
-        counts = [count(text) for text in fields["COUNT"]] if "COUNT" in fields else [1] * len(sizes)
+        counts = (
+            [count(text) for text in fields["COUNT"]] if "COUNT" in fields else [1] * len(sizes)
+        )
         if not len(fields["FIELDS"]) == len(fields["TYPE"]) == len(sizes) == len(counts):
             raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in length")
         if not set(sizes) <= {1, 2, 4, 8} or sum(counts) > PCD_NUMBERS:
@@ -186,7 +222,9 @@ COLUMNS = {
 }
 
 
-def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
+def _read_list(
+    path: Path, lens: Lens | None
+) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
     """Read one list of points. Raises UserError if it cannot be read as numbers."""
     with read_errors(f"{path}: cannot be read", LEGAL_LIST):
         content = bounded_bytes(path, TABLE_BYTES).removeprefix(codecs.BOM_UTF8)
@@ -194,12 +232,20 @@ def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, in
     head = [bool(re.match(r"\s*(#|//|;|$)", line)) or _numbers(line) is None for line in lines]
     skipped = head.index(False) if False in head else len(lines)
     first = (_numbers(lines[skipped]) or []) if skipped < len(lines) else []
-    size = [int(value) for value in first] if len(first) in (1, 2) and all(v == int(v) >= 1 for v in first) else []
+    size = (
+        [int(value) for value in first]
+        if len(first) in (1, 2) and all(v == int(v) >= 1 for v in first)
+        else []
+    )
     skipped += bool(size)
     if skipped >= len(lines):
-        raise UserError(f"{path}: no line of numbers among its first {len(lines)}", legal=LEGAL_LIST)
+        raise UserError(
+            f"{path}: no line of numbers among its first {len(lines)}", legal=LEGAL_LIST
+        )
     values = _table(path, content, skipped, lines[skipped])
-    columns = _columns(path, values, lines[skipped - 1 - bool(size)] if skipped > bool(size) else "")
+    columns = _columns(
+        path, values, lines[skipped - 1 - bool(size)] if skipped > bool(size) else ""
+    )
     width, height = size if len(size) == 2 else _stated_size(lines[:skipped])
     points = np.stack([columns[axis] for axis in "xyz"], axis=-1)
     refuse_pixels(str(path), len(points), 1)
@@ -207,7 +253,9 @@ def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, in
     if set("rgb") <= set(columns):
         rgb = np.stack([columns[channel] for channel in "rgb"], axis=-1)
         rgb = np.nan_to_num(rgb * 255 if np.nanmax(rgb) <= 1 else rgb).clip(0, 255).astype(np.uint8)
-    grid = (height, width) if width * height == len(points) and height > 1 else _grid_of(points, lens)
+    grid = (
+        (height, width) if width * height == len(points) and height > 1 else _grid_of(points, lens)
+    )
     return points, grid, rgb, columns.get("i")
 
 
@@ -220,23 +268,39 @@ def _numbers(line: str) -> list[float] | None:
 
 
 def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
-    """Return numbers (n, columns). A comma within numbers that semicolons or tabs separate is a decimal point."""
+    """Return numbers (n, columns). A comma within numbers that semicolons or tabs separate is a
+    decimal point."""
     import pandas
 
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)
     content = content.translate(bytes.maketrans(b",;", b". " if is_decimal_comma else b"  "))
-    options: Any = {"sep": r"\s+", "header": None, "comment": "#", "dtype": np.float64, "encoding": "latin1"}
+    options: Any = {
+        "sep": r"\s+",
+        "header": None,
+        "comment": "#",
+        "dtype": np.float64,
+        "encoding": "latin1",
+    }
     with read_errors(f"{path}: cannot be read as points", LEGAL_LIST):
-        values: np.ndarray = pandas.read_csv(io.BytesIO(content), skiprows=skipped, **options).to_numpy()
+        values: np.ndarray = pandas.read_csv(
+            io.BytesIO(content), skiprows=skipped, **options
+        ).to_numpy()
     if 3 <= values.shape[1] <= MOST_COLUMNS:
         return values
     is_image = values.shape[1] > MOST_COLUMNS
-    fix = "if it is a depth image, save it by numpy.save('depth.npy', ..), then name depth.npy" if is_image else None
-    raise UserError(f"{path}: {values.shape[1]} numbers in a line are not a point", legal=LEGAL_LIST, fix=fix)
+    fix = (
+        "if it is a depth image, save it by numpy.save('depth.npy', ..), then name depth.npy"
+        if is_image
+        else None
+    )
+    raise UserError(
+        f"{path}: {values.shape[1]} numbers in a line are not a point", legal=LEGAL_LIST, fix=fix
+    )
 
 
 def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]:
-    """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name them."""
+    """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name
+    them."""
     bare = re.sub(r"\([^)]*\)|\[[^]]*\]", " ", line).strip(" #/\t\r,;").lower()
     names = [COLUMNS.get(word, "") for word in re.split(r"[,;\s]+", bare)]
     count = values.shape[1]
@@ -247,7 +311,9 @@ def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]
         raise UserError(what, legal=LEGAL_LIST)
     colour = {6: "rgb", 7: "irgb"}.get(count, "i" if count in (4, 5) else "")
     found = {name: values[:, i] for i, name in enumerate("xyz" + colour)}
-    if "r" in found and ((beyond := values[:, count - 3 :]).min() < 0 or beyond.max() > 255 or (beyond % 1).any()):
+    if "r" in found and (
+        (beyond := values[:, count - 3 :]).min() < 0 or beyond.max() > 255 or (beyond % 1).any()
+    ):
         # normals or something else, but no colour
         return {name: found[name] for name in found if name not in "rgb"}
     return found

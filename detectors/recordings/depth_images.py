@@ -1,8 +1,10 @@
-"""Folders and lists of 16-bit depth PNGs: Open3D's recorder, Azure SDK exports, TUM RGB-D, or bare pictures.
+"""Folders and lists of 16-bit depth PNGs: Open3D's recorder, Azure SDK exports, TUM RGB-D, or bare
+pictures.
 
-The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), by names that contain "depth",
-or by names that are numbers; else every 16-bit grey PNG counts. A ``depth.txt`` marks TUM RGB-D. A picture's first
-bytes show its kind, and Pillow reads its header: OpenCV would decode 30,000 x 30,000 pixels into gigabytes."""
+The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), by names
+that contain "depth", or by names that are numbers; else every 16-bit grey PNG counts. A
+``depth.txt`` marks TUM RGB-D. A picture's first bytes show its kind, and Pillow reads its header:
+OpenCV would decode 30,000 x 30,000 pixels into gigabytes."""
 
 import io
 import re
@@ -29,8 +31,8 @@ LEGAL_PICTURE = "PNG or JPEG"
 
 
 def read_picture(path: Path, flags: int) -> np.ndarray:
-    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError if
-    it is another kind of file, cannot be decoded, or is too large."""
+    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first.
+    Raises UserError if it is another kind of file, cannot be decoded, or is too large."""
     with read_errors(f"{path}: cannot be read", LEGAL_PICTURE):
         content = bounded_bytes(path, PICTURE_BYTES)
     return decoded(str(path), content, flags)
@@ -47,30 +49,42 @@ def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
 
 
 def refuse_broken_png(name: str, content: bytes) -> None:
-    """Raise UserError if a PNG is truncated or a checksum fails: the decoder may fill the rest with zeros."""
+    """Raise UserError if a PNG is truncated or a checksum fails: the decoder may fill the rest
+    with zeros."""
     try:
         _header(name, content).verify()
     except (SyntaxError, OSError, ValueError) as error:
         what = "damaged" if "broken" in str(error) or "checksum" in str(error) else "truncated"
-        what, fix = f"{name}: is {what} ({error}; {len(content)} bytes)", "copy or export it again"
+        what = f"{name}: is {what} ({error}; {len(content)} bytes)"
+        fix = "copy or export it again"
         raise UserError(what, legal="a whole PNG", fix=fix) from error
 
 
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
     """Read only the header of a picture, as the kind that its first bytes show."""
-    kind = PngImagePlugin.PngImageFile if content.startswith(PNG_SIGNATURE) else JpegImagePlugin.JpegImageFile
-    with read_errors(f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated", LEGAL_PICTURE):
+    kind = (
+        PngImagePlugin.PngImageFile
+        if content.startswith(PNG_SIGNATURE)
+        else JpegImagePlugin.JpegImageFile
+    )
+    with read_errors(
+        f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated", LEGAL_PICTURE
+    ):
         return kind(io.BytesIO(content))
 
 
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg")
 TUM_MATCH_S = 0.02
-"""Largest difference of time stamps of depth and colour that belong together (the benchmark's own default)."""
+"""Largest difference of time stamps of depth and colour that belong together (the benchmark's own
+default)."""
 LEGAL_PNG = "16-bit single-channel PNG (uint16, 0 = no depth)"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
-NOT_DEPTH = re.compile(r"(?i)(^|[/_.-])(ir|infra\w*|conf\w*|amplitude|intensity|reflectivity|mask)([/_.-]|\d|$)")
-"""Words in the names of files and topics of other pictures that a depth camera writes in 16 bits or floating point."""
+NOT_DEPTH = re.compile(
+    r"(?i)(^|[/_.-])(ir|infra\w*|conf\w*|amplitude|intensity|reflectivity|mask)([/_.-]|\d|$)"
+)
+"""Words in the names of files and topics of other pictures that a depth camera writes in 16 bits
+or floating point."""
 
 
 def open_depth_folder(folder: Path, given: Given) -> Recording:
@@ -81,14 +95,23 @@ def open_depth_folder(folder: Path, given: Given) -> Recording:
     is_tum = any((place / "depth.txt").is_file() for place in (folder, folder.parent))
 
     colour_folder = next((root / name for name in COLOUR_FOLDERS if (root / name).is_dir()), None)
-    beside = [path for path in shown(root) if re.search("colou?r|rgb", path.stem.lower()) and path not in depths]
+    beside = [
+        path
+        for path in shown(root)
+        if re.search("colou?r|rgb", path.stem.lower()) and path not in depths
+    ]
     found = beside if colour_folder is None else shown(colour_folder)
     pictures = [path for path in found if path.suffix.lower() in COLOUR_SUFFIXES]
-    # the colour picture of each depth picture: the same number in its name, or the nearest time stamp
+    # the colour picture of each depth picture: the same number in its name, or the nearest time
+    # stamp
     stamps = {number: path for path in pictures if (number := _last_number(path)) is not None}
     colours: list[Path | None] = []
     for number in map(_last_number, depths):
-        apart = {abs(stamp - number): path for stamp, path in stamps.items()} if number is not None else {}
+        apart = (
+            {abs(stamp - number): path for stamp, path in stamps.items()}
+            if number is not None
+            else {}
+        )
         is_near = bool(apart) and min(apart) <= (TUM_MATCH_S if is_tum else 0.0)
         colours.append(apart[min(apart)] if is_near else None)
     note = ""
@@ -107,28 +130,41 @@ def open_depth_list(
     is_tum: bool = False,
     note: str = "",
 ) -> Recording:
-    """Open depth PNGs in the order given. ``root``: folder of the capture, in or beside which their lens is sought.
-    ``colours``: the colour picture of each, if any. Raises UserError if their lens is not known."""
+    """Open depth PNGs in the order given. ``root``: folder of the capture, in or beside which
+    their lens is sought. ``colours``: the colour picture of each, if any. Raises UserError if
+    their lens is not known."""
     root = root or depths[0].parent
     width, height = _depth_size(depths[0])
-    lens, lens_files = lens_for(str(root), given, width, height, beside=(root, depths[0].parent, root.parent))
+    lens, lens_files = lens_for(
+        str(root), given, width, height, beside=(root, depths[0].parent, root.parent)
+    )
     notes = [note]
     first = next((path for path in colours if path), None)
     if first is not None and (found := _colour(first).shape)[:2] != (height, width):
         colours = ()
-        notes = [f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"]
+        notes = [
+            f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"
+        ]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are assumed to be undistorted")
     scale_m = given.scale_m or UNITS_M["tum" if is_tum else "mm"]
-    is_whole = scale_m != UNITS_M["tum"]  # its unit of 0.2 mm is finer than the steps of most cameras
-    files, unit_from = (*depths, *filter(None, colours), *lens_files), "depth.txt, which marks TUM RGB-D" * is_tum
+    is_whole = (
+        scale_m != UNITS_M["tum"]
+    )  # its unit of 0.2 mm is finer than the steps of most cameras
+    files = (*depths, *filter(None, colours), *lens_files)
+    unit_from = "depth.txt, which marks TUM RGB-D" * is_tum
     more = {"files": files, "lens": lens, "notes": tuple(notes), "unit_from": unit_from}
-    recording = Recording.begun(name, partial(_frames, depths, colours, scale_m), scale_m, is_whole, **more)
+    recording = Recording.begun(
+        name, partial(_frames, depths, colours, scale_m), scale_m, is_whole, **more
+    )
     return replace(recording, z_step_m=recording.z_step_m or scale_m)
 
 
-def _frames(depths: Sequence[Path], colours: Sequence[Path | None], scale_m: float) -> Iterator[Frame]:
-    """Yield one frame per file. Raises UserError if a file is missing, truncated or not 16-bit grey."""
+def _frames(
+    depths: Sequence[Path], colours: Sequence[Path | None], scale_m: float
+) -> Iterator[Frame]:
+    """Yield one frame per file. Raises UserError if a file is missing, truncated or not 16-bit
+    grey."""
     for depth, colour in zip_longest(depths, colours):
         rgb = _colour(colour) if colour else None
         yield frame_of(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), scale_m, rgb)
@@ -140,18 +176,24 @@ def shown(folder: Path) -> list[Path]:
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:
-    """Return a folder's depth pictures by their numbers, without masks. Raises UserError if there is none."""
+    """Return a folder's depth pictures by their numbers, without masks. Raises UserError if there
+    is none."""
     pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
     # a 16-bit infrared picture looks like depth
-    chosen = depth_named(pictures, numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)])
+    chosen = depth_named(
+        pictures, numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)]
+    )
     if not chosen:
-        raise UserError(f"{folder}: contains no depth picture ({len(pictures)} PNG files)", legal=LEGAL_PNG)
+        raise UserError(
+            f"{folder}: contains no depth picture ({len(pictures)} PNG files)", legal=LEGAL_PNG
+        )
     return chosen
 
 
 def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the files whose names contain "depth", else ``others`` without `NOT_DEPTH`, sorted by number."""
+    """Return the files whose names contain "depth", else ``others`` without `NOT_DEPTH`, sorted by
+    number."""
     chosen = [path for path in paths if "depth" in path.stem.lower()]
     chosen = chosen or [path for path in others if not NOT_DEPTH.search(path.stem)]
 
@@ -163,18 +205,22 @@ def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ..
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """Return (width, height, bits, colour type) of a PNG. Raises UserError if it is not a PNG, or too large."""
+    """Return (width, height, bits, colour type) of a PNG. Raises UserError if it is not a PNG, or
+    too large."""
     with read_errors(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
-        raise UserError(f"{path}: is not a PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again")
+        raise UserError(
+            f"{path}: is not a PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again"
+        )
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
     refuse_pixels(str(path), width, height)
     return width, height, bits, kind
 
 
 def read_depth_png(path: Path) -> np.ndarray:
-    """Return the stored numbers (h, w) uint16. Raises UserError if the file is broken or not 16-bit grey."""
+    """Return the stored numbers (h, w) uint16. Raises UserError if the file is broken or not
+    16-bit grey."""
     _depth_size(path)
     content = bounded_bytes(path, PICTURE_BYTES)
     refuse_broken_png(str(path), content)
@@ -184,9 +230,17 @@ def read_depth_png(path: Path) -> np.ndarray:
 def _depth_size(path: Path) -> tuple[int, int]:
     width, height, bits, kind = png_kind(path)
     if (bits, kind) != (16, 0):
-        channels = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}.get(kind, f"type {kind}")
-        what = f"{path}: {bits} bits per channel, {channels}: a picture or a mask, not a depth image"
-        raise UserError(what, legal=LEGAL_PNG, fix="export the depth itself; a preview scaled to 0..255 has lost it")
+        channels = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}.get(
+            kind, f"type {kind}"
+        )
+        what = (
+            f"{path}: {bits} bits per channel, {channels}: a picture or a mask, not a depth image"
+        )
+        raise UserError(
+            what,
+            legal=LEGAL_PNG,
+            fix="export the depth itself; a preview scaled to 0..255 has lost it",
+        )
     return width, height
 
 

@@ -1,4 +1,5 @@
-"""Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its origin."""
+"""Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its
+origin."""
 
 import math
 import re
@@ -10,18 +11,26 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Reason
 
 UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "in": 0.0254, "tum": 1 / 5000}
-"""Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre."""
-LEGAL_UNITS = "mm, cm, m, um, in (inch), tum (5000 to the metre), or N/m for N to the metre (4000/m)"
-NEAREST_M, FARTHEST_M = 0.05, 20.0
+"""Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre.
+"""
+LEGAL_UNITS = (
+    "mm, cm, m, um, in (inch), tum (5000 to the metre), or N/m for N to the metre (4000/m)"
+)
+NEAREST_M = 0.05
+FARTHEST_M = 20.0
 """Bounds of a plausible median distance: no time-of-flight camera works nearer or sees farther."""
-FARTHEST_ASIDE = 4.0  # largest ratio of the median point's distance from the axis to its z: 76 degrees
+FARTHEST_ASIDE = (
+    4.0  # largest ratio of the median point's distance from the axis to its z: 76 degrees
+)
 RAYS_TELL = 3.0
-"""Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a pipe's up to 2."""
+"""Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a
+pipe's up to 2."""
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
 CAMERA_FRAME = "the camera's frame: x right, y down, z forward from the lens"
 TURNED_SHARE = 0.99
-"""Least share of points with z below 0 for which the cloud is turned: no camera measures behind itself."""
+"""Least share of points with z below 0 for which the cloud is turned: no camera measures behind
+itself."""
 
 
 def metres_per_unit(unit: str) -> float:
@@ -35,26 +44,38 @@ def metres_per_unit(unit: str) -> float:
 
 
 def default_metres(dtype: np.dtype) -> float:
-    """Return the usual unit of stored numbers: millimetres for integers, metres for floating point."""
+    """Return the usual unit of stored numbers: millimetres for integers, metres for floating
+    point."""
     return UNITS_M["mm"] if dtype.kind in "iu" else UNITS_M["m"]
 
 
 def refuse_narrow(name: str, dtype: np.dtype) -> None:
-    """Raise UserError if the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
+    """Raise UserError if the numbers cannot be distances: 8 bit, boolean, complex, text or
+    objects."""
     is_narrow = dtype.kind in "iu" and dtype.itemsize == 1
     if is_narrow or dtype.kind not in "iuf":
-        what = "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
+        what = (
+            "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
+        )
         legal = "integers of 16 bits or more, or floating point"
-        fix = "export the depth itself, not a preview" if is_narrow else "save an array of plain numbers"
+        fix = (
+            "export the depth itself, not a preview"
+            if is_narrow
+            else "save an array of plain numbers"
+        )
         raise UserError(f"{name}: holds {what}", legal=legal, fix=fix)
 
 
 def frame_of(
-    name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
+    name: str,
+    stored: np.ndarray,
+    scale_m: float,
+    rgb: np.ndarray | None = None,
+    amplitude: np.ndarray | None = None,
 ) -> Frame:
-    """Convert stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres to a frame. 0 and
-    `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError if most, not all, is
-    negative."""
+    """Convert stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres to a frame. 0
+    and `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises
+    UserError if most, not all, is negative."""
     stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
@@ -70,16 +91,22 @@ def frame_of(
     turned = valid.any() and behind.sum() > TURNED_SHARE * valid.sum()
     if turned:
         share = f"z is negative in {100 * behind.sum() / valid.sum():.3g} % of the points"
-        notes.append(f"{share}: the cloud was turned by 180 degrees about x, to y down and z forward")
+        notes.append(
+            f"{share}: the cloud was turned by 180 degrees about x, to y down and z forward"
+        )
         behind = ~behind & valid
-    elif behind.sum() > max((0.5 if stored.ndim == 2 else 1 - TURNED_SHARE) * valid.sum(), SHARED_CODE):
+    elif behind.sum() > max(
+        (0.5 if stored.ndim == 2 else 1 - TURNED_SHARE) * valid.sum(), SHARED_CODE
+    ):
         what = f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the camera (z below 0)"
         fix = "transform the cloud (from y up, z back: negate y and z; from x forward, z up: take -y, -z, x)"
         raise UserError(what, legal=CAMERA_FRAME, fix=fix)
     reason[behind] = Reason.OUT_OF_RANGE
     xy_m = None
     if stored.ndim == 3:
-        reason[~np.isfinite(stored[..., :2]).all(axis=-1) & (reason == Reason.VALID)] = Reason.NOT_FINITE
+        reason[~np.isfinite(stored[..., :2]).all(axis=-1) & (reason == Reason.VALID)] = (
+            Reason.NOT_FINITE
+        )
         xy_m = stored[..., :2].astype(np.float64) * (scale_m, -scale_m if turned else scale_m)
         xy_m[reason != Reason.VALID] = np.nan
     z_m = (stored_z * np.float64(-scale_m if turned else scale_m)).astype(np.float32)
@@ -89,15 +116,17 @@ def frame_of(
 
 SHARED_CODE = 20  # pixels that must share a number before it can be a full scale
 ISOLATED = 4.0
-"""Factor between codes and all distances: a wall four times as far as the rest has more than a few distances."""
+"""Factor between codes and all distances: a wall four times as far as the rest has more than a few
+distances."""
 FEW_CODES = 8
 
 
 def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
-    """Return the numbers among ``stored`` (n,), finite and not 0, that cannot be distances: they mean "no return". Four
-    kinds: the largest number of the type (in metres, 65.535); a full scale of fewer bits (4095, 65534 ..) that many
-    pixels share, well beyond all others; at most `FEW_CODES` different numbers that are `ISOLATED` times farther than
-    all others or, for integers, nearer; at most three negative numbers. Codes amid distances are not found."""
+    """Return the numbers among ``stored`` (n,), finite and not 0, that cannot be distances: they
+    mean "no return". Four kinds: the largest number of the type (in metres, 65.535); a full scale
+    of fewer bits (4095, 65534 ..) that many pixels share, well beyond all others; at most
+    `FEW_CODES` different numbers that are `ISOLATED` times farther than all others or, for
+    integers, nearer; at most three negative numbers. Codes amid distances are not found."""
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
@@ -109,15 +138,20 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
         top = rest.max().item()
         below = rest[rest < top]
         # 16-bit numbers are often divided by 1000 before they are stored in metres
-        is_largest = top == np.iinfo(stored.dtype).max if is_integer else bool(np.isclose(top, 65.535, 1e-6))
+        is_largest = (
+            top == np.iinfo(stored.dtype).max if is_integer else bool(np.isclose(top, 65.535, 1e-6))
+        )
         bits = math.log2(top + 3) if top < 2**32 else 0
         below_power = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
-        shared = rest.size - below.size >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
+        shared = (
+            rest.size - below.size >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
+        )
         if not (is_largest or (below_power and shared)):
             break
         codes.append(float(top))
         rest = below
-    # Between neighbours that differ by a factor of four, an octave is empty: most frames need no sorting.
+    # Between neighbours that differ by a factor of four, an octave is empty: most frames need no
+    # sorting.
     if rest.size and not np.bincount((octaves := np.frexp(rest)[1]) - octaves.min()).all():
         different = np.unique(rest)
         ratios = different[1:] / different[:-1].astype(np.float64)
@@ -131,26 +165,62 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
     return tuple(codes)
 
 
-UNIT_KEYS = ("depthscale", "depthunits", "depthunit", "depthfactor", "depthmapfactor", "pngdepthscale", "zunits")
-UNIT_NAMES = {"mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "cm": 1e-2, "m": 1.0, "meter": 1.0, "metre": 1.0}
+UNIT_KEYS = (
+    "depthscale",
+    "depthunits",
+    "depthunit",
+    "depthfactor",
+    "depthmapfactor",
+    "pngdepthscale",
+    "zunits",
+)
+UNIT_NAMES = {
+    "mm": 1e-3,
+    "millimeter": 1e-3,
+    "millimetre": 1e-3,
+    "cm": 1e-2,
+    "m": 1.0,
+    "meter": 1.0,
+    "metre": 1.0,
+}
 READINGS = {
     **{"mm": (0.867, 0.15), "4000/m": (0.08, 0.0), "tum": (0.03, 0.0), "10000/m": (0.015, 0.0)},
     **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "in": (0.0003, 0.01), "m": (0.0, 0.8)},
-}  # units and how common each is among integers and floating-point numbers: guesses that hardly move a decision
-NEAR_M = (0.8, 1.8)  # middle and spread (a factor) of the usual distances of targets: 95 % are within 0.25 to 2.6 m
-NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
-"""A distance above the first has at least the second as its share of the most common distance's weight."""
-SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: no warning from the first on; below the second, the user must decide; below the third, not listed."""
+    # units and how common each is among integers and floating-point numbers: guesses that hardly move
+    # a decision
+}
+NEAR_M = (
+    0.8,
+    1.8,
+)  # middle and spread (a factor) of the usual distances of targets: 95 % are within 0.25 to 2.6 m
+NEAR_LIMIT_M = 0.15
+FAR_FLOOR = 0.05
+"""A distance above the first has at least the second as its share of the most common distance's
+weight."""
+SURE = 0.98
+LIKELY = 0.75
+SHOWN = 0.003
+"""Probabilities: no warning from the first on; below the second, the user must decide; below the
+third, not listed."""
 MILLIMETRE_SIZES = {
-    **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0}
-}  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
+    **{
+        (640, 576): 4.5,
+        (320, 288): 6.0,
+        (512, 512): 3.5,
+        (1024, 1024): 3.0,
+        (512, 424): 8.0,
+        (256, 192): 8.0,
+    }
+    # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
+}
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
-"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and their added weight."""
+"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and
+their added weight."""
 
 
 class Unit(NamedTuple):
-    """Metres in one stored number, and the ``origin`` of this unit. ``warning``: a reason for doubt, else ""."""
+    """Metres in one stored number, and the ``origin`` of this unit. ``warning``: a reason for
+    doubt, else ""."""
 
     scale_m: float
     origin: str
@@ -158,9 +228,10 @@ class Unit(NamedTuple):
 
 
 def scale_in(statements: dict[str, Any], median: float) -> float | None:
-    """Return metres in one stored number if names with values state it, else None. Values are metres (RealSense:
-    0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a unit's name. They differ by powers of 1000,
-    so the ``median`` stored number decides between them."""
+    """Return metres in one stored number if names with values state it, else None. Values are
+    metres (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a
+    unit's name. They differ by powers of 1000, so the ``median`` stored number decides between
+    them."""
     for key, value in statements.items():
         if re.sub("[^a-z]", "", str(key).lower()) not in UNIT_KEYS:
             continue
@@ -172,7 +243,9 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
         except ValueError:
             continue
         named = UNIT_NAMES.get(counted.group(2).rstrip("s"))
-        scales = [number * named] if named else [number, number * 1e-3, 1.0 / number if number else 0.0]
+        scales = (
+            [number * named] if named else [number, number * 1e-3, 1.0 / number if number else 0.0]
+        )
         fitting = {scale for scale in scales if 0.1 <= median * scale <= 10.0}
         if len(fitting) == 1:
             return fitting.pop()
@@ -180,13 +253,17 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
 
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
-    """Return the unit of numbers (n,) if nothing states it. ``size``: width and height of the image.
+    """Return the unit of numbers (n,) if nothing states it. ``size``: width and height of the
+    image.
 
-    Each of `READINGS` is weighted by how common it is and by the distance that it gives the nearest tenth of the
-    points, which usually holds the target (`NEAR_M`). A common divisor of all numbers supports the unit in which they
-    are whole millimetres. Image sizes that only cameras with 1 mm have support that unit (`MILLIMETRE_SIZES`), and
-    exclude it beyond their range. Raises UserError if no reading is clearly the most likely, with their distances."""
-    near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
+    Each of `READINGS` is weighted by how common it is and by the distance that it gives the
+    nearest tenth of the points, which usually holds the target (`NEAR_M`). A common divisor of all
+    numbers supports the unit in which they are whole millimetres. Image sizes that only cameras
+    with 1 mm have support that unit (`MILLIMETRE_SIZES`), and exclude it beyond their range.
+    Raises UserError if no reading is clearly the most likely, with their distances."""
+    near, median = (
+        float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5))
+    )
     integers = usual_m == UNITS_M["mm"]
     divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1
     reach_m = MILLIMETRE_SIZES.get(size) if integers else None
@@ -203,30 +280,46 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
         if not NEAREST_M <= median * metres <= FARTHEST_M:
             weight = 0.0
         off = math.log(max(near * metres, 1e-9) / NEAR_M[0]) / math.log(NEAR_M[1])
-        weights[unit] = weight * (math.exp(-0.5 * off * off) + FAR_FLOOR * (near * metres > NEAR_LIMIT_M))
+        weights[unit] = weight * (
+            math.exp(-0.5 * off * off) + FAR_FLOOR * (near * metres > NEAR_LIMIT_M)
+        )
     total = sum(weights.values())
     chances = {unit: weight / total if total > 0 else 0.0 for unit, weight in weights.items()}
     ranked = sorted(chances, key=lambda unit: -chances[unit])
-    shown = [f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)" for unit in ranked if chances[unit] > SHOWN]
+    shown = [
+        f"--unit {unit} ({median * metres_per_unit(unit):.3g} m)"
+        for unit in ranked
+        if chances[unit] > SHOWN
+    ]
     best = ranked[0]
     if chances[best] < LIKELY:
         what = "several units are plausible" if shown else "no usual unit is plausible"
         what = f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})"
-        fix = f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}"
+        fix = (
+            f"pass the unit; median distance in each: {', '.join(shown)}"
+            if shown
+            else f"--unit: {LEGAL_UNITS}"
+        )
         raise UserError(what, fix=fix)
-    scale_m, usual = metres_per_unit(best), f"what is usual for {'integers' if integers else 'floating-point numbers'}"
+    scale_m = metres_per_unit(best)
+    usual = f"what is usual for {'integers' if integers else 'floating-point numbers'}"
     if math.isclose(scale_m, usual_m):
         if chances[best] >= SURE:
             return Unit(scale_m, usual)
     else:
         usual = f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be {median * usual_m:.4g} m"
     also = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
-    taken = f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{also}"
-    return Unit(scale_m, usual, f"nothing states the depth unit; {taken}; state it with --unit {best}")
+    taken = (
+        f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{also}"
+    )
+    return Unit(
+        scale_m, usual, f"nothing states the depth unit; {taken}; state it with --unit {best}"
+    )
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:
-    """Return the coarsest common rounding step of which all valid distances are multiples; 0 if there is none."""
+    """Return the coarsest common rounding step of which all valid distances are multiples; 0 if
+    there is none."""
     values = z_m[np.isfinite(z_m)].astype(np.float64)
     for step_m in COMMON_STEPS_M:
         turns = values / step_m
@@ -243,9 +336,17 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
     if NEAREST_M <= median_m <= FARTHEST_M:
         return
     in_each = {unit: median_m / scale_m * metres for unit, metres in UNITS_M.items()}
-    fitting = [f"--unit {unit} (then {m:.3g} m)" for unit, m in in_each.items() if NEAREST_M <= m <= FARTHEST_M]
-    what = f"{frame.name}: the median distance would be {median_m:.4g} m, which suggests a wrong unit"
-    fix = "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
+    fitting = [
+        f"--unit {unit} (then {m:.3g} m)"
+        for unit, m in in_each.items()
+        if NEAREST_M <= m <= FARTHEST_M
+    ]
+    what = (
+        f"{frame.name}: the median distance would be {median_m:.4g} m, which suggests a wrong unit"
+    )
+    fix = (
+        "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
+    )
     raise UserError(what, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix)
 
 
@@ -255,14 +356,18 @@ def refuse_far_aside(frame: Frame) -> None:
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
         what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
         what += " off the camera's axis: the cloud is in another frame, or z has another unit than x and y"
-        raise UserError(what, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it")
+        raise UserError(
+            what, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it"
+        )
 
 
 def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
-    """Return a sentence if ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
+    """Return a sentence if ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w,
+    2), else "".
 
-    For a plane, 1/z is a plane over the slopes, so its bends over an eighth of the picture are only noise. If z is a
-    length along the ray, that holds for 1/z times the ray's length at z = 1."""
+    For a plane, 1/z is a plane over the slopes, so its bends over an eighth of the picture are
+    only noise. If z is a length along the ray, that holds for 1/z times the ray's length at z = 1.
+    """
     with np.errstate(invalid="ignore"):
         inverse = 1.0 / z_m.astype(np.float64)
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]

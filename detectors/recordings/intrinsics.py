@@ -1,4 +1,5 @@
-"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure Kinect's calibration."""
+"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure
+Kinect's calibration."""
 
 import json
 import re
@@ -15,7 +16,8 @@ from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, st
 from harness.vocabulary.geometry import Lens, OtherLens
 
 Mode = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""A readout of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in pixels."""
+"""A readout of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in
+pixels."""
 DEPTH_MODES: dict[str, Mode] = {
     "NFOV_2X2BINNED": ((512, 512), (96, 90), (320, 288)),
     "NFOV_UNBINNED": ((1024, 1024), (192, 180), (640, 576)),
@@ -28,48 +30,68 @@ OWN_LENS = "record again, or give a lens with --intrinsics FILE"
 
 
 class ColourCamera(NamedTuple):
-    """The colour camera beside the depth camera: ``T_colour_depth`` maps points (metres) from depth to colour."""
+    """The colour camera beside the depth camera: ``T_colour_depth`` maps points (metres) from
+    depth to colour."""
 
     lens: Lens
     T_colour_depth: np.ndarray
 
 
 def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
-    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for any other content."""
+    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for
+    any other content."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
     with read_errors(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
         cameras = strict_json(content.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
-        return {camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera for camera in cameras}
+        return {
+            camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera
+            for camera in cameras
+        }
 
 
 def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
-    """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode or a bad file."""
+    """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode
+    or a bad file."""
     if mode not in DEPTH_MODES:
-        raise UserError(f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES))
+        raise UserError(
+            f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES)
+        )
     camera, numbers = _camera(name, cameras, "Depth")
     if (camera["SensorWidth"], camera["SensorHeight"]) != (1024, 1024):
-        raise UserError(f"{name}: the calibrated sensor is not 1024 x 1024, as an Azure Kinect's is")
+        raise UserError(
+            f"{name}: the calibrated sensor is not 1024 x 1024, as an Azure Kinect's is"
+        )
     return _lens(name, numbers, DEPTH_MODES[mode])
 
 
 def depth_mode_of_size(width: int, height: int) -> str | None:
     """Return the depth mode whose image has this size, None if there is none."""
-    return next((name for name, (_, _, image) in DEPTH_MODES.items() if image == (width, height)), None)
+    return next(
+        (name for name, (_, _, image) in DEPTH_MODES.items() if image == (width, height)), None
+    )
 
 
-def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -> ColourCamera | None:
-    """Return the colour camera in the mode of this image's size, None without one. Raises UserError without a lens."""
+def colour_camera(
+    name: str, cameras: dict[str, Any], width: int, height: int
+) -> ColourCamera | None:
+    """Return the colour camera in the mode of this image's size, None without one. Raises
+    UserError without a lens."""
     if (width, height) not in COLOUR_SIZES:
         return None
     rows = width * 3 // 4  # the sensor is 4 : 3, and wider images are its middle
     camera, parameters = _camera(name, cameras, "PhotoVideo")
     if camera["SensorWidth"] * 9 == camera["SensorHeight"] * 16:
-        # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from row 384.
+        # Early units were calibrated on the 16:9 part of the sensor: 2304 of its 3072 rows, from
+        # row 384.
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
         parameters[3] = parameters[3] * 2304 / 3072
     T_colour_depth = np.eye(4)
-    with read_errors(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
+    with read_errors(
+        f"{name}: the colour camera's place cannot be read",
+        "Rt with Rotation and Translation",
+        OWN_LENS,
+    ):
         T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
         T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
     mode = ((width, rows), (0, (rows - height) // 2), (width, height))
@@ -79,12 +101,16 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
 def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str, Any], list[float]]:
     """Return a camera and its 14 numbers cx, cy, fx, fy, k1..k6, codx, cody, p2, p1."""
     if purpose not in cameras:
-        raise UserError(f"{name}: the calibration has no camera for {purpose}", legal="cameras Depth and PhotoVideo")
+        raise UserError(
+            f"{name}: the calibration has no camera for {purpose}",
+            legal="cameras Depth and PhotoVideo",
+        )
     camera: dict[str, Any] = cameras[purpose]
     legal = f"SensorWidth and SensorHeight, {MODEL} with 14 finite parameters"
     with read_errors(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
         is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
-        model, numbers = camera["Intrinsics"]["ModelType"], [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
+        model = camera["Intrinsics"]["ModelType"]
+        numbers = [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
     known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
     if not known or numbers[10] or numbers[11]:
         what = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
@@ -107,11 +133,26 @@ LEGAL_LENS = (
     "an Azure Kinect's calibration.json"
 )
 FOUND_BESIDE = (
-    *("intrinsic", "intrinsics", "camera_intrinsic", "camera_intrinsics", "camera", "camera_info", "calibration"),
+    *(
+        "intrinsic",
+        "intrinsics",
+        "camera_intrinsic",
+        "camera_intrinsics",
+        "camera",
+        "camera_info",
+        "calibration",
+    ),
     *("rtabmap_calib", "scene_camera", "depth_intrinsics", "intrinsic_depth", "transforms"),
 )  # stems of the files that count as the lens of the frames beside or below them
 BARE_MATRICES = (
-    *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
+    *(
+        "intrinsics.txt",
+        "intrinsic.txt",
+        "camera-intrinsics.txt",
+        "intrinsic_depth.txt",
+        "K.txt",
+        "cam_K.txt",
+    ),
     *("camera_intrinsics.txt", "camera_intrinsic.txt", "depth_intrinsics.txt"),
 )
 """The same for text files: other text beside frames is mostly something different."""
@@ -120,17 +161,33 @@ SPELLINGS = {
     **{"cx": ("cx", "ppx", "c_x"), "cy": ("cy", "ppy", "c_y")},
 }
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
-SIZES = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"), ("w", "h"))
+SIZES = (
+    ("width", "height"),
+    ("image_width", "image_height"),
+    ("width_px", "height_px"),
+    ("w", "h"),
+)
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
 MODELS = ("distortion_model", "model", "camera_model")
-"""Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion."""
+"""Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion.
+"""
 FAR_OFF = 0.2
-"""Largest distance of a principal point from the middle, as a share of the image, without doubt about the lens."""
-NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
+"""Largest distance of a principal point from the middle, as a share of the image, without doubt
+about the lens."""
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+MAX_MATRIX_TEXT = 2000
 NESTED = 3  # levels of mappings in a file in which a lens is sought
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LARGEST = 1e12  # largest number that a lens may state, in any unit
-KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv")
+KNOWN_MODELS = (
+    "",
+    "none",
+    "pinhole",
+    "plumb_bob",
+    "brown_conrady",
+    "rational_polynomial",
+    "opencv",
+)
 
 
 def lens_for(
@@ -142,14 +199,21 @@ def lens_for(
     beside: Sequence[Path] = (),
     hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
-    """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
-    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError if no lens is stated
-    (``hint`` ends its advice), or only that of other images."""
-    lens, file = given.lens, given.intrinsics
+    """Return the lens of depth images and the files that state it: --intrinsics, the named
+    camera's, the capture's ``own``, or the first file named like a lens in the folders ``beside``.
+    Raises UserError if no lens is stated (``hint`` ends its advice), or only that of other images.
+    """
+    lens = given.lens
+    file = given.intrinsics
     if lens is None and file is None:
         lens = own()
-        names = [*(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")), *BARE_MATRICES]
-        file = next(filter(Path.is_file, (folder / name for folder in beside for name in names)), None)
+        names = [
+            *(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")),
+            *BARE_MATRICES,
+        ]
+        file = next(
+            filter(Path.is_file, (folder / name for folder in beside for name in names)), None
+        )
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
@@ -160,38 +224,57 @@ def lens_for(
     for mode in modes:
         if (mode.width, mode.height) == (width, height):
             return mode, (file,) if file else ()
-    known = ", ".join(f"{each.mode} {each.width} x {each.height}" for each in modes[1:] if isinstance(each, OtherLens))
+    known = ", ".join(
+        f"{each.mode} {each.width} x {each.height}"
+        for each in modes[1:]
+        if isinstance(each, OtherLens)
+    )
     what = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
     fix = "pass --intrinsics FILE with the lens of these images (of the colour camera, if the depth was aligned to it)"
     raise UserError(what, legal=f"the modes of this camera: {known}" if known else None, fix=fix)
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
-    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError if it is missing, unreadable,
-    of another image size, or of a lens model that is not known."""
+    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError if it is
+    missing, unreadable, of another image size, or of a lens model that is not known."""
     data = parsed_lens(path)
     if "CalibrationInformation" in data:
         mode = depth_mode_of_size(width, height)
         if mode is None:
-            raise UserError(f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels", legal=LEGAL_LENS)
-        return depth_lens(str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode)
+            raise UserError(
+                f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels",
+                legal=LEGAL_LENS,
+            )
+        return depth_lens(
+            str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode
+        )
     stated = _size(data)
     data = _the_lens(path, data, (width, height))
     across, down = _size(data) or stated or (width, height)
     if not isinstance(across, int) or not isinstance(down, int):
-        raise UserError(f"{path}: the lens' width and height are not whole numbers", legal=LEGAL_LENS)
+        raise UserError(
+            f"{path}: the lens' width and height are not whole numbers", legal=LEGAL_LENS
+        )
     if across * height != down * width:
         what = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
-        raise UserError(what, fix="give the lens of the depth images (or of the colour camera they are aligned to)")
+        raise UserError(
+            what,
+            fix="give the lens of the depth images (or of the colour camera they are aligned to)",
+        )
     fx, fy, cx, cy = _focal_and_centre(path, data)
     side = across / width
-    fx, fy, cx, cy = fx / side, fy / side, (cx + 0.5) / side - 0.5, (cy + 0.5) / side - 0.5
+    fx = fx / side
+    fy = fy / side
+    cx = (cx + 0.5) / side - 0.5
+    cy = (cy + 0.5) / side - 0.5
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
     if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
         what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for {width} x {height}"
         fix = "multiply a normalised focal length by the image's width"
-        raise UserError(f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix)
+        raise UserError(
+            f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix
+        )
     numbers = (width, height, fx, fy, cx, cy, _distortion(path, data))
     if (across, down) != (width, height):
         warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
@@ -205,7 +288,8 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; bare numbers get names. Raises UserError if it is neither JSON nor YAML."""
+    """Return the file's mapping; bare numbers get names. Raises UserError if it is neither JSON
+    nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
@@ -219,23 +303,35 @@ def parsed_lens(path: Path) -> dict[str, Any]:
             return {"K": [numbers[row * i + j] for i in range(3) for j in range(3)]}
         try:
             if text.lstrip().startswith("{"):
-                data = strict_json(text, nan=True)  # `_number` names a key whose value is not a number
+                data = strict_json(
+                    text, nan=True
+                )  # `_number` names a key whose value is not a number
             else:
                 refuse_bytes(str(path), len(text), MAX_BYTES)
-                # OpenCV's first line, "%YAML:1.0", is not a YAML directive; its matrices are mappings under a tag
-                body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
+                # OpenCV's first line, "%YAML:1.0", is not a YAML directive; its matrices are
+                # mappings under a tag
+                body = "\n".join(
+                    "" if line.startswith("%YAML") else line for line in text.splitlines()
+                )
                 data = parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
         except json.JSONDecodeError as error:
-            raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
+            raise UserError(
+                f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS
+            ) from error
         except DeclarationError as error:
-            first, at = error.problems[0], error.problems[0].place
-            raise UserError(f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS) from error
+            first = error.problems[0]
+            at = error.problems[0].place
+            raise UserError(
+                f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS
+            ) from error
     if not isinstance(data, dict):
         raise UserError(f"{path}: contains no keys with values", legal=LEGAL_LENS)
     return data
 
 
-def mappings(data: dict[str, Any], name: str = "", level: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
+def mappings(
+    data: dict[str, Any], name: str = "", level: int = 0
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield a mapping and those within it, up to `NESTED` levels, each with its path of keys."""
     yield name, data
     if level < NESTED:
@@ -245,9 +341,14 @@ def mappings(data: dict[str, Any], name: str = "", level: int = 0) -> Iterator[t
 
 
 def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
-    """Return the mapping in a file that holds the lens: if several differ, those of this image size, then those with a
-    name that contains "depth". Raises UserError if there is none, or if several remain."""
-    found = [pair for pair in mappings(data) if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)]
+    """Return the mapping in a file that holds the lens: if several differ, those of this image
+    size, then those with a name that contains "depth". Raises UserError if there is none, or if
+    several remain."""
+    found = [
+        pair
+        for pair in mappings(data)
+        if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)
+    ]
     for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
         if len(found) > 1:
             found = [(name, each) for name, each in found if fits(name, each)] or found
@@ -257,7 +358,9 @@ def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[s
     if len({_focal_and_centre(path, each) for _, each in found}) > 1:
         names = ", ".join(name for name, _ in found[:9])
         fix = "write the lens of these images to a file of its own"
-        raise UserError(f"{path}: holds {len(found)} different lenses ({names})", legal=LEGAL_LENS, fix=fix)
+        raise UserError(
+            f"{path}: holds {len(found)} different lenses ({names})", legal=LEGAL_LENS, fix=fix
+        )
     return found[0][1]
 
 
@@ -272,7 +375,10 @@ def _matrix_key(data: dict[str, Any]) -> str | None:
 
 def _size(data: dict[str, Any]) -> tuple[Any, Any] | None:
     """Return the width and height that a mapping states, None if it states none."""
-    return next(((data[across], data[down]) for across, down in SIZES if across in data and down in data), None)
+    return next(
+        ((data[across], data[down]) for across, down in SIZES if across in data and down in data),
+        None,
+    )
 
 
 def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
@@ -283,7 +389,8 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
-    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as Open3D's
+    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as
+    # Open3D's
     return (m[0], m[4], m[6], m[7]) if m[6] or m[7] else (m[0], m[4], m[2], m[5])
 
 
@@ -294,7 +401,10 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
         given = data if key is None else data[key]
         unknown = [] if key is None else sorted(map(str, set(given) - set(DISTORTION_NAMES)))
         if unknown:
-            raise UserError(f"{path}: {key} has unknown names: {', '.join(unknown)}", legal=", ".join(DISTORTION_NAMES))
+            raise UserError(
+                f"{path}: {key} has unknown names: {', '.join(unknown)}",
+                legal=", ".join(DISTORTION_NAMES),
+            )
         numbers = tuple(_number(path, name, given.get(name, 0.0)) for name in DISTORTION_NAMES)
     else:
         numbers = _numbers(path, key, data[key], None)
@@ -302,8 +412,13 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
         legal = "0, 4, 5 or 8 in OpenCV's order k1 k2 p1 p2 k3 .. k6; no thin prism, no tilt"
         raise UserError(f"{path}: {key} has {len(numbers)} numbers", legal=legal)
     model = str(next((data[name] for name in MODELS if name in data), ""))
-    if any(numbers) and re.sub(r"[ -]", "_", model.lower().removeprefix("distortion.")) not in KNOWN_MODELS:
-        raise UserError(f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:]))
+    if (
+        any(numbers)
+        and re.sub(r"[ -]", "_", model.lower().removeprefix("distortion.")) not in KNOWN_MODELS
+    ):
+        raise UserError(
+            f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:])
+        )
     return (numbers + (0.0,) * 8)[:8]
 
 
@@ -313,13 +428,19 @@ def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [x for row in value for x in row]
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        raise UserError(f"{path}: {key} is not a list of {count or 'any'} numbers", legal=LEGAL_LENS)
+        raise UserError(
+            f"{path}: {key} is not a list of {count or 'any'} numbers", legal=LEGAL_LENS
+        )
     return tuple(_number(path, key, x) for x in value)
 
 
 def _number(path: Path, key: str, value: Any) -> float:
     # Python's integers have no largest value, and lists may be too long to print
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
-        shown = repr(value)[:40] if isinstance(value, str | bool | float | None) else type(value).__name__
+        shown = (
+            repr(value)[:40]
+            if isinstance(value, str | bool | float | None)
+            else type(value).__name__
+        )
         raise UserError(f"{path}: {key} is {shown}", legal=f"a number within {LARGEST:g}")
     return float(value)

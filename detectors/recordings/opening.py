@@ -11,9 +11,22 @@ import numpy as np
 from detectors.recordings.arrays import LOADERS, open_array_list, open_arrays, raw_layout_of
 from detectors.recordings.bags import BAG_SUFFIXES, ROS1_SUFFIX, is_bag, open_bag
 from detectors.recordings.clouds import CLOUDS, POINT_LISTS, open_clouds
-from detectors.recordings.depth_images import depth_named, open_depth_folder, open_depth_list, png_kind, shown
+from detectors.recordings.depth_images import (
+    depth_named,
+    open_depth_folder,
+    open_depth_list,
+    png_kind,
+    shown,
+)
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
-from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, ray_lengths_doubt, scale_in
+from detectors.recordings.distances import (
+    UNITS_M,
+    Unit,
+    decided_unit,
+    metres_per_unit,
+    ray_lengths_doubt,
+    scale_in,
+)
 from detectors.recordings.intrinsics import mappings, parsed_lens
 from detectors.recordings.recording import Given, Recording, read_errors
 from harness.vocabulary.errors import UserError
@@ -28,22 +41,29 @@ FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_array
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
 """File suffixes for which one file is a capture, and the function that opens it."""
 ListOpener = Callable[[Sequence[Path], Given, str], Recording]
-LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds)}
+LISTS: dict[str, ListOpener] = {
+    ".png": open_depth_list,
+    **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds),
+}
 """File suffixes for which several files with the same suffix form one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
-PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
+PICTURE = SAVE.format("cv2", "cv2.imread('FILE', -1)")
+HDF5 = SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
     **{".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}", ".pgm": PICTURE},
     **dict.fromkeys((".h5", ".hdf5"), HDF5),
-    **dict.fromkeys((".e57", ".las", ".laz", ".pcap", ".obj", ".stl", ".off"), "export its points as PLY"),
+    **dict.fromkeys(
+        (".e57", ".las", ".laz", ".pcap", ".obj", ".stl", ".off"), "export its points as PLY"
+    ),
 }  # commands that convert unsupported files
 HELD = 6  # most names of a folder's contents in a message
 
 
 def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements: Any) -> Recording:
-    """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of the stored distances
-    (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other ``statements`` are the fields of
-    `recording.Given`. Raises UserError for every fault of the files."""
+    """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of
+    the stored distances (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other
+    ``statements`` are the fields of `recording.Given`. Raises UserError for every fault of the
+    files."""
     paths = [Path(path) for path in paths]
     if not paths:
         raise UserError("no capture is named", legal=LEGAL_FORMATS)
@@ -57,23 +77,32 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
     if not stated.origin:
         stated = _unit_not_stated(recording)
         if stated.scale_m != recording.scale_m:
-            recording = replace(_opened(paths, replace(given, scale_m=stated.scale_m)), selection=given.frames)
+            recording = replace(
+                _opened(paths, replace(given, scale_m=stated.scale_m)), selection=given.frames
+            )
     first, *second = islice(recording.frames(), 2)
-    lens, doubts = recording.lens, [stated.warning]
+    lens = recording.lens
+    doubts = [stated.warning]
     if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
-        doubts += ["the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"]
+        doubts += [
+            "the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"
+        ]
     if recording.slopes is not None and first.xy_m is None:
         doubts += [ray_lengths_doubt(first.z_m, recording.slopes)]
-    notes, warnings = [*recording.notes, *first.notes], [*recording.warnings, *doubts]
+    notes = [*recording.notes, *first.notes]
+    warnings = [*recording.warnings, *doubts]
     if isinstance(lens, OtherLens):
-        notes, warnings = [*notes, lens.note], [*warnings, lens.warning]
+        notes = [*notes, lens.note]
+        warnings = [*warnings, lens.warning]
         recording = replace(recording, lens=lens.plain)
-    notes, warnings = list(filter(None, notes)), list(filter(None, warnings))
+    notes = list(filter(None, notes))
+    warnings = list(filter(None, warnings))
     return replace(recording, unit_from=stated.origin, notes=tuple(notes), warnings=tuple(warnings))
 
 
 def _unit_not_stated(recording: Recording) -> Unit:
-    """Return a unit that the format leaves open: from a file beside the capture, the named camera, or the data."""
+    """Return a unit that the format leaves open: from a file beside the capture, the named camera,
+    or the data."""
     found = (frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected())
     z_m = next((each for each in found if each.size), None)
     if z_m is None:
@@ -91,9 +120,12 @@ def _unit_not_stated(recording: Recording) -> Unit:
 
 
 def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's first file."""
+    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's
+    first file."""
     for folder in dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ()):
-        beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
+        beside = (
+            path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}"))
+        )
         for path in islice(beside, 20):
             try:
                 yield from ((path, each) for _, each in mappings(parsed_lens(path)))
@@ -103,7 +135,8 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
 
 def _opened(paths: list[Path], given: Given) -> Recording:
     """Open a capture by the first format that its paths fit."""
-    path, is_single = paths[0], len(paths) == 1
+    path = paths[0]
+    is_single = len(paths) == 1
     suffix, *more = {each.suffix.lower() for each in paths}
     opener: Callable[[Path, Given], Recording] | None = FILES.get(suffix) if is_single else None
     if is_single and path.is_dir():
@@ -111,23 +144,40 @@ def _opened(paths: list[Path], given: Given) -> Recording:
     elif is_single and given.raw is not None:
         opener = open_arrays
     if given.topic is not None and opener is not open_bag:
-        raise UserError(f"{path}: is not a ROS bag, so it has no topic {given.topic}", fix="leave out --topic")
-    unused = next((name for name in ("array", "pitch", "raw") if getattr(given, name) is not None), None)
+        raise UserError(
+            f"{path}: is not a ROS bag, so it has no topic {given.topic}", fix="leave out --topic"
+        )
+    unused = next(
+        (name for name in ("array", "pitch", "raw") if getattr(given, name) is not None), None
+    )
     if unused and opener is not open_arrays:
         legal = f"{', '.join(LOADERS)}, or bare numbers with --raw"
-        raise UserError(f"{path}: --{unused} is for files of arrays", legal=legal, fix=f"leave out --{unused}")
+        raise UserError(
+            f"{path}: --{unused} is for files of arrays", legal=legal, fix=f"leave out --{unused}"
+        )
     if opener is not None:
         return opener(path, given)
     if any(each.is_dir() for each in paths):
-        raise UserError(f"{len(paths)} paths that include folders", legal=LEGAL_FORMATS, fix="name one folder alone")
+        raise UserError(
+            f"{len(paths)} paths that include folders",
+            legal=LEGAL_FORMATS,
+            fix="name one folder alone",
+        )
     if suffix in LISTS and not more:
-        return LISTS[suffix](paths, given, path.name if is_single else f"{path.name} .. {paths[-1].name}")
+        return LISTS[suffix](
+            paths, given, path.name if is_single else f"{path.name} .. {paths[-1].name}"
+        )
     if not is_single:
-        raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *more)))}", legal=LEGAL_FORMATS)
+        raise UserError(
+            f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *more)))}",
+            legal=LEGAL_FORMATS,
+        )
     if suffix in (".bin", ".raw", ".dat"):
         raise raw_layout_of(path)
     fix = CONVERT.get(suffix, "").replace("FILE", str(path)) or None
-    raise UserError(f"{path}: files of the type '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix)
+    raise UserError(
+        f"{path}: files of the type '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix
+    )
 
 
 def _open_folder(folder: Path, given: Given) -> Recording:
@@ -140,13 +190,23 @@ def _open_folder(folder: Path, given: Given) -> Recording:
         if clouds:
             recording = open_clouds(clouds, given, folder.name)
             beside = sum(path.suffix.lower() in (".png", *LOADERS) for path in inside)
-            note = f"{beside} pictures or arrays beside the {suffix} files are ignored" if beside else ""
+            note = (
+                f"{beside} pictures or arrays beside the {suffix} files are ignored"
+                if beside
+                else ""
+            )
             return replace(recording, notes=(*recording.notes, note))
     pictures = [path for path in inside if path.suffix.lower() == ".png"]
     arrays = [path for path in inside if path.suffix.lower() in LOADERS]
-    is_depth = bool(pictures) and (not arrays or any(png_kind(path)[2:] == (16, 0) for path in pictures))
+    is_depth = bool(pictures) and (
+        not arrays or any(png_kind(path)[2:] == (16, 0) for path in pictures)
+    )
     inner = folder / "depth"
-    if inner.is_dir() and not is_depth and not any(path.suffix.lower() == ".png" for path in inner.iterdir()):
+    if (
+        inner.is_dir()
+        and not is_depth
+        and not any(path.suffix.lower() == ".png" for path in inner.iterdir())
+    ):
         return _open_folder(inner, given)
     if is_depth or inner.is_dir():
         return open_depth_folder(folder, given)
@@ -154,8 +214,15 @@ def _open_folder(folder: Path, given: Given) -> Recording:
     if len(frames) > 1 and len({path.suffix.lower() for path in frames}) == 1:
         return open_array_list(frames, given, folder.name)
     held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
-    known = (p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir() for p in inside)
+    known = (
+        p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir()
+        for p in inside
+    )
     captures = [path for path, is_known in zip(inside, known, strict=True) if is_known]
     what = f"contains no capture; it holds {held}" if held else "is empty"
-    fix = f"name {'one of ' * (len(captures) > 1)}{', '.join(map(str, captures[:HELD]))}" if captures else None
+    fix = (
+        f"name {'one of ' * (len(captures) > 1)}{', '.join(map(str, captures[:HELD]))}"
+        if captures
+        else None
+    )
     raise UserError(f"{folder}: {what}", legal=LEGAL_FORMATS, fix=fix)

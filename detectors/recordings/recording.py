@@ -18,29 +18,38 @@ from harness.vocabulary.files import limited_memory
 from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 ROUND_TRIP_PX = 0.1
-"""If a pixel's ray does not return to it within this distance, the lens model has no direction for it."""
+"""If a pixel's ray does not return to it within this distance, the lens model has no direction for
+it."""
 NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
 def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
-    """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and limit its memory."""
+    """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and
+    limit its memory."""
     try:
         with limited_memory():
             yield
     except UserError:
         raise
     except Exception as error:
-        why = "there is not enough memory for the size that it states" if isinstance(error, MemoryError) else str(error)
-        raise UserError(f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix) from error
+        why = (
+            "there is not enough memory for the size that it states"
+            if isinstance(error, MemoryError)
+            else str(error)
+        )
+        raise UserError(
+            f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix
+        ) from error
 
 
 @dataclass(frozen=True)
 class Given:
-    """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
-    ``intrinsics``: a file with the depth pixels' lens, preferred to one that comes with the frames. ``lens``: the same
-    as a value. ``frames``: selects frames by number. ``topic``: of a ROS bag. ``array``: NAME or NAME:NUMBER in a file
-    of arrays. ``pitch``: of a height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
+    """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the
+    format's usual one. ``intrinsics``: a file with the depth pixels' lens, preferred to one that
+    comes with the frames. ``lens``: the same as a value. ``frames``: selects frames by number.
+    ``topic``: of a ROS bag. ``array``: NAME or NAME:NUMBER in a file of arrays. ``pitch``: of a
+    height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
 
     scale_m: float | None = None
     intrinsics: Path | None = None
@@ -56,10 +65,11 @@ class Given:
 class Recording:
     """A real capture as a `harness.vocabulary.geometry.FrameSource`.
 
-    ``read``: yields the frames in order; each call starts again. ``shape``: (height, width). ``scale_m``: metres in one
-    stored unit. ``files``: all files whose content can change a result. ``notes``: how the files were interpreted.
-    ``warnings``: full sentences on doubts about the distances; every program shows them first. ``selection``: picks
-    frames. ``unit_from``: origin of the unit; "" if the data decide."""
+    ``read``: yields the frames in order; each call starts again. ``shape``: (height, width).
+    ``scale_m``: metres in one stored unit. ``files``: all files whose content can change a result.
+    ``notes``: how the files were interpreted. ``warnings``: full sentences on doubts about the
+    distances; every program shows them first. ``selection``: picks frames. ``unit_from``: origin
+    of the unit; "" if the data decide."""
 
     name: str
     read: Callable[[], Iterator[Frame]]
@@ -77,12 +87,21 @@ class Recording:
 
     @classmethod
     def begun(
-        cls, name: str, read: Callable[[], Iterator[Frame]], scale_m: float, is_whole: bool = False, **more: Any
+        cls,
+        name: str,
+        read: Callable[[], Iterator[Frame]],
+        scale_m: float,
+        is_whole: bool = False,
+        **more: Any,
     ) -> Recording:
         """Return a recording of the first frame's size and step. Raises UserError without a frame."""
         first = next(read(), None)
         if first is None:
-            raise UserError(f"{name}: contains no frame", legal="at least one frame", fix="copy or record it again")
+            raise UserError(
+                f"{name}: contains no frame",
+                legal="at least one frame",
+                fix="copy or record it again",
+            )
         step_m = scale_m if is_whole else rounding_step_m(first.z_m)
         return cls(name, read, first.z_m.shape, scale_m, step_m, **more)
 
@@ -98,7 +117,8 @@ class Recording:
 
     @cached_property
     def slopes(self) -> np.ndarray | None:
-        """Slopes x/z, y/z (h, w, 2) of pixels; NaN where the distortion has no inverse. None if frames carry points."""
+        """Slopes x/z, y/z (h, w, 2) of pixels; NaN where the distortion has no inverse. None if
+        frames carry points."""
         return None if self.lens is None else _returning_slopes(self.lens, self.region)
 
     def selected(self) -> Iterator[Frame]:
@@ -107,15 +127,21 @@ class Recording:
         return islice(self.read(), chosen.start, chosen.stop, chosen.step)
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the selected frames. Raises UserError for different sizes, a wrong unit, or if no pixel is valid."""
-        count, judged = 0, False
+        """Yield the selected frames. Raises UserError for different sizes, a wrong unit, or if no
+        pixel is valid."""
+        count = 0
+        judged = False
         for frame in self.selected():
             count += 1
             if frame.z_m.shape != self.shape:
                 what = "pixels" if self.organised else "points"
-                sizes = [f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)]
+                sizes = [
+                    f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)
+                ]
                 what = f"{frame.name}: {sizes[0]} {what}, but the first frame has {sizes[1]}"
-                raise UserError(what, legal="frames of one size", fix="run the differing frames separately")
+                raise UserError(
+                    what, legal="frames of one size", fix="run the differing frames separately"
+                )
             if self.slopes is not None and frame.xy_m is None:
                 rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)
                 if rayless.any():
@@ -130,7 +156,9 @@ class Recording:
             yield frame
         if not judged:
             fix = "check the selected frames, and that the target was within the camera's range"
-            raise UserError(f"{self.name}: no valid pixel in {count} frame{'s' * (count != 1)}", fix=fix)
+            raise UserError(
+                f"{self.name}: no valid pixel in {count} frame{'s' * (count != 1)}", fix=fix
+            )
 
 
 @lru_cache(maxsize=2)

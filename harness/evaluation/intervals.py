@@ -1,7 +1,9 @@
-"""Intervals, two-sided at `CONFIDENCE` unless stated otherwise; false calls per area, and the threshold for a rate.
+"""Intervals, two-sided at `CONFIDENCE` unless stated otherwise; false calls per area, and the
+threshold for a rate.
 
-Sources: Wilson 1927 and Clopper and Pearson 1934 (proportions), Garwood 1936 (Poisson), Student and Welch (means),
-Efron and Tibshirani 1993 (percentile bootstrap). Not covered: repeats of one set-up are repeats of the noise."""
+Sources: Wilson 1927 and Clopper and Pearson 1934 (proportions), Garwood 1936 (Poisson), Student
+and Welch (means), Efron and Tibshirani 1993 (percentile bootstrap). Not covered: repeats of one
+set-up are repeats of the noise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ from harness.vocabulary.errors import UserError
 
 CONFIDENCE = 0.95  # two-sided confidence of every interval in tables and reports
 UPPER = 0.5 + CONFIDENCE / 2
-RESAMPLES = 2000  # the 2.5 % quantile is then the 50th smallest, stable to about 3 % of the interval's width
+# the 2.5 % quantile is then the 50th smallest, stable to about 3 % of the interval's width
+RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,8 @@ class Interval:
         return bool(self.high < value)
 
     def over(self, value: float) -> bool | None:
-        """Return whether the estimated quantity certainly exceeds ``value``; None if the interval includes both."""
+        """Return whether the estimated quantity certainly exceeds ``value``; None if the interval
+        includes both."""
         return True if self.low > value else False if self.high <= value else None
 
     def within(self, low: float, high: float) -> bool:
@@ -50,20 +54,23 @@ UNKNOWN = Interval(np.nan, np.nan)
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0. Its
-    average coverage over the proportion is near nominal; `clopper_pearson` is never below nominal and wider."""
+    """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where
+    ``trials`` is 0. Its average coverage over the proportion is near nominal; `clopper_pearson` is
+    never below nominal and wider."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
         half = np.sqrt(z2) / (n + z2) * np.sqrt(k * (n - k) / n + z2 / 4)
     # rounding would give 1e-17 instead of exactly 0 or 1
-    low, high = np.where(k == 0, 0.0, centre - half), np.where(k == n, 1.0, centre + half)
+    low = np.where(k == 0, 0.0, centre - half)
+    high = np.where(k == n, 1.0, centre + half)
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Clopper and Pearson's exact interval of a proportion, element by element; NaN where ``trials`` is 0."""
+    """Return Clopper and Pearson's exact interval of a proportion, element by element; NaN where
+    ``trials`` is 0."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     low = np.where(k == 0, 0.0, special.betaincinv(k, n - k + 1, 1 - UPPER))
     high = np.where(k == n, 1.0, special.betaincinv(k + 1, n - k, UPPER))
@@ -71,7 +78,8 @@ def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that is 0."""
+    """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that
+    is 0."""
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
@@ -80,18 +88,23 @@ def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.
 
 
 def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
-    m, s, k = np.broadcast_arrays(np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float))
+    """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN
+    below two values."""
+    m, s, k = np.broadcast_arrays(
+        np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float)
+    )
     size = np.where(k >= 2, k, np.nan)
     half = special.stdtrit(size - 1, UPPER) * s / np.sqrt(size)
     return m - half, m + half
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
-    """Return Welch's interval of mean(first) - mean(second); a point if neither varies, unknown below two values."""
+    """Return Welch's interval of mean(first) - mean(second); a point if neither varies, unknown
+    below two values."""
     from scipy import stats
 
-    a, b = np.asarray(first, float), np.asarray(second, float)
+    a = np.asarray(first, float)
+    b = np.asarray(second, float)
     if min(len(a), len(b)) < 2:
         return UNKNOWN
     if np.ptp(a) == np.ptp(b) == 0:
@@ -101,8 +114,9 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
 
 
 def standardised_bias(bias: float, std: float, n: int) -> Interval:
-    """Return the interval of bias / standard deviation (an effect size) from ``n`` normal values, by the large-sample
-    variance 1/n + d^2/(2n) (Hedges and Olkin 1985). Exact if they do not vary; unknown below two values."""
+    """Return the interval of bias / standard deviation (an effect size) from ``n`` normal values,
+    by the large-sample variance 1/n + d^2/(2n) (Hedges and Olkin 1985). Exact if they do not vary;
+    unknown below two values."""
     if n < 2 or not (np.isfinite(bias) and np.isfinite(std)):
         return UNKNOWN
     if std == 0:
@@ -113,9 +127,12 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
     return Interval(ratio - half, ratio + half)
 
 
-def bootstrap(statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES) -> Interval:
-    """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels), with the same draws
-    every time. ``statistic`` maps indices (resamples, n) to values (resamples,); NaN are left out."""
+def bootstrap(
+    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES
+) -> Interval:
+    """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of
+    pixels), with the same draws every time. ``statistic`` maps indices (resamples, n) to values
+    (resamples,); NaN are left out."""
     if n < 2:
         return UNKNOWN
     indices = np.random.default_rng(0).integers(0, n, size=(resamples, n))
@@ -123,12 +140,15 @@ def bootstrap(statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resample
 
 
 def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
-    """Return the central interval of bootstrap draws (B,); infinite ends remain. NaN draws (such as differences of two
-    infinities) are left out; if they are more than half, the interval is unknown."""
+    """Return the central interval of bootstrap draws (B,); infinite ends remain. NaN draws (such
+    as differences of two infinities) are left out; if they are more than half, the interval is
+    unknown."""
     known = draws[~np.isnan(draws)]
     if len(known) < 2 or len(known) < 0.5 * len(draws):
         return UNKNOWN
-    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf")
+    low, high = np.quantile(
+        known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf"
+    )
     return Interval(float(low), float(high))
 
 
@@ -146,17 +166,21 @@ class FalseCallRate:
 
 
 def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
-    """Return the rate of ``calls`` false calls on ``area_m2`` of unflawed surface, a Poisson count; exact limits."""
+    """Return the rate of ``calls`` false calls on ``area_m2`` of unflawed surface, a Poisson
+    count; exact limits."""
     if calls < 0 or not area_m2 > 0:
-        raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="0 calls or more, an area above 0")
+        raise UserError(
+            f"{calls} false calls on {area_m2:g} m2", legal="0 calls or more, an area above 0"
+        )
     low, high = poisson_rate(calls, area_m2)
     return FalseCallRate(calls / area_m2, Interval(float(low), float(high)), calls, area_m2)
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold of scores: findings *above* ``value`` are calls (-inf: every finding is). ``rate_per_m2``: expected
-    false calls on new runs. ``upper_per_m2``: bound on the true rate at one-sided ``confidence``."""
+    """A threshold of scores: findings *above* ``value`` are calls (-inf: every finding is).
+    ``rate_per_m2``: expected false calls on new runs. ``upper_per_m2``: bound on the true rate at
+    one-sided ``confidence``."""
 
     value: float
     rate_per_m2: float
@@ -169,22 +193,30 @@ class Threshold:
 def threshold_for_rate(
     highest_scores_per_run: ArrayLike, area_m2: float, rate_per_m2: float, confidence: float = 0.95
 ) -> Threshold:
-    """Return the lowest observed score whose rate of false calls is at most the wanted rate, from hole-free runs of
-    ``area_m2`` each. ``highest_scores_per_run`` (runs,): -inf without a finding. Calls are a Poisson process. A new
-    run's score exceeds the (k + 1)-th highest of n with probability (k + 1) / (n + 1); the true rate is Beta(k + 1, n -
-    k) distributed (Wilks 1941). Use other runs for judging. Raises UserError if the runs are too few."""
+    """Return the lowest observed score whose rate of false calls is at most the wanted rate, from
+    hole-free runs of ``area_m2`` each. ``highest_scores_per_run`` (runs,): -inf without a finding.
+    Calls are a Poisson process. A new run's score exceeds the (k + 1)-th highest of n with
+    probability (k + 1) / (n + 1); the true rate is Beta(k + 1, n - k) distributed (Wilks 1941).
+    Use other runs for judging. Raises UserError if the runs are too few."""
     scores = np.asarray(highest_scores_per_run, float).ravel()
     if not (area_m2 > 0 and rate_per_m2 > 0):
-        raise UserError(f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0")
+        raise UserError(
+            f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0"
+        )
     if np.any(np.isnan(scores)) or np.any(np.isposinf(scores)):
-        raise UserError("not every highest score is a number", legal="a finite score, or -inf for no finding")
-    n, wanted = len(scores), -float(np.expm1(-rate_per_m2 * area_m2))
+        raise UserError(
+            "not every highest score is a number", legal="a finite score, or -inf for no finding"
+        )
+    n = len(scores)
+    wanted = -float(np.expm1(-rate_per_m2 * area_m2))
     # the margin is for rounding where (n + 1) * wanted is a whole number
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
         what = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
         fix = "simulate more hole-free boards, or ask for a higher rate"
-        raise UserError(what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix)
+        raise UserError(
+            what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix
+        )
     value = float(np.sort(scores)[n - 1 - k])
     above = int(np.sum(scores > value))
     bound = float(special.betaincinv(above + 1, n - above, confidence))

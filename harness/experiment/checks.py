@@ -1,4 +1,5 @@
-"""Finds mistakes that involve several keys of an experiment, or things outside the file: names, files, views."""
+"""Finds mistakes that involve several keys of an experiment, or things outside the file: names,
+files, views."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -9,7 +10,13 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
-from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource, recording_of, splices_of
+from harness.experiment.schema import (
+    CaptureSource,
+    ExperimentConfig,
+    SimulatedSource,
+    recording_of,
+    splices_of,
+)
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
@@ -23,14 +30,16 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
 
-CAMERA_NAME, DETECTOR_NAME = ("source", "camera", "name"), ("detector", "name")
+CAMERA_NAME = ("source", "camera", "name")
+DETECTOR_NAME = ("detector", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")
 
 
 def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Validate an experiment's data; return its declaration (None if it is not valid) and all problems."""
+    """Validate an experiment's data; return its declaration (None if it is not valid) and all
+    problems."""
     config, problems = validated(ExperimentConfig, source, splices_of(source.data))
     for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
         name = shape.get(source.data, path)
@@ -44,7 +53,8 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     if config is None or problems:
         return config, problems
     if config.capture.average.frames is not None:
-        place, message = source.key_place_of(("capture", "average", "frames")), "the number of frames is set by"
+        place = source.key_place_of(("capture", "average", "frames"))
+        message = "the number of frames is set by"
         problems.append(Problem(f"{message} `capture.frames`", place, fix="remove this key"))
     if isinstance(config.source, SimulatedSource):
         for check in (_target_problems, _mapping_problems, _flat_field_problems):
@@ -55,9 +65,11 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """Find contradictions between a study, a family of boards and a threshold that is calibrated on boards."""
+    """Find contradictions between a study, a family of boards and a threshold that is calibrated
+    on boards."""
     target = config.source.target if isinstance(config.source, SimulatedSource) else None
-    drawn, calibrate = isinstance(target, DrawnTargetConfig), config.threshold.calibrate
+    drawn = isinstance(target, DrawnTargetConfig)
+    calibrate = config.threshold.calibrate
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
     if config.study is None and drawn:
         fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
@@ -71,19 +83,32 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
         return
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
-        yield Problem("a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
-    # the criterion of a hit and the wanted rate of false calls are rules of the study, equal for all set-ups
+        yield Problem(
+            "a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix
+        )
+    # the criterion of a hit and the wanted rate of false calls are rules of the study, equal for
+    # all set-ups
     for path in config.sweep:
-        if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):
+        if (
+            path.split(".")[0] == "matching"
+            or path == "threshold"
+            or path.startswith("threshold.calibrate")
+        ):
             message = f"`{path}` is a rule of the study and cannot be an axis of it"
-            fix = "run the study once for each value with --set, and compare them with harness.compare"
+            fix = (
+                "run the study once for each value with --set, and compare them with tofpod compare"
+            )
             yield Problem(message, source.key_place_of(("sweep", path)), fix=fix)
     if calibrate is not None and calibrate.boards is None:
         place = source.place_of(("threshold", "calibrate"))
-        yield Problem("a study calibrates its threshold on separate boards", place, fix="write `boards: 60`")
+        yield Problem(
+            "a study calibrates its threshold on separate boards", place, fix="write `boards: 60`"
+        )
     elif calibrate is not None and calibrate.boards is not None:
-        # the number of boards bounds the rate that they can show, even if their whole face is judged: a new run exceeds
-        # the highest of n with probability 1 / (n + 1), and has a false call with 1 - exp(-rate * area)
+        # the number of boards bounds the rate that they can show, even if their whole face is
+        # judged: a new run exceeds the highest of n with probability 1 / (n + 1), and has a false
+        # call with 1 - exp(-rate *
+        # area)
         rate_per_m2 = calibrate.false_calls_per_m2 or 0.0
         area_m2 = target.board.width_mm * target.board.height_mm * MM**2
         needed = ceil(-1 / expm1(-rate_per_m2 * area_m2) * (1 - 1e-12)) - 1
@@ -94,11 +119,15 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             yield Problem(message, boards_at, f"at least {needed}", fix=fix)
 
 
-def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+def _target_problems(
+    config: ExperimentConfig, simulated: SimulatedSource, source: Source
+) -> Iterator[Problem]:
     drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
     try:
         target = _declared(simulated.target)
-    except UserError as error:  # this includes a family of boards that are too full for their damage
+    except (
+        UserError
+    ) as error:  # this includes a family of boards that are too full for their damage
         yield Problem(error.message, source.place_of(TARGET), legal=error.legal, fix=error.fix)
         return
     if found := _unseen(simulated.camera, simulated.views, simulated.target):
@@ -124,8 +153,9 @@ def _declared(config: AnyTargetConfig) -> TargetConfig:
 def _unseen(
     camera: CameraConfig, views: AnyViews | None, declared: AnyTargetConfig
 ) -> tuple[KeyPath, UserError] | None:
-    """Return why the camera does not see the target, and the key that causes it: an unknown camera, no albedo at its
-    wavelength, or `_unseen_pose`. A family is checked in its extreme poses, first in a single view."""
+    """Return why the camera does not see the target, and the key that causes it: an unknown
+    camera, no albedo at its wavelength, or `_unseen_pose`. A family is checked in its extreme
+    poses, first in a single view."""
     target = _declared(declared)
     path: KeyPath = CAMERA_NUMBERS if camera.numbers else CAMERA_NAME
     try:
@@ -148,13 +178,17 @@ def _unseen(
     return None
 
 
-def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
-    """Return the mistake of the first pose that sees nothing of the face within range, and the key that causes it."""
+def _unseen_pose(
+    optics: Optics, views: AnyViews | None, target: TargetConfig
+) -> tuple[KeyPath, UserError] | None:
+    """Return the mistake of the first pose that sees nothing of the face within range, and the key
+    that causes it."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:
         first = error.errors()[0]
-        key, value = str(first["loc"][-1]), first["input"]
+        key = str(first["loc"][-1])
+        value = first["input"]
         legal = shape.legal_at(shape.Declared(type(target.pose), {}, {}).at((key,)))
         message = f"a view's pose is not legal: {key} would be {value:g}"
         return VIEWS, UserError(message, legal=legal, fix="lower the spread or the sway")
@@ -164,40 +198,61 @@ def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -
         except UserError as mistake:
             if views is None:
                 return TARGET, mistake
-            tilts = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+            tilts = (
+                f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+            )
             message = f"view {number} of {len(poses)} ({tilts}): {mistake.message}"
             return VIEWS, UserError(message, legal=mistake.legal, fix=mistake.fix)
     return None
 
 
-def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+def _mapping_problems(
+    config: ExperimentConfig, simulated: SimulatedSource, source: Source
+) -> Iterator[Problem]:
     """Find contradictions between several views and their mapping into one cloud."""
-    views, mapping = simulated.views, config.mapping
+    views = simulated.views
+    mapping = config.mapping
     if views is None and mapping is not None:
         fix = "declare source.views, for instance {kind: arc, count: 3, spread_deg: 40.0}"
         yield Problem("a mapping needs several views", source.place_of(("mapping",)), fix=fix)
     elif views is not None and mapping is None:
         fix = "declare mapping, for instance {registration: {method: marks}, merge: {kind: fusion}}"
-        yield Problem("several views need a mapping into one cloud", source.place_of(VIEWS), fix=fix)
-    elif views is not None and mapping is not None and (mapping.views or 0) > (count := view_count(views)):
+        yield Problem(
+            "several views need a mapping into one cloud", source.place_of(VIEWS), fix=fix
+        )
+    elif (
+        views is not None
+        and mapping is not None
+        and (mapping.views or 0) > (count := view_count(views))
+    ):
         place = source.place_of(("mapping", "views"))
-        yield Problem(f"{mapping.views} views, but source.views has {count}", place, legal=f"1 to {count}")
+        yield Problem(
+            f"{mapping.views} views, but source.views has {count}", place, legal=f"1 to {count}"
+        )
 
 
-def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+def _flat_field_problems(
+    config: ExperimentConfig, simulated: SimulatedSource, source: Source
+) -> Iterator[Problem]:
     """Report a flat field whose plane lies outside the camera's range."""
     try:
-        flat_field, optics = config.capture.flat_field, camera_of(simulated.camera).optics
+        flat_field = config.capture.flat_field
+        optics = camera_of(simulated.camera).optics
     except UserError:
         return  # reported together with the target's pose
     if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
         place = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
-        yield Problem(f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal)
+        yield Problem(
+            f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal
+        )
 
 
-def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
-    """Find files that are missing or cannot be read, and keys that only a simulated source can have."""
+def _capture_problems(
+    config: ExperimentConfig, capture: CaptureSource, source: Source
+) -> Iterator[Problem]:
+    """Find files that are missing or cannot be read, and keys that only a simulated source can
+    have."""
     missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
     for number, path in ((number, Path(capture.paths[number])) for number in missing):
         near = nearest(path.name, [file.name for file in path.parent.glob("*")])
@@ -205,18 +260,37 @@ def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: 
         yield Problem(f"{path}: there is no such file or folder", place, nearest=near)
     lens = capture.intrinsics
     if unknown := bool(lens) and lens not in camera_names() and not Path(str(lens)).is_file():
-        legal, place = f"a file, or one of {', '.join(camera_names())}", source.place_of(("source", "intrinsics"))
+        legal = f"a file, or one of {', '.join(camera_names())}"
+        place = source.place_of(("source", "intrinsics"))
         yield Problem(f"{lens}: is neither a file nor a camera", place, legal)
     try:
         if not missing and not unknown:
             recording_of(capture)
     except UserError as error:
-        yield Problem(error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix)
-    apart, hole_free = "a flat field needs a simulated unit", "only on hole-free repeats, which a capture does not have"
+        yield Problem(
+            error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix
+        )
+    apart = "a flat field needs a simulated unit"
+    hole_free = "only on hole-free repeats, which a capture does not have"
     for key, value, message, fix in (
-        ("capture.flat_field", config.capture.flat_field, apart, "use harness.flatfield, harness.detect --flat-field"),
-        ("mapping", config.mapping, "a mapping needs the views of a simulated source", "use harness.detect --register"),
-        ("threshold.calibrate", config.threshold.calibrate, f"a threshold can be calibrated {hole_free}", "give `k`"),
+        (
+            "capture.flat_field",
+            config.capture.flat_field,
+            apart,
+            "use tofpod flatfield, tofpod detect --flat-field",
+        ),
+        (
+            "mapping",
+            config.mapping,
+            "a mapping needs the views of a simulated source",
+            "use tofpod detect --register",
+        ),
+        (
+            "threshold.calibrate",
+            config.threshold.calibrate,
+            f"a threshold can be calibrated {hole_free}",
+            "give `k`",
+        ),
     ):
         if value is not None:
             yield Problem(message, source.place_of(tuple(key.split("."))), fix=fix)

@@ -1,4 +1,5 @@
-"""Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at once."""
+"""Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at
+once."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -7,26 +8,50 @@ from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVariation, declared_of, recording_of
+from harness.experiment.schema import (
+    DETECTOR_SETTINGS,
+    Experiment,
+    ValuesVariation,
+    declared_of,
+    recording_of,
+)
 from harness.experiment.unfold import OPTION, overridden, set_path, unfolded
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted
-from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Source, read_yaml, to_yaml
+from harness.vocabulary.declaration.yaml_source import (
+    DeclarationError,
+    KeyPath,
+    Source,
+    read_yaml,
+    to_yaml,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera, numbers_of_lens
+from scenes.sensor.camera import (
+    CameraConfig,
+    camera_names,
+    is_camera_path,
+    load_camera,
+    numbers_of_lens,
+)
 
-EXPERIMENT_VERSION = 1  # Version of the resolved experiment in a result folder; raised when a key changes its meaning
+# Version of the resolved experiment in a result folder; raised when a key changes its meaning
+EXPERIMENT_VERSION = 1
 STAMP_KIND = "experiment"
 
 
 def load_experiment(
-    path: Path, overrides: Sequence[str] = (), calibration: Path | None = None, *, quick: bool = False
+    path: Path,
+    overrides: Sequence[str] = (),
+    calibration: Path | None = None,
+    *,
+    quick: bool = False,
 ) -> Experiment:
-    """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises DeclarationError with all
-    problems. The lens of a recording ``calibration`` replaces the camera file's nominal lens (`lens_numbers`).
-    ``quick`` reduces repeats and boards and drops the sensitivity study; ``overrides`` take precedence."""
+    """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises
+    DeclarationError with all problems. The lens of a recording ``calibration`` replaces the camera
+    file's nominal lens (`lens_numbers`). ``quick`` reduces repeats and boards and drops the
+    sensitivity study; ``overrides`` take precedence."""
     recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
@@ -45,22 +70,31 @@ def load_experiment(
     points, unfolding = unfolded(source, None if problems else config)
     if problems or unfolding or config is None:
         raise DeclarationError(str(path), [*problems, *unfolding])
-    data, varied = config.to_data(), [*config.sweep]
+    data = config.to_data()
+    varied = [*config.sweep]
     for variation in config.sensitivity.vary if config.sensitivity else ():
         varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
     if any(each.startswith("detector") for each in varied):
-        # a detector may fill some settings from others (a preset); written out, they would override a varied preset
+        # a detector may fill some settings from others (a preset); written out, they would
+        # override a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
     return Experiment(config, points, data, source)
 
 
 def _quick(data: Any) -> list[str]:
-    """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no sensitivity."""
+    """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no
+    sensitivity."""
     title = shape.get(data, ("title",)) or shape.get(data, ("name",))
     overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
     own = "threshold.calibrate"
-    for path in ("repeats", f"{own}.repeats", "study.boards", "study.hole_free_boards", f"{own}.boards"):
+    for path in (
+        "repeats",
+        f"{own}.repeats",
+        "study.boards",
+        "study.hole_free_boards",
+        f"{own}.boards",
+    ):
         number = shape.get(data, tuple(path.split(".")))
         if isinstance(number, int):
             fewer = min(number, 5) if path.endswith("repeats") else -(-number // 3)
@@ -69,33 +103,45 @@ def _quick(data: Any) -> list[str]:
 
 
 def _experiment_file(path: Path) -> Path:
-    """Return the file for a path, or for the name of tofpod's own experiment, which may also be that of a folder here
-    (``detectors``). Raises UserError."""
+    """Return the file for a path, or for the name of tofpod's own experiment, which may also be
+    that of a folder here (``detectors``). Raises UserError."""
     if path.is_file() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
     if not (own.is_file() or path.suffix or path.exists()):
         names = ", ".join(sorted(each.stem for each in own.parent.glob("*.yaml")))
-        raise UserError(f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}")
+        raise UserError(
+            f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}"
+        )
     return own if own.is_file() else path
 
 
 def resolved_yaml(experiment: Experiment) -> str:
-    """Return the experiment as YAML with its version and every default; loading it gives the same points."""
+    """Return the experiment as YAML with its version and every default; loading it gives the same
+    points."""
     return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
 
 
 def _with_absolute_paths(source: Source, folder: Path) -> Source:
-    """Make file paths absolute: they are relative to the YAML's folder, or in ``--set`` to the current folder."""
+    """Make file paths absolute: they are relative to the YAML's folder, or in ``--set`` to the
+    current folder."""
     data = source.data
     swept: KeyPath = ("sweep", dotted(checks.CAMERA_NAME))
     listed = shape.get(data, swept)
     named: list[KeyPath] = [checks.CAMERA_NAME]
     named += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
-    files = [(*checks.TARGET, *at, "file") for at in ((), ("board", "shape"), ("material", "texture"))]
+    files = [
+        (*checks.TARGET, *at, "file") for at in ((), ("board", "shape"), ("material", "texture"))
+    ]
     if shape.get(data, ("source", "kind")) == "capture":
-        files += [("source", "paths", k) for k in range(len(shape.get(data, ("source", "paths")) or ()))]
-        files += [] if shape.get(data, ("source", "intrinsics")) in camera_names() else [("source", "intrinsics")]
+        files += [
+            ("source", "paths", k) for k in range(len(shape.get(data, ("source", "paths")) or ()))
+        ]
+        files += (
+            []
+            if shape.get(data, ("source", "intrinsics")) in camera_names()
+            else [("source", "intrinsics")]
+        )
     for at in (*named, *files):
         name = shape.get(data, at)
         if isinstance(name, str) and name and (at in files or is_camera_path(name)):
@@ -105,20 +151,36 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
 
 
 def _with_calibration(source: Source, recording: Path) -> Source:
-    """Add the recording's lens to the camera's replaced numbers; it takes precedence over the lens in the file."""
+    """Add the recording's lens to the camera's replaced numbers; it takes precedence over the lens
+    in the file."""
     if shape.get(source.data, ("source", "kind")) != "simulated":
-        raise UserError("a real capture has its own lens", fix="leave out --calibration, or use source.intrinsics")
+        raise UserError(
+            "a real capture has its own lens",
+            fix="leave out --calibration, or use source.intrinsics",
+        )
     swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
     single = shape.get(source.data, checks.CAMERA_NAME)
-    names = swept if isinstance(swept, list) else [single] if isinstance(single, str) else [CameraConfig().name]
+    names = (
+        swept
+        if isinstance(swept, list)
+        else [single]
+        if isinstance(single, str)
+        else [CameraConfig().name]
+    )
     numbers = shape.get(source.data, checks.CAMERA_NUMBERS)
-    merged = {**(numbers if isinstance(numbers, dict) else {}), **lens_numbers(recording, map(str, names))}
-    return replace(source, data=set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data)))
+    merged = {
+        **(numbers if isinstance(numbers, dict) else {}),
+        **lens_numbers(recording, map(str, names)),
+    }
+    return replace(
+        source, data=set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data))
+    )
 
 
 def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
-    """Return the ``source.camera.numbers`` that give the cameras the lens of a recording. Raises UserError if the
-    recording cannot be read, states no lens, or has another size than a camera's sensor."""
+    """Return the ``source.camera.numbers`` that give the cameras the lens of a recording. Raises
+    UserError if the recording cannot be read, states no lens, or has another size than a camera's
+    sensor."""
     from detectors.recordings import open_capture  # imports the readers of all formats
 
     lens = None
@@ -130,7 +192,11 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         legal = "an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them"
         raise UserError(f"--calibration {recording}: holds no calibrated lens", legal=legal)
     for name in cameras:
-        nominal = load_camera(name).nominal_lens if name in camera_names() or is_camera_path(name) else lens
+        nominal = (
+            load_camera(name).nominal_lens
+            if name in camera_names() or is_camera_path(name)
+            else lens
+        )
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
             fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"

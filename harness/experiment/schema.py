@@ -1,8 +1,9 @@
 """Declares the keys of an experiment's YAML, and its points with their digests.
 
-This module holds the ranges of single fields; `checks` holds conditions on several fields. A digest covers only content
-that can change a result: not the name, the number of repeats or the other points. So a new value on an axis leaves all
-other points, their seeds and their finished trials unchanged."""
+This module holds the ranges of single fields; `checks` holds conditions on several fields. A
+digest covers only content that can change a result: not the name, the number of repeats or the
+other points. So a new value on an axis leaves all other points, their seeds and their finished
+trials unchanged."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from detectors import DETECTORS, detector_names, detector_type
-from detectors.average import AverageConfig
-from detectors.flat_field import FlatFieldConfig
-from detectors.mapping.settings import MappingConfig
+from detectors.averages.average import AverageConfig
+from detectors.averages.flat_field import FlatFieldConfig
+from detectors.views.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import Source
@@ -42,34 +43,45 @@ Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
 Boards = Annotated[int, Field(ge=1, le=MAX_BOARDS)]
 ListAsTuple = BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values)
-"""Strict mode rejects a list in place of a tuple; `Config` converts lists, but not those within a mapping."""
+"""Strict mode rejects a list in place of a tuple; `Config` converts lists, but not those within a
+mapping."""
 AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), ListAsTuple]
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
-Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
+Label = Annotated[
+    str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")
+]
 Reason = Annotated[str, Field(min_length=1, max_length=1000)]
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100), ListAsTuple]
 
 
 class SimulatedSource(Config):
-    """Frames of a simulated camera that views a declared target from one pose or from several ``views``."""
+    """Frames of a simulated camera that views a declared target from one pose or from several
+    ``views``."""
 
     kind: Literal["simulated"]
     target: AnyTargetConfig
     camera: CameraConfig = CameraConfig()
     render: RenderConfig = RenderConfig()
-    views: AnyViews | None = Field(None, discriminator="kind", description="several poses; null: the target's own")
+    views: AnyViews | None = Field(
+        None, discriminator="kind", description="several poses; null: the target's own"
+    )
 
 
 class CaptureSource(Config):
-    """Frames of a real capture; see `detectors.recordings.open_capture`. Paths are relative to the YAML's folder."""
+    """Frames of a real capture; see `detectors.recordings.open_capture`. Paths are relative to the
+    YAML's folder."""
 
     kind: Literal["capture"]
     paths: tuple[FileName, ...] = Field(
         min_length=1, max_length=100_000, description="files of depth frames, or a folder"
     )
-    unit: str | None = Field(None, description="unit of the stored depth, if the files do not state it")
-    intrinsics: FileName | None = Field(None, description="a file of lens intrinsics, or a camera's name")
+    unit: str | None = Field(
+        None, description="unit of the stored depth, if the files do not state it"
+    )
+    intrinsics: FileName | None = Field(
+        None, description="a file of lens intrinsics, or a camera's name"
+    )
 
 
 class CaptureConfig(Config):
@@ -78,10 +90,12 @@ class CaptureConfig(Config):
     frames: Frames
     average: AverageConfig = AverageConfig()
     flat_field: FlatFieldConfig | None = Field(
-        None, description="a plane captured first, whose fixed pattern is subtracted from every frame"
+        None,
+        description="a plane captured first, whose fixed pattern is subtracted from every frame",
     )
     exact: bool = Field(
-        False, description="true simulates each frame; false draws the mean if its distribution is the same"
+        False,
+        description="true simulates each frame; false draws the mean if its distribution is the same",
     )
 
 
@@ -93,19 +107,25 @@ class DetectorConfig(Config):
 
 
 class CalibrateConfig(Config):
-    """Calibration of the threshold on hole-free boards: the lowest k without a detection in ``repeats`` runs of the
-    same set-up or, in a study, the lowest k that meets the rate of false calls on ``boards`` extra boards."""
+    """Calibration of the threshold on hole-free boards: the lowest k without a detection in
+    ``repeats`` runs of the same set-up or, in a study, the lowest k that meets the rate of false
+    calls on ``boards`` extra boards."""
 
     repeats: Repeats | None = None
     boards: Boards | None = Field(None, description="in a study: extra boards for calibration only")
     false_calls_per_m2: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        None, description=f"in a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}"
+        None,
+        description=f"in a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _default_rate(cls, data: Any) -> Any:
-        needs = isinstance(data, dict) and data.get("boards") is not None and data.get("false_calls_per_m2") is None
+        needs = (
+            isinstance(data, dict)
+            and data.get("boards") is not None
+            and data.get("false_calls_per_m2") is None
+        )
         return {**data, "false_calls_per_m2": DEFAULT_RATE_PER_M2} if needs else data
 
     @model_validator(mode="after")
@@ -113,14 +133,18 @@ class CalibrateConfig(Config):
         if (self.repeats is None) == (self.boards is None):
             raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
         if self.boards is None and self.false_calls_per_m2 is not None:
-            raise ValueError("`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate")
+            raise ValueError(
+                "`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate"
+            )
         return self
 
 
 class ThresholdConfig(Config):
     """The detector's threshold k, which is either given or calibrated."""
 
-    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="in units of the detector's score")
+    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(
+        None, description="in units of the detector's score"
+    )
     calibrate: CalibrateConfig | None = None
 
     @model_validator(mode="after")
@@ -131,8 +155,9 @@ class ThresholdConfig(Config):
 
 
 class MatchingConfig(Config):
-    """The rule by which a detection counts as a hit: it is matched one to one with the nearest damage within a radius
-    on the face. The distance to long damage (slot, gouge, chip) is the distance to its centre line."""
+    """The rule by which a detection counts as a hit: it is matched one to one with the nearest
+    damage within a radius on the face. The distance to long damage (slot, gouge, chip) is the
+    distance to its centre line."""
 
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
     overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
@@ -148,7 +173,9 @@ class ValuesVariation(Config):
     path: DottedPath
     values: AxisValues
     reason: Reason
-    frames: StudyFrames | None = Field(None, description="numbers of frames; null: as in sensitivity.frames")
+    frames: StudyFrames | None = Field(
+        None, description="numbers of frames; null: as in sensitivity.frames"
+    )
 
 
 class LabelledVariation(Config):
@@ -157,34 +184,46 @@ class LabelledVariation(Config):
     label: Label
     set: Annotated[dict[DottedPath, Any], Field(min_length=1, max_length=50)]
     reason: Reason
-    frames: StudyFrames | None = Field(None, description="numbers of frames; null: as in sensitivity.frames")
+    frames: StudyFrames | None = Field(
+        None, description="numbers of frames; null: as in sensitivity.frames"
+    )
 
 
 class SensitivityConfig(Config):
-    """Variations of the experiment, one at a time, each with a few numbers of frames and fewer repeats."""
+    """Variations of the experiment, one at a time, each with a few numbers of frames and fewer
+    repeats."""
 
     repeats: Repeats
-    calibration_repeats: Repeats | None = Field(None, description="hole-free runs; null: as in threshold")
+    calibration_repeats: Repeats | None = Field(
+        None, description="hole-free runs; null: as in threshold"
+    )
     frames: StudyFrames
-    vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
+    vary: Annotated[
+        tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)
+    ]
 
 
 class StudyConfig(Config):
-    """A study of the probability of detection on random boards: ``boards`` have damage, and false calls are counted on
-    ``hole_free_boards``. All set-ups inspect the same boards, each with ``repeats`` draws of noise. ``units`` are
-    cameras with different fixed patterns: all of them inspect each damaged board, another one each hole-free board."""
+    """A study of the probability of detection on random boards: ``boards`` have damage, and false
+    calls are counted on ``hole_free_boards``. All set-ups inspect the same boards, each with
+    ``repeats`` draws of noise. ``units`` are cameras with different fixed patterns: all of them
+    inspect each damaged board, another one each hole-free board."""
 
     boards: Boards
     hole_free_boards: Boards
     units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="number of units; null: only source.camera.unit_seed, so that limits hold for that unit alone"
+        None,
+        description="number of units; null: only source.camera.unit_seed, so that limits hold for that unit alone",
     )
 
 
 class ExperimentConfig(Config):
     """An experiment and the axes over which it is swept."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="also the name of its results folder")
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
+        description="also the name of its results folder",
+    )
     title: Annotated[str, Field(max_length=300)] = ""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="seed of the noise")
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
@@ -193,14 +232,20 @@ class ExperimentConfig(Config):
     detector: DetectorConfig = DetectorConfig()
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()
-    study: StudyConfig | None = Field(None, description="needs a family of boards (target: {name: drawn})")
+    study: StudyConfig | None = Field(
+        None, description="needs a family of boards (target: {name: drawn})"
+    )
     repeats: Repeats = Field(1, description="number of draws of the noise in each set-up")
-    sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
+    sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(
+        default_factory=dict
+    )
     draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="number of set-ups of the sweep to run, drawn at random without duplicates; null: all"
+        None,
+        description="number of set-ups of the sweep to run, drawn at random without duplicates; null: all",
     )
     switches: DottedPath | None = Field(
-        None, description="path of a mapping of switches, which are on: none, each alone, all but each, and all"
+        None,
+        description="path of a mapping of switches, which are on: none, each alone, all but each, and all",
     )
     sensitivity: SensitivityConfig | None = None
 
@@ -208,7 +253,9 @@ class ExperimentConfig(Config):
     def simulated(self) -> SimulatedSource:
         """The source, which must be a simulated camera. Raises UserError for a real capture."""
         if isinstance(self.source, CaptureSource):
-            raise UserError(f"{self.name}: its source is a real capture, but a simulated camera is needed")
+            raise UserError(
+                f"{self.name}: its source is a real capture, but a simulated camera is needed"
+            )
         return self.source
 
 
@@ -235,10 +282,11 @@ NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches",
 
 @dataclass(frozen=True)
 class Point:
-    """A resolved experiment without axes. ``values`` maps dotted paths to the values that make the point. ``variant``
-    labels its set-up or variation, ``label`` the point. ``axes`` holds the values of all axes but the number of frames.
-    ``reference`` is the set-up with the same ``axes`` that a variation varies ("" for none), else the point's own.
-    ``digest`` identifies the point's results, ``frames_key`` those of its frames."""
+    """A resolved experiment without axes. ``values`` maps dotted paths to the values that make the
+    point. ``variant`` labels its set-up or variation, ``label`` the point. ``axes`` holds the
+    values of all axes but the number of frames. ``reference`` is the set-up with the same ``axes``
+    that a variation varies ("" for none), else the point's own. ``digest`` identifies the point's
+    results, ``frames_key`` those of its frames."""
 
     label: str
     variant: str
@@ -253,7 +301,8 @@ class Point:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A valid experiment with its points. ``data`` is the resolved declaration as plain data, ``source`` the input."""
+    """A valid experiment with its points. ``data`` is the resolved declaration as plain data,
+    ``source`` the input."""
 
     config: ExperimentConfig
     points: tuple[Point, ...]
@@ -262,16 +311,25 @@ class Experiment:
 
     @property
     def digest(self) -> str:
-        """The digest over all points with their repeats, in order, which names the experiment's results."""
-        points = [[point.variant, point.label, point.digest, point.config.repeats] for point in self.points]
-        return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
+        """The digest over all points with their repeats, in order, which names the experiment's
+        results."""
+        points = [
+            [point.variant, point.label, point.digest, point.config.repeats]
+            for point in self.points
+        ]
+        return digest(
+            points if self.config.study is None else [self.config.study.to_data(), *points]
+        )
 
     def folder(self, results: Path) -> Path:
-        """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads out of it."""
+        """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads
+        out of it."""
         return inside(Path(results), self.config.name, self.digest)
 
 
-def point_of(label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig) -> Point:
+def point_of(
+    label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig
+) -> Point:
     """Return the point for a resolved declaration, with its digests."""
     source = config.source
     if isinstance(source, CaptureSource):
@@ -283,15 +341,27 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         # the full target, or the distribution of a family of boards, and the camera's numbers
         drawn = isinstance(source.target, DrawnTargetConfig)
         target = source.target.to_data() if drawn else source.target.declare().to_data()
-        camera, work = camera_of(source.camera), source.render.to_data()
+        camera = camera_of(source.camera)
+        work = source.render.to_data()
         frames = {"kind": source.kind, "target": target, "render": work}
-        frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": digest(camera.to_data())}
+        frames["camera"] = {
+            **source.camera.to_data(),
+            "name": camera.name,
+            "facts": digest(camera.to_data()),
+        }
         frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}
-    return Point(label, variant, values, config, digest(numbers), digest({"source": frames, "seed": config.seed}))
+    return Point(
+        label,
+        variant,
+        values,
+        config,
+        digest(numbers),
+        digest({"source": frames, "seed": config.seed}),
+    )
 
 
 def detector_version(config: ExperimentConfig) -> int:
@@ -302,10 +372,13 @@ def detector_version(config: ExperimentConfig) -> int:
 
 @lru_cache(maxsize=1000)
 def recording_of(source: CaptureSource) -> Recording:
-    """Open the recording of a source, and read and check its first frame. Raises UserError for faulty files."""
+    """Open the recording of a source, and read and check its first frame. Raises UserError for
+    faulty files."""
     from detectors.recordings import open_capture  # imports the readers of all formats
 
     name = source.intrinsics
     lens = lens_named(name) if name and name in lens_names() else None
     file = Path(name) if name and lens is None else None
-    return open_capture([Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens)
+    return open_capture(
+        [Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens
+    )

@@ -1,5 +1,6 @@
-"""Applies ``--set path=value``, unfolds axes, switches and variations into points, and validates each of them, with
-problems at the value that causes them. Set-ups differ in the axes other than the number of frames."""
+"""Applies ``--set path=value``, unfolds axes, switches and variations into points, and validates
+each of them, with problems at the value that causes them. Set-ups differ in the axes other than
+the number of frames."""
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +13,14 @@ from harness.experiment import checks
 from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of, point_of
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
-from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Place, Problem, Source, parse_yaml
+from harness.vocabulary.declaration.yaml_source import (
+    DeclarationError,
+    KeyPath,
+    Place,
+    Problem,
+    Source,
+    parse_yaml,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json, random_stream
@@ -26,25 +34,40 @@ class PathError(UserError):
 
 
 def key_path(text: str) -> KeyPath:
-    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the file."""
+    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the
+    file."""
     head, _, rest = text.partition(".")
     if head == "sweep" and rest:
         return (head, rest)
-    return tuple(int(part) if part.isascii() and part.isdigit() else part for part in text.split("."))
+    return tuple(
+        int(part) if part.isascii() and part.isdigit() else part for part in text.split(".")
+    )
 
 
-def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
-    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``, missing mappings on
-    the way get their defaults, and a new kind of a mapping (``merge.kind``) drops the keys of the former kind.
-    ``above`` is the path of ``data`` itself. Raises PathError if the path cannot be followed."""
+def set_path(
+    data: Any,
+    path: KeyPath,
+    value: Any,
+    declared: shape.Declared | None = None,
+    above: KeyPath = (),
+) -> Any:
+    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``,
+    missing mappings on the way get their defaults, and a new kind of a mapping (``merge.kind``)
+    drops the keys of the former kind. ``above`` is the path of ``data`` itself. Raises PathError
+    if the path cannot be followed."""
     if not path:
         return value
-    key, rest = _index(data, path[0], above), path[1:]
+    key = _index(data, path[0], above)
+    rest = path[1:]
     full_path = (*above, key)
     if isinstance(data, list):
         if key >= len(data):
             raise PathError(f"the list has no item {key}; it has {len(data)}, counted from 0")
-        return [*data[:key], set_path(data[key], rest, value, declared, full_path), *data[key + 1 :]]
+        return [
+            *data[:key],
+            set_path(data[key], rest, value, declared, full_path),
+            *data[key + 1 :],
+        ]
     inner = data.get(key)
     if key not in data and rest:
         default = shape.default_at(declared.at(full_path)) if declared else ()
@@ -54,7 +77,8 @@ def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | No
     around = declared.at(above) if declared and not rest else None
     kinds = shape.kinds_of(around)
     if kinds and kinds[0] == key:
-        old, new = (shape.model_for(around, kind) for kind in (data, {**data, key: value}))
+        old = shape.model_for(around, data)
+        new = shape.model_for(around, {**data, key: value})
         gone = {*(old.model_fields if old else ())} - {*(new.model_fields if new else ())}
         data = {name: held for name, held in data.items() if name not in gone}
     return {**data, key: set_path(inner, rest, value, declared, full_path)}
@@ -69,31 +93,49 @@ def _index(data: Any, key: str | int, above: KeyPath) -> Any:
 
 
 def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -> Problem | None:
-    """Return the problem for a path that the declaration lacks, with the nearest legal path; None for a legal path."""
+    """Return the problem for a path that the declaration lacks, with the nearest legal path; None
+    for a legal path."""
     for depth in range(1, len(path) + 1):
         if declared.at(path[:depth]) is None:
-            known = [dotted(legal) for legal in declared.paths() if path[0] in NOT_VARIED or legal[0] not in NOT_VARIED]
-            found = unknown_key(str(path[depth - 1]), path[: depth - 1], declared.names(path[: depth - 1]), place)
+            known = [
+                dotted(legal)
+                for legal in declared.paths()
+                if path[0] in NOT_VARIED or legal[0] not in NOT_VARIED
+            ]
+            found = unknown_key(
+                str(path[depth - 1]), path[: depth - 1], declared.names(path[: depth - 1]), place
+            )
             message = f"unknown path `{dotted(path)}`: {found.message}"
             return Problem(message, place, found.legal, nearest(dotted(path), known))
     return None
 
 
-def overridden(source: Source, overrides: Sequence[str], declared_of: shape.DeclaredOf) -> tuple[Source, list[Problem]]:
-    """Return the source with every legal ``path=value`` applied in order, and the problems of the illegal ones."""
+def overridden(
+    source: Source, overrides: Sequence[str], declared_of: shape.DeclaredOf
+) -> tuple[Source, list[Problem]]:
+    """Return the source with every legal ``path=value`` applied in order, and the problems of the
+    illegal ones."""
     problems: list[Problem] = []
-    parts = [(text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("=")))) for text in overrides]
+    parts = [
+        (text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("="))))
+        for text in overrides
+    ]
     for text, name, written, place in parts:
         if not name.strip() or not written.strip():
             fix = "write null to state no value" if "=" in text and name.strip() else None
-            problems.append(Problem("not of the form path=value", place, "capture.frames=10", fix=fix))
+            problems.append(
+                Problem("not of the form path=value", place, "capture.frames=10", fix=fix)
+            )
             continue
-        path, declared = key_path(name.strip()), declared_of(source.data)
+        path = key_path(name.strip())
+        declared = declared_of(source.data)
         try:
             value = parse_yaml(text, OPTION, start=len(name) + 1, is_argument=True)
             problem = path_problem(path, declared, place)
             if problem is None:
-                source = source.with_value(path, set_path(source.data, path, value.data, declared), value)
+                source = source.with_value(
+                    path, set_path(source.data, path, value.data, declared), value
+                )
             problems += [] if problem is None else [problem]
         except DeclarationError as error:
             problems += error.problems
@@ -103,20 +145,34 @@ def overridden(source: Source, overrides: Sequence[str], declared_of: shape.Decl
     for _, name, written, place in parts:
         if isinstance(swept, dict) and (path_text := name.strip()) in swept:
             message = f"`{path_text}` is an axis of the sweep, so this value would never be used"
-            problems.append(Problem(message, place, fix=f"{OPTION} 'sweep.{path_text}=[{written.strip()}]'"))
+            problems.append(
+                Problem(message, place, fix=f"{OPTION} 'sweep.{path_text}=[{written.strip()}]'")
+            )
     return source, problems
 
 
-MAX_POINTS = 10_000  # More than a machine can run in a week; larger numbers come from mistyped axes
-MAX_SHOWN = 20  # Most problems of combinations, which are found one point at a time and are similar
+# More than a machine can run in a week; larger numbers come from mistyped axes
+MAX_POINTS = 10_000
+# Most problems of combinations, which are found one point at a time and are similar
+MAX_SHOWN = 20
 FRAMES = "capture.frames"
 SWITCHES = "switches"  # Key of the file that states the path of a mapping of switches
-FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")  # the same for all points
+FIXED = (
+    "name",
+    "title",
+    "repeats",
+    "study",
+    "sweep",
+    "draws",
+    SWITCHES,
+    "sensitivity",
+)  # the same for all points
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A path with its value, the place of that value in the source, and its name (``path=value`` if empty)."""
+    """A path with its value, the place of that value in the source, and its name (``path=value``
+    if empty)."""
 
     path: str
     value: Any
@@ -126,7 +182,8 @@ class Setting:
 
 @dataclass(frozen=True)
 class Draft:
-    """An unresolved point. ``named_at`` is the place of its label or last value; ``frames`` are a variation's."""
+    """An unresolved point. ``named_at`` is the place of its label or last value; ``frames`` are a
+    variation's."""
 
     label: str
     variant: str
@@ -136,8 +193,11 @@ class Draft:
     frames: tuple[Setting, ...] = ()
 
 
-def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Point, ...], list[Problem]]:
-    """Return all points in order, or all problems of axes and variations. ``config``: None if other keys are wrong."""
+def unfolded(
+    source: Source, config: ExperimentConfig | None
+) -> tuple[tuple[Point, ...], list[Problem]]:
+    """Return all points in order, or all problems of axes and variations. ``config``: None if
+    other keys are wrong."""
     sweep = shape.child(source.data, "sweep")
     axes = [
         [Setting(path, value, ("sweep", path, index)) for index, value in enumerate(values)]
@@ -146,10 +206,19 @@ def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Poi
     ]
     variations = list(_written_variations(source.data))
     problems = [*_axis_problems(axes, source), *_variation_problems(variations, axes, source)]
-    switches, mistakes = _switch_axis(config, source) if config is not None and config.switches else ([], [])
+    switches, mistakes = (
+        _switch_axis(config, source) if config is not None and config.switches else ([], [])
+    )
     problems += mistakes
-    for draft in (*(Draft(_label([s]), "", (s,), s.written_at) for axis in axes for s in axis), *variations):
-        if not any(True for setting in draft.settings for _ in _path_problems(setting.path, None, source, FIXED)):
+    for draft in (
+        *(Draft(_label([s]), "", (s,), s.written_at) for axis in axes for s in axis),
+        *variations,
+    ):
+        if not any(
+            True
+            for setting in draft.settings
+            for _ in _path_problems(setting.path, None, source, FIXED)
+        ):
             problems += _resolved(draft, source, config is not None)[1]
     if problems or config is None:
         return (), problems
@@ -159,23 +228,39 @@ def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Poi
 
 
 def _written_variations(data: Any) -> Iterator[Draft]:
-    """Yield the variations as the file states them, without the numbers of frames of the sensitivity study."""
+    """Yield the variations as the file states them, without the numbers of frames of the
+    sensitivity study."""
     vary = shape.get(data, ("sensitivity", "vary"))
     for index, variation in enumerate(vary if isinstance(vary, list) else ()):
         at: KeyPath = ("sensitivity", "vary", index)
-        path, values, label, together = (shape.child(variation, key) for key in ("path", "values", "label", "set"))
+        path = shape.child(variation, "path")
+        values = shape.child(variation, "values")
+        label = shape.child(variation, "label")
+        together = shape.child(variation, "set")
         frames = _frame_settings(shape.child(variation, "frames"), (*at, "frames"))
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
                 setting = Setting(path, value, (*at, "values", number))
-                yield Draft(_label([setting]), _label([setting]), (setting,), setting.written_at, True, frames)
+                yield Draft(
+                    _label([setting]),
+                    _label([setting]),
+                    (setting,),
+                    setting.written_at,
+                    True,
+                    frames,
+                )
         elif isinstance(label, str) and isinstance(together, dict):
-            settings = tuple(Setting(key, value, (*at, "set", key)) for key, value in together.items())
+            settings = tuple(
+                Setting(key, value, (*at, "set", key)) for key, value in together.items()
+            )
             yield Draft(label, label, settings, (*at, "label"), True, frames)
 
 
 def _frame_settings(frames: Any, at: KeyPath) -> tuple[Setting, ...]:
-    return tuple(Setting(FRAMES, n, (*at, k)) for k, n in enumerate(frames if isinstance(frames, list | tuple) else ()))
+    return tuple(
+        Setting(FRAMES, n, (*at, k))
+        for k, n in enumerate(frames if isinstance(frames, list | tuple) else ())
+    )
 
 
 def _label(settings: Iterable[Setting]) -> str:
@@ -194,48 +279,79 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
             yield Problem(message, at, fix=f"sweep only `{outer}`, or only keys within it")
     count = prod(len(axis) for axis in axes)
     if count > MAX_POINTS:
-        yield Problem(f"the axes make {count} points", source.key_place_of(("sweep",)), legal=f"at most {MAX_POINTS}")
+        yield Problem(
+            f"the axes make {count} points",
+            source.key_place_of(("sweep",)),
+            legal=f"at most {MAX_POINTS}",
+        )
 
 
 def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting], list[Problem]]:
-    """Return an axis over the mapping of switches that the file names: none on, each alone, all but each, and all."""
-    path, place, problems = config.switches or "", source.place_of((SWITCHES,)), []
+    """Return an axis over the mapping of switches that the file names: none on, each alone, all
+    but each, and all."""
+    path = config.switches or ""
+    place = source.place_of((SWITCHES,))
+    problems = []
     found = shape.get(config.to_data(), key_path(path))
-    names = [*found] if isinstance(found, dict) and all(isinstance(value, bool) for value in found.values()) else []
+    names = (
+        [*found]
+        if isinstance(found, dict) and all(isinstance(value, bool) for value in found.values())
+        else []
+    )
     if len(names) < 2:
-        legal = "a mapping of at least two keys that are true or false, such as source.camera.effects"
+        legal = (
+            "a mapping of at least two keys that are true or false, such as source.camera.effects"
+        )
         problems.append(Problem(f"`{path}` does not hold switches", place, legal=legal))
     for axis in config.sweep:
         if f"{axis}.".startswith(f"{path}.") or f"{path}.".startswith(f"{axis}."):
             message = f"the switches `{path}` and the axis `{axis}` set the same key"
-            problems.append(Problem(message, place, fix="sweep other keys, or leave the switches out"))
-    alone, whole = [frozenset({name}) for name in names], frozenset(names)
+            problems.append(
+                Problem(message, place, fix="sweep other keys, or leave the switches out")
+            )
+    alone = [frozenset({name}) for name in names]
+    whole = frozenset(names)
 
     def label(on: frozenset[str]) -> str:
         few = {0: "none", len(whole): "all", 1: f"{''.join(on)} alone"}
         return few.get(len(on), f"all but {''.join(whole - on)}").replace("_", " ")
 
     chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - switch for switch in alone), whole])
-    return [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen], problems
+    return [
+        Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen
+    ], problems
 
 
-def _variation_problems(variations: list[Draft], axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
+def _variation_problems(
+    variations: list[Draft], axes: list[list[Setting]], source: Source
+) -> Iterator[Problem]:
     for draft in variations:
         for setting in draft.settings:
             listed = source.place_of((*setting.written_at[:3], "path"))
-            at = listed if "values" in setting.written_at else source.key_place_of(setting.written_at)
+            at = (
+                listed
+                if "values" in setting.written_at
+                else source.key_place_of(setting.written_at)
+            )
             yield from _path_problems(setting.path, at, source, (*FIXED, FRAMES))
-    # a variation needs a set-up of the main experiment with the same number of frames for comparison
+    # a variation needs a set-up of the main experiment with the same number of frames for
+    # comparison
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
     main = main or [shape.get(source.data, ("capture", "frames"))]
     listed_at: KeyPath = ("sensitivity", "frames")
     for setting in _frame_settings(shape.get(source.data, listed_at), listed_at):
         if setting.value not in main:
-            message = f"the main experiment has no set-up with {setting.value} frames to compare with"
-            yield Problem(message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main)))
+            message = (
+                f"the main experiment has no set-up with {setting.value} frames to compare with"
+            )
+            yield Problem(
+                message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main))
+            )
 
 
-def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterable[str]) -> Iterator[Problem]:
+def _path_problems(
+    path: str, place: Place | None, source: Source, fixed: Iterable[str]
+) -> Iterator[Problem]:
     if any(path == key or path.startswith(key + ".") for key in fixed):
         reason = "set by `sensitivity.frames`" if path == FRAMES else "the same for all points"
         yield Problem(f"`{path}` cannot be varied here: it is {reason}", place)
@@ -243,10 +359,15 @@ def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterab
         yield problem
 
 
-def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Return a point's declaration, or its problems: at the wrong value, or else (if ``keep_all``) at its name."""
+def _resolved(
+    draft: Draft, source: Source, keep_all: bool
+) -> tuple[ExperimentConfig | None, list[Problem]]:
+    """Return a point's declaration, or its problems: at the wrong value, or else (if ``keep_all``)
+    at its name."""
     place = source.place_of(draft.named_at)
-    located = replace(source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")})
+    located = replace(
+        source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")}
+    )
     try:
         for setting in draft.settings:
             path = key_path(setting.path)
@@ -256,11 +377,17 @@ def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentC
         return None, [Problem(error.message, place)]
     config, found = checks.resolved(located)
     starts = [setting.written_at for setting in draft.settings]
-    written = (item for places in (source.values, source.keys) for item in places.items()) if found else ()
+    written = (
+        (item for places in (source.values, source.keys) for item in places.items())
+        if found
+        else ()
+    )
     own = {spot for at, spot in written if any(at[: len(start)] == start for start in starts)}
     elsewhere = f"with {draft.label}: " if draft.settings else ""
     return config, [
-        problem if problem.place in own else replace(problem, message=elsewhere + problem.message, place=place)
+        problem
+        if problem.place in own
+        else replace(problem, message=elsewhere + problem.message, place=place)
         for problem in found
         if problem.place in own or keep_all
     ]
@@ -269,11 +396,15 @@ def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentC
 def _drafts(
     axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
 ) -> Iterator[Draft]:
-    """Yield the product of the axes (the last varies fastest), then all variations with all numbers of frames."""
-    names, texts = names_of(telling), dict[int, str]()
+    """Yield the product of the axes (the last varies fastest), then all variations with all
+    numbers of frames."""
+    names = names_of(telling)
+    texts = dict[int, str]()
     for axis in axes:
         for setting in axis if axis[0].path in telling else ():
-            value = value_text(setting.path, differing(setting.value, (other.value for other in axis)))
+            value = value_text(
+                setting.path, differing(setting.value, (other.value for other in axis))
+            )
             texts[id(setting)] = setting.name or f"{names[setting.path]}={value}"
     chosen = list(product(*axes))
     if config.draws is not None:
@@ -285,11 +416,19 @@ def _drafts(
     for settings in chosen:
         # a set-up has a name such as ``camera=kinect_v2, distance=0.75 m``
         parts = [texts[id(setting)] for setting in settings if setting.path in telling]
-        yield Draft(_label(settings), ", ".join(parts) or MAIN, settings, settings[-1].written_at if settings else ())
-    common = _frame_settings(config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames"))
+        yield Draft(
+            _label(settings),
+            ", ".join(parts) or MAIN,
+            settings,
+            settings[-1].written_at if settings else (),
+        )
+    common = _frame_settings(
+        config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames")
+    )
     for variation in variations:
         for frames in variation.frames or common:
-            label, settings = f"{variation.label}, {FRAMES}={frames.value}", (frames, *variation.settings)
+            label = f"{variation.label}, {FRAMES}={frames.value}"
+            settings = (frames, *variation.settings)
             yield replace(variation, label=label, variant=variation.label, settings=settings)
 
 
@@ -302,11 +441,16 @@ def _points(
     known: dict[tuple[str, str], Draft] = {}
     set_ups: dict[str, str] = {}
     for draft in drafts:
-        # a set-up and a variation, or two set-ups with long values that are shortened, may get the same name
+        # a set-up and a variation, or two set-ups with long values that are shortened, may get the
+        # same name
         values = [setting.value for setting in draft.settings if setting.path != FRAMES]
         if called.setdefault(draft.variant, values) != values:
             message = f"two different set-ups are called `{draft.variant}`"
-            return (), [Problem(message, source.place_of(draft.named_at), fix="give one of them another label")]
+            return (), [
+                Problem(
+                    message, source.place_of(draft.named_at), fix="give one of them another label"
+                )
+            ]
     for draft in drafts:
         config, found = _resolved(draft, source, True)
         problems += found
@@ -314,16 +458,24 @@ def _points(
             break
         if config is None or found:
             continue
-        study, calibrate = experiment.sensitivity, config.threshold.calibrate
+        study = experiment.sensitivity
+        calibrate = config.threshold.calibrate
         if draft.is_variation and study is not None:
-            if calibrate is not None and calibrate.repeats is not None and study.calibration_repeats is not None:
+            if (
+                calibrate is not None
+                and calibrate.repeats is not None
+                and study.calibration_repeats is not None
+            ):
                 calibrate = calibrate.model_copy(update={"repeats": study.calibration_repeats})
             threshold = config.threshold.model_copy(update={"calibrate": calibrate})
             config = config.model_copy(update={"repeats": study.repeats, "threshold": threshold})
-        # the resolved values of the axes identify set-ups, and the set-up that a variation is compared with
+        # the resolved values of the axes identify set-ups, and the set-up that a variation is
+        # compared with
         data = json.loads(json.dumps(config.to_data())) if axes else {}
         placed = {path: shape.get(data, key_path(path)) for path in axes}
-        point = point_of(draft.label, draft.variant, {s.path: s.value for s in draft.settings}, config)
+        point = point_of(
+            draft.label, draft.variant, {s.path: s.value for s in draft.settings}, config
+        )
         reference = draft.variant
         if draft.is_variation:
             reference = set_ups.get(canonical_json(placed), "")
@@ -335,5 +487,7 @@ def _points(
         if twin is not draft:
             message = f"the points {draft.label} and {twin.label} are the same experiment"
             problems.append(Problem(message, source.place_of(draft.named_at), fix="keep one"))
-        points.append(replace(point, is_variation=draft.is_variation, axes=placed, reference=reference))
+        points.append(
+            replace(point, is_variation=draft.is_variation, axes=placed, reference=reference)
+        )
     return tuple(points), problems

@@ -1,10 +1,12 @@
-"""The arguments of `harness.detect` as settings: a detector, the merging of views, captures, stated poses."""
+"""The arguments of `tofpod detect` as settings: a detector, the merging of views, captures,
+stated poses."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from detectors.interface import Detector
-    from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
+    from detectors.views.mapping.settings import MappingConfig
     from harness.vocabulary.geometry import Lens
 
 METHODS = ("marks", "icp", "cpd", "joint", "odometry", "nominal")
@@ -26,23 +28,49 @@ MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "matched"
-PREFIX = "mapping."  # prefix of the --set keys for merging views; all other keys are the detector's
+# prefix of the --set keys for merging views; all other keys are the detector's
+PREFIX = "mapping."
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
 """Settings that state a polynomial: without them, the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
 
 
-READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_capture` takes as they are
+READING = (
+    "unit",
+    "topic",
+    "array",
+    "pitch",
+    "raw",
+)  # options that `open_capture` takes as they are
 
 
 def add_reading(add: Callable[..., Any]) -> None:
     """Add the options for reading captures with ``add_argument`` of a parser or group."""
-    add("--unit", help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data")
-    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera (nominal lens)")
+    add(
+        "--unit",
+        help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data",
+    )
+    add(
+        "--intrinsics",
+        metavar="FILE|CAMERA",
+        help="lens of the depth pixels: a file, or a camera (nominal lens)",
+    )
     add("--topic", help="topic of a ROS bag with depth images or clouds (default: the only one)")
-    add("--array", metavar="NAME[:NUMBER]", help="name of the array in a .npz, .mat or .npy, and number of the map")
-    add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
-    add("--raw", metavar="LAYOUT", help="layout of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
+    add(
+        "--array",
+        metavar="NAME[:NUMBER]",
+        help="name of the array in a .npz, .mat or .npy, and number of the map",
+    )
+    add(
+        "--pitch",
+        metavar="LENGTH",
+        help="the array is a height map with this distance between pixels, such as 0.5mm",
+    )
+    add(
+        "--raw",
+        metavar="LAYOUT",
+        help="layout of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2",
+    )
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -54,8 +82,12 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
     """Raise UserError for arguments of several views with one capture, and vice versa."""
     several = f"--register {'|'.join(METHODS)}"
     if arguments.register is None:
-        given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
-        given += [f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)]
+        given = [
+            name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None
+        ]
+        given += [
+            f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)
+        ]
         if given:
             what = f"--{given[0]}: concerns several views, but without --register all PATHs are one capture"
             raise UserError(what, legal=several)
@@ -69,10 +101,14 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
         raise UserError(f"{len(paths)} view cannot be registered: there is no other view", fix=fix)
     refuse_repeats(paths)
     if arguments.register == "nominal" and arguments.poses is None:
-        raise UserError("--register nominal uses the stated poses, and none are stated", fix="give --poses FILE")
+        raise UserError(
+            "--register nominal uses the stated poses, and none are stated", fix="give --poses FILE"
+        )
     if arguments.quiet_capture is not None:
         what = "--quiet-capture is one cloud, and its noise differs from that of a cloud merged from several views"
-        raise UserError(what, fix="use --threshold with a value at which undamaged views have no finding")
+        raise UserError(
+            what, fix="use --threshold with a value at which undamaged views have no finding"
+        )
 
 
 def refuse_repeats(paths: Sequence[Path]) -> None:
@@ -81,7 +117,10 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
             legal = "captures from different places, each named once"
-            raise UserError(f"{path}: is named twice; counting the same noise twice would understate it", legal=legal)
+            raise UserError(
+                f"{path}: is named twice; counting the same noise twice would understate it",
+                legal=legal,
+            )
 
 
 def detector_of(
@@ -94,15 +133,23 @@ def detector_of(
     known = detector_type(arguments.detector).settings_type
     if "crop" in known.model_fields:
         # with several views, --crop and --target belong to the mapping
-        settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
+        settings["crop"] = crop_from_text(
+            crop, arguments.target if crop == arguments.crop else None
+        )
     elif arguments.target is not None:
-        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop for it")
+        raise UserError(
+            f"--target {arguments.target}: detector {arguments.detector} has no crop for it"
+        )
     reference = getattr(arguments, "reference", None)
     if reference is not None:
         if "surface" not in known.model_fields:
-            raise UserError(f"--reference {reference}: detector {arguments.detector} has no surface setting")
+            raise UserError(
+                f"--reference {reference}: detector {arguments.detector} has no surface setting"
+            )
         settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
-    elif "surface" in known.model_fields and not any(each.startswith(STATED_SURFACE) for each in assignments):
+    elif "surface" in known.model_fields and not any(
+        each.startswith(STATED_SURFACE) for each in assignments
+    ):
         settings["surface"] = {"shape": "auto"}
     for assignment in assignments:
         assign(settings, assignment)
@@ -110,8 +157,9 @@ def detector_of(
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
-    """Return the settings that merge views into one cloud. Raises UserError with every problem at once."""
-    from detectors.mapping.settings import MappingConfig
+    """Return the settings that merge views into one cloud. Raises UserError with every problem at
+    once."""
+    from detectors.views.mapping.settings import MappingConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 
     data: dict[str, Any] = {
@@ -127,7 +175,8 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
-    """Return the crop's declaration from text, with the number of the automatic crop's candidate. Raises UserError."""
+    """Return the crop's declaration from text, with the number of the automatic crop's candidate.
+    Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
         what = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
@@ -135,25 +184,38 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
     except ValueError as error:
-        raise UserError(f"--crop {text}: not all of its values are numbers", legal=LEGAL_CROP) from error
+        raise UserError(
+            f"--crop {text}: not all of its values are numbers", legal=LEGAL_CROP
+        ) from error
     pairs = [numbers[i : i + 2] for i in range(0, len(numbers), 2)]
     if kind in ("auto", "none") and not numbers:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
         if not all(low < high for low, high in pairs):
             what = f"--crop {text}: a lower bound is not below the upper one"
-            raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
-        return {"kind": "box", "x_mm": pairs[0], "y_mm": pairs[1], "z_mm": pairs[2], "range_max_m": None}
+            raise UserError(
+                what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first"
+            )
+        return {
+            "kind": "box",
+            "x_mm": pairs[0],
+            "y_mm": pairs[1],
+            "z_mm": pairs[2],
+            "range_max_m": None,
+        }
     if kind == "polygon" and len(numbers) >= 6 and len(numbers) % 2 == 0:
         return {"kind": "polygon", "vertices_px": pairs}
     raise UserError(f"--crop {text}: no such crop", legal=LEGAL_CROP)
 
 
 def assign(settings: dict[str, Any], assignment: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError without one."""
+    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError
+    without one."""
     path, equals, text = assignment.partition("=")
     if not (path and equals):
-        raise UserError(f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5")
+        raise UserError(
+            f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5"
+        )
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
@@ -166,7 +228,9 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
     settings[leaf] = value
 
 
-def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any) -> Recording:
+def opened(
+    paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any
+) -> Recording:
     """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
     from detectors.recordings import open_capture
 
@@ -175,35 +239,65 @@ def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = No
         from scenes.sensor.camera import lens_named, lens_names
 
         if str(intrinsics) in lens_names():
-            file, lens = None, lens_named(str(intrinsics))
+            file = None
+            lens = lens_named(str(intrinsics))
         elif not file.exists():
             legal = f"a file, or one of the cameras {', '.join(lens_names())}"
             raise UserError(f"--intrinsics {file}: no such file and no such camera", legal=legal)
     return open_capture(list(paths), intrinsics=file, lens=lens, **reading)
 
 
-POSES_KEY = "T_reference_view"  # key of the list in a file of `harness.export`, beside the file's version
+def opened_as(
+    camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any
+) -> Recording:
+    """Open a capture; if it states no lens and none is given, the nominal lens of ``camera`` is
+    used."""
+    try:
+        return opened(paths, intrinsics, **reading)
+    except UserError:
+        if camera is None or intrinsics is not None:
+            raise
+        from scenes.sensor.camera import load_camera
+
+        recording = opened(paths, None, lens=load_camera(camera).nominal_lens, **reading)
+        note = f"the capture states no lens; the nominal lens of {camera} is used"
+        return replace(recording, notes=(*recording.notes, note))
+
+
+POSES_KEY = (
+    "T_reference_view"  # key of the list in a file of `tofpod export`, beside the file's version
+)
 LEGAL_POSES = (
     "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
     f" under the key {POSES_KEY}; or lines of"
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
-RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
+# tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
+RIGID_WITHIN = 1e-4
 FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in millimetres lie beyond
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
-    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
-    UserError if the file cannot be read, has another number of poses, or one that is not rigid or too far."""
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any
+    common frame. Raises UserError if the file cannot be read, has another number of poses, or one
+    that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert
 
     try:
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8")
-        poses = _from_json(path, text) if text.lstrip().startswith(("[", "{")) else _from_lines(path, text)
+        poses = (
+            _from_json(path, text)
+            if text.lstrip().startswith(("[", "{"))
+            else _from_lines(path, text)
+        )
     except (OSError, ValueError, TypeError, OverflowError) as error:
-        why = f"cannot be read ({error.strerror})" if isinstance(error, OSError) else f"holds no poses ({error})"
+        why = (
+            f"cannot be read ({error.strerror})"
+            if isinstance(error, OSError)
+            else f"holds no poses ({error})"
+        )
         raise UserError(f"{path}: {why}", legal=LEGAL_POSES) from error
     if len(poses) != count:
         fix = "keep one pose for each PATH, in the same order (one line per view for groundtruth.txt of a sequence)"
@@ -212,9 +306,13 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     for number, pose in enumerate(poses):
         turn = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
         with np.errstate(over="ignore", invalid="ignore"):
-            is_rigid = np.allclose(turn @ turn.T, np.eye(3), atol=RIGID_WITHIN) and np.linalg.det(turn) > 0
+            is_rigid = (
+                np.allclose(turn @ turn.T, np.eye(3), atol=RIGID_WITHIN) and np.linalg.det(turn) > 0
+            )
         if not (is_rigid and np.isfinite(pose).all() and np.array_equal(pose[3], [0, 0, 0, 1])):
-            raise UserError(f"{path}: pose {number} is not a rigid 4x4 transform", legal=LEGAL_POSES)
+            raise UserError(
+                f"{path}: pose {number} is not a rigid 4x4 transform", legal=LEGAL_POSES
+            )
         if number:
             with np.errstate(over="ignore", invalid="ignore"):
                 from_first.append(invert(poses[0]) @ pose)
@@ -226,7 +324,8 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
 
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
-    """Parse a list of matrices: bare, in an object from `harness.export`, or in one without a version."""
+    """Parse a list of matrices: bare, in an object from `tofpod export`, or in one without a
+    version."""
     import numpy as np
 
     data = strict_json(text)

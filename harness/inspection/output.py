@@ -1,4 +1,5 @@
-"""The results as text for the terminal, as facts for JSON files, and as a 3-D scene for the browser."""
+"""The results as text for the terminal, as facts for JSON files, and as a 3-D scene for the
+browser."""
 
 from __future__ import annotations
 
@@ -12,16 +13,18 @@ import numpy as np
 from detectors.crop import AutoCrop, Choice, choice_of, described_text
 from harness.report.findings import Finding, Judged, save_targets
 from harness.report.view3d import Circle3d, Scene3d
-from harness.tables.text import Grid, show
 from harness.vocabulary.geometry import MM, Cloud
+from harness.vocabulary.text import Grid, show
 
 if TYPE_CHECKING:
     from detectors.interface import Evidence
-    from detectors.mapping.merge import Mapped
     from detectors.recordings import Recording
-    from detectors.views import PreparedView
+    from detectors.views.mapping.merge import Mapped
+    from detectors.views.view import PreparedView
 
-WIDEST_NATIVE_PX = 6.5  # filters of known cameras average at most 5 pixels; a measured reach scatters by one
+WIDEST_NATIVE_PX = (
+    6.5  # filters of known cameras average at most 5 pixels; a measured reach scatters by one
+)
 
 
 def mm(metres: float) -> str:
@@ -46,8 +49,11 @@ def print_notes(notes: Iterable[str]) -> None:
         print(f"note: {note}")
 
 
-def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str) -> None:
-    """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), one per line."""
+def print_capture(
+    recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str
+) -> None:
+    """Print the frames, those left out, and the points that the crop keeps (``kept``, of the
+    cloud), one per line."""
     height, width = cloud.valid.shape
     size = f"{width} x {height} pixels" if cloud.organised else f"{width} points"
     print(f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)} averaged, {size}")
@@ -86,13 +92,15 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
 
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
-    """Return the automatic crop's choice by settings; None for another crop. Raises UserError as the crop does."""
+    """Return the automatic crop's choice by settings; None for another crop. Raises UserError as
+    the crop does."""
     config = getattr(settings, "crop", None)
     return choice_of(cloud, config) if isinstance(config, AutoCrop) and cloud.valid.any() else None
 
 
 def print_choice(choice: Choice | None) -> None:
-    """Print the surface that was taken, and each other candidate with the option that takes it, one per line."""
+    """Print the surface that was taken, and each other candidate with the option that takes it,
+    one per line."""
     if choice is None or not choice.candidates:
         return
     texts = list(map(described_text, choice.candidates))
@@ -109,14 +117,22 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
     candidates = []
     for n, area in enumerate(choice.candidates, start=1):
         nearest, distance, farthest = (m / MM for m in area.depths_m)
-        facts: dict[str, Any] = {"number": n, "nearest_mm": nearest, "distance_mm": distance, "farthest_mm": farthest}
+        facts: dict[str, Any] = {
+            "number": n,
+            "nearest_mm": nearest,
+            "distance_mm": distance,
+            "farthest_mm": farthest,
+        }
         facts |= {"extent_mm": [side / MM for side in area.extent_m], "share_of_view": area.share}
         candidates.append({**facts, "tilt_deg": area.tilt_deg, "pixels": int(area.own.sum())})
     return {"taken": choice.taken, "warnings": choice.warnings, "candidates": candidates}
 
 
-def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Callable[[Path], object]]:
-    """Return the writer of the candidates' numbered picture, by file name, for `report.findings.write_findings`."""
+def pictures(
+    choice: Choice | None, name: str = "targets.png"
+) -> dict[str, Callable[[Path], object]]:
+    """Return the writer of the candidates' numbered picture, by file name, for
+    `report.findings.write_findings`."""
     if choice is None or not choice.candidates:
         return {}
     outlines = [candidate.outline for candidate in choice.candidates]
@@ -131,10 +147,16 @@ def print_registrations(data: Mapping[str, Any]) -> None:
         "across mm": ("predicted_across_mm", 3), "held out mm": ("held_out_mark_mm", 3), "pairs": ("pairs", 0),
     }  # fmt: skip
     rows = [
-        (row["view"], row["method"], *(number(row[key], digits) for key, digits in columns.values()))
+        (
+            row["view"],
+            row["method"],
+            *(number(row[key], digits) for key, digits in columns.values()),
+        )
         for row in data["views"]
     ]
-    print("registration to the first view (in plane, across: predicted root mean square error over the target)")
+    print(
+        "registration to the first view (in plane, across: predicted root mean square error over the target)"
+    )
     show([Grid.of(("view", "method", *columns), rows, left=0)])
     for row in data["views"]:
         print_notes(f"{row['view']}: {note}" for note in row["notes"])
@@ -152,29 +174,74 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
     if not findings:
         print("no findings")
         return
-    places = {"u_px": f"u {grid}", "v_px": f"v {grid}", "x_mm": "x mm", "y_mm": "y mm", "z_mm": "z mm"}
-    heads = ("id", "kind", *places.values(), "diam. mm", "from", "depth mm", "vol. mm3", "points", "score")
+    places = {
+        "u_px": f"u {grid}",
+        "v_px": f"v {grid}",
+        "x_mm": "x mm",
+        "y_mm": "y mm",
+        "z_mm": "z mm",
+    }
+    heads = (
+        "id",
+        "kind",
+        *places.values(),
+        "diam. mm",
+        "from",
+        "depth mm",
+        "vol. mm3",
+        "points",
+        "score",
+    )
     rows = []
     for f in findings:
-        sizes = (number(f.diameter_mm, 1), f.size_from, number(f.depth_mm, 2), number(f.volume_mm3, 1))
-        rows.append((f.id, f.kind, *(number(getattr(f, key), 1) for key in places), *sizes, f.points, f"{f.score:.2f}"))
+        sizes = (
+            number(f.diameter_mm, 1),
+            f.size_from,
+            number(f.depth_mm, 2),
+            number(f.volume_mm3, 1),
+        )
+        rows.append(
+            (
+                f.id,
+                f.kind,
+                *(number(getattr(f, key), 1) for key in places),
+                *sizes,
+                f.points,
+                f"{f.score:.2f}",
+            )
+        )
     if any(f.is_long for f in findings):
         heads += ("long damage: mm, degrees",)
-        long = [f"{f.length_mm:.1f} x {f.width_mm:.1f}, {f.angle_deg:.0f}" if f.is_long else "-" for f in findings]
+        long = [
+            f"{f.length_mm:.1f} x {f.width_mm:.1f}, {f.angle_deg:.0f}" if f.is_long else "-"
+            for f in findings
+        ]
         rows = [(*row, text) for row, text in zip(rows, long, strict=True)]
     show([Grid.of(heads, rows, left=0)])
 
 
 def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
-    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around each finding."""
-    cloud, merged = judged.cloud, mapped.merged
+    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around
+    each finding."""
+    cloud = judged.cloud
+    merged = mapped.merged
     valid = cloud.valid.reshape(-1)
     detected = np.zeros(valid.size, bool)
     for detection in judged.detections:
         detected[detection.pixels] = True
-    rgb = None if cloud.rgb is None else np.clip(np.nan_to_num(cloud.rgb.reshape(-1, 3)[valid]), 0, 255)
+    rgb = (
+        None
+        if cloud.rgb is None
+        else np.clip(np.nan_to_num(cloud.rgb.reshape(-1, 3)[valid]), 0, 255)
+    )
     circles = [
-        Circle3d(place, np.array([0.0, 0.0, -1.0]), f.diameter_mm, f"{f.id}: {f.diameter_mm:.1f}", "finding")
+        Circle3d(
+            place,
+            np.array([0.0, 0.0, -1.0]),
+            f.diameter_mm,
+            f"{f.id}: {f.diameter_mm:.1f}",
+            "finding",
+        )
         for f in judged.findings
         if np.isfinite([*(place := np.array([f.x_mm, f.y_mm, f.z_mm])), f.diameter_mm]).all()
     ]

@@ -1,4 +1,5 @@
-"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with coloured damage.
+"""Findings of `tofpod detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with
+coloured damage.
 
 All files of a run are first written under temporary names and renamed together at the end."""
 
@@ -14,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
+from harness.records import outputs, trials
 from harness.report.clouds import residual_bar, residual_norm
-from harness.tables import outputs, trials
 from harness.vocabulary.files import atomic_path, plain_json
 from harness.vocabulary.geometry import MM, Cloud
 
@@ -24,16 +25,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DAMAGE_RGB = (255, 0, 255)
-ELONGATED = 2.0  # least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1 mm
+# least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1
+# mm
+ELONGATED = 2.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A row: the better of both measures in the camera frame; NaN if nothing could be measured. ``kind`` is ``hole``,
-    ``bump`` or ``no return``. ``length_mm`` and ``width_mm`` are the sides of a rectangle with the residual's second
-    moments; ``angle_deg`` is the longer side's angle from x towards y, -90 to 90, across the line of sight.
-    ``size_from`` is ``model`` (blurred hole, standard errors), ``contour`` (half depth), ``extent`` (extreme points) or
-    ``area`` (no return); ``depth_from`` is the same, ``extreme residual`` of the cluster's points, or ``none``."""
+    """A row: the better of both measures in the camera frame; NaN if nothing could be measured.
+    ``kind`` is ``hole``, ``bump`` or ``no return``. ``length_mm`` and ``width_mm`` are the sides
+    of a rectangle with the residual's second moments; ``angle_deg`` is the longer side's angle
+    from x towards y, -90 to 90, across the line of sight. ``size_from`` is ``model`` (blurred
+    hole, standard errors), ``contour`` (half depth), ``extent`` (extreme points) or ``area`` (no
+    return); ``depth_from`` is the same, ``extreme residual`` of the cluster's points, or ``none``.
+    """
 
     id: int
     kind: str
@@ -61,7 +66,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with a detector's results. ``missing`` are its missing returns, None without a pixel grid."""
+    """A cloud with a detector's results. ``missing`` are its missing returns, None without a pixel
+    grid."""
 
     cloud: Cloud
     evidence: Evidence
@@ -76,25 +82,45 @@ class Judged:
         return tuple(finding_of(i, self.evidence, d, m) for i, (d, m) in enumerate(pairs, start=1))
 
 
-def finding_of(number: int, evidence: Evidence, detection: Detection, measured: Measurement) -> Finding:
-    """Return the row of a detection: the model's numbers if they exist, or else those of the extents."""
+def finding_of(
+    number: int, evidence: Evidence, detection: Detection, measured: Measurement
+) -> Finding:
+    """Return the row of a detection: the model's numbers if they exist, or else those of the
+    extents."""
     modelled = math.isfinite(measured.model_diameter_m)
     placed = bool(np.isfinite(measured.model_centre_m).all())
-    x_mm, y_mm, z_mm = (float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m))
+    x_mm, y_mm, z_mm = (
+        float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m)
+    )
     diameter_m = measured.model_diameter_m if modelled else measured.extent_diameter_m
-    size_from = "extent" if not modelled else "contour" if math.isnan(measured.model_diameter_se_m) else "model"
-    depth_m, depth_from = measured.model_depth_m, size_from
+    size_from = (
+        "extent"
+        if not modelled
+        else "contour"
+        if math.isnan(measured.model_diameter_se_m)
+        else "model"
+    )
+    depth_m = measured.model_depth_m
+    depth_from = size_from
     if detection.kind == "no return":
-        size_from, depth_from = "area", "none"
+        size_from = "area"
+        depth_from = "none"
     elif math.isnan(depth_m):
         residuals = evidence.residual_m.reshape(-1)[detection.pixels]
-        depth_m, depth_from = float(residuals[np.argmax(np.abs(residuals))]), "extreme residual"
+        depth_m = float(residuals[np.argmax(np.abs(residuals))])
+        depth_from = "extreme residual"
     kind = detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole"
     place = (measured.u_px, measured.v_px, x_mm, y_mm, z_mm)
     sizes = (diameter_m / MM, depth_m / MM, measured.volume_m3 / MM**3)
     x, y, _ = measured.along
-    sides = (measured.length_m / MM, measured.width_m / MM, float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90))
-    return Finding(number, kind, *place, *sizes, measured.points, measured.score, *sides, size_from, depth_from)
+    sides = (
+        measured.length_m / MM,
+        measured.width_m / MM,
+        float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90),
+    )
+    return Finding(
+        number, kind, *place, *sizes, measured.points, measured.score, *sides, size_from, depth_from
+    )
 
 
 def write_findings(
@@ -105,13 +131,23 @@ def write_findings(
     cloud_name: str = outputs.CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about`` besides the findings;
-    ``beside`` maps names of further files to functions that write them. Raises UserError if writing fails."""
-    is_new, (cloud, missing, detections) = not folder.exists(), (judged.cloud, judged.missing, judged.detections)
+    """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about``
+    besides the findings; ``beside`` maps names of further files to functions that write them.
+    Raises UserError if writing fails."""
+    is_new, (cloud, missing, detections) = (
+        not folder.exists(),
+        (judged.cloud, judged.missing, judged.detections),
+    )
     writers: dict[str, Callable[[Path], object]] = {
-        outputs.FINDINGS.name: lambda path: path.write_text(csv_text(judged.findings), encoding="utf-8"),
-        outputs.FINDINGS_DATA.name: lambda path: path.write_text(json_text(judged, about), encoding="utf-8"),
-        outputs.ANNOTATED.name: lambda path: _save(path, findings_figure(cloud, judged.evidence, detections, title)),
+        outputs.FINDINGS.name: lambda path: path.write_text(
+            csv_text(judged.findings), encoding="utf-8"
+        ),
+        outputs.FINDINGS_DATA.name: lambda path: path.write_text(
+            json_text(judged, about), encoding="utf-8"
+        ),
+        outputs.ANNOTATED.name: lambda path: _save(
+            path, findings_figure(cloud, judged.evidence, detections, title)
+        ),
         cloud_name: lambda path: path.write_bytes(ply_bytes(cloud, detections)),
         **(beside or {}),
     }
@@ -132,16 +168,27 @@ def write_findings(
 def csv_text(findings: Sequence[Finding]) -> str:
     """Return the content of findings.csv; unknown numbers are empty cells."""
     frame = trials.FINDINGS_OF_CAPTURE.frame(findings)
-    return str(frame.to_csv(index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"))
+    return str(
+        frame.to_csv(
+            index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"
+        )
+    )
 
 
 def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
-    """Return the findings with both measures and their standard errors, then ``about``; unknown numbers are null."""
+    """Return the findings with both measures and their standard errors, then ``about``; unknown
+    numbers are null."""
     rows = [
         asdict(finding)
         | {
-            "extent": {"diameter_mm": m.extent_diameter_m / MM, "centre_mm": m.extent_centre_m / MM},
-            "model": {**{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED}, "note": m.model_note},
+            "extent": {
+                "diameter_mm": m.extent_diameter_m / MM,
+                "centre_mm": m.extent_centre_m / MM,
+            },
+            "model": {
+                **{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED},
+                "note": m.model_note,
+            },
         }
         for finding, m in zip(judged.findings, judged.measurements, strict=True)
     ]
@@ -149,7 +196,8 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
 
 
 def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
-    """Return the valid points (camera frame, metres, float32) as a binary PLY: damage magenta, the rest coloured."""
+    """Return the valid points (camera frame, metres, float32) as a binary PLY: damage magenta, the
+    rest coloured."""
     import trimesh
 
     colours = np.full((cloud.valid.size, 3), 160, np.uint8)
@@ -164,14 +212,20 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 
 
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
-WIDTH_IN, DPI = 11.0, 150
-TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
-"""Colours that differ from grey and from one another, also for viewers with red-green blindness."""
+WIDTH_IN = 11.0
+DPI = 150
+TAKEN = "#ff00ff"
+OTHERS = ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
+"""Colours that differ from grey and from one another, also for viewers with red-green blindness.
+"""
 Box = tuple[float, float, float, float]
 
 
-def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> Figure:
-    """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan view in mm."""
+def findings_figure(
+    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str
+) -> Figure:
+    """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan
+    view in mm."""
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
     residual_mm = evidence.residual_m / MM
@@ -183,10 +237,13 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
             axes[0].imshow(_bytes(cloud.rgb), extent=_edges(cloud), interpolation="nearest")
         axes[-1].set_facecolor("0.82")
         if cloud.organised:
-            shown = axes[-1].imshow(residual_mm, extent=_edges(cloud), interpolation="nearest", **style)
+            shown = axes[-1].imshow(
+                residual_mm, extent=_edges(cloud), interpolation="nearest", **style
+            )
         else:
             judged = np.isfinite(residual_mm)
-            x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
+            x = cloud.points_m[..., 0][judged] / MM
+            y = cloud.points_m[..., 1][judged] / MM
             shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
         residual_bar(figure, shown, "mm behind (+) or before (−) the surface", ax=list(axes))
         for panel in axes:
@@ -196,27 +253,58 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
     return _figure(title, panels * _height_in(box), draw)
 
 
-def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]) -> None:
-    """Write a PNG with each pixel's share of frames without a return, the outline, and findings without a return."""
+def save_blind_map(
+    path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]
+) -> None:
+    """Write a PNG with each pixel's share of frames without a return, the outline, and findings
+    without a return."""
     box = _around(cloud, missing.outline)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        style: dict[str, Any] = {"interpolation": "nearest", "cmap": "Greys", "vmin": 0, "vmax": 100}
+        style: dict[str, Any] = {
+            "interpolation": "nearest",
+            "cmap": "Greys",
+            "vmin": 0,
+            "vmax": 100,
+        }
         shown = axes.imshow(100 * missing.unseen, extent=_edges(cloud), **style)
-        figure.colorbar(shown, ax=axes, shrink=0.6).set_label("frames without a return, %", fontsize=8)
+        figure.colorbar(shown, ax=axes, shrink=0.6).set_label(
+            "frames without a return, %", fontsize=8
+        )
         if min(missing.outline.shape) > 1 and not missing.outline.all():
             height, width = missing.outline.shape
-            columns, rows = np.arange(width) + cloud.region.col0, np.arange(height) + cloud.region.row0
-            axes.contour(columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8)
+            columns = np.arange(width) + cloud.region.col0
+            rows = np.arange(height) + cloud.region.row0
+            axes.contour(
+                columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8
+            )
         _frame(axes, cloud, box)
-        _circle(axes, cloud, ((n, found) for n, found in enumerate(detections, start=1) if found.kind == "no return"))
+        _circle(
+            axes,
+            cloud,
+            (
+                (n, found)
+                for n, found in enumerate(detections, start=1)
+                if found.kind == "no return"
+            ),
+        )
 
-    _save(path, _figure(f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", _height_in(box), draw))
+    _save(
+        path,
+        _figure(
+            f"{100 * missing.blind:.2g} % of the target's pixels returned nothing",
+            _height_in(box),
+            draw,
+        ),
+    )
 
 
-def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
-    """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and numbers from 1."""
+def save_targets(
+    path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int
+) -> None:
+    """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and
+    numbers from 1."""
     import cv2
     from matplotlib.patheffects import withStroke
 
@@ -230,20 +318,32 @@ def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts:
         for number, (outline, text) in enumerate(zip(outlines, texts, strict=True), start=1):
             chosen = number == taken
             colour = TAKEN if chosen else next(colours)
-            x, y = np.arange(-1, width + 1), np.arange(-1, height + 1)
+            x = np.arange(-1, width + 1)
+            y = np.arange(-1, height + 1)
             padded = np.pad(outline, 1)
-            axes.contour(x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4)
+            axes.contour(
+                x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4
+            )
             # the pixel that is farthest from the outline
             depth = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
             v, u = np.unravel_index(int(depth.argmax()), depth.shape)
-            style: dict[str, Any] = {"fontsize": 22, "weight": "bold", "ha": "center", "va": "center", "color": colour}
+            style: dict[str, Any] = {
+                "fontsize": 22,
+                "weight": "bold",
+                "ha": "center",
+                "va": "center",
+                "color": colour,
+            }
             style["path_effects"] = [withStroke(linewidth=4, foreground="black")]
             axes.text(float(u), float(v), str(number), **style)
             how = "taken" if chosen else f"--target {number}"
             axes.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {text}")
         figure.legend(loc="outside lower center", fontsize=9, frameon=False)
 
-    _save(path, _figure("", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw))
+    _save(
+        path,
+        _figure("", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw),
+    )
 
 
 def _figure(title: str, height_in: float, draw: Callable[[Figure], None]) -> Figure:
@@ -267,12 +367,16 @@ def _height_in(box: Box) -> float:
 
 
 def _around(cloud: Cloud, part: np.ndarray) -> Box:
-    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a margin of a twelfth."""
+    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a margin of
+    a twelfth."""
     left, right, bottom, top = _edges(cloud)
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
         return left, right, bottom, top
-    u0, u1, v0, v1 = (float(n) for n in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
+    u0 = float(columns.min())
+    u1 = float(columns.max() + 1)
+    v0 = float(rows.min())
+    v1 = float(rows.max() + 1)
     margin = max(u1 - u0, v1 - v0) / 12.0
     sides = left + np.array([u0 - margin, u1 + margin]), top + np.array([v1 + margin, v0 - margin])
     (a, b), (c, d) = np.clip(sides[0], left, right), np.clip(sides[1], top, bottom)
@@ -280,11 +384,13 @@ def _around(cloud: Cloud, part: np.ndarray) -> Box:
 
 
 def _edges(cloud: Cloud) -> Box:
-    """Return (left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid; down is positive."""
+    """Return (left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid;
+    down is positive."""
     if cloud.organised:
         region = cloud.region
         return region.col0 - 0.5, region.col1 - 0.5, region.row1 - 0.5, region.row0 - 0.5
-    x, y = (cloud.points_m[..., axis][cloud.valid] / MM for axis in (0, 1))
+    x = cloud.points_m[..., 0][cloud.valid] / MM
+    y = cloud.points_m[..., 1][cloud.valid] / MM
     return float(x.min()), float(x.max()), float(y.max()), float(y.min())
 
 
@@ -301,7 +407,9 @@ def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]])
     for number, detection in numbered:
         if cloud.organised:
             rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
-            u, v, margin = columns + cloud.region.col0, rows + cloud.region.row0, 3.0
+            u = columns + cloud.region.col0
+            v = rows + cloud.region.row0
+            margin = 3.0
         else:
             u, v = (cloud.points_m.reshape(-1, 3)[detection.pixels] / MM).T[:2]
             margin = 2.0
@@ -310,7 +418,15 @@ def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]])
         axes.add_patch(Circle(centre, radius, fill=False, color=TAKEN, linewidth=0.9))
         at = (centre[0] + 0.71 * radius, centre[1] - 0.71 * radius)
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.4}
-        axes.annotate(str(number), at, (1, 1), textcoords="offset points", bbox=box, fontsize=7, annotation_clip=True)
+        axes.annotate(
+            str(number),
+            at,
+            (1, 1),
+            textcoords="offset points",
+            bbox=box,
+            fontsize=7,
+            annotation_clip=True,
+        )
 
 
 def _bytes(rgb: Any) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""The page of an experiment with several views: the gain of more views, and the effects of registering and merging."""
+"""The page of an experiment with several views: the gain of more views, and the effects of
+registering and merging."""
 
 from __future__ import annotations
 
@@ -12,32 +13,50 @@ from markupsafe import Markup
 
 from harness.evaluation import maps
 from harness.evaluation.set_ups import set_ups_of
+from harness.programs.thesis.claims import Verdict
+from harness.records.outputs import MAPS
+from harness.records.schema import Table
+from harness.records.trials import REGISTRATION_ERRORS, SET_UPS, SUMMARY, ResultTables
 from harness.report import blocks, sections
 from harness.report.clouds import MappedExample
 from harness.report.summaries import Summaries, summaries, verdicts_of
-from harness.tables.outputs import MAPS
-from harness.tables.schema import Table
-from harness.tables.text import many
-from harness.tables.trials import REGISTRATION_ERRORS, SET_UPS, SUMMARY, ResultTables
-from harness.thesis.claims import Verdict
+from harness.vocabulary.text import many
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That is undecided"}
+LEADS = {
+    "borne out": "Yes",
+    "not borne out": "Not in every respect",
+    "undecided": "That is undecided",
+}
 MAPS_SHOWN = (
-    *("registration", "merge", "views", "found", "from (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
+    *(
+        "registration",
+        "merge",
+        "views",
+        "found",
+        "from (mm)",
+        "average (mm)",
+        "offset (mm)",
+        "pattern (mm)",
+    ),
     *("surface noise (mm)", "threshold (mm)", "false calls", "views left out", "time (s)"),
 )
 
 
 def perspectives_html(
-    tables: ResultTables, examples: Sequence[MappedExample], about: sections.About, found: Summaries | None = None
+    tables: ResultTables,
+    examples: Sequence[MappedExample],
+    about: sections.About,
+    found: Summaries | None = None,
 ) -> str:
     """Return the page as text; see `harness.report.page.write_report`."""
     found = found or summaries(tables, with_claims=about.with_claims)
-    compared, errors, verdicts = found[SET_UPS], found[REGISTRATION_ERRORS], verdicts_of(found)
+    compared = found[SET_UPS]
+    errors = found[REGISTRATION_ERRORS]
+    verdicts = verdicts_of(found)
     cases = maps.map_cases(tables, found[SUMMARY])
     set_ups = compared[~compared["is_variation"]] if len(compared) else compared
     own = tables.registrations[tables.registrations["variant"].isin(set_ups_of(tables))]
@@ -53,7 +72,10 @@ def perspectives_html(
     )
 
     def by_frames(table: Table, rows: pd.DataFrame, only: Sequence[str] = ()) -> Markup:
-        grids = [(n, table.grid(sections.records(rows[rows["frames"] == n]), only=only).html()) for n in frames]
+        grids = [
+            (n, table.grid(sections.records(rows[rows["frames"] == n]), only=only).html())
+            for n in frames
+        ]
         return blocks.joined(blocks.folded([(maps.frames_text(n), grid) for n, grid in grids]))
 
     return sections.sweep_page(
@@ -73,7 +95,8 @@ def perspectives_html(
 
 
 def found_figure(rows: Sequence[sections.Row]) -> str:
-    """Draw the number of holes found against the number of views, with a line per registration and merging method."""
+    """Draw the number of holes found against the number of views, with a line per registration and
+    merging method."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -81,7 +104,8 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         for number, way in enumerate(ways):
             of_way = [row for row in rows if (row["registration"], row["merge"]) == way]
             own = sorted((row["views"], len(row["found"])) for row in of_way)
-            colour, marker = (each[number % len(each)] for each in (blocks.COLOURS, blocks.MARKERS))
+            colour = blocks.COLOURS[number % len(blocks.COLOURS)]
+            marker = blocks.MARKERS[number % len(blocks.MARKERS)]
             shift = 0.04 * (number - len(ways) / 2)  # separates equal counts
             views, counts = np.array(sorted(own), float).T
             label = maps.label_of(method_text(way[0]), way[1])
@@ -91,52 +115,80 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         axes.set_xticks(sorted({row["views"] for row in rows}))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
-    return blocks.svg("found", (5.4, 4.4), "Number of holes found against views, by method of merging.", draw)
+    return blocks.svg(
+        "found", (5.4, 4.4), "Number of holes found against views, by method of merging.", draw
+    )
 
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
-    """State how many holes one view finds, how many the most views find by the best method, and the verdicts."""
+    """State how many holes one view finds, how many the most views find by the best method, and
+    the verdicts."""
     sentences = []
     for case in cases:
         alone = case.single()
         if alone is None:
             continue
-        finds = [(map_, case.named(map_.views, map_.registration, map_.merge, alone.frames)) for map_ in case.set_ups]
-        ways = [(map_, list(case.status(found).values())) for map_, found in finds if found and map_.views > 1]
+        finds = [
+            (map_, case.named(map_.views, map_.registration, map_.merge, alone.frames))
+            for map_ in case.set_ups
+        ]
+        ways = [
+            (map_, list(case.status(found).values()))
+            for map_, found in finds
+            if found and map_.views > 1
+        ]
         ways.sort(key=lambda way: (-way[0].views, -way[1].count("found")))
         counts: list[str] = []
         for way, states in [("one view finds", list(case.status(alone).values()))] + [
-            (f"{map_.views} views ({maps.label_of(method_text(map_.registration), map_.merge)})", states)
+            (
+                f"{map_.views} views ({maps.label_of(method_text(map_.registration), map_.merge)})",
+                states,
+            )
             for map_, states in ways[:1]
         ]:
             open_ = f" ({states.count('undecided')} undecided)" if "undecided" in states else ""
-            counts.append(f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}")
+            counts.append(
+                f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}"
+            )
         where = f"{case.place}: " if len(cases) > 1 else ""
         sentences.append(f"{where}With {maps.frames_text(alone.frames)} {', '.join(counts)}.")
     if not sentences:
         return "No trial of any set-up finished, so there is no answer."
     if verdicts:
-        leads = dict.fromkeys(LEADS[verdict.verdict] for verdict in verdicts if verdict.claim == "H1")
+        leads = dict.fromkeys(
+            LEADS[verdict.verdict] for verdict in verdicts if verdict.claim == "H1"
+        )
         sentences.insert(0, f"Are several views better than one? {' / '.join(leads)}.")
-        sentences.append(f"{', '.join(f'{verdict.claim} is {verdict.verdict}' for verdict in verdicts)}.")
+        sentences.append(
+            f"{', '.join(f'{verdict.claim} is {verdict.verdict}' for verdict in verdicts)}."
+        )
     return " ".join(sentences)
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
-    """Return the file of each browser map beside the report, sorted by frames (most first), views and method."""
+    """Return the file of each browser map beside the report, sorted by frames (most first), views
+    and method."""
     files: dict[str, MappedExample] = {}
-    for example in sorted(examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant)):
-        words = f"{example.views} views {example.registration} {example.merge} {example.frames} frames"
+    for example in sorted(
+        examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant)
+    ):
+        words = (
+            f"{example.views} views {example.registration} {example.merge} {example.frames} frames"
+        )
         words += f" {example.variant}" if example.is_variation else ""
         stem = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
-        names = (MAPS.name.replace("*", f"{stem}{f'-{number}' if number > 1 else ''}") for number in count(1))
+        names = (
+            MAPS.name.replace("*", f"{stem}{f'-{number}' if number > 1 else ''}")
+            for number in count(1)
+        )
         files[next(name for name in names if name not in files)] = example
     return files
 
 
 def map_text(example: MappedExample) -> str:
     """Describe one map in words."""
-    variation, way = f": {example.variant}" if example.is_variation else "", method_text(example.registration)
+    variation = f": {example.variant}" if example.is_variation else ""
+    way = method_text(example.registration)
     way = maps.label_of(way, example.merge)
     return f"{many(example.views, 'view')} ({way}), {maps.frames_text(example.frames)}{variation}"
 
@@ -166,18 +218,40 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
         for axes, part in zip(panels, maps.PARTS, strict=True):
             for place, method in enumerate(methods):
                 for side, n in enumerate(frames):
-                    rows = registrations[(registrations["method"] == method) & (registrations["frames"] == n)]
+                    rows = registrations[
+                        (registrations["method"] == method) & (registrations["frames"] == n)
+                    ]
                     x = place + 0.36 * (side - (len(frames) - 1) / 2)
-                    good, bad = maps.trusted(rows), rows[rows["failure"] != ""]
+                    good = maps.trusted(rows)
+                    bad = rows[rows["failure"] != ""]
                     colour = METHOD_COLOURS.get(method, blocks.SKY)
-                    for chosen, marker, shade, size in ((good, "o", colour, 2.2), (bad, "x", blocks.INK, 4)):
+                    for chosen, marker, shade, size in (
+                        (good, "o", colour, 2.2),
+                        (bad, "x", blocks.INK, 4),
+                    ):
                         values = chosen[f"tre_{part}_mm"].to_numpy(float)
                         values = values[np.isfinite(values) & (values > 0)]
                         # points are spread evenly by rank, so that the picture is reproducible
-                        spread = x + 0.26 * (np.modf(np.arange(len(values)) * 0.6180339887)[0] - 0.5)
-                        axes.plot(spread, values, ls="none", marker=marker, ms=size, color=shade, alpha=0.45)
+                        spread = x + 0.26 * (
+                            np.modf(np.arange(len(values)) * 0.6180339887)[0] - 0.5
+                        )
+                        axes.plot(
+                            spread,
+                            values,
+                            ls="none",
+                            marker=marker,
+                            ms=size,
+                            color=shade,
+                            alpha=0.45,
+                        )
                     median = good[f"tre_{part}_mm"].median()
-                    axes.plot([x - 0.16, x + 0.16], [median] * 2, color=blocks.INK, lw=2, solid_capstyle="butt")
+                    axes.plot(
+                        [x - 0.16, x + 0.16],
+                        [median] * 2,
+                        color=blocks.INK,
+                        lw=2,
+                        solid_capstyle="butt",
+                    )
             axes.set_yscale("log")
             blocks.plain_decades(axes.yaxis)
             axes.set_xticks(range(len(methods)), [method_text(method) for method in methods])

@@ -1,4 +1,5 @@
-"""Presents a probability of detection curve: tables for terminal and page, and a figure with the inspections."""
+"""Presents a probability of detection curve: tables for terminal and page, and a figure with the
+inspections."""
 
 from __future__ import annotations
 
@@ -10,10 +11,10 @@ import numpy as np
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE
 from harness.evaluation.pod.statement import POD, PodStatement
+from harness.records.schema import Column, Table
 from harness.report import blocks
 from harness.report.blocks import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED
-from harness.tables.schema import Column, Table
-from harness.tables.text import ROUGH, Grid
+from harness.vocabulary.text import ROUGH, Grid
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,8 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-MOST_MARKS = 2000  # most inspections that a figure draws as vector marks; if there are more, they are rasterised
-STRIPE = 0.10  # height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD
+# most inspections that a figure draws as vector marks; if there are more, they are rasterised
+MOST_MARKS = 2000
+# height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD
+STRIPE = 0.10
 VALIDITY = (
     "The limit holds for inspections like these: the same kind of flaws and parts, the same procedure, and the sizes "
     "inspected. Targets are assumed to be independent. Sizes beyond the largest target are extrapolated."
@@ -53,10 +56,19 @@ def pod_html(statement: PodStatement, command: str) -> str:
     body += [blocks.note(chosen_by), models_grid(statement).html()]
     body += [blocks.heading("Fit"), fit_grid(statement).html()]
     if statement.tests:
-        rows = [(what, "< 0.001" if p < 0.001 else f"{p:.3f}", reads) for what, p, reads in statement.tests]
+        rows = [
+            (what, "< 0.001" if p < 0.001 else f"{p:.3f}", reads)
+            for what, p, reads in statement.tests
+        ]
         body += [blocks.subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
-    body += [blocks.heading("Notes"), blocks.bullets((*statement.notes, VALIDITY)), *blocks.command_of(command)]
-    under = [blocks.note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
+    body += [
+        blocks.heading("Notes"),
+        blocks.bullets((*statement.notes, VALIDITY)),
+        *blocks.command_of(command),
+    ]
+    under = [
+        blocks.note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")
+    ]
     title = f"Probability of detection: {statement.read.path.name}"
     return blocks.page(title, answer(statement), body, under, statement.doubts)
 
@@ -64,7 +76,10 @@ def pod_html(statement: PodStatement, command: str) -> str:
 def pod_parts(statement: PodStatement) -> list[str | Grid]:
     """Return the parts for a terminal: the page's tables and sentences."""
     parts: list[str | Grid] = [f"warning: {doubt}" for doubt in statement.doubts]
-    parts += [f"{statement.read.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
+    parts += [
+        f"{statement.read.path}: {statement.kind}, {statement.counts}",
+        f"model: {statement.model}",
+    ]
     parts += ["", models_grid(statement), "", sizes_grid(statement), "", fit_grid(statement)]
     if statement.tests:
         parts += ["", *(f"{what}: p = {p:.3g}, {reads}" for what, p, reads in statement.tests)]
@@ -75,8 +90,11 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 def sizes_grid(statement: PodStatement) -> Grid:
     """Return the table of a50, a90 and a90/95 with the method of each."""
     of_models = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
-    digits, unit = _digits(statement), statement.unit
-    rows = [(name, sized(getattr(statement, name), unit, digits), "estimate") for name in ("a50", "a90")]
+    digits = _digits(statement)
+    unit = statement.unit
+    rows = [
+        (name, sized(getattr(statement, name), unit, digits), "estimate") for name in ("a50", "a90")
+    ]
     how = f"{statement.bound.method}{of_models}: the limit to quote"
     rows.append(("a90/95", _bound_text(statement.bound, unit, digits), how))
     return Grid.of(("", "size", "how"), rows, left=3)
@@ -86,25 +104,42 @@ MODELS = Table(
     "models",
     "one row per model that was tried",
     (
-        Column("", "model", lambda row: f"{row.name}{' (used)' if row.chosen else ' (compared)' if row.near else ''}"),
+        Column(
+            "",
+            "model",
+            lambda row: (
+                f"{row.name}{' (used)' if row.chosen else ' (compared)' if row.near else ''}"
+            ),
+        ),
         Column("", "deviance", lambda row: f"{row.deviance:.2f}"),
         Column("", "a50", lambda row: sized(row.a50, "")),
         Column("", "a90", lambda row: sized(row.a90, "")),
-        Column("", "a90/95", lambda row: _bound_text(row.bound, ""), tone=lambda row: "key" if row.chosen else ""),
+        Column(
+            "",
+            "a90/95",
+            lambda row: _bound_text(row.bound, ""),
+            tone=lambda row: "key" if row.chosen else "",
+        ),
     ),
     formats=(),
 )
 
 
 def models_grid(statement: PodStatement) -> Grid:
-    """Return the table of models; it marks the model of the curve, and the models whose bounds are compared with it."""
+    """Return the table of models; it marks the model of the curve, and the models whose bounds are
+    compared with it."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
-    return MODELS.grid(statement.models, heads={name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")})
+    return MODELS.grid(
+        statement.models, heads={name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
+    )
 
 
 def fit_grid(statement: PodStatement) -> Grid:
     """Return the table with the numbers of the fit."""
-    return Grid.of(("of the fit", "value"), ((name, f"{value:.5g}") for name, value in statement.numbers.items()))
+    return Grid.of(
+        ("of the fit", "value"),
+        ((name, f"{value:.5g}") for name, value in statement.numbers.items()),
+    )
 
 
 def _bound_text(bound: Bound, unit: str, digits: int = 2) -> str:
@@ -132,7 +167,8 @@ def answer(statement: PodStatement) -> str:
 
 
 def sized(value: float, unit: str, digits: int = 2) -> str:
-    """Return a size with that many significant digits and its unit, or "not reached" if it is not finite."""
+    """Return a size with that many significant digits and its unit, or "not reached" if it is not
+    finite."""
     if not np.isfinite(value):
         return "not reached"
     decimals = max(0, digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2]))
@@ -150,7 +186,8 @@ def plain(text: str) -> str:
 
 
 def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figure], None]]:
-    """Return the figure's size and the function that draws it: a second panel shows signals, if there are any."""
+    """Return the figure's size and the function that draws it: a second panel shows signals, if
+    there are any."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
@@ -175,7 +212,14 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
     curve, sizes, (lower, upper) = statement.curve, statement.sizes, statement.band
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
     axes.fill_between(sizes, lower, upper, color=BLUE, alpha=0.16, lw=0)
-    axes.plot(sizes, lower, color=BLUE, lw=0.9, ls="--", label=f"{confidence} band, {statement.bound.method}")
+    axes.plot(
+        sizes,
+        lower,
+        color=BLUE,
+        lw=0.9,
+        ls="--",
+        label=f"{confidence} band, {statement.bound.method}",
+    )
     axes.plot(sizes, upper, color=BLUE, lw=0.9, ls="--")
     axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
     axes.axhline(POD, color=GREY, lw=0.8, ls=":")
@@ -192,15 +236,32 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
         if inside:
             axes.plot([value, value], [0, pod], color=colour, lw=1.1)
         at = ([value], [pod]) if inside else ([], [])
-        axes.plot(*at, "o", color=colour, ms=6, mec="white", mew=0.8, label=plain(f"{name}: {text}"), zorder=5)
+        axes.plot(
+            *at,
+            "o",
+            color=colour,
+            ms=6,
+            mec="white",
+            mew=0.8,
+            label=plain(f"{name}: {text}"),
+            zorder=5,
+        )
     hits_in_view(axes, STRIPE + 0.06 if statement.signal is None else 0.03)
 
 
 def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray) -> None:
-    """Draw each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke; equal sizes are spread in height."""
+    """Draw each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke; equal sizes are
+    spread in height."""
     # multiples of the golden ratio spread the strokes without random numbers
     spread = STRIPE * np.asarray((np.arange(len(size)) * 0.6180339887498949) % 1.0)
-    style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": 0.6, "clip_on": False}
+    style: dict[str, Any] = {
+        "marker": "|",
+        "s": 26,
+        "lw": 0.8,
+        "color": INK,
+        "alpha": 0.6,
+        "clip_on": False,
+    }
     style["rasterized"] = len(size) > MOST_MARKS
     axes.scatter(size[hit], 1.03 + spread[hit], **style)
     label = f"hits above ({int(hit.sum())}), misses below ({int((~hit).sum())})"
@@ -214,28 +275,48 @@ def hits_in_view(axes: Axes, beside: float = STRIPE + 0.06) -> None:
 
 
 def draw_signals(axes: Axes, statement: PodStatement) -> None:
-    """Draw signals against sizes, the fitted line with one standard deviation, the decision, and censored signals."""
+    """Draw signals against sizes, the fitted line with one standard deviation, the decision, and
+    censored signals."""
     model = statement.signal
     assert model is not None
     sizes = statement.sizes
     x = np.log(sizes) if statement.curve.log_size else sizes
     line = model.b0 + model.b1 * x
     back = np.exp if model.log_signal else np.asarray
-    axes.fill_between(sizes, back(line - model.tau), back(line + model.tau), color=BLUE, alpha=0.14, lw=0)
+    axes.fill_between(
+        sizes, back(line - model.tau), back(line + model.tau), color=BLUE, alpha=0.14, lw=0
+    )
     axes.plot(sizes, back(line), color=BLUE, label="fit ± one standard deviation")
     axes.axhline(model.decision, color=RED, lw=1.2, label=f"decision {model.decision:.4g}")
-    ends = [f"{sign} {value:.4g}" for sign, value in (("≤", model.left), ("≥", model.right)) if value is not None]
+    ends = [
+        f"{sign} {value:.4g}"
+        for sign, value in (("≤", model.left), ("≥", model.right))
+        if value is not None
+    ]
     for value in (model.left, model.right):
         if value is not None:
             axes.axhline(value, color=GREY, lw=1.0, ls="--")
-    left, right = -np.inf if model.left is None else model.left, np.inf if model.right is None else model.right
+    left = -np.inf if model.left is None else model.left
+    right = np.inf if model.right is None else model.right
     kept = (statement.read.response > left) & (statement.read.response < right)
     many = len(kept) > MOST_MARKS
-    marks: dict[str, Any] = {"s": 14, "color": INK, "alpha": 0.7, "lw": 0, "label": "signals", "rasterized": many}
+    marks: dict[str, Any] = {
+        "s": 14,
+        "color": INK,
+        "alpha": 0.7,
+        "lw": 0,
+        "label": "signals",
+        "rasterized": many,
+    }
     axes.scatter(statement.read.size[kept], statement.read.response[kept], **marks)
     if ends:
-        censored: dict[str, Any] = {"marker": "x", "color": PURPLE, "label": f"censored, {' or '.join(ends)}"}
-        size, signal = statement.read.size[~kept], statement.read.response[~kept]
+        censored: dict[str, Any] = {
+            "marker": "x",
+            "color": PURPLE,
+            "label": f"censored, {' or '.join(ends)}",
+        }
+        size = statement.read.size[~kept]
+        signal = statement.read.response[~kept]
         axes.scatter(size, signal, s=18, lw=1, rasterized=many, **censored)
     if model.log_signal:
         axes.set_yscale("log")

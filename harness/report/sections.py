@@ -11,21 +11,22 @@ from harness.evaluation.maps import label_of
 from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.study.result import conditions_of
 from harness.evaluation.summary import MAIN, found_rule
+from harness.programs.thesis.claims import Verdict
+from harness.records.schema import Column, Table
+from harness.records.trials import CLAIMS, MARKS, SET_UPS, SUMMARY, ResultTables
 from harness.report.blocks import closing, fold, heading, joined, note, paragraph, template
 from harness.report.scene import scene_svg
 from harness.report.summaries import Summaries, of_set_ups
-from harness.tables.schema import Column, Table
-from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
-from harness.tables.trials import CLAIMS, MARKS, SET_UPS, SUMMARY, ResultTables
-from harness.thesis.claims import Verdict
 from harness.vocabulary.path_names import in_words
+from harness.vocabulary.text import Cell, Grid, Tone, inches, many, plus_minus
 
 Row = Mapping[str, Any]
 
 
 class About(NamedTuple):
-    """Title and origin of a report. ``provenance`` is as in `harness.report.blocks.closing`; ``facts`` is the resolved
-    experiment as plain data. ``with_claims`` says whether the target is that of the thesis."""
+    """Title and origin of a report. ``provenance`` is as in `harness.report.blocks.closing`;
+    ``facts`` is the resolved experiment as plain data. ``with_claims`` says whether the target is
+    that of the thesis."""
 
     provenance: Mapping[str, Any]
     experiment_yaml_text: str
@@ -35,13 +36,25 @@ class About(NamedTuple):
 
 
 def sweep_page(
-    name: str, tables: ResultTables, about: About, answer: str, figures: Mapping[str, str], **parts: Any
+    name: str,
+    tables: ResultTables,
+    about: About,
+    answer: str,
+    figures: Mapping[str, str],
+    **parts: Any,
 ) -> str:
-    """Return a sweep's page from the template ``name``, with the sections of all pages and its own ``parts``."""
+    """Return a sweep's page from the template ``name``, with the sections of all pages and its own
+    ``parts``."""
     warnings = about.provenance.get("warnings", ())
     base = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
-    seen = int(tables.holes.groupby("variant")["hole"].nunique().min()) if len(tables.holes) else None
-    base |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts, seen), "calls_note": CALLS_NOTE}
+    seen = (
+        int(tables.holes.groupby("variant")["hole"].nunique().min()) if len(tables.holes) else None
+    )
+    base |= {
+        "scene": scene_svg(about.facts),
+        "conditions": conditions_of(about.facts, seen),
+        "calls_note": CALLS_NOTE,
+    }
     end = closing(about.provenance, about.experiment_yaml_text, left_out(tables.runs))
     return template(name).render(**base, closing=joined(end), **parts)
 
@@ -57,7 +70,8 @@ CALLS_NOTE = (
 
 
 class Varied(NamedTuple):
-    """A variation with one number of frames: its row of `SET_UPS`, and the row of the set-up that it changes."""
+    """A variation with one number of frames: its row of `SET_UPS`, and the row of the set-up that
+    it changes."""
 
     variant: Row
     row: Row | None
@@ -74,7 +88,11 @@ def _why(varied: Varied) -> str:
     """Return the reason for a variation, and its settings if its name does not state them."""
     variant = varied.variant
     settings = variant["settings"].strip("{}").replace('"', "").replace(": ", "=")
-    return "\n".join(filter(None, (variant["reason"], "" if settings == variant["variant"] else variant["settings"])))
+    return "\n".join(
+        filter(
+            None, (variant["reason"], "" if settings == variant["variant"] else variant["settings"])
+        )
+    )
 
 
 def _side(label: str, side: str) -> Column:
@@ -96,8 +114,14 @@ VARIED = Table(
         Column("", "variation", lambda row: in_words(row.variant["variant"])),
         Column("", "why", _why),
         Column("", "changes", lambda row: in_words(row.variant["reference"] or "–")),
-        Column("", "frames", lambda row: "no trial of it finished" if row.row is None else row.row["frames"]),
-        Column("", "≠", lambda row: Cell("≠" if row.differs else "", "changed" if row.differs else "")),
+        Column(
+            "",
+            "frames",
+            lambda row: "no trial of it finished" if row.row is None else row.row["frames"],
+        ),
+        Column(
+            "", "≠", lambda row: Cell("≠" if row.differs else "", "changed" if row.differs else "")
+        ),
         *(_side(label, side) for label in COMPARED for side in ("row", "other")),
     ),
     formats=(),
@@ -106,9 +130,12 @@ VARIED = Table(
 )
 
 
-def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = "") -> Markup:
-    """Return the sensitivity study: each variation beside the set-up that it changes (or else ``of``) with as many
-    frames (or else the most). ``compared`` comes from `compare_set_ups`; empty ``frames`` show all."""
+def varied_section(
+    tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = ""
+) -> Markup:
+    """Return the sensitivity study: each variation beside the set-up that it changes (or else
+    ``of``) with as many frames (or else the most). ``compared`` comes from `compare_set_ups`;
+    empty ``frames`` show all."""
     by_variant: dict[str, list[Row]] = {}
     for row in records(compared):
         if not frames or row["frames"] in frames:
@@ -118,9 +145,15 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
         variant["reference"] = variant["reference"] or of
         originals = by_variant.get(variant["reference"], [])
         for number, own in enumerate(by_variant.get(str(variant["variant"]), [None])):
-            alike = [original for original in originals if own is not None and original["frames"] == own["frames"]]
+            alike = [
+                original
+                for original in originals
+                if own is not None and original["frames"] == own["frames"]
+            ]
             again = {"reason": "", "settings": ""} if number else {}  # the reason appears once
-            rows.append(Varied({**variant, **again}, own, next(iter([*alike, *originals[-1:]]), None)))
+            rows.append(
+                Varied({**variant, **again}, own, next(iter([*alike, *originals[-1:]]), None))
+            )
     if not rows:
         return Markup("")
     text = (
@@ -132,20 +165,29 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
-    """Return a heading and the table of claims; empty without verdicts, as on pages of other targets."""
+    """Return a heading and the table of claims; empty without verdicts, as on pages of other
+    targets."""
     if not verdicts:
         return Markup("")
-    rows, keys = [vars(verdict) for verdict in verdicts], ("claim", "says", "verdict", "evidence")
-    criteria = fold("Criteria, fixed in advance", CLAIMS.grid(rows, only=("claim", "criterion")).html())
-    return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows, only=keys).html(), criteria])
+    rows = [vars(verdict) for verdict in verdicts]
+    keys = ("claim", "says", "verdict", "evidence")
+    criteria = fold(
+        "Criteria, fixed in advance", CLAIMS.grid(rows, only=("claim", "criterion")).html()
+    )
+    return joined(
+        [heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows, only=keys).html(), criteria]
+    )
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
-    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
+    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without
+    verdicts."""
     parts = []
     for answer in MARKS:
         if names := [verdict.claim for verdict in verdicts if verdict.verdict == answer]:
-            parts.append(f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})")
+            parts.append(
+                f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
+            )
     return f" Of {many(len(verdicts), 'claim')}, {', '.join(parts)}." if parts else ""
 
 
@@ -160,8 +202,10 @@ def rule_note(repeats: int, *more: str) -> Markup:
 
 
 def left_out(runs: pd.DataFrame) -> str:
-    """State how many frames were left out of averages as disturbed, over all runs; empty if there were none."""
-    out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
+    """State how many frames were left out of averages as disturbed, over all runs; empty if there
+    were none."""
+    out = int(runs["left_out"].sum())
+    used = int(runs["frames_used"].sum())
     return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
 
 
@@ -190,7 +234,8 @@ def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
 
 
 def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
-    """Return the main set-up's share of detections by hole and frames, with intervals (page) or sizes (terminal)."""
+    """Return the main set-up's share of detections by hole and frames, with intervals (page) or
+    sizes (terminal)."""
     summary = summary[summary["variant"] == MAIN]
     frames = sorted(int(n) for n in summary["frames"].unique())
 
@@ -205,15 +250,22 @@ def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
         by_frames = {row["frames"]: row for row in records(part)}
         last = by_frames[max(by_frames)]
         true = float(last["true_diameter_mm"])
-        cells: list[str | Cell] = [str(hole), inches(true).replace(" in", '"') or "–", f"{true:.2f}"]
+        cells: list[str | Cell] = [
+            str(hole),
+            inches(true).replace(" in", '"') or "–",
+            f"{true:.2f}",
+        ]
         cells += [detected(by_frames[n]) if n in by_frames else "–" for n in frames]
         for kind in ("extent", "model") if terminal else ():
-            cells.append(plus_minus(*(last[f"{kind}_diameter_{what}_mm"] for what in ("mean", "std"))))
+            cells.append(
+                plus_minus(*(last[f"{kind}_diameter_{what}_mm"] for what in ("mean", "std")))
+            )
         rows.append(cells)
     counted = [f"N={n}" if terminal else many(n, "frame") for n in frames]
     heads = ["hole", "drill", "mm", *counted, *(("extent mm", "model mm") if terminal else ())]
     if all(cells[1] == "–" for cells in rows):
-        heads, rows = [heads[0], *heads[2:]], [[cells[0], *cells[2:]] for cells in rows]
+        heads = [heads[0], *heads[2:]]
+        rows = [[cells[0], *cells[2:]] for cells in rows]
     return Grid.of(heads, rows, 1, "holes detected of trials, by number of averaged frames (N)")
 
 
@@ -224,9 +276,11 @@ def set_ups_grid(compared: pd.DataFrame, *, terminal: bool = False) -> Grid:
 
 
 def ways_grid(compared: pd.DataFrame) -> Grid:
-    """Return the holes found for each method of registering and merging (down) and each number of views (across)."""
+    """Return the holes found for each method of registering and merging (down) and each number of
+    views (across)."""
     rows = [row for row in records(compared) if not row["is_variation"]]
-    frames, views = shown_frames(compared), sorted({row["views"] for row in rows})
+    frames = shown_frames(compared)
+    views = sorted({row["views"] for row in rows})
     several = len({row["place"] for row in rows}) > 1
     by_way: dict[str, dict[tuple[int, int], Row]] = {}
     for row in rows:
@@ -237,9 +291,14 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
         undecided = f"+{len(row['undecided'])}" if row and row["undecided"] else ""
         return "–" if row is None else f"{len(row['found'])}{undecided}"
 
-    heads, cells = ("registration, merge", *(many(n, "view") for n in views)), []
+    heads = ("registration, merge", *(many(n, "view") for n in views))
+    cells = []
     for way, found in by_way.items():
-        cells.append([way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)])
+        cells.append(
+            [way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)]
+        )
     of_holes = f" of {max(row['holes'] for row in rows)}" if rows else ""
     numbers = " / ".join(f"N={n}" for n in frames)
-    return Grid.of(heads, cells, title=f"holes found{of_holes} with {numbers} frames per view (+: undecided)")
+    return Grid.of(
+        heads, cells, title=f"holes found{of_holes} with {numbers} frames per view (+: undecided)"
+    )

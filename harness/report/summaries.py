@@ -8,33 +8,45 @@ import pandas as pd
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import MAIN, false_calls, noise_against_frames, summarise_holes
-from harness.tables import trials
-from harness.tables.schema import Table
-from harness.thesis.claims import Verdict, claim_c11, score_claims
-from harness.thesis.inference import posterior_of
-from harness.thesis.views import score_views
+from harness.programs.thesis.claims import Verdict, claim_c11, score_claims
+from harness.programs.thesis.inference import posterior_of
+from harness.programs.thesis.views import score_views
+from harness.records import trials
+from harness.records.schema import Table
 from harness.vocabulary.provenance import RESULTS_VERSION
 
 Summaries = Mapping[Table, pd.DataFrame]
-LISTS = ("found", "undecided", "reasons")  # columns whose values are lists in memory and text in files
+LISTS = (
+    "found",
+    "undecided",
+    "reasons",
+)  # columns whose values are lists in memory and text in files
 
 
 def is_thesis(facts: Mapping[str, Any]) -> bool:
-    """Return whether the resolved experiment ``facts`` has the target of the thesis, whose claims are scored."""
+    """Return whether the resolved experiment ``facts`` has the target of the thesis, whose claims
+    are scored."""
     return (facts.get("source", {}).get("target") or {}).get("name") == "thesis"
 
 
-def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True) -> Summaries:
-    """Return all tables for a page; claims, which use the pictures ``examples``, and posterior only ``with_claims``."""
-    paths, set_ups = [str(path) for path in tables.axes["path"]], set_ups_of(tables)
-    summary, everything = summarise_holes(tables.holes, paths), [str(name) for name in tables.variants["variant"]]
+def summaries(
+    tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True
+) -> Summaries:
+    """Return all tables for a page; claims, which use the pictures ``examples``, and posterior
+    only ``with_claims``."""
+    paths = [str(path) for path in tables.axes["path"]]
+    set_ups = set_ups_of(tables)
+    summary = summarise_holes(tables.holes, paths)
+    everything = [str(name) for name in tables.variants["variant"]]
     found = {trials.SUMMARY: summary, trials.FALSE_CALLS: false_calls(tables.runs)}
     found[trials.NOISE_BY_FRAMES] = noise_against_frames(tables.probes)
     verdicts: Sequence[Verdict] = ()
     if not tables.registrations.empty:
         own = tables.registrations[tables.registrations["variant"].isin(set_ups)]
         found[trials.SET_UPS] = compare_maps(tables, summary)
-        found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({set_up.views for set_up in maps_of(tables)}))
+        found[trials.REGISTRATION_ERRORS] = by_views(
+            own, sorted({set_up.views for set_up in maps_of(tables)})
+        )
         verdicts = score_views(map_cases(tables, summary)) if with_claims else ()
     else:
         several = len(set_ups) > 1
@@ -44,7 +56,8 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with
         found[trials.SET_UPS] = compared
         found[trials.EFFECTS] = effect_costs(tables)
         if with_claims and several:
-            verdict, posterior = claim_c11(summary, paths), posterior_of(of_set_ups(summary, tables), paths)
+            verdict = claim_c11(summary, paths)
+            posterior = posterior_of(of_set_ups(summary, tables), paths)
             verdicts = [verdict] if verdict else ()
             found |= {} if posterior is None else {trials.POSTERIOR: posterior}
         elif with_claims:
@@ -68,4 +81,6 @@ def as_files(found: Summaries) -> dict[Table, pd.DataFrame]:
         table: frame.assign(**{name: frame[name].map("; ".join) for name in LISTS if name in frame})
         for table, frame in found.items()
     }
-    return written | {trials.SUMMARY: written[trials.SUMMARY].assign(results_version=RESULTS_VERSION)}
+    return written | {
+        trials.SUMMARY: written[trials.SUMMARY].assign(results_version=RESULTS_VERSION)
+    }

@@ -1,4 +1,5 @@
-"""A cloud that can be turned in the browser: an offline file with the findings and, if known, the true damage."""
+"""A cloud that can be turned in the browser: an offline file with the findings and, if known, the
+true damage."""
 
 import base64
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, "#F0E442", "#332288", "#882255", "#44AA99")
-"""Okabe and Ito's colours, then four of Tol's muted colours; further views repeat them from the start."""
+"""Okabe and Ito's colours, then four of Tol's muted colours; further views repeat them from the
+start."""
 SEVERAL_CODE = 255
 RESIDUAL_STEP_MM = 0.01
 NO_RESIDUAL = -32768
@@ -28,7 +30,8 @@ KINDS: dict[Kind, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Circle3d:
-    """A damage or a finding (by the thesis' measure); ``centre_mm`` (3,), unit ``normal`` (3,) in the scene's frame."""
+    """A damage or a finding (by the thesis' measure); ``centre_mm`` (3,), unit ``normal`` (3,) in
+    the scene's frame."""
 
     centre_mm: np.ndarray
     normal: np.ndarray
@@ -39,10 +42,11 @@ class Circle3d:
 
 @dataclass(frozen=True)
 class Scene3d:
-    """The cloud to show. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN if not judged;
-    ``view_of`` (n,), an index into ``view_names`` or -1 for several; ``detected`` (n,) bool. ``frame`` is "board" (x
-    right, y up, z to the viewer) or "camera" (x right, y down, z away). ``facts`` are (name, value) beside the picture.
-    ``shown`` says what ``rgb`` represents; ``key`` explains its colours as (words, colour)."""
+    """The cloud to show. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN if
+    not judged; ``view_of`` (n,), an index into ``view_names`` or -1 for several; ``detected`` (n,)
+    bool. ``frame`` is "board" (x right, y up, z to the viewer) or "camera" (x right, y down, z
+    away). ``facts`` are (name, value) beside the picture. ``shown`` says what ``rgb`` represents;
+    ``key`` explains its colours as (words, colour)."""
 
     points_mm: np.ndarray
     frame: Literal["board", "camera"]
@@ -58,8 +62,9 @@ class Scene3d:
 
 
 def write_view3d(path: Path, scene: Scene3d, title: str) -> Path:
-    """Write a self-contained page that shows at most `MOST_POINTS` of the cloud (WebGL 1) and return its path. Raises
-    UserError if the file cannot be written, ValueError if no point is finite."""
+    """Write a self-contained page that shows at most `MOST_POINTS` of the cloud (WebGL 1) and
+    return its path. Raises UserError if the file cannot be written, ValueError if no point is
+    finite."""
     write_text(Path(path), view3d_html(scene, title))
     return Path(path)
 
@@ -68,19 +73,25 @@ def view3d_html(scene: Scene3d, title: str) -> str:
     """Return the page as text; see `write_view3d`."""
     present = {circle.kind for circle in scene.circles}
     kinds = [(kind, *words) for kind, words in KINDS.items() if kind in present]
-    return template("view3d.html").render(title=title, facts=scene.facts, data=packed(scene), kinds=kinds)
+    return template("view3d.html").render(
+        title=title, facts=scene.facts, data=packed(scene), kinds=kinds
+    )
 
 
 def packed(scene: Scene3d) -> dict[str, Any]:
-    """Return the cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers. Places are
-    16-bit integers within the bounding box, which gives steps of 0.01 mm over 0.6 m."""
+    """Return the cloud as the page reads it: plain numbers, and arrays as base64 of little-endian
+    numbers. Places are 16-bit integers within the bounding box, which gives steps of 0.01 mm over
+    0.6 m."""
     kept = _kept(scene)
-    # The page's frame has x right, y up, z to the viewer: half a turn about x from a camera's frame.
+    # The page's frame has x right, y up, z to the viewer: half a turn about x from a camera's
+    # frame.
     turn = np.array([1.0, 1.0, 1.0] if scene.frame == "board" else [1.0, -1.0, -1.0])
     points = scene.points_mm[kept].astype(float) * turn
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     step = np.maximum((high - low) / 65535, 1e-9)
-    # mean distance between points across the line of sight, if they were spread evenly over their extent
+    # mean distance between points across the line of sight, if they were spread evenly over their
+    # extent
     span = high[:2] - low[:2]
     pitch = float(np.sqrt(max(span[0] * span[1], 1e-6) / len(points)))
     residual = view = None
@@ -88,7 +99,10 @@ def packed(scene: Scene3d) -> dict[str, Any]:
         steps = np.clip(np.rint(scene.residual_mm[kept] / RESIDUAL_STEP_MM), -32767, 32767)
         residual = _base64(np.where(np.isfinite(steps), steps, NO_RESIDUAL), "<i2")
     if scene.view_of is not None:
-        view = _base64(np.where((number := scene.view_of[kept]) < 0, SEVERAL_CODE, number % SEVERAL_CODE), "<u1")
+        view = _base64(
+            np.where((number := scene.view_of[kept]) < 0, SEVERAL_CODE, number % SEVERAL_CODE),
+            "<u1",
+        )
     views = [(name, VIEW_COLOURS[n % len(VIEW_COLOURS)]) for n, name in enumerate(scene.view_names)]
     circles = [
         {
@@ -131,7 +145,8 @@ def _kept(scene: Scene3d) -> np.ndarray:
     if len(finite) <= MOST_POINTS:
         return finite
     first = np.zeros(len(scene.points_mm), bool) if scene.detected is None else scene.detected
-    marked, unmarked = finite[first[finite]][:MOST_POINTS], finite[~first[finite]]
+    marked = finite[first[finite]][:MOST_POINTS]
+    unmarked = finite[~first[finite]]
     sample = np.random.default_rng(0).permutation(len(unmarked))[: MOST_POINTS - len(marked)]
     return np.sort(np.concatenate([marked, unmarked[sample]]))
 

@@ -1,6 +1,8 @@
-"""The table of detection limits, and the limits in words: the answer, a sentence for each set-up, and notes.
+"""The table of detection limits, and the limits in words: the answer, a sentence for each set-up,
+and notes.
 
-A curve says nothing about sizes that were not inspected, so a size beyond the largest is written as ``> 15.9``."""
+A curve says nothing about sizes that were not inspected, so a size beyond the largest is written
+as ``> 15.9``."""
 
 import re
 from collections.abc import Sequence
@@ -12,15 +14,16 @@ import numpy as np
 
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.study.limit import SetUpLimit
-from harness.tables import text
-from harness.tables.schema import Column, Estimate, Table
-from harness.tables.text import Grid
+from harness.records.schema import Column, Estimate, Table
+from harness.vocabulary import text
+from harness.vocabulary.text import Grid
 
 MOST_ANSWERS = 3
 ONE_UNIT = "One unit of the camera"
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
-"""Words of a statement's note on an extrapolated bound, which `notes_of` replaces by a sentence of its own."""
+"""Words of a statement's note on an extrapolated bound, which `notes_of` replaces by a sentence of
+its own."""
 
 
 def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
@@ -45,20 +48,34 @@ def bound_text(bound: Estimate) -> str:
 
 
 def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown if not above 0."""
-    size_mm, ends = getattr(limit, f"{of}_mm"), getattr(limit, f"{of}_interval_mm")
+    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown
+    if not above 0."""
+    size_mm = getattr(limit, f"{of}_mm")
+    ends = getattr(limit, f"{of}_interval_mm")
     if size_mm <= 0:
         return Estimate(np.nan)
     return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
-a50_of, a90_of = (partial(size_estimate, of=name) for name in ("a50", "a90"))
-FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
-BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
+a50_of = partial(size_estimate, of="a50")
+a90_of = partial(size_estimate, of="a90")
+FOUND_50 = f"size found {50} % of the time"
+FOUND_90 = f"size found {90} % of the time"
+BRIEF: dict[str, Any] = {
+    "interval": True,
+    "brief": lambda estimate: estimate.text().partition(" ")[0],
+}
 OF = "what these sizes are: diameters (for long damage, widths or lengths), or depths if only the depth varies"
 MET = "status of that bound: demonstrated, beyond the sizes inspected, or not demonstrated"
 EFFECT = "variance of a90 with boards as sampling units over that with damages as sampling units"
-SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
+SET_UP = Column(
+    "set_up",
+    "set-up",
+    "record.label",
+    "name of the set-up, with its frames",
+    text.unbroken,
+    brief=str,
+)
 CALLS = (
     Column(
         "false_calls_per_m2",
@@ -68,19 +85,28 @@ CALLS = (
         lambda rate: "none inspected" if np.isnan(rate.value) else rate.text(),
     ),
     Column("false_calls", "", "false_calls.calls", "number of these false calls"),
-    Column("hole_free_m2", "", lambda row: float(row.record.unflawed.area_m2.sum()), "undamaged area inspected"),
+    Column(
+        "hole_free_m2",
+        "",
+        lambda row: float(row.record.unflawed.area_m2.sum()),
+        "undamaged area inspected",
+    ),
 )
 
 
 def quoted(limit: SetUpLimit) -> Bound:
-    """Return the limit to quote: that of a new unit if the study has several units, else a90/95 of its single unit."""
+    """Return the limit to quote: that of a new unit if the study has several units, else a90/95 of
+    its single unit."""
     return limit.a90_95 if limit.over_units is None else limit.over_units.new_unit
 
 
 def _one_unit(limit: SetUpLimit) -> Estimate:
-    """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several units."""
+    """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several
+    units."""
     bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
-    middle, low, high = (float(statistic(bounds)) for statistic in (np.median, np.min, np.max))
+    middle = float(np.median(bounds))
+    low = float(np.min(bounds))
+    high = float(np.max(bounds))
     ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
     return Estimate(middle if np.isfinite(middle) else np.nan, *ends, limit.largest_mm)
 
@@ -91,7 +117,8 @@ def _verdict(limit: SetUpLimit, bound: Bound) -> str:
 
 
 def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
-    """Return the numbers of hits by depth and by missing returns; None if they were not counted separately."""
+    """Return the numbers of hits by depth and by missing returns; None if they were not counted
+    separately."""
     seen = limit.record.inspected
     if seen.by_depth is None or seen.by_no_return is None:
         return None
@@ -100,7 +127,11 @@ def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
 
 def _found(limit: SetUpLimit) -> str:
     kinds = _kinds(limit)
-    beside = "" if kinds is None or not kinds[1] else f" ({kinds[0]} by depth, {kinds[1]} by missing returns)"
+    beside = (
+        ""
+        if kinds is None or not kinds[1]
+        else f" ({kinds[0]} by depth, {kinds[1]} by missing returns)"
+    )
     return f"{limit.hits} of {limit.inspections}{beside}"
 
 
@@ -111,7 +142,13 @@ LIMITS = Table(
         SET_UP,
         Column("variant", "", "record.variant", "name of the set-up"),
         Column("frames", "", "record.frames", "number of averaged frames"),
-        Column("<axis>", "", "record.axes", "one column per axis, named by its dotted path: the value", spread=True),
+        Column(
+            "<axis>",
+            "",
+            "record.axes",
+            "one column per axis, named by its dotted path: the value",
+            spread=True,
+        ),
         Column(
             "a90_95_mm",
             "a90/95 (mm)",
@@ -138,14 +175,39 @@ LIMITS = Table(
             "if there are several units: upper bound, at 95 % confidence, of the a90 of a new unit",
             lambda bound: text.UNKNOWN_TEXT if bound is None else bound_text(bound),
         ),
-        Column("new_unit_verdict", "", lambda row: _verdict(row, quoted(row)) if row.over_units else None, MET),
-        Column("one_unit_mm", "one unit (mm)", _one_unit, "a90/95 of single units: median, lowest, highest", **BRIEF),
-        Column("unit_spread", "", "over_units.spread", "standard deviation of ln a90 between units, noise included"),
+        Column(
+            "new_unit_verdict",
+            "",
+            lambda row: _verdict(row, quoted(row)) if row.over_units else None,
+            MET,
+        ),
+        Column(
+            "one_unit_mm",
+            "one unit (mm)",
+            _one_unit,
+            "a90/95 of single units: median, lowest, highest",
+            **BRIEF,
+        ),
+        Column(
+            "unit_spread",
+            "",
+            "over_units.spread",
+            "standard deviation of ln a90 between units, noise included",
+        ),
         Column("units", "", "record.units", "number of units of the camera"),
-        Column("a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF),
-        Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF),
+        Column(
+            "a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF
+        ),
+        Column(
+            "a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF
+        ),
         Column("limit_of", "", "record.inspected.limit_of", OF),
-        Column("is_at_most", "", "is_at_most", "whether everything was found, so that a50 and a90 are upper bounds"),
+        Column(
+            "is_at_most",
+            "",
+            "is_at_most",
+            "whether everything was found, so that a50 and a90 are upper bounds",
+        ),
         Column("smallest_mm", "", lambda row: _ends_mm(row)[0], "smallest size inspected"),
         Column("largest_mm", "", lambda row: _ends_mm(row)[1], "largest size inspected"),
         *CALLS,
@@ -178,13 +240,28 @@ LIMITS = Table(
             brief=False,
         ),
         Column("hits_by_depth", "", lambda row: (_kinds(row) or (None, None))[0], "hits by depth"),
-        Column("hits_by_no_return", "", lambda row: (_kinds(row) or (None, None))[1], "hits by missing returns"),
+        Column(
+            "hits_by_no_return",
+            "",
+            lambda row: (_kinds(row) or (None, None))[1],
+            "hits by missing returns",
+        ),
         Column("targets", "targets", "targets", "number of damages", brief=False),
         Column("boards", "boards", "boards", "number of damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
         Column("threshold", "", "record.threshold", "threshold in the detector's units"),
-        Column("threshold_mm", "", "record.threshold_mm", "threshold times the mean residual per unit of score"),
-        Column("calibration_runs", "", "record.calibration_runs", "number of calibration runs; 0: threshold was given"),
+        Column(
+            "threshold_mm",
+            "",
+            "record.threshold_mm",
+            "threshold times the mean residual per unit of score",
+        ),
+        Column(
+            "calibration_runs",
+            "",
+            "record.calibration_runs",
+            "number of calibration runs; 0: threshold was given",
+        ),
         Column("detector", "", "record.detector", "name of the detector"),
         Column("detector_version", "", "record.detector_version", "version of the detector"),
         Column("failed", "", "record.failed", "number of trials that failed"),
@@ -198,18 +275,31 @@ SCORES = Table(
     "one row per category of a data set: quality of anomaly maps on the inspected pixels",
     (
         Column("category", "category", note="name of the category"),
-        Column("au_pro", "AU-PRO", note="area under the per-region overlap up to 30 % false pixels, divided by 0.3"),
+        Column(
+            "au_pro",
+            "AU-PRO",
+            note="area under the per-region overlap up to 30 % false pixels, divided by 0.3",
+        ),
         Column("pixel_auroc", "AUROC of pixels", note="area under the ROC curve of pixels"),
-        Column("board_auroc", "AUROC of boards", note="area under the ROC curve of boards, by their highest pixels"),
+        Column(
+            "board_auroc",
+            "AUROC of boards",
+            note="area under the ROC curve of boards, by their highest pixels",
+        ),
     ),
     title="anomaly maps",
 )
 
 
 def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
-    """Return the table. It has columns on units if there are several; if there is only one, the title says so."""
+    """Return the table. It has columns on units if there are several; if there is only one, the
+    title says so."""
     if any(limit.over_units for limit in limits):
-        return LIMITS.grid(limits, terminal=terminal, heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""})
+        return LIMITS.grid(
+            limits,
+            terminal=terminal,
+            heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""},
+        )
     grid = LIMITS.grid(limits, terminal=terminal, heads={"new unit (mm)": "", "one unit (mm)": ""})
     return replace(grid, title=f"{ONE_UNIT}: {grid.title.partition(': ')[2]}")
 
@@ -220,7 +310,8 @@ def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
-    """Return a sentence for each set-up, or the range of many limits. An answer for a single unit says so first."""
+    """Return a sentence for each set-up, or the range of many limits. An answer for a single unit
+    says so first."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
     answer = _answer(limits)
@@ -231,8 +322,13 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
 
 def _answer(limits: Sequence[SetUpLimit]) -> str:
     if len(limits) <= MOST_ANSWERS:
-        return " ".join(limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits))
-    shown = sorted((lim for lim in limits if is_within_sizes(lim, quoted(lim))), key=lambda lim: quoted(lim).value)
+        return " ".join(
+            limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits)
+        )
+    shown = sorted(
+        (lim for lim in limits if is_within_sizes(lim, quoted(lim))),
+        key=lambda lim: quoted(lim).value,
+    )
     if not shown:
         sentence = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
         return f"{sentence}{_sizes(*limits)}."
@@ -240,9 +336,14 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
         own = [limit for limit in shown if limit.record.inspected.limit_of == kind]
-        best, worst = ((text.size(quoted(limit).value), limit.record.label) for limit in (own[0], own[-1]))
+        best = (text.size(quoted(own[0]).value), own[0].record.label)
+        worst = (text.size(quoted(own[-1]).value), own[-1].record.label)
         which = f" of {kind}" if len(kinds) > 1 else ""
-        spans.append("the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(which, *best, *worst))
+        spans.append(
+            "the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(
+                which, *best, *worst
+            )
+        )
     span = f"Of {len(limits)} set-ups, {'; '.join(spans)}"
     without = len(limits) - len(shown)
     few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
@@ -250,8 +351,10 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
 
 
 def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
-    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``, or only the size after such a sentence (``again``)."""
-    quote, new = quoted(limit), ""
+    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``, or only the size after such a
+    sentence (``again``)."""
+    quote = quoted(limit)
+    new = ""
     if limit.over_units is not None:
         new = f" by a new unit of the camera, judged from {limit.over_units.units},"
     if not quote.demonstrated:
@@ -266,12 +369,17 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
         confidence = f"{100 * quote.confidence:.0f} %"
         words = {"depth": "{} mm deep", "width": "{} mm wide", "length": "{} mm long"}
         size = words.get(limit.record.inspected.limit_of, "of {} mm").format(text.size(quote.value))
-        found = f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
+        found = (
+            f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
+        )
         found = size.removeprefix("of ") if again else found
-    calls, rate = limit.false_calls, ""
+    calls = limit.false_calls
+    rate = ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
-        if limit.over_units is not None:  # each board has its own unit: false calls on one board are not independent
+        if (
+            limit.over_units is not None
+        ):  # each board has its own unit: false calls on one board are not independent
             over = limit.false_calls_interval_per_m2
             ends = (ends[0], float(np.fmin(ends[1], over.low)), float(np.fmax(ends[2], over.high)))
         at, low, high = (f"{end:.2g}" if end < 99.5 else f"{end:.0f}" for end in ends)
@@ -288,16 +396,24 @@ def notes_of(limit: SetUpLimit) -> list[str]:
         notes += [limit.a90_95.method] if limit.a90_95.demonstrated else []
     else:
         if limit.a90_95.demonstrated and not is_within_sizes(limit):
-            notes.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, so no inspection supports it")
+            notes.append(
+                f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, so no inspection supports it"
+            )
         notes += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
     if limit.a50_mm <= 0:
-        notes.append("the curve hardly rises with size: the sizes found would lie below 0, so they are not stated")
+        notes.append(
+            "the curve hardly rises with size: the sizes found would lie below 0, so they are not stated"
+        )
     if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
-        notes.append(f"the results of damages on one board are correlated ({effect}): quote the limit over boards")
+        notes.append(
+            f"the results of damages on one board are correlated ({effect}): quote the limit over boards"
+        )
     only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
     if only:
-        notes.append(f"{only} of {limit.hits} hits by missing returns alone, which leave no depth to measure")
+        notes.append(
+            f"{only} of {limit.hits} hits by missing returns alone, which leave no depth to measure"
+        )
     if limit.record.failed:
         notes.append(f"{limit.record.failed} trials failed and are not included")
     return notes
@@ -306,8 +422,15 @@ def notes_of(limit: SetUpLimit) -> list[str]:
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
-    shared = [note for note in notes[0][1] if all(note in these for _, these in notes)] if len(notes) > 1 else []
-    own = [("every set-up", shared), *((name, [note for note in these if note not in shared]) for name, these in notes)]
+    shared = (
+        [note for note in notes[0][1] if all(note in these for _, these in notes)]
+        if len(notes) > 1
+        else []
+    )
+    own = [
+        ("every set-up", shared),
+        *((name, [note for note in these if note not in shared]) for name, these in notes),
+    ]
     return [f"{name}: {'; '.join(these)}" for name, these in own if these]
 
 

@@ -1,4 +1,5 @@
-"""Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and limits of depth."""
+"""Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and
+limits of depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from harness.evaluation.study.curves import PRO_LIMIT
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.result import FRAMES, AxisLine, Difference, SetUpResult, StudyResult
-from harness.tables import text
+from harness.records.schema import Column, Estimate, Table
 from harness.tables.limits import (
     CALLS,
     FOUND_50,
@@ -23,13 +24,23 @@ from harness.tables.limits import (
     bound_text,
     name_of,
 )
-from harness.tables.schema import Column, Estimate, Table
-from harness.tables.text import Grid
-from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
+from harness.vocabulary import text
+from harness.vocabulary.path_names import (
+    camera_title,
+    differing,
+    names_of,
+    on_one_line,
+    unit_of,
+    value_text,
+)
+from harness.vocabulary.text import Grid
 
-BLOB_PX = 5.0  # distance on the sensor within which two highest scores are one blob: the width of a camera's filter
+# distance on the sensor within which two highest scores are one blob: the width of a camera's
+# filter
+BLOB_PX = 5.0
 HIGH_THRESHOLD = 10.0
-"""Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
+"""Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a
+fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
 BOUND = "upper bound of a90 at 95 % confidence; empty if not demonstrated"
@@ -41,21 +52,48 @@ CHANCE = Table(
     "one row per set-up and number of frames: how often an unrelated finding would count as a hit",
     (
         SET_UP_OF,
-        Column("shuffled_share", "shuffled positions", "chance.probability", "places near another board's finding"),
-        Column("unflawed_share", "unflawed places (95 %)", UNFLAWED, "share of undamaged places with a finding"),
+        Column(
+            "shuffled_share",
+            "shuffled positions",
+            "chance.probability",
+            "places near another board's finding",
+        ),
+        Column(
+            "unflawed_share",
+            "unflawed places (95 %)",
+            UNFLAWED,
+            "share of undamaged places with a finding",
+        ),
         Column("places", "places", "chance.sites", "number of undamaged places"),
-        Column("expected_share", "from the rate", "chance.expected", "share if false calls were spread evenly"),
+        Column(
+            "expected_share",
+            "from the rate",
+            "chance.expected",
+            "share if false calls were spread evenly",
+        ),
     ),
 )
-GIVEN, UNSET = "number of calibration runs; 0 for a given threshold", "none: given"
+GIVEN = "number of calibration runs; 0 for a given threshold"
+UNSET = "none: given"
 THRESHOLDS = Table(
     "thresholds",
     "one row per set-up and number of frames: its threshold, and the false calls at that threshold on other boards",
     (
         SET_UP,
         Column("threshold", "threshold", "record.threshold", "threshold in the detector's units"),
-        Column("threshold_mm", "in mm", "record.threshold_mm", "threshold times the mean residual per unit of score"),
-        Column("calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, lambda n: str(n or UNSET)),
+        Column(
+            "threshold_mm",
+            "in mm",
+            "record.threshold_mm",
+            "threshold times the mean residual per unit of score",
+        ),
+        Column(
+            "calibration_runs",
+            "calibration runs",
+            "record.calibration_runs",
+            GIVEN,
+            lambda n: str(n or UNSET),
+        ),
         replace(CALLS[0], label="per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
         replace(CALLS[2], label="undamaged m²"),
@@ -65,7 +103,8 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run that set a threshold. ``same_pixels`` counts runs with the highest score on the same pixels."""
+    """The hole-free run that set a threshold. ``same_pixels`` counts runs with the highest score
+    on the same pixels."""
 
     limit: SetUpLimit
     board: int
@@ -77,7 +116,11 @@ class SetBy:
     @property
     def place(self) -> str:
         """The place on the board in mm, as text."""
-        return f"{self.x_mm:.0f}, {self.y_mm:.0f}".replace("-", "−") if np.isfinite(self.x_mm) else OFF_BOARD
+        return (
+            f"{self.x_mm:.0f}, {self.y_mm:.0f}".replace("-", "−")
+            if np.isfinite(self.x_mm)
+            else OFF_BOARD
+        )
 
 
 def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
@@ -89,18 +132,28 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
             place = (int(runs.board[at]), float(runs.x_mm[at]), float(runs.y_mm[at]))
             same = None
             if runs.u_px is not None and runs.v_px is not None:
-                same = int((np.hypot(runs.u_px - runs.u_px[at], runs.v_px - runs.v_px[at]) <= BLOB_PX).sum())
+                same = int(
+                    (
+                        np.hypot(runs.u_px - runs.u_px[at], runs.v_px - runs.v_px[at]) <= BLOB_PX
+                    ).sum()
+                )
             found.append(SetBy(limit, *place, len(runs.score), same))
     return found
 
 
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return warnings about calibrated thresholds that are too high for noise or set by one place on the sensor."""
+    """Return warnings about calibrated thresholds that are too high for noise or set by one place
+    on the sensor."""
     rows = set_by(limits)
-    warnings, crowded = [], [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
+    warnings = []
+    crowded = [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
     if crowded:
         counts = sorted({row.same_pixels or 0 for row in crowded})
-        where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
+        where = (
+            crowded[0].limit.record.label
+            if len(crowded) == 1
+            else f"{len(crowded)} of {len(limits)} set-ups"
+        )
         warnings.append(
             f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
             "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
@@ -138,7 +191,12 @@ OPERATING = Table(
         SET_UP_OF,
         Column("damages", "damages", "roc.damages", "number of inspected damages"),
         Column("places", "places", "roc.unflawed", "number of undamaged places"),
-        Column("roc_area", "ROC's area", "roc.area", "area under the ROC curve of damages and undamaged places"),
+        Column(
+            "roc_area",
+            "ROC's area",
+            "roc.area",
+            "area under the ROC curve of damages and undamaged places",
+        ),
         Column("pro_area", "AU-PRO", "pixels.pro", "area under the per-region overlap of pixels"),
     ),
 )
@@ -151,12 +209,20 @@ def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
         f"pixels above it, up to a share of {PRO_LIMIT:g} and divided by {PRO_LIMIT:g}, as in MVTec AD."
     )
     without = [result for result in results if result.pixels is not None and result.pixels.why]
-    return [text, *(f"{name_of(result.limit)}: no AU-PRO: {result.pixels.why}." for result in without if result.pixels)]
+    return [
+        text,
+        *(
+            f"{name_of(result.limit)}: no AU-PRO: {result.pixels.why}."
+            for result in without
+            if result.pixels
+        ),
+    ]
 
 
 @dataclass(frozen=True, eq=False)
 class AxisGroup:
-    """An axis: its ``values``, ascending if they are numbers, and its ``lines`` by their values on the other axes."""
+    """An axis: its ``values``, ascending if they are numbers, and its ``lines`` by their values on
+    the other axes."""
 
     path: str
     name: str
@@ -180,7 +246,8 @@ class AxisGroup:
 
 
 def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
-    """Return the lines of each axis. A line's label gives its values on those other axes on which the lines differ."""
+    """Return the lines of each axis. A line's label gives its values on those other axes on which
+    the lines differ."""
     names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
@@ -190,16 +257,26 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
         varied = [axis for axis, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
         def held(line: AxisLine, axis: str, values: Sequence[Any]) -> str:
-            """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key (``albedo=0.2``)."""
+            """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key
+            (``albedo=0.2``)."""
             words = axis_value(axis, differing(line.held[axis], values))
-            return words if axis == FRAMES or isinstance(line.held[axis], str) else f"{names[axis]}={words}"
+            return (
+                words
+                if axis == FRAMES or isinstance(line.held[axis], str)
+                else f"{names[axis]}={words}"
+            )
 
-        labels = [", ".join(held(line, axis, taken[axis]) for axis in varied if axis in line.held) for line in of_axis]
+        labels = [
+            ", ".join(held(line, axis, taken[axis]) for axis in varied if axis in line.held)
+            for line in of_axis
+        ]
         every = [value for line in of_axis for value in line.values]
         values = [value for at, value in enumerate(every) if value not in every[:at]]
         if all(line.numeric for line in of_axis):
             values.sort()
-        groups.append(AxisGroup(path, names[path], tuple(values), dict(zip(labels, of_axis, strict=True))))
+        groups.append(
+            AxisGroup(path, names[path], tuple(values), dict(zip(labels, of_axis, strict=True)))
+        )
     return groups
 
 
@@ -250,11 +327,34 @@ AXES = Table(
         Column("value", "", lambda row: on_one_line(row.value), "value on the axis"),
         Column("", "value", lambda row: row.group.words(row.value)),
         replace(SET_UP_OF, label=""),
-        Column("a50_mm", "a50 (mm)", lambda row: a50_of(row.limit), f"{FOUND_50}, with interval", interval=True),
-        Column("a90_mm", "a90 (mm)", lambda row: a90_of(row.limit), f"{FOUND_90}, with interval", interval=True),
-        Column("a90_95_mm", "a90/95 (mm)", lambda row: bound_estimate(row.limit, row.limit.a90_95), BOUND, bound_text),
+        Column(
+            "a50_mm",
+            "a50 (mm)",
+            lambda row: a50_of(row.limit),
+            f"{FOUND_50}, with interval",
+            interval=True,
+        ),
+        Column(
+            "a90_mm",
+            "a90 (mm)",
+            lambda row: a90_of(row.limit),
+            f"{FOUND_90}, with interval",
+            interval=True,
+        ),
+        Column(
+            "a90_95_mm",
+            "a90/95 (mm)",
+            lambda row: bound_estimate(row.limit, row.limit.a90_95),
+            BOUND,
+            bound_text,
+        ),
         Column("", "a90 over the row above", _step_text),
-        Column("ratio", "", ("step.ratio", "step.interval"), "a90 over a90 at the previous value, with interval"),
+        Column(
+            "ratio",
+            "",
+            ("step.ratio", "step.interval"),
+            "a90 over a90 at the previous value, with interval",
+        ),
         Column("beyond_chance", "", "step.beyond_chance", "whether that interval excludes 1"),
         Column("paired", "", "step.paired", "whether both set-ups inspected the same boards"),
     ),
@@ -270,7 +370,11 @@ def axis_grid(group: AxisGroup) -> Grid:
 def axis_note(group: AxisGroup) -> str:
     """Explain the changes of a90 and their intervals."""
     steps = [step for line in group.lines.values() for step in line.steps]
-    paired = "the same boards, resampled together" if all(step.paired for step in steps) else "not all of them the same"
+    paired = (
+        "the same boards, resampled together"
+        if all(step.paired for step in steps)
+        else "not all of them the same"
+    )
     beyond = sum(step.beyond_chance for step in steps)
     rows = sum(len(line.values) for line in group.lines.values())
     cut = f" The first {SHOWN_ROWS} of {rows} rows are shown." if rows > SHOWN_ROWS else ""
@@ -291,10 +395,16 @@ class DepthAt(NamedTuple):
 def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
     """Return the contours at a probability of 90 % of all surfaces."""
     rows = []
-    for limit, surface in ((result.limit, result.surface) for result in results if result.surface is not None):
-        depths = np.stack([surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1).tolist()
+    for limit, surface in (
+        (result.limit, result.surface) for result in results if result.surface is not None
+    ):
+        depths = np.stack(
+            [surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1
+        ).tolist()
         for diameter, (depth, low, high) in zip(surface.diameter_mm.tolist(), depths, strict=True):
-            rows.append(DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1])))
+            rows.append(
+                DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1]))
+            )
     return rows
 
 
@@ -304,7 +414,13 @@ DEPTH_LIMITS = Table(
     (
         SET_UP_OF,
         Column("diameter_mm", "diameter (mm)", "diameter_mm", "diameter of the damage"),
-        Column("depth_mm", "depth (mm)", "depth", "depth found 90 % of the time; inf if no depth is", interval=True),
+        Column(
+            "depth_mm",
+            "depth (mm)",
+            "depth",
+            "depth found 90 % of the time; inf if no depth is",
+            interval=True,
+        ),
     ),
 )
 STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
@@ -312,7 +428,8 @@ STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
     """Return every table of a study with its rows."""
-    limits, set_ups = result.limits, result.set_ups
+    limits = result.limits
+    set_ups = result.set_ups
     return {
         LIMITS: list(limits),
         THRESHOLDS: list(limits),

@@ -1,1 +1,2 @@
-"""Types and functions that every room uses: captures, lenses, geometry, units, errors, seeds, files."""
+"""Types and functions that every room uses: captures, lenses, geometry, units, errors, seeds,
+files."""

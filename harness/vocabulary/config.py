@@ -1,4 +1,5 @@
-"""The base class of every declaration that a user writes: strict, finite and frozen, without unknown keys."""
+"""The base class of every declaration that a user writes: strict, finite and frozen, without
+unknown keys."""
 
 from typing import Any, Self
 
@@ -6,7 +7,8 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Config(BaseModel):
-    """A declaration. It refuses unknown keys, NaN, infinity, and text or booleans in place of numbers."""
+    """A declaration. It refuses unknown keys, NaN, infinity, and text or booleans in place of
+    numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -14,7 +16,11 @@ class Config(BaseModel):
     @classmethod
     def _lists_are_tuples(cls, data: Any) -> Any:
         # Strict mode accepts no list in place of a tuple, and YAML and JSON have only lists.
-        return {key: _as_tuple(value) for key, value in data.items()} if isinstance(data, dict) else data
+        return (
+            {key: _as_tuple(value) for key, value in data.items()}
+            if isinstance(data, dict)
+            else data
+        )
 
     def model_copy(self, **how: Any) -> Self:
         """Copy as pydantic does, but drop the values that the original has cached."""
@@ -25,7 +31,8 @@ class Config(BaseModel):
 
     @classmethod
     def from_data(cls, data: Any) -> Self:
-        """Validate plain data. Raises pydantic.ValidationError, whose ``loc`` entries are paths in the data."""
+        """Validate plain data. Raises pydantic.ValidationError, whose ``loc`` entries are paths in
+        the data."""
         return cls.model_validate(data)
 
     def to_data(self) -> dict[str, Any]:
@@ -34,5 +41,6 @@ class Config(BaseModel):
 
 
 def _as_tuple(value: Any) -> Any:
-    """Convert nested lists to nested tuples. Lists within a mapping are converted by the mapping's own model."""
+    """Convert nested lists to nested tuples. Lists within a mapping are converted by the mapping's
+    own model."""
     return tuple(_as_tuple(item) for item in value) if isinstance(value, list) else value

@@ -1,4 +1,5 @@
-"""The user's mistakes: one clear message and exit code 2. Any other exception is a bug and keeps its traceback."""
+"""The user's mistakes: one clear message and exit code 2. Any other exception is a bug and keeps
+its traceback."""
 
 import io
 import os
@@ -13,7 +14,8 @@ CLOSED_PIPE = 141  # Exit code that a shell reports when SIGPIPE ends a program:
 
 
 class UserError(Exception):
-    """A user's mistake: ``message`` says what is wrong and where, ``legal`` what is allowed, ``fix`` what to do."""
+    """A user's mistake: ``message`` says what is wrong and where, ``legal`` what is allowed,
+    ``fix`` what to do."""
 
     def __init__(self, message: str, *, legal: str | None = None, fix: str | None = None) -> None:
         super().__init__(message)
@@ -22,7 +24,8 @@ class UserError(Exception):
         self.fix = fix
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Without this, exceptions with keyword arguments do not survive pickling between worker processes.
+        # Without this, exceptions with keyword arguments do not survive pickling between worker
+        # processes.
         return partial(type(self), legal=self.legal, fix=self.fix), (self.message,)
 
     def __str__(self) -> str:
@@ -35,10 +38,13 @@ class DiskFull(UserError):
 
 
 def exit_code_of(program: Callable[[], int]) -> int:
-    """Run a program's body and return its exit code. A UserError gives one message on stderr and code 2, Ctrl-C gives
-    130, and a closed output pipe (``| head``) silently gives 141. Further Ctrl-C are ignored during the shutdown."""
+    """Run a program's body and return its exit code. A UserError gives one message on stderr and
+    code 2, Ctrl-C gives 130, and a closed output pipe (``| head``) silently gives 141. Further
+    Ctrl-C are ignored during the shutdown."""
     owns_interrupt = threading.current_thread() is threading.main_thread()
-    owns_interrupt = owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    owns_interrupt = (
+        owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
 
     def interrupt(number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -48,7 +54,9 @@ def exit_code_of(program: Callable[[], int]) -> int:
         signal.signal(signal.SIGINT, interrupt)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")  # a terminal that lacks a character such as "±" shows "?"
+            stream.reconfigure(
+                errors="replace"
+            )  # a terminal that lacks a character such as "±" shows "?"
     try:
         code = program()
         sys.stdout.flush()
@@ -71,7 +79,8 @@ def exit_code_of(program: Callable[[], int]) -> int:
 def _nobody_reads() -> bool:
     """Return whether the closed pipe is that of the standard output."""
     try:
-        output, poll = sys.stdout.fileno(), select.poll()
+        output = sys.stdout.fileno()
+        poll = select.poll()
     except (OSError, ValueError):
         return False
     poll.register(output, 0)

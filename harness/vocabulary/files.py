@@ -1,6 +1,7 @@
 """Reading files within size limits and as strict JSON, writing them atomically, and locking them.
 
-A hostile file may try to fill the memory. Most such files are refused unread; libraries run in `limited_memory`."""
+A hostile file may try to fill the memory. Most such files are refused unread; libraries run in
+`limited_memory`."""
 
 import errno
 import hashlib
@@ -20,12 +21,24 @@ from typing import IO, Any, Literal
 
 from harness.vocabulary.errors import DiskFull, UserError
 
-FRAME_PIXELS = 64_000_000  # A frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
-ARRAYS_BYTES = 4 << 30  # All arrays of one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits
-READING_BYTES = 5 << 30  # Memory of a library that reads one file: `ARRAYS_BYTES` and the memory to unpack them
-PICTURE_BYTES = 512 << 20  # A picture file: more than `FRAME_PIXELS` of 48 bits need without compression
-RECORD_BYTES = 256 << 20  # A study's record: three million inspections; Python objects take 10 times as much
-TEXT_BYTES = 16 << 20  # A file of settings, poses or calibration, or a bag's description: usually a few kB
+FRAME_PIXELS = (
+    64_000_000  # A frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
+)
+ARRAYS_BYTES = (
+    4 << 30
+)  # All arrays of one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits
+READING_BYTES = (
+    5 << 30
+)  # Memory of a library that reads one file: `ARRAYS_BYTES` and the memory to unpack them
+PICTURE_BYTES = (
+    512 << 20
+)  # A picture file: more than `FRAME_PIXELS` of 48 bits need without compression
+RECORD_BYTES = (
+    256 << 20
+)  # A study's record: three million inspections; Python objects take 10 times as much
+TEXT_BYTES = (
+    16 << 20
+)  # A file of settings, poses or calibration, or a bag's description: usually a few kB
 TABLE_BYTES = 256 << 20  # A table of inspections: five million rows
 RAISE = "if the file must be this large, raise the limit in harness/vocabulary/files.py"
 
@@ -33,45 +46,65 @@ RAISE = "if the file must be this large, raise the limit in harness/vocabulary/f
 def size_text(count: int) -> str:
     """Return a number of bytes as text in the unit that is easiest to read."""
     units = (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10))
-    return next((f"{count / factor:.4g} {unit}" for unit, factor in units if count >= factor), f"{count} bytes")
+    return next(
+        (f"{count / factor:.4g} {unit}" for unit, factor in units if count >= factor),
+        f"{count} bytes",
+    )
 
 
 def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: str = RAISE) -> None:
     """Raise UserError if ``count`` bytes exceed ``at_most``."""
     if count > at_most:
-        raise UserError(f"{name}: {what} {size_text(count)}", legal=f"at most {size_text(at_most)}", fix=fix)
+        raise UserError(
+            f"{name}: {what} {size_text(count)}", legal=f"at most {size_text(at_most)}", fix=fix
+        )
 
 
 def refuse_pixels(name: str, width: int, height: int) -> None:
     """Raise UserError if an image has no pixels, or more than `FRAME_PIXELS`."""
     if min(width, height) < 1 or width * height > FRAME_PIXELS:
-        legal, fix = f"1 to {FRAME_PIXELS // 10**6} million pixels", RAISE if min(width, height) > 0 else None
+        legal = f"1 to {FRAME_PIXELS // 10**6} million pixels"
+        fix = RAISE if min(width, height) > 0 else None
         raise UserError(f"{name}: {width} x {height} pixels", legal=legal, fix=fix)
 
 
 def bounded_bytes(path: Path, at_most: int) -> bytes:
-    """Return the content of a file, device or pipe. Raises UserError if it exceeds ``at_most``, OSError as `open`."""
+    """Return the content of a file, device or pipe. Raises UserError if it exceeds ``at_most``,
+    OSError as `open`."""
     with Path(path).open("rb") as stream:
         content = stream.read(at_most + 1)
     if len(content) > at_most:
-        raise UserError(f"{path}: has more than {size_text(at_most)}", legal=f"at most {size_text(at_most)}", fix=RAISE)
+        raise UserError(
+            f"{path}: has more than {size_text(at_most)}",
+            legal=f"at most {size_text(at_most)}",
+            fix=RAISE,
+        )
     return content
 
 
 def shipped(kind: str) -> Path:
-    """Return the folder ``experiments`` or ``baselines``: of tofpod's checkout, or else of the environment."""
-    folder = Path(__file__).resolve().parents[2] / ("results/baselines" if kind == "baselines" else kind)
-    return folder if folder.is_dir() else Path(sysconfig.get_path("data")) / "share" / "tofpod" / kind
+    """Return the folder ``experiments`` or ``baselines``: of tofpod's checkout, or else of the
+    environment."""
+    folder = Path(__file__).resolve().parents[2] / (
+        "results/baselines" if kind == "baselines" else kind
+    )
+    return (
+        folder if folder.is_dir() else Path(sysconfig.get_path("data")) / "share" / "tofpod" / kind
+    )
 
 
-_LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()
-"""The limits that active `limited_memory` contexts request, and the process's own limit before the first of them."""
+_LOCK = threading.Lock()
+_WANTED = list[int]()
+_BEFORE = list[tuple[int, int]]()
+"""The limits that active `limited_memory` contexts request, and the process's own limit before the
+first of them."""
 
 
 @contextmanager
 def limited_memory() -> Iterator[None]:
-    """Limit the additional memory of the process to `READING_BYTES`; an excess raises MemoryError. The limit
-    (RLIMIT_AS) holds for all threads; the lowest of several counts. Systems without it or /proc set no limit."""
+    """Limit the additional memory of the process to `READING_BYTES`; an excess raises MemoryError.
+    The limit (RLIMIT_AS) holds for all threads; the lowest of several counts. Systems without it
+    or /proc set no limit."""
     try:
         import resource
 
@@ -100,8 +133,9 @@ def limited_memory() -> Iterator[None]:
 
 
 def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value of a JSON text (UTF-8). Raises ValueError with the reason if the text is not JSON, repeats a key
-    in an object, holds NaN or Infinity (unless ``nan``), is nested too deeply, or holds too long an integer."""
+    """Return the value of a JSON text (UTF-8). Raises ValueError with the reason if the text is
+    not JSON, repeats a key in an object, holds NaN or Infinity (unless ``nan``), is nested too
+    deeply, or holds too long an integer."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -121,19 +155,30 @@ def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-NOT_WRITABLE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENOENT}
+NOT_WRITABLE = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOTDIR,
+    errno.EEXIST,
+    errno.EISDIR,
+    errno.ENOENT,
+}
 NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
 """Error numbers for a place where no file can be created (ENOENT for a place inside /proc)."""
 
 
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``
-    flushes the file to disk before the rename. Raises UserError if the folder is not writable or the disk is full."""
+    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on
+    failure. ``durable`` flushes the file to disk before the rename. Raises UserError if the folder
+    is not writable or the disk is full."""
     path = Path(path)
 
     def make() -> str:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent
+        )
         os.close(handle)
         return name
 
@@ -146,10 +191,14 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder, which is renamed to ``path`` on success. Raises UserError if it cannot be created."""
+    """Yield a temporary folder, which is renamed to ``path`` on success. Raises UserError if it
+    cannot be created."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
-        raise UserError(f"{path}: the folder is not empty; it was not changed", fix="name a new folder with --out")
+        raise UserError(
+            f"{path}: the folder is not empty; it was not changed",
+            fix="name a new folder with --out",
+        )
 
     def make() -> str:
         if path.exists() and not path.is_dir():
@@ -162,7 +211,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
-    """Create a temporary file or folder and rename it, with the user's umask: tempfile makes everything private."""
+    """Create a temporary file or folder and rename it, with the user's umask: tempfile makes
+    everything private."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,19 +226,26 @@ def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
         raise explained(error, path) from error
     finally:
         if temporary is not None and temporary.exists():
-            shutil.rmtree(temporary, ignore_errors=True) if temporary.is_dir() else temporary.unlink()
+            shutil.rmtree(
+                temporary, ignore_errors=True
+            ) if temporary.is_dir() else temporary.unlink()
 
 
 def inside(folder: Path, *parts: str) -> Path:
-    """Return ``folder`` joined with ``parts``, names that may come from an untrusted file. Raises UserError if a part
-    is not a plain name, or if a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
+    """Return ``folder`` joined with ``parts``, names that may come from an untrusted file. Raises
+    UserError if a part is not a plain name, or if a link in ``folder`` leads out of it. ``folder``
+    itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
-            raise UserError(f"{part!r} is not a name for a file or folder", legal="letters, digits, - and _")
+            raise UserError(
+                f"{part!r} is not a name for a file or folder", legal="letters, digits, - and _"
+            )
     path = Path(folder).joinpath(*parts)
     if not path.resolve().is_relative_to(Path(folder).resolve()):
         fix = f"remove the link, or name its target with --out; {folder} itself may be a link"
-        raise UserError(f"{path}: is a link that leads out of {folder}, to {path.resolve()}", fix=fix)
+        raise UserError(
+            f"{path}: is a link that leads out of {folder}, to {path.resolve()}", fix=fix
+        )
     return path
 
 
@@ -204,12 +261,17 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 
 def open_plain(path: Path, flags: int) -> IO[bytes]:
-    """Open a regular file, never through a link; a file opened for writing is unbuffered. ``flags`` are those of
-    `os.open`. Raises UserError if the path is a link, a pipe or a folder; OSError as `os.open` does."""
-    irregular = UserError(f"{path}: is not a regular file, so it is neither read nor written", fix="remove it")
+    """Open a regular file, never through a link; a file opened for writing is unbuffered.
+    ``flags`` are those of `os.open`. Raises UserError if the path is a link, a pipe or a folder;
+    OSError as `os.open` does."""
+    irregular = UserError(
+        f"{path}: is not a regular file, so it is neither read nor written", fix="remove it"
+    )
     if path.is_symlink() or path.is_dir():
         raise irregular
-    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    flags |= (
+        getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    )
     descriptor = os.open(path, flags, 0o666)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -219,21 +281,28 @@ def open_plain(path: Path, flags: int) -> IO[bytes]:
 
 
 def explained(error: OSError, path: Path) -> Exception:
-    """Return the user's mistake that caused an OSError during writing, or the error itself if the cause is unknown."""
+    """Return the user's mistake that caused an OSError during writing, or the error itself if the
+    cause is unknown."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         fix = "free some space and run the same command again; finished work is kept"
         return DiskFull(f"{path}: the disk is full", fix=fix)
     if error.errno is not None and error.errno in NOT_WRITABLE:
         reason = os.strerror(error.errno).lower()
-        return UserError(f"{path}: cannot be written ({reason})", fix="name a folder that you may write to with --out")
+        return UserError(
+            f"{path}: cannot be written ({reason})",
+            fix="name a folder that you may write to with --out",
+        )
     return error
 
 
-Answer = Literal["held", "busy", "no locks"]  # busy: held by another process; no locks: Windows, some file systems
+Answer = Literal[
+    "held", "busy", "no locks"
+]  # busy: held by another process; no locks: Windows, some file systems
 
 
 def opened_lock(path: Path) -> IO[bytes]:
-    """Open a lock file; create it if it is missing. Raises OSError, or UserError if it is not a regular file."""
+    """Open a lock file; create it if it is missing. Raises OSError, or UserError if it is not a
+    regular file."""
     return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
@@ -244,7 +313,9 @@ def lock(file: IO[bytes], *, shared: bool, wait: bool) -> Answer:
     except ImportError:
         return "no locks"
     try:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(
+            file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB)
+        )
     except BlockingIOError:
         return "busy"
     except OSError:
@@ -269,7 +340,8 @@ def one_at_a_time(path: Path, number: int) -> Iterator[None]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the digest of a file's content; the file is read again if its size or modification time has changed."""
+    """Return the digest of a file's content; the file is read again if its size or modification
+    time has changed."""
     found = path.stat()
     return _digest_of(path, found.st_size, found.st_mtime_ns)
 
@@ -291,7 +363,8 @@ def plain_json(data: Mapping[str, Any]) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """Convert plain data, tuples, arrays and NumPy numbers to JSON types; numbers that are not finite become None."""
+    """Convert plain data, tuples, arrays and NumPy numbers to JSON types; numbers that are not
+    finite become None."""
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):

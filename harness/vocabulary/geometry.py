@@ -1,10 +1,12 @@
-"""Units, rigid transforms, regions of pixels, lenses, and what cameras capture: frames and their clouds.
+"""Units, rigid transforms, regions of pixels, lenses, and what cameras capture: frames and their
+clouds.
 
-The program computes in SI units; millimetres, inches and degrees occur only in YAML, tables and reports.
+The program computes in SI units; millimetres, inches and degrees occur only in YAML, tables and
+reports.
 
-Frames. ``camera``: x right, y down, z along the optical axis, origin at the depth lens (OpenCV's convention), metres.
-``board``: x along the row of holes, y up the face, z out of the face to the camera, origin at the centre, metres.
-``T_a_b`` maps co-ordinates in b to co-ordinates in a."""
+Frames. ``camera``: x right, y down, z along the optical axis, origin at the depth lens (OpenCV's
+convention), metres. ``board``: x along the row of holes, y up the face, z out of the face to the
+camera, origin at the centre, metres. ``T_a_b`` maps co-ordinates in b to co-ordinates in a."""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ MM = 1e-3  # Metres in a millimetre
 INCH = 25.4e-3  # Metres in an inch (exact by definition)
 UW_CM2 = 1e-2  # Watts per square metre in a microwatt per square centimetre
 SPEED_OF_LIGHT_VACUUM = 299_792_458.0  # m/s, exact by definition
-REFRACTIVE_INDEX_AIR = 1.00027  # At 850 nm, 20 C, 101 kPa (Ciddor 1996): +-1e-5 over indoor weather, 10 um at 1 m
+REFRACTIVE_INDEX_AIR = (
+    1.00027  # At 850 nm, 20 C, 101 kPa (Ciddor 1996): +-1e-5 over indoor weather, 10 um at 1 m
+)
 SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR  # m/s in indoor air
 
 
@@ -47,7 +51,9 @@ def rotation_xyz_deg(about_x: float, about_y: float, about_z: float) -> np.ndarr
     ax, ay, az = np.deg2rad([about_x, about_y, about_z])
     rx = np.array([[1, 0, 0], [0, np.cos(ax), -np.sin(ax)], [0, np.sin(ax), np.cos(ax)]])
     ry = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
-    return np.array([[np.cos(az), -np.sin(az), 0], [np.sin(az), np.cos(az), 0], [0, 0, 1]]) @ ry @ rx
+    return (
+        np.array([[np.cos(az), -np.sin(az), 0], [np.sin(az), np.cos(az), 0], [0, 0, 1]]) @ ry @ rx
+    )
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,8 @@ class Region:
         return self.row1 - self.row0, self.col1 - self.col0
 
     def grown(self, margin: int, height: int, width: int) -> Region:
-        """Return the region with ``margin`` more pixels on each side, clipped to a sensor of ``height`` x ``width``."""
+        """Return the region with ``margin`` more pixels on each side, clipped to a sensor of
+        ``height`` x ``width``."""
         rows = max(self.row0 - margin, 0), min(self.row1 + margin, height)
         return Region(*rows, max(self.col0 - margin, 0), min(self.col1 + margin, width))
 
@@ -85,14 +92,17 @@ class Region:
         return rows, slice(self.col0 - outer.col0, self.col1 - outer.col0)
 
 
-UNDISTORT_STEPS = 200  # Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60
-SAME_SLOPE = 1e-3  # Rays closer in slope are the same; where a lens's distortion folds back they differ by more
+# Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60
+UNDISTORT_STEPS = 200
+# Rays closer in slope are the same; where a lens's distortion folds back they differ by more
+SAME_SLOPE = 1e-3
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1, k2, p1, p2, k3, k4,
-    k5, k6); zeros mean none. (0, 0) is the centre of the first pixel. Not modelled: tilted sensors, thin prisms."""
+    """A pinhole camera with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1,
+    k2, p1, p2, k3, k4, k5, k6); zeros mean none. (0, 0) is the centre of the first pixel. Not
+    modelled: tilted sensors, thin prisms."""
 
     width: int
     height: int
@@ -113,7 +123,8 @@ class Lens:
         return Region(0, self.height, 0, self.width)
 
     def slopes(self, u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
-        """Return the undistorted (x/z, y/z), shape (..., 2), of rays through pixel positions (sub-pixel allowed)."""
+        """Return the undistorted (x/z, y/z), shape (..., 2), of rays through pixel positions
+        (sub-pixel allowed)."""
         import cv2
 
         u, v = np.broadcast_arrays(np.asarray(u_px, float), np.asarray(v_px, float))
@@ -121,16 +132,23 @@ class Lens:
             return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
         pixels = np.stack([u.ravel(), v.ravel()], axis=-1)[:, None, :]
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_STEPS, 1e-10)
-        return cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop).reshape(*u.shape, 2)
+        return cv2.undistortPoints(
+            pixels, self.matrix, np.array(self.distortion), criteria=stop
+        ).reshape(*u.shape, 2)
 
     def region_slopes(self, region: Region, shift_px: float = 0.0) -> np.ndarray:
-        """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2), or ``shift_px`` beside and below
-        them; do not write to it. Slopes are kept, as the boards of a study lie in nearly one place."""
+        """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2), or
+        ``shift_px`` beside and below them; do not write to it. Slopes are kept, as the boards of a
+        study lie in nearly one place."""
         known, slopes = _slopes.pop((self, shift_px), (region, None))
         joint = known.joined(region)
         if slopes is None or joint != known:
             joint = joint.grown(SPARE_PX, self.height + 1, self.width + 1)
-            known = joint if slopes is not None and joint.area <= 2 * (known.area + region.area) else region
+            known = (
+                joint
+                if slopes is not None and joint.area <= 2 * (known.area + region.area)
+                else region
+            )
             v, u = np.mgrid[known.row0 : known.row1, known.col0 : known.col1] + shift_px
             slopes = self.slopes(u, v)
         _slopes[self, shift_px] = known, slopes
@@ -139,28 +157,36 @@ class Lens:
         return np.ascontiguousarray(slopes[region.within(known)])
 
     def project(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Return the pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the camera (z > 0)."""
+        """Return the pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the
+        camera (z > 0)."""
         import cv2
 
         flat = np.ascontiguousarray(points_camera_m.reshape(-1, 3), dtype=float)
-        pixels, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
+        pixels, _ = cv2.projectPoints(
+            flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion)
+        )
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Return which points (..., 3) have an image, (...) bool: in front, and on the ray of their own pixel."""
+        """Return which points (..., 3) have an image, (...) bool: in front, and on the ray of
+        their own pixel."""
         ahead = points_camera_m[..., 2] > 0
         points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
         u, v = np.moveaxis(self.project(points), -1, 0)
         found = ahead & (u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)
-        back = self.slopes(np.where(found, u, 0.0), np.where(found, v, 0.0)) - points[..., :2] / points[..., 2:]
+        back = (
+            self.slopes(np.where(found, u, 0.0), np.where(found, v, 0.0))
+            - points[..., :2] / points[..., 2:]
+        )
         return np.asarray(found & (np.abs(back).max(axis=-1) < SAME_SLOPE))
 
 
 @dataclass(frozen=True)
 class OtherLens(Lens):
-    """A lens that was not calibrated for the images at hand. ``note`` and ``warning`` are remarks on it, "" for none. A
-    camera's nominal lens has three more: ``mode`` is the name of its depth mode, ``unit_m`` the metres per stored
-    number in that mode, and ``others`` the lenses of the same camera's other modes."""
+    """A lens that was not calibrated for the images at hand. ``note`` and ``warning`` are remarks
+    on it, "" for none. A camera's nominal lens has three more: ``mode`` is the name of its depth
+    mode, ``unit_m`` the metres per stored number in that mode, and ``others`` the lenses of the
+    same camera's other modes."""
 
     note: str = ""
     warning: str = ""
@@ -174,12 +200,17 @@ class OtherLens(Lens):
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
-_slopes: dict[tuple[Lens, float], tuple[Region, np.ndarray]] = {}  # of regions, the last used at the end
-MOST_LENSES, SPARE_PX = 6, 16  # a region of 640 x 576 pixels takes 6 MB and 0.3 s; margin of a region for several views
+_slopes: dict[
+    tuple[Lens, float], tuple[Region, np.ndarray]
+] = {}  # of regions, the last used at the end
+# a region of 640 x 576 pixels takes 6 MB and 0.3 s; margin of a region for several views
+MOST_LENSES = 6
+SPARE_PX = 16
 
 
 class Reason(IntEnum):
-    """The reason why a pixel has no range. A recording gives only NO_RETURN or NOT_FINITE, a simulated camera all."""
+    """The reason why a pixel has no range. A recording gives only NO_RETURN or NOT_FINITE, a
+    simulated camera all."""
 
     VALID = 0
     NO_RETURN = 1  # the file holds the code for "no depth" (0), or the ray met nothing
@@ -196,9 +227,10 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure. ``z_m`` (h, w) float32 is the distance along the optical axis, NaN where invalid. ``reason`` (h, w)
-    uint8 holds `Reason`. ``xy_m`` (h, w, 2) is given only if the source has no lens (a stored point cloud); ``rgb`` (h,
-    w, 3) uint8 and ``amplitude`` (h, w) float32 if known. ``notes`` say how stored numbers were interpreted."""
+    """One exposure. ``z_m`` (h, w) float32 is the distance along the optical axis, NaN where
+    invalid. ``reason`` (h, w) uint8 holds `Reason`. ``xy_m`` (h, w, 2) is given only if the source
+    has no lens (a stored point cloud); ``rgb`` (h, w, 3) uint8 and ``amplitude`` (h, w) float32 if
+    known. ``notes`` say how stored numbers were interpreted."""
 
     name: str
     z_m: np.ndarray
@@ -210,9 +242,10 @@ class Frame:
 
 
 class FrameSource(Protocol):
-    """A source of frames: a simulated camera or a recording. Frames are streamed, never all in memory. ``slopes`` (h,
-    w, 2) are x/z and y/z per pixel, None if each frame carries ``xy_m``. ``organised`` is False for a cloud without a
-    pixel grid (then h == 1). ``z_step_m`` is the rounding step of the stored distance (0 if none)."""
+    """A source of frames: a simulated camera or a recording. Frames are streamed, never all in
+    memory. ``slopes`` (h, w, 2) are x/z and y/z per pixel, None if each frame carries ``xy_m``.
+    ``organised`` is False for a cloud without a pixel grid (then h == 1). ``z_step_m`` is the
+    rounding step of the stored distance (0 if none)."""
 
     @property
     def name(self) -> str: ...
@@ -241,8 +274,9 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class MapViews:
-    """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4) map their camera frames to the map's frame.
-    ``shares`` (k,) are their weights, which sum to 1. ``pixel_m`` are a pixel's sides in x and y on the surface."""
+    """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4) map their camera frames to
+    the map's frame. ``shares`` (k,) are their weights, which sum to 1. ``pixel_m`` are a pixel's
+    sides in x and y on the surface."""
 
     T_cloud_cameras: np.ndarray
     shares: np.ndarray
@@ -251,14 +285,16 @@ class MapViews:
 
 @dataclass(frozen=True)
 class Cloud:
-    """The average of frames as points in the camera's frame: the input of a detector. ``points_m`` (h, w, 3) float64 is
-    NaN where invalid. ``reason`` (h, w) uint8 holds `Reason` (the most frequent one, if no sample was valid). ``count``
-    (h, w) is the number of valid samples, ``variance_m2`` (h, w) the sample variance of one frame's z, NaN below two
-    samples. An unorganised cloud has h == 1 and ``organised`` False. ``region`` places the grid on the sensor;
-    ``z_step_m`` is the rounding step of one frame's z. ``projection`` is "central" for rays through the origin (a
-    camera) and "parallel" for equal cells in x and y. A map of several views is such a cloud, in a frame with z away
-    from the viewer. ``mean_variance_m2`` (h, w), if stated, is the variance of each averaged z with its systematic
-    parts. ``noise_reach_px`` is the side of the square over which noise is blurred; 0 means unknown."""
+    """The average of frames as points in the camera's frame: the input of a detector. ``points_m``
+    (h, w, 3) float64 is NaN where invalid. ``reason`` (h, w) uint8 holds `Reason` (the most
+    frequent one, if no sample was valid). ``count`` (h, w) is the number of valid samples,
+    ``variance_m2`` (h, w) the sample variance of one frame's z, NaN below two samples. An
+    unorganised cloud has h == 1 and ``organised`` False. ``region`` places the grid on the sensor;
+    ``z_step_m`` is the rounding step of one frame's z. ``projection`` is "central" for rays
+    through the origin (a camera) and "parallel" for equal cells in x and y. A map of several views
+    is such a cloud, in a frame with z away from the viewer. ``mean_variance_m2`` (h, w), if
+    stated, is the variance of each averaged z with its systematic parts. ``noise_reach_px`` is the
+    side of the square over which noise is blurred; 0 means unknown."""
 
     points_m: np.ndarray
     reason: np.ndarray

@@ -1,4 +1,5 @@
-"""Reads meshes of parts from files of limited size, in metres and with the front facing the camera."""
+"""Reads meshes of parts from files of limited size, in metres and with the front facing the
+camera."""
 
 import io
 from pathlib import Path
@@ -10,9 +11,11 @@ from pydantic import Field
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import bounded_bytes, limited_memory
 
-MOST_BYTES, FILES = 1 << 29, ".stl, .ply, .obj or .glb"
+MOST_BYTES = 1 << 29
+FILES = ".stl, .ply, .obj or .glb"
 FrontAxis = Annotated[
-    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points at the camera")
+    Literal["+x", "-x", "+y", "-y", "+z", "-z"],
+    Field(description="the file's axis that points at the camera"),
 ]
 FileUnit = Literal["mm", "cm", "m", "in"]
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
@@ -28,7 +31,8 @@ FRONTS = {
 
 
 def read_mesh(file: str) -> Any:
-    """Return a file's triangles as a `trimesh.Trimesh`, without degenerate or duplicate triangles. Raises UserError."""
+    """Return a file's triangles as a `trimesh.Trimesh`, without degenerate or duplicate triangles.
+    Raises UserError."""
     import trimesh
 
     path = Path(file)
@@ -38,7 +42,9 @@ def read_mesh(file: str) -> Any:
     try:
         content = bounded_bytes(path, MOST_BYTES)
         with limited_memory():
-            mesh: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix.lower().removeprefix("."), force="mesh")
+            mesh: Any = trimesh.load(
+                io.BytesIO(content), file_type=path.suffix.lower().removeprefix("."), force="mesh"
+            )
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:
@@ -49,5 +55,8 @@ def read_mesh(file: str) -> Any:
 
 
 def front_first(mesh: Any, unit: str, front: str) -> np.ndarray:
-    """Return a mesh's vertices (n, 3) in metres, with z along its front axis and y as close to upright as possible."""
-    return np.asarray(np.asarray(mesh.vertices, float) @ np.array(FRONTS[front], float).T * UNITS_M[unit])
+    """Return a mesh's vertices (n, 3) in metres, with z along its front axis and y as close to
+    upright as possible."""
+    return np.asarray(
+        np.asarray(mesh.vertices, float) @ np.array(FRONTS[front], float).T * UNITS_M[unit]
+    )

@@ -1,4 +1,5 @@
-"""Dotted paths and their values as tables show them: ``source.target.distance_m`` becomes "distance", in m."""
+"""Dotted paths and their values as tables show them: ``source.target.distance_m`` becomes
+"distance", in m."""
 
 import contextlib
 import json
@@ -9,17 +10,33 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
+UNITS = {
+    "_mrad": "mrad",
+    "_deg": "°",
+    "_mm": "mm",
+    "_nm": "nm",
+    "_px": "px",
+    "_hz": "Hz",
+    "_m": "m",
+}
 """Endings of keys that name a unit; longer endings come first."""
-CHOICES = ("name", "kind", "method")  # keys that select one of several kinds of what the key before them names
+CHOICES = (
+    "name",
+    "kind",
+    "method",
+)  # keys that select one of several kinds of what the key before them names
 NAMED = ("camera", "detector", "damage")  # axes whose values explain themselves
 LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """Return a name without unit for each path: its last meaningful key, or the whole path if that is not unique."""
+    """Return a name without unit for each path: its last meaningful key, or the whole path if that
+    is not unique."""
     short = {path: _split(path)[0] for path in paths}
-    return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
+    return {
+        path: name if list(short.values()).count(name) == 1 else path
+        for path, name in short.items()
+    }
 
 
 def unit_of(path: str) -> str:
@@ -28,32 +45,45 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """Return a value with its unit on one short line; a mapping as its kind, then its keys and values."""
+    """Return a value with its unit on one short line; a mapping as its kind, then its keys and
+    values."""
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
-        rest = (f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items() if key != choice)
+        rest = (
+            f"{_split(key)[0]} {value_text(key, held)}"
+            for key, held in value.items()
+            if key != choice
+        )
         return on_one_line(", ".join(([str(value[choice])] if choice else []) + list(rest)))
     unit = unit_of(path)
     if unit and isinstance(value, list | tuple) and len(value) == 2 and all(map(_is_number, value)):
         low, high = value
         return f"{low:g} {unit}" if low == high else f"{low:g} to {high:g} {unit}"
-    text = on_one_line(Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value)
+    text = on_one_line(
+        Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value
+    )
     return f"{value:g} {unit}" if _is_number(value) and unit else text
 
 
 @cache
 def camera_title(name: str) -> str:
-    """Return the title of one of tofpod's cameras without commas; for any other name or path, its words."""
+    """Return the title of one of tofpod's cameras without commas; for any other name or path, its
+    words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
-        found = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None
+        found = (
+            re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            if file.is_file()
+            else None
+        )
         if found:
             return found[1].replace(",", "")
     return name.rpartition("/")[2].removesuffix(".yaml").replace("_", " ")
 
 
 def in_words(variant: str) -> str:
-    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m`` becomes "Kinect v2, distance 0.5 m"."""
+    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m`` becomes "Kinect v2,
+    distance 0.5 m"."""
     return ", ".join(_setting_in_words(part) for part in re.split(r", (?=[^=,]+=)", variant))
 
 
@@ -63,13 +93,16 @@ def _setting_in_words(part: str) -> str:
         return part
     if re.fullmatch(r"\w+(\.\w+)+", name):
         with contextlib.suppress(ValueError):
-            text = {"true": "on", "false": "off", "null": "none"}.get(text) or value_text(name, json.loads(text))
+            text = {"true": "on", "false": "off", "null": "none"}.get(text) or value_text(
+                name, json.loads(text)
+            )
         name = _split(name)[0]
     return camera_title(text) if name in NAMED else f"{name} {text}".strip()
 
 
 def differing(value: Any, others: Iterable[Any]) -> Any:
-    """Return a mapping without the entries that all ``others`` share; return any other value unchanged."""
+    """Return a mapping without the entries that all ``others`` share; return any other value
+    unchanged."""
     held = list(others)
     if not all(isinstance(item, dict) for item in (value, *held)):
         return value
@@ -81,11 +114,14 @@ def _is_number(value: Any) -> bool:
 
 
 def on_one_line(value: Any) -> str:
-    """Return a value as text of at most `LONGEST` characters; a mapping starts with its kind, as in ``flat {...}``."""
+    """Return a value as text of at most `LONGEST` characters; a mapping starts with its kind, as
+    in ``flat {...}``."""
     choice = next((key for key in CHOICES if key in value), "") if isinstance(value, dict) else ""
     if choice:
         rest = {key: part for key, part in value.items() if key != choice}
-        text = f"{value[choice]} {json.dumps(rest, ensure_ascii=False)}".replace('"', "").removesuffix(" {}")
+        text = f"{value[choice]} {json.dumps(rest, ensure_ascii=False)}".replace(
+            '"', ""
+        ).removesuffix(" {}")
     else:
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"

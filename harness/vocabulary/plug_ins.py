@@ -15,7 +15,8 @@ OWN = "tofpod"  # name of the package with the built-in parts
 
 @dataclass(frozen=True)
 class Offer:
-    """A name, its ``target`` (``module:attribute``, or a file for some built-in parts), and the package it is from."""
+    """A name, its ``target`` (``module:attribute``, or a file for some built-in parts), and the
+    package it is from."""
 
     name: str
     target: str
@@ -35,7 +36,8 @@ class Offer:
 
 @dataclass(frozen=True)
 class PlugIns:
-    """The names of an entry point group. ``noun`` is used in messages, ``fix`` is advice; ``built_in`` maps names."""
+    """The names of an entry point group. ``noun`` is used in messages, ``fix`` is advice;
+    ``built_in`` maps names."""
 
     group: str
     noun: str
@@ -51,14 +53,20 @@ class PlugIns:
         return tuple(sorted({offer.name for offer in self.offers()}))
 
     def offer(self, name: str) -> Offer:
-        """Find the offer of a name. Raises UserError if the name is unknown (with the nearest name) or taken twice."""
+        """Find the offer of a name. Raises UserError if the name is unknown (with the nearest
+        name) or taken twice."""
         found = [offer for offer in self.offers() if offer.name == name]
         if not found:
             from harness.vocabulary.declaration.diagnose import nearest
 
             near = nearest(name, self.names())
-            message = f"there is no {self.noun} {name!r}" + (f"; did you mean {near!r}?" if near else "")
-            fix = self.fix or f"install the package that offers it through the entry point group {self.group!r}"
+            message = f"there is no {self.noun} {name!r}" + (
+                f"; did you mean {near!r}?" if near else ""
+            )
+            fix = (
+                self.fix
+                or f"install the package that offers it through the entry point group {self.group!r}"
+            )
             raise UserError(message, legal=", ".join(self.names()), fix=fix)
         if len({offer.target for offer in found}) > 1:
             both = " and ".join(f"{offer.target} ({offer.origin})" for offer in found)
@@ -67,34 +75,52 @@ class PlugIns:
         return found[0]
 
     def load(self, offer: Offer) -> Any:
-        """Import and return an offer's attribute. Raises UserError if a plug-in fails; built-in parts must not fail."""
+        """Import and return an offer's attribute. Raises UserError if a plug-in fails; built-in
+        parts must not fail."""
         module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
         try:
             found: Any = importlib.import_module(module)
             for part in filter(None, attribute.split(".")):
                 found = getattr(found, part)
             return found
-        # whatever a foreign module does on import, even sys.exit(), the user must repair or uninstall it
+        # whatever a foreign module does on import, even sys.exit(), the user must repair or
+        # uninstall it
         except (Exception, SystemExit) as error:
             if offer.built_in:
                 raise
-            raise self.broken(offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'") from error
+            raise self.broken(
+                offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'"
+            ) from error
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
-        """Return the error for a plug-in that does not fit its group. ``command`` shows the user more."""
-        fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
+        """Return the error for a plug-in that does not fit its group. ``command`` shows the user
+        more."""
+        fix = f"repair or uninstall the package {offer.package}" + (
+            f"; `{command}` shows more" if command else ""
+        )
         what = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
         return UserError(what, fix=fix)
 
 
 @lru_cache(maxsize=8)
-def _offers(group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]) -> tuple[Offer, ...]:
-    """Return tofpod's own offers and the group's. Cached, since reading every installed package takes 7 ms."""
+def _offers(
+    group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]
+) -> tuple[Offer, ...]:
+    """Return tofpod's own offers and the group's. Cached, since reading every installed package
+    takes 7 ms."""
     from harness import __version__
 
     found = [Offer(name, target, OWN, __version__) for name, target in built_in]
     found += [
-        Offer(entry.name, entry.value, *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")))
+        Offer(
+            entry.name,
+            entry.value,
+            *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")),
+        )
         for entry in entry_points(group=group)
     ]
-    return tuple(sorted(dict.fromkeys(found), key=lambda offer: (offer.name, not offer.built_in, offer.package)))
+    return tuple(
+        sorted(
+            dict.fromkeys(found), key=lambda offer: (offer.name, not offer.built_in, offer.package)
+        )
+    )

@@ -1,6 +1,8 @@
-"""The frame of all programs: the parser, one message for a user's mistake, and exit codes."""
+"""The frame of all programs: the parser, one message for a user's mistake, exit codes, and types
+of arguments."""
 
 import argparse
+import re
 import shlex
 import signal
 import sys
@@ -8,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.vocabulary.errors import exit_code_of
+from harness.vocabulary.errors import UserError, exit_code_of
 
 Options = Callable[[argparse.ArgumentParser], None]
 Run = Callable[[argparse.Namespace, str], int]
@@ -16,7 +18,8 @@ Run = Callable[[argparse.Namespace, str], int]
 
 @dataclass(frozen=True)
 class Program:
-    """A program, ``python -m <name>``. A call parses the arguments (None: those of the command line) and runs it."""
+    """A program, ``tofpod <name>``. A call parses the arguments (None: those of the command line)
+    and runs it."""
 
     name: str
     options: Options
@@ -26,28 +29,41 @@ class Program:
 
     @property
     def command(self) -> str:
-        """The name by which it was called: ``tofpod sweep`` or ``python -m harness.sweep``."""
-        return self.name.replace("harness.", "tofpod " if Path(sys.argv[0]).name == "tofpod" else "python -m harness.")
+        """The words that call it: ``tofpod sweep``, or ``python -m harness.sweep`` where it was
+        called so."""
+        called_as_module = Path(sys.argv[0]).stem == self.name
+        return f"python -m harness.{self.name}" if called_as_module else f"tofpod {self.name}"
 
     def parser(self) -> argparse.ArgumentParser:
         """Return a parser of its arguments."""
-        parser = argparse.ArgumentParser(prog=self.command, description=self.description, epilog=self.epilog)
+        parser = argparse.ArgumentParser(
+            prog=self.command, description=self.description, epilog=self.epilog
+        )
         self.options(parser)
         return parser
 
     def __call__(self, arguments: list[str] | None = None) -> int:
-        """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after Ctrl-C."""
+        """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after
+        Ctrl-C."""
         given = sys.argv[1:] if arguments is None else arguments
         parsed = self.parser().parse_args(given)
         if arguments is None:
-            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C does
+            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C
+            # does
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return exit_code_of(lambda: self.run(parsed, f"{self.command} {shlex.join(given)}".rstrip()))
+        return exit_code_of(
+            lambda: self.run(parsed, f"{self.command} {shlex.join(given)}".rstrip())
+        )
 
 
-def program(options: Options, description: str, epilog: str | None = None) -> Callable[[Run], Program]:
-    """Return a decorator that turns a function into a program, which is named after the function's module."""
-    return lambda run: Program(f"harness.{Path(run.__code__.co_filename).stem}", options, run, description, epilog)
+def program(
+    options: Options, description: str, epilog: str | None = None
+) -> Callable[[Run], Program]:
+    """Return a decorator that turns a function into a program, which is named after the function's
+    module."""
+    return lambda run: Program(
+        Path(run.__code__.co_filename).stem, options, run, description, epilog
+    )
 
 
 def whole_number(most: int) -> Callable[[str], int]:
@@ -59,3 +75,25 @@ def whole_number(most: int) -> Callable[[str], int]:
         return int(text)
 
     return parsed
+
+
+def span(text: str) -> tuple[float, float]:
+    """Return the ends of FROM:TO, for argparse."""
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not FROM:TO, such as 2:10") from error
+    return low, high
+
+
+def length_m(option: str, text: str) -> float:
+    """Convert a length with its unit to metres. Raises UserError that names the option."""
+    from harness.vocabulary.meshes import UNITS_M
+
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
+    if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
+        raise UserError(
+            f"{option} {text}: is not a length with a unit",
+            legal="such as 5mm, 0.5cm, 1m or 0.25in",
+        )
+    return float(match[1]) * UNITS_M[match[2]]

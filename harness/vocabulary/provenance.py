@@ -1,7 +1,9 @@
-"""The origin of a result: the code and its digest, versions of packages and stored files, and the machine.
+"""The origin of a result: the code and its digest, versions of packages and stored files, and the
+machine.
 
-Every stored file states its version: JSON and Parquet in a key, CSV in a column, YAML in a comment on the first line,
-HTML in ``<meta name="generator">``. A newer file is refused; an older file is read or made again."""
+Every stored file states its version: JSON and Parquet in a key, CSV in a column, YAML in a comment
+on the first line, HTML in ``<meta name="generator">``. A newer file is refused; an older file is
+read or made again."""
 
 import contextlib
 import hashlib
@@ -18,17 +20,30 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-PACKAGES = ("mitsuba", "drjit", "trimesh", "numpy", "scipy", "numba", "pandas", "open3d-cpu", "opencv-python-headless")
+PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "trimesh",
+    "numpy",
+    "scipy",
+    "numba",
+    "pandas",
+    "open3d-cpu",
+    "opencv-python-headless",
+)
 
 
 def commit_and_dirty() -> tuple[str | None, bool | None]:
-    """Return the commit of the checkout that this code runs from, and whether it has changes; None without checkout."""
+    """Return the commit of the checkout that this code runs from, and whether it has changes; None
+    without checkout."""
     root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str | None:
         command = ["git", "-C", str(root), *arguments]
         try:
-            return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+            return subprocess.run(
+                command, capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
         except (OSError, subprocess.SubprocessError):
             return None
 
@@ -51,26 +66,51 @@ def versions() -> dict[str, str]:
 
 
 def record(command: str) -> dict[str, Any]:
-    """Return the origin for a stored result: command, commit, dirty flag, versions and machine, without any names."""
+    """Return the origin for a stored result: command, commit, dirty flag, versions and machine,
+    without any names."""
     commit, dirty = commit_and_dirty()
-    machine = {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
-    return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
+    machine = {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+    }
+    return {
+        "command": command,
+        "commit": commit,
+        "dirty": dirty,
+        "versions": versions(),
+        "machine": machine,
+    }
 
 
-RESULTS_VERSION = 1  # version of files that have none of their own; increased when the tables' meaning changes
+RESULTS_VERSION = (
+    1  # version of files that have none of their own; increased when the tables' meaning changes
+)
 GENERATOR = f"tofpod results {RESULTS_VERSION}"  # written into pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 
 def check_version(
-    found: object, known: int, path: Path, what: str, *, oldest: int | None = None, again: str | None = None
+    found: object,
+    known: int,
+    path: Path,
+    what: str,
+    *,
+    oldest: int | None = None,
+    again: str | None = None,
 ) -> int:
-    """Return a file's version if it lies between ``oldest`` (default: ``known``) and ``known``; else raise UserError.
-    ``what`` names the kind of file, such as "a record"; ``again`` says how to make an outdated file again."""
+    """Return a file's version if it lies between ``oldest`` (default: ``known``) and ``known``;
+    else raise UserError. ``what`` names the kind of file, such as "a record"; ``again`` says how
+    to make an outdated file again."""
     first = known if oldest is None else oldest
-    legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
+    legal = f"version {known}" if first == known else f"versions {first} to {known}"
+    fix = again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
-        fault = "states no version" if found is None else f"states the invalid version {str(found)[:40]!r}"
+        fault = (
+            "states no version"
+            if found is None
+            else f"states the invalid version {str(found)[:40]!r}"
+        )
         message = f"is {what} that {fault}"
     elif found > known:
         message = f"was written by a newer tofpod: it is {what} of version {found}"
@@ -88,8 +128,9 @@ def stamped(kind: str, version: int) -> str:
 
 
 def stamp_of(text: str, kind: str) -> object:
-    """Return the version that a text's first line states: an int, or the text after the kind if it is not a number, or
-    None if the line is not a stamp of this kind, as in a file that was written by hand."""
+    """Return the version that a text's first line states: an int, or the text after the kind if it
+    is not a number, or None if the line is not a stamp of this kind, as in a file that was written
+    by hand."""
     match = STAMP.match(text.partition("\n")[0].removeprefix("\ufeff").strip())
     number = match[2].strip() if match and match[1] == kind else None
     return int(number) if number and re.fullmatch(r"[0-9]{1,9}", number) else number
@@ -98,15 +139,18 @@ def stamp_of(text: str, kind: str) -> object:
 ROOT = Path(__file__).resolve().parents[2]
 OWN = ("detectors", "harness", "scenes")  # The project's packages
 IMPORT = re.compile(
-    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))", re.MULTILINE
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))",
+    re.MULTILINE,
 )
-"""Matches import statements, a hundred times faster than a parser; a false match in a text only adds a file."""
+"""Matches import statements, a hundred times faster than a parser; a false match in a text only
+adds a file."""
 
 
 @lru_cache
 def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
-    """Return the digest of all project sources that ``modules`` reach, and of the versions of ``packages``. A module of
-    another project counts with all sources of its package. Computed once, since a process runs what it first read."""
+    """Return the digest of all project sources that ``modules`` reach, and of the versions of
+    ``packages``. A module of another project counts with all sources of its package. Computed
+    once, since a process runs what it first read."""
     state = hashlib.blake2b(digest_size=8)
     own = tuple(name for name in modules if name.partition(".")[0] in OWN)
     files = {path.relative_to(ROOT).as_posix(): path for path in reached_sources(own)}
@@ -123,8 +167,9 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
 
 @lru_cache
 def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
-    """Return the sorted source files that modules reach by import statements, also inside functions and for type
-    checking. A module that is loaded by a name in a variable is not seen: list it in ``modules``."""
+    """Return the sorted source files that modules reach by import statements, also inside
+    functions and for type checking. A module that is loaded by a name in a variable is not seen:
+    list it in ``modules``."""
     found: dict[str, Path] = {}
     waiting = list(modules)
     while waiting:
@@ -140,26 +185,33 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
 
 @cache
 def _content(path: Path) -> bytes:
-    """Return a source as this process first read it: later edits do not affect this process or its forks."""
+    """Return a source as this process first read it: later edits do not affect this process or its
+    forks."""
     return path.read_bytes()
 
 
 def _source_of(name: str) -> Path | None:
     """Return the file of a module of the project, or None if there is no such module."""
     place = ROOT.joinpath(*name.split("."))
-    files = (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
+    files = (
+        (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
+    )
     return next((path for path in files if path.is_file()), None)
 
 
 def _imported(text: str) -> Iterator[str]:
-    """Yield every dotted name that absolute imports may mean: both ``a`` and ``a.b`` for ``from a import b``."""
+    """Yield every dotted name that absolute imports may mean: both ``a`` and ``a.b`` for ``from a
+    import b``."""
     for start, names, plain in IMPORT.findall(text):
-        words = [name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()]
+        words = [
+            name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()
+        ]
         yield from ([start, *(f"{start}.{word}" for word in words)] if start else words)
 
 
 def _foreign_sources(module: str) -> Iterable[tuple[str, Path]]:
-    """Yield (display name, file) for all sources of the package that a module of another project belongs to."""
+    """Yield (display name, file) for all sources of the package that a module of another project
+    belongs to."""
     try:
         spec = importlib.util.find_spec(module.partition(".")[0])
     except (ImportError, ValueError):

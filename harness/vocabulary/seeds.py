@@ -1,4 +1,5 @@
-"""Random streams and digests derived from content, so that order, processes and resumption cannot change a result."""
+"""Random streams and digests derived from content, so that order, processes and resumption cannot
+change a result."""
 
 import hashlib
 import json
@@ -18,7 +19,10 @@ def digest(value: Any) -> str:
 
 
 def random_stream(seed: int, *labels: str | int) -> np.random.Generator:
-    """Return the random stream of (seed, labels): equal labels give equal numbers in any process and order. SFC64 is
-    the fastest of NumPy's generators that passes PractRand; streams are separated by a 128-bit hash."""
+    """Return the random stream of (seed, labels): equal labels give equal numbers in any process
+    and order. SFC64 is the fastest of NumPy's generators that passes PractRand; streams are
+    separated by a 128-bit hash."""
     key = hashlib.blake2b(canonical_json([seed, *labels]).encode(), digest_size=16).digest()
-    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(int.from_bytes(key, "little"))))
+    return np.random.Generator(
+        np.random.SFC64(np.random.SeedSequence(int.from_bytes(key, "little")))
+    )

@@ -1,1 +1,2 @@
-"""Light transport with Mitsuba 3: computes the noise-free view of a target that a camera's sensor receives."""
+"""Light transport with Mitsuba 3: computes the noise-free view of a target that a camera's sensor
+receives."""

@@ -1,1 +1,2 @@
-"""Camera models: they turn noise-free phasors into noisy frames. Each kind of camera has its package."""
+"""Camera models: they turn noise-free phasors into noisy frames. Each kind of camera has its
+package."""

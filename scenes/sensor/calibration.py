@@ -1,8 +1,10 @@
-"""Fits numbers of a camera: the gain that gives the published noise, and a lidar's confidence threshold.
+"""Fits numbers of a camera: the gain that gives the published noise, and a lidar's confidence
+threshold.
 
-After a change of the sensor model, run ``python -m scenes.sensor.calibration NAME`` and write the numbers into the
-camera's file; a test compares both. The gain gives the published temporal deviation of single pixels, without the
-jitter of whole frames (subtracted in squares) and without jumps. Ambient light is the default of `CameraConfig`."""
+After a change of the sensor model, run ``python -m scenes.sensor.calibration NAME`` and write the
+numbers into the camera's file; a test compares both. The gain gives the published temporal
+deviation of single pixels, without the jitter of whole frames (subtracted in squares) and without
+jumps. Ambient light is the default of `CameraConfig`."""
 
 import argparse
 import sys
@@ -22,9 +24,16 @@ from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
 
 ONLY_NOISE = CameraConfig(effects=NO_EFFECTS.model_copy(update={"noise": True, "ambient": True}))
-HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}  # half the plane's height, width
+HALF_PX = {
+    "amcw_imager": (24, 40),
+    "scanned_lidar": (32, 32),
+    "empirical": (32, 32),
+}  # half the plane's height, width
 RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 200_000.0), "scanned_lidar": (1e3, 1e5)}
-FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}  # with some 3,000 pixels that share their noise: a gain to 0.5 %
+FRAMES = {
+    "amcw_imager": 200,
+    "scanned_lidar": 100,
+}  # with some 3,000 pixels that share their noise: a gain to 0.5 %
 
 PhotonCamera = AmcwCamera | ScannedLidar  # cameras whose noise follows from a photon budget
 Camera = TypeVar("Camera", bound=AnyCamera)
@@ -38,62 +47,89 @@ def with_number(camera: Camera, section: str, key: str, value: float) -> Camera:
 
 
 def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> SimulatedUnit:
-    """Return a unit with noise only, without jitter, before a plane that is tilted to cover all phases of rounding."""
+    """Return a unit with noise only, without jitter, before a plane that is tilted to cover all
+    phases of rounding."""
     lens, (half_h, half_w) = camera.nominal_lens, HALF_PX[camera.kind]
-    row, col = int(lens.cy), int(lens.cx)
+    row = int(lens.cy)
+    col = int(lens.cx)
     region = Region(row - half_h, row + half_h, col - half_w, col + half_w)
     view = plane_view(camera, region, distance_m, albedo, 0.05, 0.02)
     return SimulatedUnit(camera, ONLY_NOISE.model_copy(update={"name": camera.name}), view)
 
 
-def temporal_sigma_m(camera: AnyCamera, distance_m: float, albedo: float, frames: int, seed: int) -> float:
-    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres. NaN if a pixel of an imager is
-    invalid in any frame; invalid samples of a lidar are left out."""
+def temporal_sigma_m(
+    camera: AnyCamera, distance_m: float, albedo: float, frames: int, seed: int
+) -> float:
+    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres. NaN if a
+    pixel of an imager is invalid in any frame; invalid samples of a lidar are left out."""
     unit = unit_before_plane(camera, distance_m, albedo)
-    z = np.stack([frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]).astype(float)
-    variance = np.nanvar(z, axis=0, ddof=1) if isinstance(camera, ScannedLidar) else z.var(axis=0, ddof=1)
+    z = np.stack(
+        [frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]
+    ).astype(float)
+    variance = (
+        np.nanvar(z, axis=0, ddof=1) if isinstance(camera, ScannedLidar) else z.var(axis=0, ddof=1)
+    )
     return float(np.sqrt(variance.mean()))
 
 
-def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None, seed: int = 1) -> float:
+def calibrated_signal_electrons(
+    camera: PhotonCamera, frames: int | None = None, seed: int = 1
+) -> float:
     """Return the gain that reproduces the camera's calibration point to 0.5 %."""
-    photons, count = camera.photons, frames or FRAMES[camera.kind]
+    photons = camera.photons
+    count = frames or FRAMES[camera.kind]
     wanted = photons.calibration_sigma_mm.value * MM
-    distance_m, albedo = photons.calibration_distance_m.value, photons.calibration_albedo.value
+    distance_m = photons.calibration_distance_m.value
+    albedo = photons.calibration_albedo.value
 
     def excess(log_electrons: float) -> float:
-        trial: PhotonCamera = with_number(camera, "photons", "signal_electrons", float(np.exp(log_electrons)))
+        trial: PhotonCamera = with_number(
+            camera, "photons", "signal_electrons", float(np.exp(log_electrons))
+        )
         sigma_m = temporal_sigma_m(trial, distance_m, albedo, count, seed)
         # a camera too dim to see the wall at all counts as far too noisy
         with_jitter_m = float(np.hypot(sigma_m, camera.unit.jitter_mm.value * MM))
         return with_jitter_m / wanted - 1 if np.isfinite(sigma_m) else 100.0
 
-    return float(np.exp(optimize.brentq(excess, *np.log(RANGE_OF_ELECTRONS[camera.kind]), xtol=1e-3)))
+    return float(
+        np.exp(optimize.brentq(excess, *np.log(RANGE_OF_ELECTRONS[camera.kind]), xtol=1e-3))
+    )
 
 
 def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
-    """Return the gain and a lidar's threshold at which half of the pixels are valid at the published reach, by key."""
+    """Return the gain and a lidar's threshold at which half of the pixels are valid at the
+    published reach, by key."""
     numbers = {"photons.signal_electrons": calibrated_signal_electrons(camera)}
     if isinstance(camera, ScannedLidar):
-        fitted = with_number(camera, "photons", "signal_electrons", numbers["photons.signal_electrons"])
-        open_gate, photons = with_number(fitted, "engine", "confidence_electrons", 0.0), camera.photons
-        unit = unit_before_plane(open_gate, photons.calibration_reach_m.value, photons.calibration_reach_albedo.value)
+        fitted = with_number(
+            camera, "photons", "signal_electrons", numbers["photons.signal_electrons"]
+        )
+        open_gate = with_number(fitted, "engine", "confidence_electrons", 0.0)
+        photons = camera.photons
+        unit = unit_before_plane(
+            open_gate, photons.calibration_reach_m.value, photons.calibration_reach_albedo.value
+        )
         rng = random_stream(1, "calibration")
         decoded = [unit.model.frame(unit.exposure, rng) for _ in range(100)]
-        strength = [np.where(frame.reason == Reason.VALID, frame.amplitude, 0.0)[unit.cut] for frame in decoded]
+        strength = [
+            np.where(frame.reason == Reason.VALID, frame.amplitude, 0.0)[unit.cut]
+            for frame in decoded
+        ]
         numbers["engine.confidence_electrons"] = float(np.median(strength))
     return numbers
 
 
 def _main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser("python -m scenes.sensor.calibration", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        "python -m scenes.sensor.calibration", description=__doc__.partition("\n")[0]
+    )
     parser.add_argument("camera", help="the name of a file in scenes/cameras/ without .yaml")
     name = parser.parse_args(arguments).camera
 
     def print_numbers() -> int:
         camera = load_camera(name)
         if isinstance(camera, EmpiricalCamera):
-            fix = "measure it again with python -m harness.characterise"
+            fix = "measure it again with tofpod characterise"
             raise UserError(f"{name}: an empirical camera has no gain to calibrate", fix=fix)
         for key, value in calibrated_numbers(camera).items():
             print(f"{name}: {key} = {value:.5g}")

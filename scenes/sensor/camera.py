@@ -1,4 +1,5 @@
-"""Cameras as data: a YAML file in which every number has a tag and a source, of tofpod or of an installed package."""
+"""Cameras as data: a YAML file in which every number has a tag and a source, of tofpod or of an
+installed package."""
 
 import difflib
 import json
@@ -13,7 +14,13 @@ from pydantic import Field
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import read_as, settings_of, with_value_at
-from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml
+from harness.vocabulary.declaration.yaml_source import (
+    DeclarationError,
+    KeyPath,
+    Problem,
+    Source,
+    read_yaml,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens, OtherLens
 from harness.vocabulary.plug_ins import PlugIns
@@ -24,7 +31,8 @@ from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 DEEPEST = 5  # most cameras in a chain of ``like``
-GROUP = "tofpod.cameras"  # its entry points give the path of a camera's file, which has the entry point's name
+# its entry points give the path of a camera's file, which has the entry point's name
+GROUP = "tofpod.cameras"
 CAMERAS = PlugIns(
     GROUP,
     "camera",
@@ -33,48 +41,72 @@ CAMERAS = PlugIns(
 )
 
 AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
-"""All kinds of camera, distinguished by ``kind``. Each has name, title, nominal_lens, optics, unit, z_step_m."""
+"""All kinds of camera, distinguished by ``kind``. Each has name, title, nominal_lens, optics,
+unit, z_step_m."""
 KINDS: dict[str, type[AnyCamera]]
 KINDS = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar, "empirical": EmpiricalCamera}
 
 
 class EffectsConfig(Config):
-    """Switches for the effects of a real unit. With all off, the camera is noise-free and sees direct light only."""
+    """Switches for the effects of a real unit. With all off, the camera is noise-free and sees
+    direct light only."""
 
     noise: bool = Field(True, description="shot and read noise of the samples")
     multipath: bool = Field(True, description="light that was reflected by more than one surface")
-    wiggling: bool = Field(True, description="error that harmonics of the modulation leave after factory calibration")
+    wiggling: bool = Field(
+        True, description="error that harmonics of the modulation leave after factory calibration"
+    )
     fixed_pattern: bool = Field(True, description="the unit's own range error of each pixel")
     unit_offset: bool = Field(True, description="the unit's own constant range error")
     warm_up_drift: bool = Field(True, description="range error that decays after power-on")
-    ambient: bool = Field(True, description="noise and full-scale range that ambient light (`ambient_uw_cm2_nm`) takes")
-    saturation: bool = Field(True, description="pixels beyond their own or the converter's full scale are invalid")
-    frame_jumps: bool = Field(True, description="displacement of whole frames: rare jumps and a small jitter")
+    ambient: bool = Field(
+        True,
+        description="noise and full-scale range that ambient light (`ambient_uw_cm2_nm`) takes",
+    )
+    saturation: bool = Field(
+        True, description="pixels beyond their own or the converter's full scale are invalid"
+    )
+    frame_jumps: bool = Field(
+        True, description="displacement of whole frames: rare jumps and a small jitter"
+    )
 
 
 NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))  # every effect off
 
 
 class CameraConfig(Config):
-    """The camera of an experiment: its name, the unit, the effects that are on, and the ambient light."""
+    """The camera of an experiment: its name, the unit, the effects that are on, and the ambient
+    light."""
 
     name: str = Field(
-        "azure_kinect_nfov", description="a camera of tofpod or of an installed package, or the path of a .yaml file"
+        "azure_kinect_nfov",
+        description="a camera of tofpod or of an installed package, or the path of a .yaml file",
     )
-    unit_seed: int = Field(1, ge=0, description="draws the unit's fixed pattern: another seed is another unit")
+    unit_seed: int = Field(
+        1, ge=0, description="draws the unit's fixed pattern: another seed is another unit"
+    )
     effects: EffectsConfig = EffectsConfig()
-    fixed_pattern_scale: float = Field(1.0, ge=0, le=100, description="multiplies the file's fixed pattern; 0: off")
-    edge_gate: bool = Field(True, description="whether pixels at edges are invalid, by a rule inferred from data")
+    fixed_pattern_scale: float = Field(
+        1.0, ge=0, le=100, description="multiplies the file's fixed pattern; 0: off"
+    )
+    edge_gate: bool = Field(
+        True, description="whether pixels at edges are invalid, by a rule inferred from data"
+    )
     ambient_uw_cm2_nm: Annotated[float, Field(ge=0, le=200)] = Field(
         0.04,
         description="irradiance of ambient light at the camera's wavelength, in microwatts per square centimetre and "
         "nanometre: 0.04 in a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 in full sun",
     )
-    minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="time for which the unit has warmed up")
-    numbers: dict[str, Any] = Field({}, description="replaces numbers of the camera file, such as lens.fx_px: 505.1")
+    minutes_since_power_on: float = Field(
+        60.0, ge=0, le=1e5, description="time for which the unit has warmed up"
+    )
+    numbers: dict[str, Any] = Field(
+        {}, description="replaces numbers of the camera file, such as lens.fx_px: 505.1"
+    )
 
     def __hash__(self) -> int:
-        # a mapping has no hash, and workers keep what they derived from a camera by its declaration
+        # a mapping has no hash, and workers keep what they derived from a camera by its
+        # declaration
         return hash(canonical_json(self.to_data()))
 
 
@@ -84,7 +116,8 @@ def camera_names() -> tuple[str, ...]:
 
 
 def camera_file(name: str) -> Path:
-    """Return the path of a camera's file. Raises UserError for a name that is unknown, ambiguous or without a file."""
+    """Return the path of a camera's file. Raises UserError for a name that is unknown, ambiguous
+    or without a file."""
     if is_camera_path(name):
         return Path(name)
     offer = CAMERAS.offer(name)
@@ -92,10 +125,15 @@ def camera_file(name: str) -> Path:
         return Path(offer.target)
     offered = CAMERAS.load(offer)
     if not isinstance(offered, str | Path):
-        raise CAMERAS.broken(offer, f"it must be the path of a YAML file, not {type(offered).__name__}")
+        raise CAMERAS.broken(
+            offer, f"it must be the path of a YAML file, not {type(offered).__name__}"
+        )
     path = Path(offered)
     if path.stem != name or not path.is_file():
-        raise CAMERAS.broken(offer, f"the camera {name} needs a file called {name}.yaml; there is no such file {path}")
+        raise CAMERAS.broken(
+            offer,
+            f"the camera {name} needs a file called {name}.yaml; there is no such file {path}",
+        )
     return path
 
 
@@ -105,12 +143,14 @@ def is_camera_path(name: str) -> bool:
 
 
 def load_camera(name: str) -> AnyCamera:
-    """Return the camera of that name. Raises UserError as `camera_file` does, and for a file that is not a camera."""
+    """Return the camera of that name. Raises UserError as `camera_file` does, and for a file that
+    is not a camera."""
     return _camera_at(camera_file(name))
 
 
 def lens_names() -> dict[str, str]:
-    """Return the names that `lens_named` knows (cameras, and further depth modes), each with its camera."""
+    """Return the names that `lens_named` knows (cameras, and further depth modes), each with its
+    camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
         # a mode with its own file stays with the camera whose mode it is
@@ -119,23 +159,36 @@ def lens_names() -> dict[str, str]:
 
 
 def lens_named(name: str) -> OtherLens:
-    """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError for other names."""
+    """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError
+    for other names."""
     camera_name = lens_names().get(name, name)
     lenses = {}
     for mode in (camera_name, *load_camera(camera_name).modes):
-        camera, note = load_camera(mode), f"the lens is the nominal one of {mode}"
-        lenses[mode] = OtherLens(**vars(camera.nominal_lens), note=note, mode=mode, unit_m=camera.z_step_m)
+        camera = load_camera(mode)
+        note = f"the lens is the nominal one of {mode}"
+        lenses[mode] = OtherLens(
+            **vars(camera.nominal_lens), note=note, mode=mode, unit_m=camera.z_step_m
+        )
     return replace(lenses[name], others=tuple(lenses.values()))
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
-    """Return the camera that an experiment declares. Raises UserError if a replaced number is impossible."""
-    return _with_numbers(config.name, canonical_json(config.numbers)) if config.numbers else load_camera(config.name)
+    """Return the camera that an experiment declares. Raises UserError if a replaced number is
+    impossible."""
+    return (
+        _with_numbers(config.name, canonical_json(config.numbers))
+        if config.numbers
+        else load_camera(config.name)
+    )
 
 
 def guessed_precision(camera: AnyCamera) -> str:
-    """Return a warning for a camera whose precision is not published (shot noise by its gain); empty for others."""
-    if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
+    """Return a warning for a camera whose precision is not published (shot noise by its gain);
+    empty for others."""
+    if (
+        isinstance(camera, EmpiricalCamera)
+        or (gain := camera.photons.signal_electrons).range is None
+    ):
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
     what = f"the precision of {camera.title} is not published: its noise is a guess"
@@ -159,9 +212,15 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             near = difflib.get_close_matches(path, number_paths(data), n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             legal = f"a number of {camera_file(name)}, such as lens.fx_px"
-            raise UserError(f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal)
+            raise UserError(
+                f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal
+            )
         at.update(value=value, tag="U", source="set by the experiment")
-    return settings_of(KINDS[data["kind"]], data, f"source.camera.numbers and {name} together do not describe a camera")
+    return settings_of(
+        KINDS[data["kind"]],
+        data,
+        f"source.camera.numbers and {name} together do not describe a camera",
+    )
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
@@ -174,29 +233,44 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def read_camera(path: Path) -> AnyCamera:
-    """Read a camera file. Raises UserError that names the file and each key that is missing, unknown or impossible."""
+    """Read a camera file. Raises UserError that names the file and each key that is missing,
+    unknown or impossible."""
     source = _completed(read_yaml(path))
     camera = read_as(KINDS, "kind", source)
     if camera.name != path.stem:
         message = f"`name` is {camera.name}, but the file is {path.name}"
-        raise DeclarationError(str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")])
+        raise DeclarationError(
+            str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")]
+        )
     return camera
 
 
 def _completed(source: Source, depth: int = 0) -> Source:
-    """Return a file's content, completed from the camera that its key ``like`` names: by whole facts and lists, never
-    by parts of them. Other modes of the lens are not inherited."""
+    """Return a file's content, completed from the camera that its key ``like`` names: by whole
+    facts and lists, never by parts of them. Other modes of the lens are not inherited."""
     name = source.data.get("like")
     if name is None:
         return source
     if not isinstance(name, str) or depth == DEEPEST:
-        message = "`like` is not the name of a camera" if depth < DEEPEST else f"`like` chains {DEEPEST} files"
-        problem = Problem(message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}")
+        message = (
+            "`like` is not the name of a camera"
+            if depth < DEEPEST
+            else f"`like` chains {DEEPEST} files"
+        )
+        problem = Problem(
+            message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}"
+        )
         raise DeclarationError(source.origin, [problem])
     beside = Path(source.origin).parent / name
-    base = _completed(read_yaml(beside), depth + 1) if is_camera_path(name) else _named(name, depth + 1)
+    base = (
+        _completed(read_yaml(beside), depth + 1)
+        if is_camera_path(name)
+        else _named(name, depth + 1)
+    )
     found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})
-    found = replace(found, values={**base.values, **source.values}, keys={**base.keys, **source.keys})
+    found = replace(
+        found, values={**base.values, **source.values}, keys={**base.keys, **source.keys}
+    )
     for path, value in _stated({key: value for key, value in source.data.items() if key != "like"}):
         found = found.with_value(path, with_value_at(found.data, path, value), source, path)
     return found
@@ -208,7 +282,8 @@ def _named(name: str, depth: int) -> Source:
 
 
 def _stated(data: Mapping[str, Any], prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield the path and value of each fact, and of everything else that is not a mapping of facts."""
+    """Yield the path and value of each fact, and of everything else that is not a mapping of
+    facts."""
     for key, value in data.items():
         if isinstance(value, dict) and "value" not in value:
             yield from _stated(value, (*prefix, key))

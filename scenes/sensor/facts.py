@@ -1,4 +1,5 @@
-"""The parts of every camera file, whatever the kind: numbers with sources, the lens, the properties of a unit."""
+"""The parts of every camera file, whatever the kind: numbers with sources, the lens, the
+properties of a unit."""
 
 from __future__ import annotations
 
@@ -16,14 +17,16 @@ from scenes.optics import Optics
 T = TypeVar("T")
 
 TERMS = (0, 4, 5, 8)  # numbers of distortion coefficients in OpenCV's models
-WORST_PX = 0.01  # largest error of a pixel after undistortion and distortion; good lenses have 1e-6
+# largest error of a pixel after undistortion and distortion; good lenses have 1e-6
+WORST_PX = 0.01
 STEEPEST = 6.0  # slope from the axis up to which distortion is checked: 80 degrees
 
 
 class Fact(Config, Generic[T]):
-    """One number of a camera with its origin. ``tag``: R read in the named public source, D derived from such, S a
-    single secondary source, W measured on public captures, O measured on the owner's by `harness.characterise`, C
-    calibrated, M a guess, G a guess of the precision with its ``range``, U set by the user of an experiment."""
+    """One number of a camera with its origin. ``tag``: R read in the named public source, D
+    derived from such, S a single secondary source, W measured on public captures, O measured on
+    the owner's by `tofpod characterise`, C calibrated, M a guess, G a guess of the precision with
+    its ``range``, U set by the user of an experiment."""
 
     value: T
     tag: Literal["R", "D", "S", "W", "O", "C", "M", "G", "U"]
@@ -33,13 +36,18 @@ class Fact(Config, Generic[T]):
     @model_validator(mode="after")
     def _guess_has_a_range(self) -> Fact[T]:
         low, high = self.range or (np.nan, np.nan)
-        if (self.tag == "G") != (self.range is not None) or (self.range and not low <= self.value <= high):  # type: ignore[operator]
-            raise ValueError("a number with the tag G, and no other, states the `range` that it may lie in")
+        if (self.tag == "G") != (self.range is not None) or (
+            self.range and not low <= self.value <= high
+        ):  # type: ignore[operator]
+            raise ValueError(
+                "a number with the tag G, and no other, states the `range` that it may lie in"
+            )
         return self
 
 
 def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
-    """Return a validator of a fact whose value, or each of its values, must satisfy what ``legal`` states."""
+    """Return a validator of a fact whose value, or each of its values, must satisfy what ``legal``
+    states."""
 
     def check(fact: Fact[Any]) -> Fact[Any]:
         for value in fact.value if isinstance(fact.value, tuple) else (fact.value,):
@@ -58,14 +66,21 @@ PositiveEach = Annotated[Fact[tuple[float, ...]], ABOVE_0]
 NonNegative = Annotated[Fact[float], checked("0 or more", lambda value: value >= 0)]
 Share = Annotated[Fact[float], TO_1]
 ShareEach = Annotated[Fact[tuple[float, ...]], TO_1]
-LengthPx = Annotated[Fact[float], checked("above 0 and at most 1000 pixels", lambda value: 0 < value <= 1000)]
-HalfAngle = Annotated[Fact[float], checked("above 0 and below 90 degrees", lambda value: 0 < value < 90)]
-Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambda value: 300 <= value <= 2000)]
+LengthPx = Annotated[
+    Fact[float], checked("above 0 and at most 1000 pixels", lambda value: 0 < value <= 1000)
+]
+HalfAngle = Annotated[
+    Fact[float], checked("above 0 and below 90 degrees", lambda value: 0 < value < 90)
+]
+Wavelength = Annotated[
+    Fact[float], checked("from 300 to 2000 nanometres", lambda value: 300 <= value <= 2000)
+]
 
 
 class LensFacts(Config):
-    """The nominal lens. ``distortion``: k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty. Pixels beyond
-    ``field_half_angle_deg`` see nothing, and distortion may fold there; None: the image covers the sensor."""
+    """The nominal lens. ``distortion``: k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty.
+    Pixels beyond ``field_half_angle_deg`` see nothing, and distortion may fold there; None: the
+    image covers the sensor."""
 
     width_px: PositiveInt
     height_px: PositiveInt
@@ -79,20 +94,32 @@ class LensFacts(Config):
     @model_validator(mode="after")
     def _sees_each_direction_once(self) -> LensFacts:
         if (count := len(self.distortion.value)) not in TERMS:
-            raise ValueError(f"distortion has {count} terms; OpenCV's models have {', '.join(map(str, TERMS))}")
+            raise ValueError(
+                f"distortion has {count} terms; OpenCV's models have {', '.join(map(str, TERMS))}"
+            )
         lens = self.lens()
-        across, down = max(lens.cx, lens.width - 1 - lens.cx), max(lens.cy, lens.height - 1 - lens.cy)
-        corner, limit = float(np.hypot(across / lens.fx, down / lens.fy)), unfolded_slope(lens.distortion)
+        across = max(lens.cx, lens.width - 1 - lens.cx)
+        down = max(lens.cy, lens.height - 1 - lens.cy)
+        corner = float(np.hypot(across / lens.fx, down / lens.fy))
+        limit = unfolded_slope(lens.distortion)
         if (ends := min(corner, self.image_radius)) > limit:
             end = "corner of the sensor lies" if corner < self.image_radius else "field ends"
             folds = f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis"
             raise ValueError(f"{folds}, and the {end} at {ends:.3g}")
-        u, v = (a.ravel() for a in np.meshgrid(np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)))
+        u, v = (
+            a.ravel()
+            for a in np.meshgrid(
+                np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)
+            )
+        )
         seen = np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) < self.image_radius
-        u, v = u[seen], v[seen]
+        u = u[seen]
+        v = v[seen]
         again = lens.project(np.concatenate([lens.slopes(u, v), np.ones((u.size, 1))], axis=-1))
         if not (np.abs(again - np.stack([u, v], axis=-1)) < WORST_PX).all():
-            raise ValueError("distortion folds the image: somewhere on the sensor no direction leads to a pixel")
+            raise ValueError(
+                "distortion folds the image: somewhere on the sensor no direction leads to a pixel"
+            )
         return self
 
     @cached_property
@@ -107,20 +134,27 @@ class LensFacts(Config):
         """Return (h, w) bool: pixels beyond the lens's image."""
         lens = self.lens()
         v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
-        return np.asarray(np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) > self.image_radius)
+        return np.asarray(
+            np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) > self.image_radius
+        )
 
     def lens(self) -> Lens:
         """The lens as a `Lens` of the program."""
-        width, height, terms = self.width_px.value, self.height_px.value, self.distortion.value
+        width = self.width_px.value
+        height = self.height_px.value
+        terms = self.distortion.value
         centre = self.cx_px.value, self.cy_px.value
-        return Lens(width, height, self.fx_px.value, self.fy_px.value, *centre, (*terms, *(0.0,) * 8)[:8])
+        return Lens(
+            width, height, self.fx_px.value, self.fy_px.value, *centre, (*terms, *(0.0,) * 8)[:8]
+        )
 
 
 class UnitFacts(Config):
-    """Differences of a unit from the nominal camera, and of its frames from each other. ``offset_mm``: deviation
-    between units of a constant range error. ``drift_mm`` exp(-t / ``drift_min``): range error after power-on, greater
-    by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames that are displaced as a whole by
-    ``jump_mm``, either way. ``jitter_mm``: deviation of a small displacement of every frame."""
+    """Differences of a unit from the nominal camera, and of its frames from each other.
+    ``offset_mm``: deviation between units of a constant range error. ``drift_mm`` exp(-t /
+    ``drift_min``): range error after power-on, greater by ``drift_ramp`` of itself per unit of
+    x/z. ``jump_rate``: share of frames that are displaced as a whole by ``jump_mm``, either way.
+    ``jitter_mm``: deviation of a small displacement of every frame."""
 
     frames_per_second: Positive
     offset_mm: NonNegative
@@ -159,7 +193,8 @@ class LimitFacts(OutputFacts):
 
 
 class ConeFacts(Config):
-    """A cone about the optical axis from ``position_mm``, with a linear roll-off between two half angles."""
+    """A cone about the optical axis from ``position_mm``, with a linear roll-off between two half
+    angles."""
 
     position_mm: Fact[tuple[float, float, float]]
     full_half_angle_deg: HalfAngle
@@ -173,7 +208,10 @@ class ConeFacts(Config):
 
     def optics(self) -> dict[str, Any]:
         """Return the arguments that a camera's optics take from this cone."""
-        angles = {key: getattr(self, key).value for key in ("full_half_angle_deg", "cutoff_half_angle_deg")}
+        angles = {
+            key: getattr(self, key).value
+            for key in ("full_half_angle_deg", "cutoff_half_angle_deg")
+        }
         return {"emitter_m": np.array(self.position_mm.value) * MM, **angles}
 
 
@@ -187,11 +225,13 @@ class CameraFacts(Config):
     unit: UnitFacts
     engine: OutputFacts
     modes: Annotated[tuple[str, ...], BeforeValidator(tuple)] = Field((), exclude=True)
-    """Cameras that are other modes of this one, or a mapping of them by name; no simulation uses them."""
+    """Cameras that are other modes of this one, or a mapping of them by name; no simulation uses
+    them."""
 
     @cached_property
     def nominal_lens(self) -> Lens:
-        """The lens in the file, without distortion; a scanner's is the raster of its beam's directions."""
+        """The lens in the file, without distortion; a scanner's is the raster of its beam's
+        directions."""
         return self.lens.lens()
 
     @property
@@ -201,26 +241,38 @@ class CameraFacts(Config):
 
     def optics_with(self, **own: Any) -> Optics:
         """Return the camera's optics for the render. ``own``: arguments that only its kind knows."""
-        facts = {"title": self.title, "lens": self.nominal_lens, "wavelength_nm": self.wavelength_nm.value}
+        facts = {
+            "title": self.title,
+            "lens": self.nominal_lens,
+            "wavelength_nm": self.wavelength_nm.value,
+        }
         return Optics(**facts, nearest_m=self.engine.min_range_mm.value * MM, **own)  # type: ignore[arg-type]
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Return (...) bool: whether points (..., 3) have an image on the sensor and within the lens's field."""
-        half_angle, aside = self.lens.field_half_angle_deg, np.linalg.norm(points_camera_m[..., :2], axis=-1)
+        """Return (...) bool: whether points (..., 3) have an image on the sensor and within the
+        lens's field."""
+        half_angle = self.lens.field_half_angle_deg
+        aside = np.linalg.norm(points_camera_m[..., :2], axis=-1)
         widest = np.deg2rad(half_angle.value) if half_angle else np.pi / 2
-        return self.nominal_lens.images(points_camera_m) & (np.arctan2(aside, points_camera_m[..., 2]) <= widest)
+        return self.nominal_lens.images(points_camera_m) & (
+            np.arctan2(aside, points_camera_m[..., 2]) <= widest
+        )
 
 
 def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Return the slopes (n,) that radial distortion alone (k1 k2 p1 p2 k3 k4 k5 k6) makes of true slopes (n,)."""
+    """Return the slopes (n,) that radial distortion alone (k1 k2 p1 p2 k3 k4 k5 k6) makes of true
+    slopes (n,)."""
     k1, k2, _, _, k3, k4, k5, k6 = distortion
     s = slope**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(slope * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6))))
+        return np.asarray(
+            slope * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
+        )
 
 
 def unfolded_slope(distortion: tuple[float, ...]) -> float:
-    """Return the largest distorted slope up to which radial distortion grows with the true one, or infinity."""
+    """Return the largest distorted slope up to which radial distortion grows with the true one, or
+    infinity."""
     distorted = distorted_slope(np.linspace(0.0, STEEPEST, 6001), distortion)
     with np.errstate(invalid="ignore"):
         back = np.flatnonzero(~(np.diff(distorted) > 0))

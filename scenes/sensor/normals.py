@@ -1,4 +1,5 @@
-"""Standard normals for the cameras' noise, vectorised, from a generator's raw words; single-threaded, float32."""
+"""Standard normals for the cameras' noise, vectorised, from a generator's raw words;
+single-threaded, float32."""
 
 import math
 from typing import Any
@@ -9,17 +10,23 @@ from numba import types
 from numba.extending import intrinsic
 
 FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil": True}
-"""Compiler options of all camera kernels: operations are neither reordered nor fused, so that every processor gives the
-same bits. Values may be infinite: an unlit pixel may divide by zero and is gated out later."""
-EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}  # of whole numbers that float32 holds: exact in any order
+"""Compiler options of all camera kernels: operations are neither reordered nor fused, so that
+every processor gives the same bits. Values may be infinite: an unlit pixel may divide by zero and
+is gated out later."""
+EXACT_SUMS: Any = {
+    **FAST,
+    "fastmath": {"nsz", "reassoc"},
+}  # of whole numbers that float32 holds: exact in any order
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
-"""The same for float64 sums that are rounded to float32 afterwards; their order changes a range by 1e-13 m."""
+"""The same for float64 sums that are rounded to float32 afterwards; their order changes a range by
+1e-13 m."""
 TWO_PI = np.float32(2.0 * math.pi)
 
 
 @numba.njit(**FAST)
 def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
-    """Write standard normals (2 n,) float32 from uniform words (2 n,) by Box and Muller, to 1e-5 and 5.9 deviations."""
+    """Write standard normals (2 n,) float32 from uniform words (2 n,) by Box and Muller, to 1e-5
+    and 5.9 deviations."""
     n = np.uint64(out.size // 2)
     for i in range(n):
         # the upper 24 bits of a word fill a float32 exactly
@@ -33,7 +40,8 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
 
 @numba.njit(inline="always", **FAST)
 def normal_pair(word):  # type: ignore[no-untyped-def]
-    """Return two standard normals from a uniform word of 32 bits: from 65,536 radii, up to 4.9, and as many angles."""
+    """Return two standard normals from a uniform word of 32 bits: from 65,536 radii, up to 4.9,
+    and as many angles."""
     u = (np.float32(word & np.uint32(0xFFFF)) + np.float32(0.5)) * np.float32(2.0**-16)
     radius = np.sqrt(np.float32(-2) * _log(u))
     sine, cosine = _sincos_turns(np.float32(word >> np.uint32(16)) * np.float32(2.0**-16))
@@ -42,7 +50,8 @@ def normal_pair(word):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", **FAST)
 def _log(u):  # type: ignore[no-untyped-def]
-    """Return the natural logarithm of a positive float32: exponent from its bits, mantissa by an atanh series."""
+    """Return the natural logarithm of a positive float32: exponent from its bits, mantissa by an
+    atanh series."""
     word: Any = float_bits(u)
     exponent = np.int32(word >> np.uint32(23)) - np.int32(127)
     mantissa = bits_float((word & np.uint32(0x007FFFFF)) | np.uint32(0x3F800000))
@@ -51,7 +60,9 @@ def _log(u):  # type: ignore[no-untyped-def]
     exponent = exponent + np.int32(1) if big else exponent
     q = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
     s = q * q
-    series = np.float32(2 / 3) + s * (np.float32(2 / 5) + s * (np.float32(2 / 7) + s * np.float32(2 / 9)))
+    series = np.float32(2 / 3) + s * (
+        np.float32(2 / 5) + s * (np.float32(2 / 7) + s * np.float32(2 / 9))
+    )
     return np.float32(exponent) * np.float32(0.69314718) + q * (np.float32(2) + s * series)
 
 
@@ -61,7 +72,10 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
     quarter = np.floor(v * np.float32(4) + np.float32(0.5))
     x = (v - quarter * np.float32(0.25)) * TWO_PI
     x2 = x * x
-    sine = x * (np.float32(1) + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040))))
+    sine = x * (
+        np.float32(1)
+        + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040)))
+    )
     series = np.float32(1 / 24) + x2 * (np.float32(-1 / 720) + x2 * np.float32(1 / 40320))
     cosine = np.float32(1) + x2 * (np.float32(-0.5) + x2 * series)
     k = np.int32(quarter)
@@ -74,15 +88,19 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
 
 
 def _bits(of: Any, into: Any) -> Any:
-    """Return a compiled function that reinterprets the bits of a number of one type as another type."""
+    """Return a compiled function that reinterprets the bits of a number of one type as another
+    type."""
 
     def cast(context, value):  # type: ignore[no-untyped-def]
-        return into(of), lambda inner, builder, _, args: builder.bitcast(args[0], inner.get_value_type(into))
+        return into(of), lambda inner, builder, _, args: builder.bitcast(
+            args[0], inner.get_value_type(into)
+        )
 
     return intrinsic(cast)
 
 
-float_bits, bits_float = _bits(types.float32, types.uint32), _bits(types.uint32, types.float32)
+float_bits = _bits(types.float32, types.uint32)
+bits_float = _bits(types.uint32, types.float32)
 
 
 def _fused(context: Any, a: Any, b: Any, c: Any) -> Any:
@@ -94,7 +112,8 @@ fma: Any = intrinsic(_fused)
 
 
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Draw standard normals (shape) float32 from the generator's raw words; an odd count uses half a word more."""
+    """Draw standard normals (shape) float32 from the generator's raw words; an odd count uses half
+    a word more."""
     count = math.prod(shape)
     even = count + count % 2
     out = np.empty(even, np.float32)

@@ -23,7 +23,8 @@ from scenes.sensor.unit import FrameTotals, frame_errors_m
 
 @dataclass(frozen=True)
 class SimulatedUnit:
-    """A unit of a camera in front of a view: all that its frames share. Build it once, then `capture` many times."""
+    """A unit of a camera in front of a view: all that its frames share. Build it once, then
+    `capture` many times."""
 
     camera: AnyCamera
     config: CameraConfig
@@ -32,7 +33,11 @@ class SimulatedUnit:
     @cached_property
     def model(self) -> AmcwImager | LidarScanner | EmpiricalImager:
         """The model of the camera's kind on the view's region; it has `expose` and `frame`."""
-        kinds = {"amcw_imager": AmcwImager, "scanned_lidar": LidarScanner, "empirical": EmpiricalImager}
+        kinds = {
+            "amcw_imager": AmcwImager,
+            "scanned_lidar": LidarScanner,
+            "empirical": EmpiricalImager,
+        }
         return kinds[self.camera.kind](self.camera, self.config, self.view.region, self.view.slopes)
 
     @cached_property
@@ -42,7 +47,8 @@ class SimulatedUnit:
 
     @cached_property
     def at_once(self) -> AtOnce | None:
-        """Sums of frames of this view without drawing each; None if frames must be drawn, or for other kinds."""
+        """Sums of frames of this view without drawing each; None if frames must be drawn, or for
+        other kinds."""
         if not isinstance(self.model, AmcwImager):
             return None
         wanted = np.zeros(self.view.range_m.shape, bool)
@@ -51,15 +57,21 @@ class SimulatedUnit:
 
     @cached_property
     def region(self) -> Region:
-        """The view's region without the margin where the filter's window is cut, except at the sensor's own border."""
-        outer, lens, m = self.view.region, self.camera.nominal_lens, self.camera.optics.margin_px
-        top, left = m * (outer.row0 > 0), m * (outer.col0 > 0)
-        bottom, right = m * (outer.row1 < lens.height), m * (outer.col1 < lens.width)
+        """The view's region without the margin where the filter's window is cut, except at the
+        sensor's own border."""
+        outer = self.view.region
+        lens = self.camera.nominal_lens
+        m = self.camera.optics.margin_px
+        top = m * (outer.row0 > 0)
+        left = m * (outer.col0 > 0)
+        bottom = m * (outer.row1 < lens.height)
+        right = m * (outer.col1 < lens.width)
         return Region(outer.row0 + top, outer.row1 - bottom, outer.col0 + left, outer.col1 - right)
 
     @cached_property
     def rgb(self) -> np.ndarray:
-        """Colour (h, w, 3) uint8 on the depth pixels: the albedo, evenly lit, without noise of a colour camera."""
+        """Colour (h, w, 3) uint8 on the depth pixels: the albedo, evenly lit, without noise of a
+        colour camera."""
         return np.asarray(np.round(255 * self.view.rgb[self.cut]), np.uint8)
 
     @property
@@ -68,7 +80,8 @@ class SimulatedUnit:
         return self.region.within(self.view.region)
 
     def capture(self, frames: int, seed: int, *labels: str | int) -> SimulatedCapture:
-        """Return ``frames`` exposures with noise of the stream (seed, labels); fewer are a prefix of more."""
+        """Return ``frames`` exposures with noise of the stream (seed, labels); fewer are a prefix
+        of more."""
         return SimulatedCapture(self, frames, seed, labels)
 
 
@@ -95,16 +108,24 @@ class SimulatedCapture:
     @cached_property
     def errors_m(self) -> np.ndarray:
         """Displacements (n_frames,) of each frame as a whole, metres of half path."""
-        camera, config = self.unit.camera, self.unit.config
+        camera = self.unit.camera
+        config = self.unit.config
         stream = random_stream(self.seed, "frame errors", *self.labels)
-        errors_m = frame_errors_m(camera.unit, config.effects, config.minutes_since_power_on, stream)
+        errors_m = frame_errors_m(
+            camera.unit, config.effects, config.minutes_since_power_on, stream
+        )
         return np.array(list(islice(errors_m, self.n_frames)))
 
     def totals(self, parts: Sequence[np.ndarray]) -> list[FrameTotals] | None:
-        """Return the sums over the frames of the first of ``parts``, of the first two, and so on, drawn at once: their
-        distribution is that of `frames`. Each part has numbers of frames (t,). None if frames must be drawn."""
-        summer, errors_m = self.unit.at_once, self.errors_m
-        if summer is None or np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0) > summer.farthest_error_m:
+        """Return the sums over the frames of the first of ``parts``, of the first two, and so on,
+        drawn at once: their distribution is that of `frames`. Each part has numbers of frames
+        (t,). None if frames must be drawn."""
+        summer = self.unit.at_once
+        errors_m = self.errors_m
+        if (
+            summer is None
+            or np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0) > summer.farthest_error_m
+        ):
             return None
 
         def stream(block: int) -> np.random.Generator:

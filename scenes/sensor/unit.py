@@ -1,4 +1,5 @@
-"""Frames and their sums, and the light and range errors of a unit or frame, for every kind of camera."""
+"""Frames and their sums, and the light and range errors of a unit or frame, for every kind of
+camera."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ SUMMED = ("count", "total", "squares", "amplitude")
 
 
 class DecodedFrame(NamedTuple):
-    """A frame. ``z_m`` (h, w) float32: NaN where ``reason`` (h, w) uint8 is not VALID. ``amplitude``: (h, w)."""
+    """A frame. ``z_m`` (h, w) float32: NaN where ``reason`` (h, w) uint8 is not VALID.
+    ``amplitude``: (h, w)."""
 
     z_m: np.ndarray
     reason: np.ndarray
@@ -35,9 +37,10 @@ class DecodedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameTotals:
-    """Sums over ``frames`` frames on pixels (h, w), with z in whole steps of ``step_m``, so that sums are exact.
-    ``count``: of valid samples. ``total``, ``squares``: of their z minus ``base``. ``amplitude``: in the camera's
-    units. ``reasons`` (r, h, w): how often each `Reason` occurred."""
+    """Sums over ``frames`` frames on pixels (h, w), with z in whole steps of ``step_m``, so that
+    sums are exact. ``count``: of valid samples. ``total``, ``squares``: of their z minus ``base``.
+    ``amplitude``: in the camera's units. ``reasons`` (r, h, w): how often each `Reason` occurred.
+    """
 
     frames: int
     step_m: float
@@ -55,31 +58,42 @@ class FrameTotals:
 
 
 def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, (h, w) each, an offset's (3,) component along each pixel's unit ray, and the ray's cosine to the axis."""
+    """Return, (h, w) each, an offset's (3,) component along each pixel's unit ray, and the ray's
+    cosine to the axis."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     length = np.linalg.norm(rays, axis=-1)
     return rays @ offset_m / length, 1 / length
 
 
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
-    """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2), periodic."""
+    """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2),
+    periodic."""
     responses = []
     for size in white.shape:
-        response = ndimage.gaussian_filter1d(np.eye(1, size)[0], length_px / np.sqrt(2), mode="wrap")
+        response = ndimage.gaussian_filter1d(
+            np.eye(1, size)[0], length_px / np.sqrt(2), mode="wrap"
+        )
         responses.append(scipy.fft.fft(response / np.linalg.norm(response)).astype(np.complex64))
     down, across = responses
     spectrum = scipy.fft.rfft2(white)
-    return np.asarray(scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape), float)
+    return np.asarray(
+        scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape), float
+    )
 
 
-SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05
-"""Frequencies of a filter's spectrum, and its least power and tap relative to the largest: correlations to 0.015."""
+SPECTRUM = 256
+LEAST_POWER = 1e-3
+FAINT = 0.05
+"""Frequencies of a filter's spectrum, and its least power and tap relative to the largest:
+correlations to 0.015."""
 
 
 def taps_of(correlation: np.ndarray) -> np.ndarray:
-    """Return causal taps (k,) with a sum of squares of 1 that give white noise this correlation (n,) at lags 0 to
-    n - 1: the minimum-phase factor of its spectrum, by the cepstrum (Oppenheim and Schafer), as it is short."""
-    lags, circle = len(correlation), np.zeros(SPECTRUM)
+    """Return causal taps (k,) with a sum of squares of 1 that give white noise this correlation
+    (n,) at lags 0 to n - 1: the minimum-phase factor of its spectrum, by the cepstrum (Oppenheim
+    and Schafer), as it is short."""
+    lags = len(correlation)
+    circle = np.zeros(SPECTRUM)
     circle[:lags] = correlation
     circle[SPECTRUM - lags + 1 :] = correlation[:0:-1]
     spectrum = np.fft.fft(circle).real
@@ -87,13 +101,16 @@ def taps_of(correlation: np.ndarray) -> np.ndarray:
     cepstrum[1 : SPECTRUM // 2] *= 2.0
     cepstrum[SPECTRUM // 2 + 1 :] = 0.0
     taps = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
-    taps = taps[: 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())]
+    taps = taps[
+        : 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())
+    ]
     return np.asarray(taps / np.sqrt((taps**2).sum()), np.float32)
 
 
 def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return phasors (f, h, w) and intensity (h, w) of all light or, with multipath off, of direct light; intensity is
-    then the longest phasor over the frequencies, too small where two surfaces cancel at every frequency."""
+    """Return phasors (f, h, w) and intensity (h, w) of all light or, with multipath off, of direct
+    light; intensity is then the longest phasor over the frequencies, too small where two surfaces
+    cancel at every frequency."""
     if effects.multipath:
         return view.phasor, view.intensity
     return view.phasor_direct, np.minimum(np.abs(view.phasor_direct).max(axis=0), view.intensity)
@@ -106,8 +123,13 @@ _patterns_mm: dict[tuple[Any, ...], np.ndarray] = {}
 class UnitModel(ABC, Generic[Camera]):
     """A unit of a camera on a region of its sensor whose central rays have ``slopes`` (h, w, 2)."""
 
-    def __init__(self, camera: Camera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
-        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+    def __init__(
+        self, camera: Camera, config: CameraConfig, region: Region, slopes: np.ndarray
+    ) -> None:
+        self.camera = camera
+        self.config = config
+        self.region = region
+        self.slopes = slopes
 
     @abstractmethod
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
@@ -116,10 +138,16 @@ class UnitModel(ABC, Generic[Camera]):
     @cached_property
     def static_error_m(self) -> np.ndarray:
         """All range errors (h, w) that the frames of this unit share, if they are switched on."""
-        camera, config, lens = self.camera, self.config, self.camera.nominal_lens
-        error = _drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
+        camera = self.camera
+        config = self.config
+        lens = self.camera.nominal_lens
+        error = _drift_m(
+            camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0]
+        )
         if config.effects.unit_offset:
-            deviation = float(random_stream(config.unit_seed, "unit offset", camera.name).standard_normal())
+            deviation = float(
+                random_stream(config.unit_seed, "unit offset", camera.name).standard_normal()
+            )
             error = error + deviation * camera.unit.offset_mm.value * MM
         if not config.effects.fixed_pattern:
             return error
@@ -134,7 +162,9 @@ class UnitModel(ABC, Generic[Camera]):
         return np.asarray(error + drawn_mm * MM * config.fixed_pattern_scale)
 
 
-def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:
+def _drift_m(
+    facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray
+) -> np.ndarray:
     """Return the error of range ``minutes`` after power-on; zeros where off."""
     if not effects.warm_up_drift:
         return np.zeros(slope_x.shape)
@@ -145,14 +175,17 @@ def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: 
 def frame_errors_m(
     facts: UnitFacts, effects: EffectsConfig, minutes: float, rng: np.random.Generator
 ) -> Iterator[float]:
-    """Yield range errors in metres for endless frames: jitter in all, a jump either way in a few, and the change of the
-    drift on the axis since the first frame, ``minutes`` after power-on. An effect that is off adds 0."""
-    axis, per_minute = np.zeros(1), facts.frames_per_second.value * 60
+    """Yield range errors in metres for endless frames: jitter in all, a jump either way in a few,
+    and the change of the drift on the axis since the first frame, ``minutes`` after power-on. An
+    effect that is off adds 0."""
+    axis = np.zeros(1)
+    per_minute = facts.frames_per_second.value * 60
     first = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():
         drifted = float(_drift_m(facts, effects, minutes + frame / per_minute, axis)[0] - first)
         # each half of the chances of a jump stands for one direction
-        jitter, chance = rng.standard_normal(), rng.random() / max(facts.jump_rate.value, 1e-12)
+        jitter = rng.standard_normal()
+        chance = rng.random() / max(facts.jump_rate.value, 1e-12)
         jump = math.copysign(facts.jump_mm.value, chance - 0.5) if chance < 1 else 0.0
         moved = (jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
         yield moved + drifted

@@ -1,9 +1,10 @@
 """Declaration of a target: board, damage, tape, material, backing, room and pose.
 
-Frames. ``board``: x across the face, y up, z out of the face towards the camera, origin on the face's centre.
-``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
-+x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at 850 nm and for red, green and blue. Ranges of single
-fields are checked here; rules on several fields (a hole that leaves the board) by `scenes.target.checks`."""
+Frames. ``board``: x across the face, y up, z out of the face towards the camera, origin on the
+face's centre. ``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero
+tilt board +x, +y, +z are camera +x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at
+850 nm and for red, green and blue. Ranges of single fields are checked here; rules on several
+fields (a hole that leaves the board) by `scenes.target.checks`."""
 
 from __future__ import annotations
 
@@ -20,12 +21,16 @@ from harness.vocabulary.geometry import MM, rotation_xyz_deg
 from harness.vocabulary.meshes import FileUnit, FrontAxis
 from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
-NEAR_NM = 20.0  # range of wavelengths for which an albedo holds: wood and paint change by a per cent or two (a guess)
+# range of wavelengths for which an albedo holds: wood and paint change by a per cent or two (a
+# guess)
+NEAR_NM = 20.0
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
-Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")]
+Chamfer = Annotated[
+    float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")
+]
 
 
 class FlatConfig(Config):
@@ -36,11 +41,14 @@ class FlatConfig(Config):
 
 class _CurvedConfig(Config):
     radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
-    bulge: Literal["towards", "away"] = Field("towards", description="bulges towards the camera or away from it")
+    bulge: Literal["towards", "away"] = Field(
+        "towards", description="bulges towards the camera or away from it"
+    )
 
 
 class CylinderConfig(_CurvedConfig):
-    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), where s runs across the straight direction."""
+    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), where s runs across the straight
+    direction."""
 
     kind: Literal["cylinder"]
     straight_along: Literal["x", "y"] = "y"
@@ -53,7 +61,8 @@ class SphereConfig(_CurvedConfig):
 
 
 class TermConfig(Config):
-    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y / height)^power_y."""
+    """One term of a polynomial face: coefficient_mm * (2 x / width)^power_x * (2 y /
+    height)^power_y."""
 
     power_x: Annotated[int, Field(ge=0, le=8)]
     power_y: Annotated[int, Field(ge=0, le=8)]
@@ -74,17 +83,21 @@ class PolynomialConfig(Config):
 
 
 class CorrugatedConfig(Config):
-    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), where s runs across the straight direction."""
+    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), where s runs across the
+    straight direction."""
 
     kind: Literal["corrugated"]
     period_mm: Annotated[float, Field(ge=5.0, le=1e3)] = 76.0
-    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(18.0, description="height from valley to crest")
+    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(
+        18.0, description="height from valley to crest"
+    )
     straight_along: Literal["x", "y"] = "y"
 
 
 class PanelConfig(Config):
-    """A panel like that of a car door. It is bent in both directions, and the face steps at a swage line along x:
-    z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 / w)). The default values are guesses."""
+    """A panel like that of a car door. It is bent in both directions, and the face steps at a
+    swage line along x: z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 /
+    w)). The default values are guesses."""
 
     kind: Literal["panel"]
     radius_x_mm: Annotated[float, Field(ge=50.0, le=1e6)] = 4000.0
@@ -95,22 +108,28 @@ class PanelConfig(Config):
 
 
 class RoughConfig(Config):
-    """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their power spectrum in
-    two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi / ``outer_mm``, and ends at 2 pi / ``inner_mm``;
-    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Not modelled:
-    pores, gravel."""
+    """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their
+    power spectrum in two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi /
+    ``outer_mm``, and ends at 2 pi / ``inner_mm``; between both, the surface is self-affine
+    (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Not modelled: pores, gravel."""
 
     kind: Literal["rough"]
-    deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
+    deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(
+        0.3, description="standard deviation of the heights"
+    )
     outer_mm: Annotated[float, Field(ge=2.0, le=1e3)] = 60.0
     inner_mm: Annotated[float, Field(ge=1.0, le=100.0)] = 6.0
     hurst: Annotated[float, Field(gt=0.0, le=1.0)] = Field(0.8, description="H, the Hurst exponent")
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="a family of boards draws it for each board")
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
+        1, description="a family of boards draws it for each board"
+    )
 
 
 class _FileConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
-    content: str = Field("", max_length=32, description="the file's digest, filled in when the file is read")
+    content: str = Field(
+        "", max_length=32, description="the file's digest, filled in when the file is read"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -122,7 +141,8 @@ class _FileConfig(Config):
 
 
 class MeshConfig(_FileConfig):
-    """The front of a part from a mesh file (`scenes.target.part`). Its bounds give the board's sizes."""
+    """The front of a part from a mesh file (`scenes.target.part`). Its bounds give the board's
+    sizes."""
 
     kind: Literal["mesh"]
     unit: FileUnit = "mm"
@@ -143,7 +163,8 @@ ShapeConfig = Annotated[
 
 
 class BoardConfig(Config):
-    """A board. Its outline, seen along z, is a rectangle; its thickness along the face's normal is constant."""
+    """A board. Its outline, seen along z, is a rectangle; its thickness along the face's normal is
+    constant."""
 
     width_mm: Annotated[float, Field(ge=5.0, le=5e3)]
     height_mm: Annotated[float, Field(ge=5.0, le=5e3)]
@@ -173,16 +194,20 @@ class DamageConfig(PlacedConfig):
 
 
 class DrillConfig(Config):
-    """The drill of all holes of a board. It replaces the diameter, kind, depth and chamfer of each hole."""
+    """The drill of all holes of a board. It replaces the diameter, kind, depth and chamfer of each
+    hole."""
 
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     kind: Literal["through", "blind"] = "through"
-    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="of blind holes only")
+    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(
+        default=None, description="of blind holes only"
+    )
     chamfer_mm: Chamfer = 0.0
 
 
 class HoleConfig(DrillConfig, DamageConfig):
-    """A drilled cylinder whose axis is the face's normal at its centre. A blind hole has a flat bottom."""
+    """A drilled cylinder whose axis is the face's normal at its centre. A blind hole has a flat
+    bottom."""
 
     @model_validator(mode="after")
     def _depth_where_blind(self) -> Self:
@@ -209,7 +234,8 @@ AnyDamage = HoleConfig | DentConfig | FlawConfig
 
 
 class TapeConfig(Config):
-    """A strip of tape on the face. Its size and place are those in plan; its angle counts from board +x towards +y."""
+    """A strip of tape on the face. Its size and place are those in plan; its angle counts from
+    board +x towards +y."""
 
     centre_mm: PlaceMm
     size_mm: SizeMm
@@ -220,28 +246,39 @@ class TapeConfig(Config):
 
 
 class GlossConfig(Config):
-    """A Phong lobe beside diffuse reflection: the part ``share`` of the reflected light goes into a lobe about the
-    mirror direction, (exponent + 2) / (2 pi) cos^exponent of the angle from it (Lafortune and Willems 1994). The model
-    is reciprocal and never reflects more than the albedo. It lacks the growth at grazing angles (Fresnel)."""
+    """A Phong lobe beside diffuse reflection: the part ``share`` of the reflected light goes into
+    a lobe about the mirror direction, (exponent + 2) / (2 pi) cos^exponent of the angle from it
+    (Lafortune and Willems 1994). The model is reciprocal and never reflects more than the albedo.
+    It lacks the growth at grazing angles (Fresnel)."""
 
     share: Albedo
-    exponent: float = Field(ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees")
+    exponent: float = Field(
+        ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees"
+    )
 
 
 class TextureConfig(_FileConfig):
-    """An image on the face in place of the grain. It is stretched over the board's width and height, its first row at
-    the top. Its brightness in linear light (decoded from sRGB) scales the albedo at 850 nm and all colours alike, so
-    that their means are those declared. A pattern that looks different at 850 nm is not modelled."""
+    """An image on the face in place of the grain. It is stretched over the board's width and
+    height, its first row at the top. Its brightness in linear light (decoded from sRGB) scales the
+    albedo at 850 nm and all colours alike, so that their means are those declared. A pattern that
+    looks different at 850 nm is not modelled."""
 
 
 class ReflectanceConfig(Config):
-    """Reflectance of a board: diffuse, with a grain along x or a ``texture``, which scale 850 nm and all colours alike.
-    ``gloss`` acts at the camera's wavelength, on the face and in holes, but not on tape."""
+    """Reflectance of a board: diffuse, with a grain along x or a ``texture``, which scale 850 nm
+    and all colours alike. ``gloss`` acts at the camera's wavelength, on the face and in holes, but
+    not on tape."""
 
-    albedo_850: Albedo = Field(0.6, description="pale wood has 0.5 to 0.7; no published value for plywood was found")
+    albedo_850: Albedo = Field(
+        0.6, description="pale wood has 0.5 to 0.7; no published value for plywood was found"
+    )
     rgb: Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: float = Field(0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean")
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(8.0, description="distance between dark lines")
+    grain_contrast: float = Field(
+        0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean"
+    )
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(
+        8.0, description="distance between dark lines"
+    )
     gloss: GlossConfig | None = None
     texture: TextureConfig | None = None
 
@@ -255,15 +292,20 @@ class MaterialConfig(ReflectanceConfig):
 class BackingConfig(Config):
     """A plane behind the board, parallel to the board frame's x and y."""
 
-    distance_mm: float = Field(ge=0.0, le=5e3, description="distance behind the deepest point of the board's back")
+    distance_mm: float = Field(
+        ge=0.0, le=5e3, description="distance behind the deepest point of the board's back"
+    )
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
-    size_mm: SizeMm | None = Field(None, description="null: what the board hides from the lens at zero tilt")
+    size_mm: SizeMm | None = Field(
+        None, description="null: what the board hides from the lens at zero tilt"
+    )
 
 
 class RoomConfig(Config):
-    """Floor and back wall, from which light reaches the board (multipath). In the camera's frame, the floor is parallel
-    to the optical axis and the wall is perpendicular to it. A key that is null leaves that surface out."""
+    """Floor and back wall, from which light reaches the board (multipath). In the camera's frame,
+    the floor is parallel to the optical axis and the wall is perpendicular to it. A key that is
+    null leaves that surface out."""
 
     floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = None
     floor_albedo_850: Albedo = 0.3
@@ -271,13 +313,15 @@ class RoomConfig(Config):
     back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = None
     back_wall_albedo_850: Albedo = 0.6
     back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
-    width_m: float = Field(4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis")
+    width_m: float = Field(
+        4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis"
+    )
     height_m: float = Field(2.5, ge=0.5, le=20.0, description="height of the wall above the floor")
 
 
 class WavelengthConfig(Config):
-    """Albedos at a wavelength other than 850 nm: one for each kind of surface that the target has. ``as_at_850`` gives
-    the ``board`` the albedo that its material has at 850 nm."""
+    """Albedos at a wavelength other than 850 nm: one for each kind of surface that the target has.
+    ``as_at_850`` gives the ``board`` the albedo that its material has at 850 nm."""
 
     wavelength_nm: Annotated[float, Field(ge=300.0, le=2000.0)]
     board: Albedo | Literal["as_at_850"]
@@ -292,9 +336,12 @@ OtherWavelengths = Annotated[tuple[WavelengthConfig, ...], _OTHER]
 
 
 class PoseConfig(Config):
-    """Pose of the board: the face's centre in the camera's axes, and rotations about the board's own x, then y, z."""
+    """Pose of the board: the face's centre in the camera's axes, and rotations about the board's
+    own x, then y, z."""
 
-    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(0.7, description="depth of the face's centre")
+    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(
+        0.7, description="depth of the face's centre"
+    )
     offset_x_mm: Coordinate = 0.0
     offset_y_mm: Coordinate = 0.0
     tilt_x_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
@@ -303,8 +350,9 @@ class PoseConfig(Config):
 
     @property
     def T_camera_board(self) -> np.ndarray:
-        """The 4x4 matrix that maps board to camera. Positive ``tilt_x_deg`` brings the upper edge nearer, positive
-        ``tilt_y_deg`` the -x edge, and positive ``roll_deg`` lifts the +x edge."""
+        """The 4x4 matrix that maps board to camera. Positive ``tilt_x_deg`` brings the upper edge
+        nearer, positive ``tilt_y_deg`` the -x edge, and positive ``roll_deg`` lifts the +x edge.
+        """
         T_camera_board = np.eye(4)
         turned = rotation_xyz_deg(self.tilt_x_deg, self.tilt_y_deg, self.roll_deg)
         T_camera_board[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turned
@@ -317,7 +365,8 @@ class SetUpConfig(Config):
 
     name: str
     flaws: Annotated[
-        tuple[AnyFlawConfig, ...], Field(max_length=500, description="damage of all kinds but holes and dents")
+        tuple[AnyFlawConfig, ...],
+        Field(max_length=500, description="damage of all kinds but holes and dents"),
     ] = ()
     material: MaterialConfig = MaterialConfig()
     backing: BackingConfig | None = None
@@ -331,7 +380,9 @@ class TargetConfig(SetUpConfig):
 
     name: Literal["custom"] = "custom"
     board: BoardConfig
-    drill: DrillConfig | None = Field(None, description="one drill for all holes, so that an axis can vary it")
+    drill: DrillConfig | None = Field(
+        None, description="one drill for all holes, so that an axis can vary it"
+    )
     holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
     dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
     tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = ()
@@ -339,17 +390,24 @@ class TargetConfig(SetUpConfig):
     @model_validator(mode="before")
     @classmethod
     def _one_drill(cls, data: Any) -> Any:
-        drill, holes = (data.get("drill"), data.get("holes")) if isinstance(data, dict) else (None, None)
+        drill, holes = (
+            (data.get("drill"), data.get("holes")) if isinstance(data, dict) else (None, None)
+        )
         if not isinstance(drill, dict) or not isinstance(holes, list | tuple):
             return data
         whole = {"kind": "through", "depth_mm": None, "chamfer_mm": 0.0, **drill}
-        return {**data, "holes": [{**hole, **whole} if isinstance(hole, dict) else hole for hole in holes]}
+        return {
+            **data,
+            "holes": [{**hole, **whole} if isinstance(hole, dict) else hole for hole in holes],
+        }
 
     @model_validator(mode="after")
     def _ids_once(self) -> Self:
         ids = [damage.id for damage in self.damages]
         if twice := sorted({i for i in ids if ids.count(i) > 1}):
-            raise ValueError(f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}")
+            raise ValueError(
+                f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}"
+            )
         return self
 
     @property
@@ -366,11 +424,18 @@ class TargetConfig(SetUpConfig):
         return self.model_copy(update={"holes": (), "dents": (), "flaws": ()})
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
-        """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
-        Raises UserError if the declaration has none for it, or lacks the albedo of one of its surfaces."""
-        near = [albedos for albedos in self.other_wavelengths if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM]
+        """Return the declaration with the nearest albedos to that wavelength as its
+        ``albedo_850``, and no others. Raises UserError if the declaration has none for it, or
+        lacks the albedo of one of its surfaces."""
+        near = [
+            albedos
+            for albedos in self.other_wavelengths
+            if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM
+        ]
         from_850 = abs(wavelength_nm - 850.0)
-        if from_850 <= NEAR_NM and all(from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near):
+        if from_850 <= NEAR_NM and all(
+            from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near
+        ):
             return self.model_copy(update={"other_wavelengths": ()})
         if not near:
             known = sorted({850.0, *(albedos.wavelength_nm for albedos in self.other_wavelengths)})
@@ -384,16 +449,26 @@ class TargetConfig(SetUpConfig):
         surfaces: dict[str, Any] = {"tape": self.tapes, "backing": self.backing}
         if room is not None:
             surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
-        lacking = [name for name, surface in surfaces.items() if surface and getattr(albedos, name) is None]
+        lacking = [
+            name for name, surface in surfaces.items() if surface and getattr(albedos, name) is None
+        ]
         if lacking:
             what = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
             raise UserError(what, legal="an albedo for every surface that the target has")
         board = self.material.albedo_850 if albedos.board == "as_at_850" else albedos.board
-        changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": board})}
-        changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
+        changed: dict[str, Any] = {
+            "material": self.material.model_copy(update={"albedo_850": board})
+        }
+        changed["tapes"] = tuple(
+            tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes
+        )
         if self.backing is not None:
             changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
         if room is not None:
-            named = {f"{name}_albedo_850": getattr(albedos, name) for name in ("floor", "back_wall")}
-            changed["room"] = room.model_copy(update={key: value for key, value in named.items() if value is not None})
+            named = {
+                f"{name}_albedo_850": getattr(albedos, name) for name in ("floor", "back_wall")
+            }
+            changed["room"] = room.model_copy(
+                update={key: value for key, value in named.items() if value is not None}
+            )
         return self.model_copy(update={**changed, "other_wavelengths": ()})

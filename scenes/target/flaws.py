@@ -1,12 +1,15 @@
-"""Damage other than drilled holes and ball dents: slots, gouges, pressed sheets, corrosion, chips, protrusions.
+"""Damage other than drilled holes and ball dents: slots, gouges, pressed sheets, corrosion, chips,
+protrusions.
 
-Each is a depth over its own frame, which touches the face at the damage's centre: s runs along the damage, t across it,
-and depth counts along the face's normal there, into the board. A kind gives its depth on a grid of (s, t) whose border
-is the outline; `mesh.solids_of` cuts or adds the solid between that grid and the face, and `truth.truth_of` measures
-outline, centre line and volume on it. ``angle_deg`` turns s from board +x towards board +y. Sizes are those in the
-plane that touches the face; they are exact to second order in size over radius of curvature.
+Each is a depth over its own frame, which touches the face at the damage's centre: s runs along the
+damage, t across it, and depth counts along the face's normal there, into the board. A kind gives
+its depth on a grid of (s, t) whose border is the outline; `mesh.solids_of` cuts or adds the solid
+between that grid and the face, and `truth.truth_of` measures outline, centre line and volume on
+it. ``angle_deg`` turns s from board +x towards board +y. Sizes are those in the plane that touches
+the face; they are exact to second order in size over radius of curvature.
 
-Not modelled: burrs, spring-back, rust that stands on the face, another albedo of the exposed material."""
+Not modelled: burrs, spring-back, rust that stands on the face, another albedo of the exposed
+material."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -27,16 +30,20 @@ Extent = Annotated[float, Field(ge=0.05, le=2e3)]
 Depth = Annotated[float, Field(gt=0.0, le=500.0)]
 Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
-ALONG, ACROSS = 96, 24  # cells of an elongated damage's grid: volume within 0.1 %
+# cells of an elongated damage's grid: volume within 0.1 %
+ALONG = 96
+ACROSS = 24
 ROUND = 64  # cells along each side of a round damage's grid: volume within 0.1 %
-CHIP_ARC = 0.998  # part of a chip's half-length that its grid spans: at the very tips it would have no width
+# part of a chip's half-length that its grid spans: at the very tips it would have no width
+CHIP_ARC = 0.998
 
 
 @dataclass(frozen=True)
 class Relief:
-    """The depth of a damage over its own frame, metres. ``s_m``, ``t_m``, ``depth_m`` (rows, columns): a grid whose
-    border is the outline; ``depth_m`` is negative where the damage stands out of the face, and NaN through the board.
-    ``open_row``: whether the last row lies on the board's edge, beyond which a cutter goes on."""
+    """The depth of a damage over its own frame, metres. ``s_m``, ``t_m``, ``depth_m`` (rows,
+    columns): a grid whose border is the outline; ``depth_m`` is negative where the damage stands
+    out of the face, and NaN through the board. ``open_row``: whether the last row lies on the
+    board's edge, beyond which a cutter goes on."""
 
     s_m: np.ndarray
     t_m: np.ndarray
@@ -86,7 +93,8 @@ class _FlawConfig(PlacedConfig):
 
 
 class _LongConfig(_FlawConfig):
-    """A damage along a line. ``wander_mm``: deviation of the line from a straight one; ``seed`` draws its waves."""
+    """A damage along a line. ``wander_mm``: deviation of the line from a straight one; ``seed``
+    draws its waves."""
 
     length_mm: Extent
     width_mm: Extent
@@ -95,10 +103,15 @@ class _LongConfig(_FlawConfig):
     seed: Seed = 1
 
     def _grid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return s and t (rows, columns) in metres, and the part of the half-width at which each row lies."""
-        part, s = np.linspace(-1.0, 1.0, ACROSS + 1), np.linspace(-0.5, 0.5, ALONG + 1)
+        """Return s and t (rows, columns) in metres, and the part of the half-width at which each
+        row lies."""
+        part = np.linspace(-1.0, 1.0, ACROSS + 1)
+        s = np.linspace(-0.5, 0.5, ALONG + 1)
         turns, weights = random_stream(self.seed, "centre line").uniform(size=(2, 3))
-        waves = [w * np.sin(2 * np.pi * (k * s + turn)) for k, turn, w in zip((1, 2, 3), turns, weights, strict=True)]
+        waves = [
+            w * np.sin(2 * np.pi * (k * s + turn))
+            for k, turn, w in zip((1, 2, 3), turns, weights, strict=True)
+        ]
         line = np.sum(waves, axis=0)
         line = self.wander_mm * MM * (line - line.mean()) / max(float(line.std()), 1e-12)
         across, along = np.broadcast_arrays(part[:, None], s * self.length_mm * MM)
@@ -106,8 +119,9 @@ class _LongConfig(_FlawConfig):
 
 
 class SlotConfig(_LongConfig):
-    """A slot or open crack of constant depth, with upright walls and blunt ends. Its limit is a width. ``wander_mm`` is
-    the deviation of its centre line from a straight one; ``seed`` draws the line."""
+    """A slot or open crack of constant depth, with upright walls and blunt ends. Its limit is a
+    width. ``wander_mm`` is the deviation of its centre line from a straight one; ``seed`` draws
+    the line."""
 
     kind: Literal["slot"]
     size_of: ClassVar[str] = "width"
@@ -115,13 +129,15 @@ class SlotConfig(_LongConfig):
 
     def relief(self) -> Relief:
         s, t, _ = self._grid()
-        return Relief(s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM))
+        return Relief(
+            s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM)
+        )
 
 
 class GougeConfig(_LongConfig):
-    """A scratch or gouge. Its section is a V or a parabola, and its floor rises to the face over ``run_out_mm`` at each
-    end. Its limit is a length; assessments of pipes (ASME B31G, API 579) use its depth and its length. ``wander_mm``
-    and ``seed`` are those of a slot."""
+    """A scratch or gouge. Its section is a V or a parabola, and its floor rises to the face over
+    ``run_out_mm`` at each end. Its limit is a length; assessments of pipes (ASME B31G, API 579)
+    use its depth and its length. ``wander_mm`` and ``seed`` are those of a slot."""
 
     kind: Literal["gouge"]
     size_of: ClassVar[str] = "length"
@@ -138,13 +154,16 @@ class GougeConfig(_LongConfig):
 
 
 class RoundConfig(_FlawConfig):
-    """A sheet that is pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move alike, by a raised
-    cosine of the distance from the centre, and may move further than the sheet is thick. A ``protrusion`` is an object
-    on the face, such as weld spatter or a rivet's head: a paraboloid of height ``depth_mm``."""
+    """A sheet that is pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move
+    alike, by a raised cosine of the distance from the centre, and may move further than the sheet
+    is thick. A ``protrusion`` is an object on the face, such as weld spatter or a rivet's head: a
+    paraboloid of height ``depth_mm``."""
 
     kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
     diameter_mm: Extent
-    depth_mm: Annotated[Depth, Field(description="depth; of a protrusion, its height above the face")]
+    depth_mm: Annotated[
+        Depth, Field(description="depth; of a protrusion, its height above the face")
+    ]
 
     @property
     def pressed(self) -> bool:
@@ -154,16 +173,21 @@ class RoundConfig(_FlawConfig):
     def relief(self) -> Relief:
         s, t, ring = _disc(self.diameter_mm * MM / 2)
         height = (1 + np.cos(np.pi * ring)) / 2 if self.pressed else 1 - ring**2
-        return Relief(s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height)
+        return Relief(
+            s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height
+        )
 
 
 class CorrosionConfig(_FlawConfig):
-    """A corroded patch. Its outline is uneven: the radius varies by ``uneven`` (deviation over mean). Its floor is
-    rough, with the deviation ``rough_mm`` and the correlation length ``grain_mm`` (Gaussian, cut at the face), and
-    rises to the face over the outer tenth of the radius. ``seed`` draws both."""
+    """A corroded patch. Its outline is uneven: the radius varies by ``uneven`` (deviation over
+    mean). Its floor is rough, with the deviation ``rough_mm`` and the correlation length
+    ``grain_mm`` (Gaussian, cut at the face), and rises to the face over the outer tenth of the
+    radius. ``seed`` draws both."""
 
     kind: Literal["corrosion"]
-    diameter_mm: Annotated[Extent, Field(description="diameter of the circle that has the patch's area")]
+    diameter_mm: Annotated[
+        Extent, Field(description="diameter of the circle that has the patch's area")
+    ]
     depth_mm: Annotated[Depth, Field(description="mean depth")]
     rough_mm: Annotated[float, Field(ge=0.0, le=100.0)] = 0.2
     grain_mm: Annotated[float, Field(ge=0.1, le=200.0)] = 3.0
@@ -171,27 +195,35 @@ class CorrosionConfig(_FlawConfig):
     seed: Seed = 1
 
     def relief(self) -> Relief:
-        rng, radius_m = random_stream(self.seed, "corrosion"), self.diameter_mm * MM / 2
+        rng = random_stream(self.seed, "corrosion")
+        radius_m = self.diameter_mm * MM / 2
         s, t, ring = _disc(1.0)
-        angle, turn = np.arctan2(t, s), np.linspace(0, 2 * np.pi, 721)
-        turns, weights = rng.uniform(0, 2 * np.pi, 4), rng.uniform(0.3, 1.0, 4)
-        spread, waves = self.uneven / np.sqrt((weights**2).sum() / 2), [*zip((2, 3, 4, 5), weights, turns, strict=True)]
+        angle = np.arctan2(t, s)
+        turn = np.linspace(0, 2 * np.pi, 721)
+        turns = rng.uniform(0, 2 * np.pi, 4)
+        weights = rng.uniform(0.3, 1.0, 4)
+        spread = self.uneven / np.sqrt((weights**2).sum() / 2)
+        waves = [*zip((2, 3, 4, 5), weights, turns, strict=True)]
 
         def outline(at: np.ndarray) -> np.ndarray:
             return 1 + spread * sum(w * np.cos(k * at + p) for k, w, p in waves)
 
         stretch = radius_m * outline(angle) / np.sqrt(np.mean(outline(turn[:-1]) ** 2))
-        noise = gaussian_filter(rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2))
+        noise = gaussian_filter(
+            rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2)
+        )
         noise *= self.rough_mm * MM / max(float(noise.std()), 1e-12)
         ramp = np.clip((1 - ring) / 0.1, 0.0, 1.0)
         depth = np.maximum(self.depth_mm * MM + noise, 0.0) * ramp
-        s, t = s * stretch, t * stretch
+        s = s * stretch
+        t = t * stretch
         return Relief(s, t, depth * self.depth_mm * MM / _mean(s, t, depth))
 
 
 class ChipConfig(_FlawConfig):
-    """Material missing at the board's edge (a chip, a spall): a quarter of an ellipsoid about a point of the edge.
-    ``angle_deg`` names the edge: 0 top, 90 left, 180 bottom, -90 right. Its limit is a length."""
+    """Material missing at the board's edge (a chip, a spall): a quarter of an ellipsoid about a
+    point of the edge. ``angle_deg`` names the edge: 0 top, 90 left, 180 bottom, -90 right. Its
+    limit is a length."""
 
     kind: Literal["chip"]
     size_of: ClassVar[str] = "length"
@@ -201,10 +233,19 @@ class ChipConfig(_FlawConfig):
     angle_deg: Literal[0, 90, 180, -90]
 
     def relief(self) -> Relief:
-        u, v = np.meshgrid(CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2), np.linspace(1, 0, ACROSS + 1))
+        u, v = np.meshgrid(
+            CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2),
+            np.linspace(1, 0, ACROSS + 1),
+        )
         v = np.sin(v * np.pi / 2)
-        s, t = u * self.length_mm * MM / 2, -v * np.sqrt(1 - u**2) * self.width_mm * MM
-        return Relief(s, t, self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)), open_row=True)
+        s = u * self.length_mm * MM / 2
+        t = -v * np.sqrt(1 - u**2) * self.width_mm * MM
+        return Relief(
+            s,
+            t,
+            self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)),
+            open_row=True,
+        )
 
 
 FlawConfig = SlotConfig | GougeConfig | RoundConfig | CorrosionConfig | ChipConfig
@@ -212,15 +253,19 @@ AnyFlawConfig = Annotated[FlawConfig, Field(discriminator="kind")]
 
 
 def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return s and t of a square grid mapped onto a disc, border on the rim, and each point's share of the radius."""
+    """Return s and t of a square grid mapped onto a disc, border on the rim, and each point's
+    share of the radius."""
     u, v = np.meshgrid(np.linspace(-1, 1, ROUND + 1), np.linspace(-1, 1, ROUND + 1))
-    s, t = u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)
+    s = u * np.sqrt(1 - v**2 / 2)
+    t = v * np.sqrt(1 - u**2 / 2)
     return radius_m * s, radius_m * t, np.minimum(np.hypot(s, t), 1.0)
 
 
 def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
     """Return the mean of a grid's values over its area."""
-    across, down = (np.stack([each[1:, 1:] - each[:-1, :-1], each[1:, :-1] - each[:-1, 1:]]) for each in (s, t))
+    across, down = (
+        np.stack([each[1:, 1:] - each[:-1, :-1], each[1:, :-1] - each[:-1, 1:]]) for each in (s, t)
+    )
     areas = np.abs(across[0] * down[1] - across[1] * down[0])
     middles = (values[1:, 1:] + values[:-1, :-1] + values[1:, :-1] + values[:-1, 1:]) / 4
     return float((areas * middles).sum() / areas.sum())
@@ -228,22 +273,30 @@ def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
 
 def turned(angle_rad: float) -> np.ndarray:
     """Return the 2x2 matrix that turns from x towards y."""
-    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+    return np.array(
+        [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
+    )
 
 
 def border(grid: np.ndarray) -> np.ndarray:
-    """Return the border (n, ...) of a grid (rows, columns, ...), once round, from its first corner along the row."""
+    """Return the border (n, ...) of a grid (rows, columns, ...), once round, from its first corner
+    along the row."""
     return np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
 
 
 def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) and outward triangles (m, 3) of the solid between two grids (rows, columns, 3) of points,
-    columns running with x and rows with y as seen from above, closed by walls between their borders."""
+    """Return vertices (n, 3) and outward triangles (m, 3) of the solid between two grids (rows,
+    columns, 3) of points, columns running with x and rows with y as seen from above, closed by
+    walls between their borders."""
     rows, columns = upper.shape[:2]
     grid = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    a = grid[:-1, :-1].ravel()
+    b = grid[:-1, 1:].ravel()
+    c = grid[1:, 1:].ravel()
+    d = grid[1:, :-1].ravel()
     top = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    rim, below = border(grid), grid.size
+    rim = border(grid)
+    below = grid.size
     following = np.roll(rim, -1)
     corners = (rim + below, following + below, following), (rim + below, following, rim)
     vertices = np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)])
@@ -263,10 +316,12 @@ def outside_m(outline_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
 
 
 def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of places (n, 2) from a line of straight pieces (k, 2), or from one point (1, 2)."""
+    """Return the distance (n,) of places (n, 2) from a line of straight pieces (k, 2), or from one
+    point (1, 2)."""
     if len(line_m) == 1:
         return np.asarray(np.linalg.norm(places_m - line_m[0], axis=-1))
-    way, to = np.diff(line_m, axis=0), places_m[:, None] - line_m[:-1]
+    way = np.diff(line_m, axis=0)
+    to = places_m[:, None] - line_m[:-1]
     square = np.maximum((way**2).sum(axis=1), 1e-30)
     part = np.clip((to * way).sum(axis=-1) / square, 0.0, 1.0)
     return np.asarray(np.linalg.norm(to - part[..., None] * way, axis=-1).min(axis=1))

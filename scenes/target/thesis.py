@@ -1,9 +1,11 @@
-"""The target named ``thesis``, with a field for every fact that its source leaves open; and all kinds of targets.
+"""The target named ``thesis``, with a field for every fact that its source leaves open; and all
+kinds of targets.
 
-Source: "Damage Detection and Location Using Time of Flight Depth Cameras" (Rutgers), Table I and the ruler readings of
-its error script. They state eleven holes of 1/16 to 1 in, drilled in one row of a half-inch plywood sheet and about
-2 in apart from the 1/4 in hole on, strips of coloured tape, and an Azure Kinect. Every other value is a choice with a
-reason, made before any claim was scored; `experiments/averaging.yaml` tries other plausible values."""
+Source: "Damage Detection and Location Using Time of Flight Depth Cameras" (Rutgers), Table I and
+the ruler readings of its error script. They state eleven holes of 1/16 to 1 in, drilled in one row
+of a half-inch plywood sheet and about 2 in apart from the 1/4 in hole on, strips of coloured tape,
+and an Azure Kinect. Every other value is a choice with a reason, made before any claim was scored;
+`experiments/averaging.yaml` tries other plausible values."""
 
 from typing import Annotated, Any, Literal, get_args
 
@@ -16,7 +18,19 @@ from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.part import MeshTargetConfig
 
 THICKNESS_MM = 12.7  # half an inch (stated)
-DIAMETERS_IN = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 5 / 16, 3 / 8, 7 / 16, 1 / 2, 5 / 8, 3 / 4, 1.0)  # stated, Table I
+DIAMETERS_IN = (
+    1 / 16,
+    1 / 8,
+    3 / 16,
+    1 / 4,
+    5 / 16,
+    3 / 8,
+    7 / 16,
+    1 / 2,
+    5 / 8,
+    3 / 4,
+    1.0,
+)  # stated, Table I
 Degrees = Annotated[float, Field(ge=-70.0, le=70.0)]
 NonNegativeMm = Annotated[float, Field(ge=0.0, le=5e3)]
 
@@ -26,12 +40,17 @@ def _open(default: Any, reason: str) -> Any:
 
 
 class ThesisTargetConfig(Config):
-    """The thesis' target. The thesis states the holes' diameters and the board's thickness; each key is a fact that it
-    leaves open, and the meaning gives the reason for the default. ``declare()`` returns the full declaration."""
+    """The thesis' target. The thesis states the holes' diameters and the board's thickness; each
+    key is a fact that it leaves open, and the meaning gives the reason for the default.
+    ``declare()`` returns the full declaration."""
 
     name: Literal["thesis"] = "thesis"
-    hole_kind: Literal["through", "blind"] = _open("through", "'Drilled' in a thin sheet means drilled through.")
-    blind_depth_mm: Annotated[float, Field(gt=0.0, lt=THICKNESS_MM)] = _open(9.5, "Three quarters of the thickness.")
+    hole_kind: Literal["through", "blind"] = _open(
+        "through", "'Drilled' in a thin sheet means drilled through."
+    )
+    blind_depth_mm: Annotated[float, Field(gt=0.0, lt=THICKNESS_MM)] = _open(
+        9.5, "Three quarters of the thickness."
+    )
     backing_distance_mm: NonNegativeMm | None = _open(
         20.0,
         "Distance of a surface behind the board; null: nothing. The thesis keeps points with z < 1.1 m and range < 1 m "
@@ -39,46 +58,84 @@ class ThesisTargetConfig(Config):
     )
     backing_albedo_850: custom.Albedo = _open(0.6, "A guess; typical of painted walls and wood.")
     hole_spacing_mm: Annotated[float, Field(ge=30.0, le=100.0)] = _open(
-        50.8, "2 in, from the ruler readings of holes 4 to 11; holes 1 to 3 are assumed to be as far apart."
+        50.8,
+        "2 in, from the ruler readings of holes 4 to 11; holes 1 to 3 are assumed to be as far apart.",
     )
-    board_width_mm: Annotated[float, Field(ge=100.0, le=5e3)] = _open(609.6, "24 in, a stock size; the row takes 20.")
-    board_height_mm: Annotated[float, Field(ge=30.0, le=5e3)] = _open(114.3, "4.5 in: room for the row and the tape.")
+    board_width_mm: Annotated[float, Field(ge=100.0, le=5e3)] = _open(
+        609.6, "24 in, a stock size; the row takes 20."
+    )
+    board_height_mm: Annotated[float, Field(ge=30.0, le=5e3)] = _open(
+        114.3, "4.5 in: room for the row and the tape."
+    )
     row_offset_y_mm: Annotated[float, Field(ge=-2e3, le=2e3)] = _open(0.0, "The row is centred.")
     distance_m: Annotated[float, Field(ge=0.3, le=5.0)] = _open(
-        0.7, "About midway from the camera's minimum (0.5 m) to 0.95 m, where the board's ends have a range of 1 m."
+        0.7,
+        "About midway from the camera's minimum (0.5 m) to 0.95 m, where the board's ends have a range of 1 m.",
     )
     offset_x_mm: custom.Coordinate = _open(0.0, "The board is centred in front of the camera.")
     offset_y_mm: custom.Coordinate = _open(0.0, "The board is centred in front of the camera.")
-    tilt_x_deg: Degrees = _open(3.0, "No sheet set up by hand is frontal; zero tilt would let rounding hide noise.")
+    tilt_x_deg: Degrees = _open(
+        3.0, "No sheet set up by hand is frontal; zero tilt would let rounding hide noise."
+    )
     tilt_y_deg: Degrees = _open(4.0, "As tilt_x_deg.")
     roll_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = _open(0.0, "The board stands level.")
-    plywood_albedo_850: custom.Albedo = _open(0.6, "Pale wood: 0.5 to 0.7. No published value for plywood was found.")
+    plywood_albedo_850: custom.Albedo = _open(
+        0.6, "Pale wood: 0.5 to 0.7. No published value for plywood was found."
+    )
     plywood_rgb: custom.Rgb = _open((0.55, 0.42, 0.28), "A guess: pale wood.")
-    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = _open(0.05, "A guess: deviation of albedo over its mean.")
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = _open(8.0, "A guess: dark lines of a softwood veneer.")
-    grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = _open(1, "Seed of the grain: which of many alike boards.")
-    tape_length_mm: custom.Length = _open(40.0, "Four strips, one near each corner, clear of the row.")
+    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = _open(
+        0.05, "A guess: deviation of albedo over its mean."
+    )
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = _open(
+        8.0, "A guess: dark lines of a softwood veneer."
+    )
+    grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = _open(
+        1, "Seed of the grain: which of many alike boards."
+    )
+    tape_length_mm: custom.Length = _open(
+        40.0, "Four strips, one near each corner, clear of the row."
+    )
     tape_width_mm: custom.Length = _open(12.0, "Half-inch tape.")
     tape_x_mm: NonNegativeMm = _open(200.0, "The strips' centres are at plus and minus this x.")
     tape_y_mm: NonNegativeMm = _open(38.0, "The strips' centres are at plus and minus this y.")
-    tape_thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = _open(0.15, "Vinyl tape is 0.13 to 0.18 mm thick.")
-    tape_albedo_850: custom.Albedo = _open(0.6, "A guess: red dyes absorb little in the near infrared.")
-    tape_rgb: custom.Rgb = _open((0.85, 0.08, 0.08), "The thesis finds strips by red above mean + 2.6 deviations.")
-    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(0.75, "A table; null: no floor.")
+    tape_thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = _open(
+        0.15, "Vinyl tape is 0.13 to 0.18 mm thick."
+    )
+    tape_albedo_850: custom.Albedo = _open(
+        0.6, "A guess: red dyes absorb little in the near infrared."
+    )
+    tape_rgb: custom.Rgb = _open(
+        (0.85, 0.08, 0.08), "The thesis finds strips by red above mean + 2.6 deviations."
+    )
+    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(
+        0.75, "A table; null: no floor."
+    )
     floor_albedo_850: custom.Albedo = _open(0.3, "A guess.")
-    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(2.5, "A small room; null: no wall.")
+    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(
+        2.5, "A small room; null: no wall."
+    )
     back_wall_albedo_850: custom.Albedo = _open(0.6, "A guess: a painted wall.")
     other_wavelengths: custom.OtherWavelengths = ()
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Whether the parts fit together is checked when it is built."""
         middle = (len(DIAMETERS_IN) - 1) / 2
-        room = {key: getattr(self, key) for key in custom.RoomConfig.model_fields if hasattr(self, key)}
+        room = {
+            key: getattr(self, key) for key in custom.RoomConfig.model_fields if hasattr(self, key)
+        }
         backing = None
         if self.backing_distance_mm is not None:
-            backing = custom.BackingConfig(distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850)
-        sizes = {"width_mm": self.board_width_mm, "height_mm": self.board_height_mm, "thickness_mm": THICKNESS_MM}
-        strip: dict[str, Any] = {key: getattr(self, f"tape_{key}") for key in ("rgb", "albedo_850", "thickness_mm")}
+            backing = custom.BackingConfig(
+                distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850
+            )
+        sizes = {
+            "width_mm": self.board_width_mm,
+            "height_mm": self.board_height_mm,
+            "thickness_mm": THICKNESS_MM,
+        }
+        strip: dict[str, Any] = {
+            key: getattr(self, f"tape_{key}") for key in ("rgb", "albedo_850", "thickness_mm")
+        }
         return custom.TargetConfig(
             board=custom.BoardConfig(**sizes, shape=custom.FlatConfig()),
             # hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle
@@ -86,7 +143,10 @@ class ThesisTargetConfig(Config):
                 custom.HoleConfig(
                     id=number,
                     diameter_mm=round(diameter_in * INCH / MM, 6),
-                    centre_mm=(round((number - 1 - middle) * self.hole_spacing_mm, 6), self.row_offset_y_mm),
+                    centre_mm=(
+                        round((number - 1 - middle) * self.hole_spacing_mm, 6),
+                        self.row_offset_y_mm,
+                    ),
                     kind=self.hole_kind,
                     depth_mm=self.blind_depth_mm if self.hole_kind == "blind" else None,
                 )
@@ -104,11 +164,18 @@ class ThesisTargetConfig(Config):
             material=custom.MaterialConfig(
                 albedo_850=self.plywood_albedo_850,
                 rgb=self.plywood_rgb,
-                **{key: getattr(self, key) for key in ("grain_contrast", "grain_period_mm", "grain_seed")},
+                **{
+                    key: getattr(self, key)
+                    for key in ("grain_contrast", "grain_period_mm", "grain_seed")
+                },
             ),
             backing=backing,
-            room=custom.RoomConfig(**room) if room["floor_below_lens_m"] or room["back_wall_distance_m"] else None,
-            pose=custom.PoseConfig(**{key: getattr(self, key) for key in custom.PoseConfig.model_fields}),
+            room=custom.RoomConfig(**room)
+            if room["floor_below_lens_m"] or room["back_wall_distance_m"]
+            else None,
+            pose=custom.PoseConfig(
+                **{key: getattr(self, key) for key in custom.PoseConfig.model_fields}
+            ),
             other_wavelengths=self.other_wavelengths,
         )
 

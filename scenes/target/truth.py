@@ -1,4 +1,5 @@
-"""The target in closed form: the face as a height field, the planes around it, and the damage: place and volume."""
+"""The target in closed form: the face as a height field, the planes around it, and the damage:
+place and volume."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -18,23 +19,27 @@ from scenes.target.part import front_derivatives, part_of
 
 OUTLINE_STEPS = 64  # points along each side of the outline
 LINE_STEP = 8  # columns of a flaw's grid between two points of its centre line
-OPEN_FLOOR_M = 3.0  # reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m
+# reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m
+OPEN_FLOOR_M = 3.0
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of a face's derivatives in x and y
 _UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 
 
 @dataclass(frozen=True)
 class Face:
-    """A smooth height field with z(0, 0) = 0. ``derivatives``: gives z and its derivatives (`ORDERS`), each of the
-    shape of x and y, NaN beyond its reach; ``height``: z alone, if that is much quicker. On a ``rough`` face, slope and
-    curvature at one place do not describe the places around it. Arguments of the methods broadcast."""
+    """A smooth height field with z(0, 0) = 0. ``derivatives``: gives z and its derivatives
+    (`ORDERS`), each of the shape of x and y, NaN beyond its reach; ``height``: z alone, if that is
+    much quicker. On a ``rough`` face, slope and curvature at one place do not describe the places
+    around it. Arguments of the methods broadcast."""
 
     derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     rough: bool = False
     height: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def _derived(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
-        return self.derivatives(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
+        return self.derivatives(
+            *np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
+        )
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return z of the face; NaN where the shape does not reach."""
@@ -62,13 +67,15 @@ class Face:
         return upward / np.linalg.norm(upward, axis=-1, keepdims=True)
 
     def axis(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
-        """Return (..., 3): the direction from which a damage's depth counts: the normal, or z for a rough face."""
+        """Return (..., 3): the direction from which a damage's depth counts: the normal, or z for
+        a rough face."""
         normal = self.normal(x_m, y_m)
         return np.broadcast_to([0.0, 0.0, 1.0], normal.shape).copy() if self.rough else normal
 
     def curvatures(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
-        """Return (..., 2): principal curvatures in 1/m, positive where the face bulges to the camera, larger first.
-        From mean and Gaussian curvature of a Monge patch (do Carmo, Differential Geometry, section 3-3, example 5)."""
+        """Return (..., 2): principal curvatures in 1/m, positive where the face bulges to the
+        camera, larger first. From mean and Gaussian curvature of a Monge patch (do Carmo,
+        Differential Geometry, section 3-3, example 5)."""
         _, fx, fy, fxx, fxy, fyy = self._derived(x_m, y_m)
         metric = 1 + fx**2 + fy**2
         mean = ((1 + fx**2) * fyy - 2 * fx * fy * fxy + (1 + fy**2) * fxx) / (2 * metric**1.5)
@@ -86,11 +93,15 @@ def face_of(board: custom.BoardConfig) -> Face:
     if isinstance(shape, custom.MeshConfig):
         return Face(partial(front_derivatives, shape))
     if isinstance(shape, custom.CorrugatedConfig):
-        bent_along, wave, high_m = shape.straight_along, 2 * np.pi / (shape.period_mm * MM), shape.depth_mm * MM / 2
+        bent_along = shape.straight_along
+        wave = 2 * np.pi / (shape.period_mm * MM)
+        high_m = shape.depth_mm * MM / 2
 
         def corrugated(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-            across, none = (x if bent_along == "y" else y) * wave, np.zeros(x.shape)
-            slope, bend = -high_m * wave * np.sin(across), -high_m * wave**2 * np.cos(across)
+            across = (x if bent_along == "y" else y) * wave
+            none = np.zeros(x.shape)
+            slope = -high_m * wave * np.sin(across)
+            bend = -high_m * wave**2 * np.cos(across)
             height = high_m * (np.cos(across) - 1)
             along_x = (height, slope, none, bend, none, none)
             return along_x if bent_along == "y" else (height, none, slope, none, none, bend)
@@ -98,20 +109,33 @@ def face_of(board: custom.BoardConfig) -> Face:
         return Face(corrugated)
     if isinstance(shape, custom.PanelConfig):
         bends = -1 / (shape.radius_x_mm * MM), -1 / (shape.radius_y_mm * MM)
-        high_m, y0, wide_m = shape.swage_mm * MM / 2, shape.swage_y_mm * MM, shape.swage_width_mm * MM
+        high_m = shape.swage_mm * MM / 2
+        y0 = shape.swage_y_mm * MM
+        wide_m = shape.swage_width_mm * MM
 
         def panel(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
             step = np.tanh((y - y0) / wide_m)
-            height = (bends[0] * x**2 + bends[1] * y**2) / 2 + high_m * (step + np.tanh(y0 / wide_m))
+            height = (bends[0] * x**2 + bends[1] * y**2) / 2 + high_m * (
+                step + np.tanh(y0 / wide_m)
+            )
             slope_y = bends[1] * y + high_m / wide_m * (1 - step**2)
             bend_y = bends[1] - 2 * high_m / wide_m**2 * step * (1 - step**2)
-            return height, bends[0] * x, slope_y, np.full(x.shape, bends[0]), np.zeros(x.shape), bend_y
+            return (
+                height,
+                bends[0] * x,
+                slope_y,
+                np.full(x.shape, bends[0]),
+                np.zeros(x.shape),
+                bend_y,
+            )
 
         return Face(panel)
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
         straight = shape.straight_along if isinstance(shape, custom.CylinderConfig) else ""
-        radius_m, sign = shape.radius_mm * MM, 1.0 if shape.bulge == "towards" else -1.0
-        bent_x, bent_y = float(straight != "x"), float(straight != "y")
+        radius_m = shape.radius_mm * MM
+        sign = 1.0 if shape.bulge == "towards" else -1.0
+        bent_x = float(straight != "x")
+        bent_y = float(straight != "y")
 
         def round_face(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
             square = radius_m**2 - bent_x * np.square(x) - bent_y * np.square(y)
@@ -126,7 +150,8 @@ def face_of(board: custom.BoardConfig) -> Face:
             )
 
         return Face(round_face)
-    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
+    half_x = board.width_mm * MM / 2
+    half_y = board.height_mm * MM / 2
     terms = shape.terms if isinstance(shape, custom.PolynomialConfig) else ()
     powers = np.array([(0, 0), *((term.power_x, term.power_y) for term in terms)])
     coefficients = np.zeros(powers.max(axis=0) + 1)
@@ -138,13 +163,18 @@ def face_of(board: custom.BoardConfig) -> Face:
         if not coefficients.any():
             return tuple(np.zeros(x.shape) for _ in ORDERS)
         derived = (np.polynomial.polynomial.polyder(coefficients, dx, axis=0) for dx, _ in ORDERS)
-        along = (np.polynomial.polynomial.polyder(c, dy, axis=1) for c, (_, dy) in zip(derived, ORDERS, strict=True))
+        along = (
+            np.polynomial.polynomial.polyder(c, dy, axis=1)
+            for c, (_, dy) in zip(derived, ORDERS, strict=True)
+        )
         return tuple(np.asarray(np.polynomial.polynomial.polyval2d(x, y, c)) for c in along)
 
     return Face(polynomial)
 
 
-ROUGH_MARGIN_M, ROUGH_STEPS = 0.02, 4  # beyond the board; knots of the spline to the shortest wavelength
+# beyond the board; knots of the spline to the shortest wavelength
+ROUGH_MARGIN_M = 0.02
+ROUGH_STEPS = 4
 
 
 def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
@@ -153,8 +183,11 @@ def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
 
     step_m = shape.inner_mm * MM / ROUGH_STEPS
     counts = [2 * math.ceil((side / 2 + ROUGH_MARGIN_M) / step_m) + 1 for side in size_m]
-    k = np.hypot(*np.meshgrid(*(2 * np.pi * np.fft.fftfreq(n, step_m) for n in counts), indexing="ij"))
-    outer, inner = 2 * np.pi / (shape.outer_mm * MM), 2 * np.pi / (shape.inner_mm * MM)
+    k = np.hypot(
+        *np.meshgrid(*(2 * np.pi * np.fft.fftfreq(n, step_m) for n in counts), indexing="ij")
+    )
+    outer = 2 * np.pi / (shape.outer_mm * MM)
+    inner = 2 * np.pi / (shape.inner_mm * MM)
     amplitude = np.where((k > 0) & (k <= inner), (k**2 + outer**2) ** (-(1 + shape.hurst) / 2), 0.0)
     noise = random_stream(shape.seed, "rough face").standard_normal(counts)
     heights = np.fft.ifft2(np.fft.fft2(noise) * amplitude).real
@@ -169,30 +202,40 @@ def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
 
 
 def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
-    """Return (n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board frame; of a part from
-    a mesh the convex hull of its plan, in the plane of its foremost point."""
+    """Return (n, 3): the rim of the undamaged face, counter-clockwise seen from the camera, board
+    frame; of a part from a mesh the convex hull of its plan, in the plane of its foremost point.
+    """
     if isinstance(board.shape, custom.MeshConfig):
         plan = part_of(board.shape)[0][:, :2]
         rim = plan[ConvexHull(plan).vertices]
         return np.column_stack([rim, np.zeros(len(rim))])
-    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
-    side, end = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False), np.ones(OUTLINE_STEPS)
-    x, y = np.concatenate([side, end, -side, -end]), np.concatenate([-end, side, end, -side])
+    half_x = board.width_mm * MM / 2
+    half_y = board.height_mm * MM / 2
+    side = np.linspace(-1, 1, OUTLINE_STEPS, endpoint=False)
+    end = np.ones(OUTLINE_STEPS)
+    x = np.concatenate([side, end, -side, -end])
+    y = np.concatenate([-end, side, end, -side])
     return face_of(board).point(half_x * x, half_y * y)
 
 
 @lru_cache(maxsize=100)
 def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
-    """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the board; board frame."""
-    face, places = face_of(board), np.linspace(-0.5, 0.5, steps + 1)
+    """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the
+    board; board frame."""
+    face = face_of(board)
+    places = np.linspace(-0.5, 0.5, steps + 1)
     x, y = np.meshgrid(places * board.width_mm * MM, places * board.height_mm * MM)
     points = face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
     if isinstance(board.shape, custom.MeshConfig):  # where its front is not, its bounds count
-        points = np.where(np.isnan(points[..., 2:]), np.dstack([x, y, np.full(x.shape, -depth_m)]), points)
+        points = np.where(
+            np.isnan(points[..., 2:]), np.dstack([x, y, np.full(x.shape, -depth_m)]), points
+        )
     return points
 
 
-def backing_corners_board_m(config: custom.TargetConfig, backing: custom.BackingConfig) -> np.ndarray:
+def backing_corners_board_m(
+    config: custom.TargetConfig, backing: custom.BackingConfig
+) -> np.ndarray:
     """Return the backing's corners in the board's frame; it faces the board."""
     deepest_m = -float(face_grid_m(config.board, config.board.thickness_mm * MM)[..., 2].min())
     z_m = deepest_m + backing.distance_mm * MM
@@ -203,15 +246,23 @@ def backing_corners_board_m(config: custom.TargetConfig, backing: custom.Backing
 
 
 def planes_of(config: custom.TargetConfig) -> Iterator[tuple[str, np.ndarray, float, custom.Rgb]]:
-    """Yield backing, floor and back wall, as declared: name, corners (4, 3) in the camera's frame, albedo at 850 nm and
-    rgb. The floor reaches to the back wall, which stands on it or, without a floor, is centred on the axis."""
-    backing, room, across, up = config.backing, config.room, _UNIT_CORNERS[:, 0], _UNIT_CORNERS[:, 1] + 0.5
+    """Yield backing, floor and back wall, as declared: name, corners (4, 3) in the camera's frame,
+    albedo at 850 nm and rgb. The floor reaches to the back wall, which stands on it or, without a
+    floor, is centred on the axis."""
+    backing = config.backing
+    room = config.room
+    across = _UNIT_CORNERS[:, 0]
+    up = _UNIT_CORNERS[:, 1] + 0.5
     if backing is not None:
-        corners = transform_points(config.pose.T_camera_board, backing_corners_board_m(config, backing))
+        corners = transform_points(
+            config.pose.T_camera_board, backing_corners_board_m(config, backing)
+        )
         yield "backing", corners, backing.albedo_850, backing.rgb
     if room is None:
         return
-    floor_m, wall_m, across_m = room.floor_below_lens_m, room.back_wall_distance_m, room.width_m * across
+    floor_m = room.floor_below_lens_m
+    wall_m = room.back_wall_distance_m
+    across_m = room.width_m * across
     if floor_m is not None:
         corners = np.column_stack([across_m, np.full(4, floor_m), (wall_m or OPEN_FLOOR_M) * up])
         yield "floor", corners, room.floor_albedo_850, room.floor_rgb
@@ -223,13 +274,15 @@ def planes_of(config: custom.TargetConfig) -> Iterator[tuple[str, np.ndarray, fl
 
 @dataclass(frozen=True)
 class Damage:
-    """A hole, a dent or another damage. ``centre_*`` (3,): on the undamaged face. ``axis_*`` (3,): the face's unit
-    normal there, out of the board. ``diameter_m``: of the drill, of a dent's rim on this face (by equal area), or of
-    other kinds the size in plan that ``size_of`` names. ``depth_m``: along the axis; for corrosion the mean, for
-    ``raised`` damage its height, for through-damage the board's thickness. ``volume_m3`` of holes and dents: exact on a
-    flat face, to second order in diameter over radius of curvature on a curved one; of other kinds as
-    `scenes.target.flaws` meshes them, of a pressed sheet on its front. Kinds with an outline of their own have it and
-    their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2), else None), and their sides."""
+    """A hole, a dent or another damage. ``centre_*`` (3,): on the undamaged face. ``axis_*`` (3,):
+    the face's unit normal there, out of the board. ``diameter_m``: of the drill, of a dent's rim
+    on this face (by equal area), or of other kinds the size in plan that ``size_of`` names.
+    ``depth_m``: along the axis; for corrosion the mean, for ``raised`` damage its height, for
+    through-damage the board's thickness. ``volume_m3`` of holes and dents: exact on a flat face,
+    to second order in diameter over radius of curvature on a curved one; of other kinds as
+    `scenes.target.flaws` meshes them, of a pressed sheet on its front. Kinds with an outline of
+    their own have it and their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m``
+    (k, 2), else None), and their sides."""
 
     id: int
     kind: str
@@ -256,7 +309,8 @@ class Damage:
         return float(np.linalg.norm(self.outline_board_m - self.centre_board_m[:2], axis=1).max())
 
     def within(self, x_m: np.ndarray, y_m: np.ndarray, margin_m: float = 0.0) -> np.ndarray:
-        """Return which places in plan lie inside the outline, or within ``margin_m`` of it; shaped like ``x_m``."""
+        """Return which places in plan lie inside the outline, or within ``margin_m`` of it; shaped
+        like ``x_m``."""
         apart = np.sqrt((x_m - self.centre_board_m[0]) ** 2 + (y_m - self.centre_board_m[1]) ** 2)
         with np.errstate(invalid="ignore"):
             near = np.asarray(apart < self.reach_m + margin_m)
@@ -272,23 +326,41 @@ class Damage:
 
     def to_row(self) -> dict[str, Any]:
         """Return plain data in millimetres, one flat row for JSON or a table."""
-        row: dict[str, Any] = {"id": self.id, "kind": self.kind, "diameter_mm": self.diameter_m / MM}
+        row: dict[str, Any] = {
+            "id": self.id,
+            "kind": self.kind,
+            "diameter_mm": self.diameter_m / MM,
+        }
         row |= {"depth_mm": self.depth_m / MM, "volume_mm3": self.volume_m3 / MM**3}
         if self.outline_board_m is not None:
-            row |= {"length_mm": self.length_m / MM, "width_mm": self.width_m / MM, "raised": self.raised}
+            row |= {
+                "length_mm": self.length_m / MM,
+                "width_mm": self.width_m / MM,
+                "raised": self.raised,
+            }
             row |= {"angle_deg": math.degrees(self.angle_rad), "size_of": self.size_of}
-        places = {"board": (self.centre_board_m, self.axis_board), "camera": (self.centre_camera_m, self.axis_camera)}
+        places = {
+            "board": (self.centre_board_m, self.axis_board),
+            "camera": (self.centre_camera_m, self.axis_camera),
+        }
         for frame, (centre_m, axis) in places.items():
-            row |= {f"{a}_{frame}_mm": float(value) / MM for a, value in zip("xyz", centre_m, strict=True)}
+            row |= {
+                f"{a}_{frame}_mm": float(value) / MM
+                for a, value in zip("xyz", centre_m, strict=True)
+            }
             row |= {f"axis_{a}_{frame}": float(value) for a, value in zip("xyz", axis, strict=True)}
         return row
 
 
 def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
-    """Return the truth of a declaration: holes, dents, then other kinds, in the order of their declaration."""
-    face, truth = face_of(config.board), []
+    """Return the truth of a declaration: holes, dents, then other kinds, in the order of their
+    declaration."""
+    face = face_of(config.board)
+    truth = []
     for item in config.damages:
-        centre, axis, bends = (function(*item.centre_m) for function in (face.point, face.axis, face.curvatures))
+        centre = face.point(*item.centre_m)
+        axis = face.axis(*item.centre_m)
+        bends = face.curvatures(*item.centre_m)
         in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         if isinstance(item, FlawConfig):
             sizes, outline = _flaw_truth(item, face, config.board.thickness_mm * MM)
@@ -297,28 +369,36 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
         radius_m = item.radius_m
         depth_m = (config.board.thickness_mm if item.depth_mm is None else item.depth_mm) * MM
         if isinstance(item, custom.DentConfig):
-            # The sphere's curvature gives paraboloids of the two principal curvatures the same volume as the face;
-            # exact on flat and spherical faces.
+            # The sphere's curvature gives paraboloids of the two principal curvatures the same
+            # volume as the face; exact on flat and spherical faces.
             bend = (math.sqrt(float(np.prod(1 + item.ball_m * bends))) - 1) / item.ball_m
             radius_m, volume_m3 = _lens(item, bend)
         else:
-            # Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) / 8 lower
-            # on average than at the centre. The back of a through-hole is a parallel surface, curvatures k / (1 - t k).
+            # Over a disc of radius a about the normal a face with principal curvatures k lies a^2
+            # (k1 + k2) / 8 lower on average than at the centre. The back of a through-hole is a
+            # parallel surface,
+            # curvatures k / (1 - t k).
             back = float((bends / (1 - depth_m * bends)).sum()) if item.kind == "through" else 0.0
             leg_m = item.mouth_m - radius_m
-            volume_m3 = math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
+            volume_m3 = (
+                math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
+            )
             volume_m3 += math.pi * leg_m**2 * (radius_m + leg_m / 3)
-        truth.append(Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera))
+        truth.append(
+            Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera)
+        )
     return tuple(truth)
 
 
 def relief_points(
     item: FlawConfig, face: Face, thickness_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a flaw's grid on the face: points (rows, columns, 3) on it, depths (rows, columns) along the axis, that
-    axis (3,) out of the board, and the direction (3,) of t; board frame, metres."""
+    """Return a flaw's grid on the face: points (rows, columns, 3) on it, depths (rows, columns)
+    along the axis, that axis (3,) out of the board, and the direction (3,) of t; board frame,
+    metres."""
     relief, (x, y) = item.relief(), item.centre_m
-    axis, along = face.axis(x, y), np.array([math.cos(item.turn_rad), math.sin(item.turn_rad), 0.0])
+    axis = face.axis(x, y)
+    along = np.array([math.cos(item.turn_rad), math.sin(item.turn_rad), 0.0])
     along[2] = -(axis[:2] @ along[:2]) / axis[2]
     along /= np.linalg.norm(along)
     across = np.cross(axis, along)
@@ -327,15 +407,25 @@ def relief_points(
     return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
 
 
-def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float) -> tuple[tuple[float, float, float], dict[str, Any]]:
-    """Return size, depth and volume of a flaw, and the fields that kinds with an outline of their own have."""
+def _flaw_truth(
+    item: FlawConfig, face: Face, thickness_m: float
+) -> tuple[tuple[float, float, float], dict[str, Any]]:
+    """Return size, depth and volume of a flaw, and the fields that kinds with an outline of their
+    own have."""
     points, depth_m, axis, _ = relief_points(item, face, thickness_m)
-    plan, moved, raised = points[..., :2], points - depth_m[..., None] * axis, bool(depth_m.min() < 0)
+    plan = points[..., :2]
+    moved = points - depth_m[..., None] * axis
+    raised = bool(depth_m.min() < 0)
     length_mm, width_mm = item.sides_mm
     deepest_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
     removed_m3 = volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved)))
     line_board_m = plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None
-    outline = {"size_of": item.size_of, "raised": raised, "outline_board_m": border(plan), "line_board_m": line_board_m}
+    outline = {
+        "size_of": item.size_of,
+        "raised": raised,
+        "outline_board_m": border(plan),
+        "line_board_m": line_board_m,
+    }
     outline |= {"length_m": length_mm * MM, "width_m": width_mm * MM, "angle_rad": item.turn_rad}
     return (item.size_mm * MM, deepest_m, removed_m3), outline
 
@@ -346,12 +436,15 @@ def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
     half_square = dent.radius_m**2 / (2 * (1 + bend * (dent.ball_m - depth_m)))
     sphere_cap_m = bend * half_square
     rim_square = 2 * half_square - sphere_cap_m**2
-    caps = [math.pi * h * (3 * rim_square + h**2) / 6 for h in (depth_m - sphere_cap_m, sphere_cap_m)]
+    caps = [
+        math.pi * h * (3 * rim_square + h**2) / 6 for h in (depth_m - sphere_cap_m, sphere_cap_m)
+    ]
     return math.sqrt(rim_square), sum(caps)
 
 
 def widest_rim_m(item: custom.AnyDamage, face: Face) -> float:
-    """Return the largest radius of a rim: a chamfer counts, and the direction in which a face bends to a dent most."""
+    """Return the largest radius of a rim: a chamfer counts, and the direction in which a face
+    bends to a dent most."""
     if not isinstance(item, custom.DentConfig):
         return item.reach_mm * MM
     return _lens(item, float(face.curvatures(*item.centre_m).min()))[0]

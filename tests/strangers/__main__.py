@@ -1,4 +1,5 @@
-"""Make recordings of all kinds, answer them with the default command, and print right, warned and wrong by kind."""
+"""Make recordings of all kinds, answer them with the default command, and print right, warned and
+wrong by kind."""
 
 from __future__ import annotations
 
@@ -10,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from strangers.kinds import KINDS
-from strangers.recording import recorded, written
-from strangers.score import Score, answered, scored
+from tests.strangers.kinds import KINDS
+from tests.strangers.recording import recorded, written
+from tests.strangers.score import Score, answered, scored
 
 
 def made(kind: str, seed: int, folder: Path) -> Score:
-    """Make one recording in ``folder``, answer it and score the answer; what was printed goes to answer.txt there."""
+    """Make one recording in ``folder``, answer it and score the answer; what was printed goes to
+    answer.txt there."""
     rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
     stranger = KINDS[kind](rng)
     stack, view, truths = recorded(stranger, rng)
@@ -29,11 +31,17 @@ def made(kind: str, seed: int, folder: Path) -> Score:
 
 def main() -> int:
     """Run the chosen kinds; returns 0 where no answer is wrong, else 1."""
-    parser = argparse.ArgumentParser(prog="python -m strangers", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.strangers", description=__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default all: {', '.join(KINDS)}")
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="recordings of each kind (default 2)")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="first seed (default 0)")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep all recordings and answers here")
+    parser.add_argument(
+        "--seeds", type=int, default=2, metavar="N", help="recordings of each kind (default 2)"
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="SEED", help="first seed (default 0)"
+    )
+    parser.add_argument(
+        "--keep", type=Path, metavar="DIR", help="keep all recordings and answers here"
+    )
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.kinds) - set(KINDS))
     if unknown:

@@ -8,13 +8,19 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from strangers.recording import Format, Noise, Stranger
-from strangers.world import Camera, Damage, Surface, with_damage
+from tests.strangers.recording import Format, Noise, Stranger
+from tests.strangers.world import Camera, Damage, Surface, with_damage
 
 Rng = np.random.Generator
 KINDS: dict[str, Callable[[Rng], Stranger]] = {}
 
-CAMERAS = ((640, 576, 504.6), (320, 288, 252.3), (512, 424, 365.0), (320, 240, 290.0), (240, 180, 225.0))
+CAMERAS = (
+    (640, 576, 504.6),
+    (320, 288, 252.3),
+    (512, 424, 365.0),
+    (320, 240, 290.0),
+    (240, 180, 225.0),
+)
 """Width, height and focal length: today's cameras, and halves of them."""
 
 
@@ -24,21 +30,25 @@ def kind(make: Callable[[Rng], Stranger]) -> Callable[[Rng], Stranger]:
     return make
 
 
-# ---- parts -----------------------------------------------------------------------------------------------------------
+# ---- parts
+# -----------------------------------------------------------------------------------------------------------
 
 
 def camera(rng: Rng, *among: tuple[int, int, float]) -> Camera:
     """A camera with its centre a few pixels off the image's."""
     width, height, f = (among or CAMERAS)[int(rng.integers(len(among or CAMERAS)))]
-    cx, cy = (width - 1) / 2 + rng.uniform(-0.02, 0.02) * width, (height - 1) / 2 + rng.uniform(-0.04, 0.04) * height
+    cx = (width - 1) / 2 + rng.uniform(-0.02, 0.02) * width
+    cy = (height - 1) / 2 + rng.uniform(-0.04, 0.04) * height
     return Camera(width, height, f, float(cx), float(cy))
 
 
 def turned(tilt_deg: float, towards_deg: float, spin_deg: float = 0.0) -> np.ndarray:
-    """Axes of a surface whose normal leaves the line of sight by ``tilt_deg`` towards a direction in the image."""
+    """Axes of a surface whose normal leaves the line of sight by ``tilt_deg`` towards a direction
+    in the image."""
     tilt, to, spin = np.radians([tilt_deg, towards_deg, spin_deg])
     axis = np.array([-np.sin(to), np.cos(to), 0.0]) * tilt
-    turn, about_z = cv2.Rodrigues(axis)[0], cv2.Rodrigues(np.array([0.0, 0.0, spin]))[0]
+    turn = cv2.Rodrigues(axis)[0]
+    about_z = cv2.Rodrigues(np.array([0.0, 0.0, spin]))[0]
     return turn @ about_z
 
 
@@ -54,15 +64,27 @@ def board(
     return Surface(np.array([*at, d]), r, half[0], half[1], is_target=True)
 
 
-def filling(rng: Rng, cam: Camera, distance: tuple[float, float] = (0.4, 1.0), tilt: float = 15) -> Surface:
+def filling(
+    rng: Rng, cam: Camera, distance: tuple[float, float] = (0.4, 1.0), tilt: float = 15
+) -> Surface:
     """A plane that fills the view; its half extents are those of the view."""
     d = rng.uniform(*distance)
-    return Surface(np.array([0, 0, d]), turned(rng.uniform(0, tilt), rng.uniform(0, 360)), 5.0, 5.0, is_target=True)
+    return Surface(
+        np.array([0, 0, d]),
+        turned(rng.uniform(0, tilt), rng.uniform(0, 360)),
+        5.0,
+        5.0,
+        is_target=True,
+    )
 
 
-def wall(surface: Surface, gap_m: float, tilt_deg: float = 0.0, towards_deg: float = 0.0) -> Surface:
-    """An endless plane behind a surface's farthest corner, parallel to the image but for its own tilt."""
-    x, y = (0.999 * half if half < 5 else 0.0 for half in (surface.half_x_m, surface.half_y_m))
+def wall(
+    surface: Surface, gap_m: float, tilt_deg: float = 0.0, towards_deg: float = 0.0
+) -> Surface:
+    """An endless plane behind a surface's farthest corner, parallel to the image but for its own
+    tilt."""
+    x = 0.999 * surface.half_x_m if surface.half_x_m < 5 else 0.0
+    y = 0.999 * surface.half_y_m if surface.half_y_m < 5 else 0.0
     corners = [surface.point_m(i * x, j * y)[2] for i in (-1, 0, 1) for j in (-1, 0, 1)]
     at = np.array([*surface.origin_m[:2], np.nanmax(corners) + gap_m])
     return Surface(at, turned(tilt_deg, towards_deg), 9.0, 9.0)
@@ -73,13 +95,17 @@ def damaged(
     radius_mm: tuple[float, float] = (3, 20), depth_mm: tuple[float, float] = (4, 40), sign: float = 1.0,
     reach: tuple[float, float] | None = None,
 ) -> Surface:  # fmt: skip
-    """``n`` damages (fewer where they do not fit) at least 12 mm apart and 12 mm from the rim and the view's edge.
+    """``n`` damages (fewer where they do not fit) at least 12 mm apart and 12 mm from the rim and
+    the view's edge.
 
-    Sizes are uniform in their logarithm; a tapered one is at most 0.4 of its radius deep, as pressed dents are.
+    Sizes are uniform in their logarithm; a tapered one is at most 0.4 of its radius deep, as
+    pressed dents are.
     """
     d = surface.origin_m[2]
     view = np.array([cam.width, cam.height]) / cam.f_px * d / 2 * 0.85
-    half = np.minimum([surface.half_x_m, surface.half_y_m], view) if reach is None else np.array(reach)
+    half = (
+        np.minimum([surface.half_x_m, surface.half_y_m], view) if reach is None else np.array(reach)
+    )
     damages: list[Damage] = []
     for _ in range(60 * n):
         if len(damages) == n:
@@ -97,22 +123,35 @@ def damaged(
         if surface.outline == "disc" and np.hypot(x / room[0], y / room[1]) > 1:
             continue
         extent = radius + length / 2
-        gaps = [np.hypot(x - o.x_m, y - o.y_m) - extent - o.radius_m - o.length_m / 2 for o in damages]
+        gaps = [
+            np.hypot(x - o.x_m, y - o.y_m) - extent - o.radius_m - o.length_m / 2 for o in damages
+        ]
         if all(gap > max(0.015, 0.4 * extent) for gap in gaps):
-            damages.append(Damage(x, y, radius, sign * depth, profile, length, rng.uniform(0, np.pi)))
+            damages.append(
+                Damage(x, y, radius, sign * depth, profile, length, rng.uniform(0, np.pi))
+            )
     return with_damage(surface, damages)
 
 
 def usual(rng: Rng, z_m: float = 0.7) -> Noise:
     """A camera's ordinary noise: 0.5 to 1.5 mm, mostly mixed at edges."""
-    return Noise(white_m=rng.uniform(0.5e-3, 1.5e-3), mixing_px=float(rng.choice([0.0, 0.5, 0.7])), dropout=0.001)
+    return Noise(
+        white_m=rng.uniform(0.5e-3, 1.5e-3),
+        mixing_px=float(rng.choice([0.0, 0.5, 0.7])),
+        dropout=0.001,
+    )
 
 
 def plate(rng: Rng, n: int = 4, cam: Camera | None = None, **more: object) -> Stranger:
     """A damaged board before a wall with ordinary noise: what most kinds vary."""
     cam = cam or camera(rng)
     target = damaged(rng, cam, board(rng, cam), n)
-    made = Stranger([target, wall(target, rng.uniform(0.15, 0.8))], cam, usual(rng), frames=int(rng.integers(4, 12)))
+    made = Stranger(
+        [target, wall(target, rng.uniform(0.15, 0.8))],
+        cam,
+        usual(rng),
+        frames=int(rng.integers(4, 12)),
+    )
     return replace(made, **more)  # type: ignore[arg-type]
 
 
@@ -127,7 +166,8 @@ def blotch(rng: Rng, cam: Camera, share: float, n: int = 1) -> np.ndarray:
     return image > 0
 
 
-# ---- boards ----------------------------------------------------------------------------------------------------------
+# ---- boards
+# ----------------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -135,7 +175,9 @@ def before_wall(rng: Rng) -> Stranger:
     cam = camera(rng)
     target = damaged(rng, cam, board(rng, cam, (0.6, 0.9)), int(rng.integers(2, 6)))
     gap = np.exp(rng.uniform(np.log(0.015), np.log(0.6)))
-    return Stranger([target, wall(target, gap, rng.uniform(0, 8), rng.uniform(0, 360))], cam, usual(rng))
+    return Stranger(
+        [target, wall(target, gap, rng.uniform(0, 8), rng.uniform(0, 360))], cam, usual(rng)
+    )
 
 
 @kind
@@ -151,17 +193,27 @@ def on_floor(rng: Rng) -> Stranger:
     """A thick board that lies on a floor, seen from above at an angle."""
     cam = camera(rng)
     target = board(rng, cam, (0.6, 0.9), tilt=(5, 35))
-    floor = replace(target, origin_m=target.origin_m + target.R @ np.array([0, 0, rng.uniform(0.01, 0.05)]))
+    floor = replace(
+        target, origin_m=target.origin_m + target.R @ np.array([0, 0, rng.uniform(0.01, 0.05)])
+    )
     target = damaged(rng, cam, target, 4, depth_mm=(4, 9))
-    return Stranger([target, replace(floor, half_x_m=9.0, half_y_m=9.0, is_target=False)], cam, usual(rng))
+    return Stranger(
+        [target, replace(floor, half_x_m=9.0, half_y_m=9.0, is_target=False)], cam, usual(rng)
+    )
 
 
 @kind
 def corner(rng: Rng) -> Stranger:
-    """A board that stands on a floor before a wall; the floor runs from below the camera to the wall."""
+    """A board that stands on a floor before a wall; the floor runs from below the camera to the
+    wall."""
     cam = camera(rng)
     target = damaged(rng, cam, board(rng, cam, (0.6, 0.9), tilt=(0, 12), spin=(0, 0)), 3)
-    floor = Surface(np.array([0, target.origin_m[1] + target.half_y_m, target.origin_m[2]]), turned(88, 90), 9, 9)
+    floor = Surface(
+        np.array([0, target.origin_m[1] + target.half_y_m, target.origin_m[2]]),
+        turned(88, 90),
+        9,
+        9,
+    )
     return Stranger([target, floor, wall(target, rng.uniform(0.1, 0.5))], cam, usual(rng))
 
 
@@ -169,7 +221,11 @@ def corner(rng: Rng) -> Stranger:
 def tilted(rng: Rng) -> Stranger:
     cam = camera(rng)
     target = damaged(rng, cam, board(rng, cam, (0.55, 0.9), tilt=(20, 60)), 4, depth_mm=(4, 15))
-    return Stranger([target, wall(target, rng.uniform(0.4, 1.0))] if rng.random() < 0.6 else [target], cam, usual(rng))
+    return Stranger(
+        [target, wall(target, rng.uniform(0.4, 1.0))] if rng.random() < 0.6 else [target],
+        cam,
+        usual(rng),
+    )
 
 
 @kind
@@ -182,15 +238,20 @@ def fills_view(rng: Rng) -> Stranger:
 def round_board(rng: Rng) -> Stranger:
     cam = camera(rng)
     target = replace(board(rng, cam), outline="disc")
-    return Stranger([damaged(rng, cam, target, 3), wall(target, rng.uniform(0.05, 0.6))], cam, usual(rng))
+    return Stranger(
+        [damaged(rng, cam, target, 3), wall(target, rng.uniform(0.05, 0.6))], cam, usual(rng)
+    )
 
 
-# ---- curved targets --------------------------------------------------------------------------------------------------
+# ---- curved targets
+# --------------------------------------------------------------------------------------------------
 
 
 def _pipe(rng: Rng, cam: Camera, radius_m: float, **more: object) -> Surface:
     d = rng.uniform(0.5, 0.9)
-    r = turned(rng.uniform(0, 15), rng.uniform(0, 360), float(rng.choice([0, 90, rng.uniform(0, 180)])))
+    r = turned(
+        rng.uniform(0, 15), rng.uniform(0, 360), float(rng.choice([0, 90, rng.uniform(0, 180)]))
+    )
     half = 0.999 * abs(radius_m)
     pipe = Surface(np.array([0, 0, d]), r, half, 0.5, "cylinder", radius_m, is_target=True)
     view = 0.4 * min(cam.width, cam.height) / cam.f_px * d
@@ -201,14 +262,29 @@ def _pipe(rng: Rng, cam: Camera, radius_m: float, **more: object) -> Surface:
 @kind
 def pipe_outside(rng: Rng) -> Stranger:
     cam = camera(rng)
-    pipe = _pipe(rng, cam, np.exp(rng.uniform(np.log(0.05), np.log(0.5))), radius_mm=(6, 20), depth_mm=(3, 12))
-    return Stranger([pipe, wall(pipe, rng.uniform(0.6, 1.5))] if rng.random() < 0.5 else [pipe], cam, usual(rng))
+    pipe = _pipe(
+        rng,
+        cam,
+        np.exp(rng.uniform(np.log(0.05), np.log(0.5))),
+        radius_mm=(6, 20),
+        depth_mm=(3, 12),
+    )
+    return Stranger(
+        [pipe, wall(pipe, rng.uniform(0.6, 1.5))] if rng.random() < 0.5 else [pipe], cam, usual(rng)
+    )
 
 
 @kind
 def thin_pipe(rng: Rng) -> Stranger:
     cam = camera(rng, CAMERAS[0])
-    pipe = _pipe(rng, cam, rng.uniform(0.03, 0.06), radius_mm=(6, 10), depth_mm=(3, 8), profiles=("flat", "bowl"))
+    pipe = _pipe(
+        rng,
+        cam,
+        rng.uniform(0.03, 0.06),
+        radius_mm=(6, 10),
+        depth_mm=(3, 8),
+        profiles=("flat", "bowl"),
+    )
     return Stranger([pipe, wall(pipe, rng.uniform(0.3, 0.8))], cam, usual(rng))
 
 
@@ -223,9 +299,21 @@ def pipe_inside(rng: Rng) -> Stranger:
 @kind
 def sphere(rng: Rng) -> Stranger:
     cam = camera(rng)
-    radius, d = rng.uniform(0.08, 0.3), rng.uniform(0.5, 0.9)
-    ball = Surface(np.array([0, 0, d]), np.eye(3), radius, radius, "sphere", radius, outline="disc", is_target=True)
-    ball = damaged(rng, cam, ball, 3, ("bowl", "flat"), (6, 15), (3, 10), reach=(0.55 * radius,) * 2)
+    radius = rng.uniform(0.08, 0.3)
+    d = rng.uniform(0.5, 0.9)
+    ball = Surface(
+        np.array([0, 0, d]),
+        np.eye(3),
+        radius,
+        radius,
+        "sphere",
+        radius,
+        outline="disc",
+        is_target=True,
+    )
+    ball = damaged(
+        rng, cam, ball, 3, ("bowl", "flat"), (6, 15), (3, 10), reach=(0.55 * radius,) * 2
+    )
     behind = [wall(ball, radius + rng.uniform(0.1, 0.8))] if rng.random() < 0.6 else []
     return Stranger([ball, *behind], cam, usual(rng))
 
@@ -258,7 +346,8 @@ def corrugated(rng: Rng) -> Stranger:
     return _shaped(rng, "waves", pitch * rng.uniform(0.02, 0.06), pitch, n=2)
 
 
-# ---- things on and before the target ---------------------------------------------------------------------------------
+# ---- things on and before the target
+# ---------------------------------------------------------------------------------
 
 
 def _objects(target: Surface, rng: Rng) -> list[Surface]:
@@ -266,12 +355,20 @@ def _objects(target: Surface, rng: Rng) -> list[Surface]:
     made: list[Surface] = []
     for _ in range(200):
         what = str(rng.choice(["box", "tape", "cable"]))
-        halves = {"box": rng.uniform(0.015, 0.05, 2), "tape": (rng.uniform(0.04, 0.1), 0.012), "cable": (0.1, 0.004)}
+        halves = {
+            "box": rng.uniform(0.015, 0.05, 2),
+            "tape": (rng.uniform(0.04, 0.1), 0.012),
+            "cable": (0.1, 0.004),
+        }
         half = halves[what]
         high = {"box": rng.uniform(0.01, 0.06), "tape": 0.0003, "cable": 0.008}[what]
         reach = float(np.hypot(*half))
-        x, y = rng.uniform(-0.8, 0.8) * target.half_x_m, rng.uniform(-0.8, 0.8) * target.half_y_m
-        if any(np.hypot(x - d.x_m, y - d.y_m) < reach + d.radius_m + d.length_m + 0.02 for d in target.damages):
+        x = rng.uniform(-0.8, 0.8) * target.half_x_m
+        y = rng.uniform(-0.8, 0.8) * target.half_y_m
+        if any(
+            np.hypot(x - d.x_m, y - d.y_m) < reach + d.radius_m + d.length_m + 0.02
+            for d in target.damages
+        ):
             continue
         at = target.origin_m + target.R @ np.array([x, y, -high])
         turn = cv2.Rodrigues(np.array([0, 0, rng.uniform(0, np.pi)]))[0]
@@ -285,18 +382,23 @@ def _objects(target: Surface, rng: Rng) -> list[Surface]:
 def object_on_plate(rng: Rng) -> Stranger:
     cam = camera(rng)
     target = damaged(rng, cam, board(rng, cam, tilt=(0, 15), share=(0.7, 0.95)), 3)
-    return Stranger([target, *_objects(target, rng), wall(target, rng.uniform(0.2, 0.8))], cam, usual(rng))
+    return Stranger(
+        [target, *_objects(target, rng), wall(target, rng.uniform(0.2, 0.8))], cam, usual(rng)
+    )
 
 
 @kind
 def tags(rng: Rng) -> Stranger:
-    """Printed tags with black squares that a measures 1 to 3 mm off; findings there are not judged."""
+    """Printed tags with black squares that a measures 1 to 3 mm off; findings there are not
+    judged."""
     made = plate(rng)
-    cam, target = made.camera, made.surfaces[0]
+    cam = made.camera
+    target = made.surfaces[0]
     offset = np.zeros((cam.height, cam.width))
     for sx, sy in ((-0.8, -0.8), (0.8, -0.8), (-0.8, 0.8), (0.8, 0.8)):
         at = target.point_m(sx * target.half_x_m, sy * target.half_y_m)
-        u, v = (int(cam.f_px * at[i] / at[2] + c) for i, c in ((0, cam.cx_px), (1, cam.cy_px)))
+        u = int(cam.f_px * at[0] / at[2] + cam.cx_px)
+        v = int(cam.f_px * at[1] / at[2] + cam.cy_px)
         pattern = rng.integers(0, 2, (4, 4)).repeat(3, 0).repeat(3, 1) * rng.uniform(1e-3, 3e-3)
         window = offset[max(v, 0) : v + 12, max(u, 0) : u + 12]
         window[:] = pattern[: window.shape[0], : window.shape[1]]
@@ -324,11 +426,14 @@ def foreground(rng: Rng) -> Stranger:
 
 @kind
 def white_millimetre(rng: Rng) -> Stranger:
-    """Another kind's scene before the simplest camera: 1 mm of white noise, nothing mixed at edges, some pixels lost;
-    stored in millimetres or finer, with 0 or 65535 for no return."""
+    """Another kind's scene before the simplest camera: 1 mm of white noise, nothing mixed at
+    edges, some pixels lost; stored in millimetres or finer, with 0 or 65535 for no return."""
     named = "before_wall on_floor corner tilted fills_view pipe_outside pipe_inside sphere dome bent_sheet drilled"
     made = KINDS[str(rng.choice([*named.split(), "dents", "no_return", "object_on_plate"]))](rng)
-    form = Format(unit_m=float(rng.choice([1e-3, 1e-3, 1e-3, 0.25e-3])), invalid=float(rng.choice([0, 0, 65535])))
+    form = Format(
+        unit_m=float(rng.choice([1e-3, 1e-3, 1e-3, 0.25e-3])),
+        invalid=float(rng.choice([0, 0, 65535])),
+    )
     noise = Noise(1e-3, dropout=float(rng.choice([0, 0, 0.1])))
     return replace(made, camera=Camera(640, 576, 504.6, 321.7, 333.3), noise=noise, format=form)
 
@@ -346,7 +451,8 @@ def camera_model(rng: Rng) -> Stranger:
     return replace(made, camera=cam, noise=noise, model=model, frames=int(rng.integers(1, 9)))
 
 
-# ---- damage ----------------------------------------------------------------------------------------------------------
+# ---- damage
+# ----------------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -362,13 +468,17 @@ def drilled(rng: Rng) -> Stranger:
 def dents(rng: Rng) -> Stranger:
     cam = camera(rng)
     target = damaged(rng, cam, board(rng, cam), 4, ("bowl", "cosine", "cone"), (8, 25), (2, 8))
-    return Stranger([target, wall(target, rng.uniform(0.2, 0.8))], cam, replace(usual(rng), white_m=5e-4))
+    return Stranger(
+        [target, wall(target, rng.uniform(0.2, 0.8))], cam, replace(usual(rng), white_m=5e-4)
+    )
 
 
 @kind
 def bumps(rng: Rng) -> Stranger:
     cam = camera(rng)
-    target = damaged(rng, cam, board(rng, cam), 4, ("bowl", "flat", "cosine"), (5, 20), (3, 12), sign=-1.0)
+    target = damaged(
+        rng, cam, board(rng, cam), 4, ("bowl", "flat", "cosine"), (5, 20), (3, 12), sign=-1.0
+    )
     return Stranger([target, wall(target, rng.uniform(0.2, 0.8))], cam, usual(rng))
 
 
@@ -388,10 +498,13 @@ def no_return(rng: Rng) -> Stranger:
     widest = min(50.0, cam.height / 8)
     target = damaged(rng, cam, target, 3, ("absent",), (2 * pitch_mm, widest * pitch_mm))
     behind = [wall(target, rng.uniform(0.1, 0.6))] if rng.random() < 0.5 else []
-    return Stranger([target, *behind], cam, replace(usual(rng), dropout=float(rng.choice([0, 0.001, 0.02]))))
+    return Stranger(
+        [target, *behind], cam, replace(usual(rng), dropout=float(rng.choice([0, 0.001, 0.02])))
+    )
 
 
-# ---- what the camera loses -------------------------------------------------------------------------------------------
+# ---- what the camera loses
+# -------------------------------------------------------------------------------------------
 
 
 @kind
@@ -421,10 +534,13 @@ def dark_patch(rng: Rng) -> Stranger:
 
 @kind
 def specular(rng: Rng) -> Stranger:
-    """A highlight that saturates: nothing returns from a patch; calling it is right, calling it not too."""
+    """A highlight that saturates: nothing returns from a patch; calling it is right, calling it
+    not too."""
     made = plate(rng)
     patch = blotch(rng, made.camera, rng.uniform(0.001, 0.01))
-    return replace(made, gone=patch, ignored=cv2.dilate(patch.astype(np.uint8), np.ones((9, 9))) > 0)
+    return replace(
+        made, gone=patch, ignored=cv2.dilate(patch.astype(np.uint8), np.ones((9, 9))) > 0
+    )
 
 
 @kind
@@ -433,13 +549,17 @@ def flying_pixels(rng: Rng) -> Stranger:
     return replace(made, noise=replace(made.noise, mixing_px=rng.uniform(0.8, 1.5)))
 
 
-# ---- noise -----------------------------------------------------------------------------------------------------------
+# ---- noise
+# -----------------------------------------------------------------------------------------------------------
 
 
 @kind
 def white_noise(rng: Rng) -> Stranger:
     made = plate(rng)
-    return replace(made, noise=replace(made.noise, white_m=float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))))
+    return replace(
+        made,
+        noise=replace(made.noise, white_m=float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))),
+    )
 
 
 @kind
@@ -472,13 +592,15 @@ def fifty_frames(rng: Rng) -> Stranger:
     return replace(plate(rng, cam=camera(rng, CAMERAS[1], CAMERAS[3], CAMERAS[4])), frames=50)
 
 
-# ---- what moves ------------------------------------------------------------------------------------------------------
+# ---- what moves
+# ------------------------------------------------------------------------------------------------------
 
 
 @kind
 def frame_jump(rng: Rng) -> Stranger:
     """One frame reads 5 to 30 mm off, as after an interrupted exposure."""
-    at, off = int(rng.integers(8)), float(rng.choice([-1, 1])) * rng.uniform(5e-3, 30e-3)
+    at = int(rng.integers(8))
+    off = float(rng.choice([-1, 1])) * rng.uniform(5e-3, 30e-3)
     return replace(plate(rng), frames=8, per_frame=lambda k, depth: depth + off * (k == at))
 
 
@@ -487,14 +609,17 @@ def moved_camera(rng: Rng) -> Stranger:
     """The camera is knocked half way: the picture shifts by 5 to 20 pixels."""
     made = plate(rng)
     by = int(rng.integers(5, 20)) * made.camera.width // 320
-    return replace(made, frames=8, per_frame=lambda k, depth: np.roll(depth, by, axis=1) if k >= 5 else depth)
+    return replace(
+        made, frames=8, per_frame=lambda k, depth: np.roll(depth, by, axis=1) if k >= 5 else depth
+    )
 
 
 @kind
 def passer_by(rng: Rng) -> Stranger:
     """Somebody walks through the view in two of ten frames."""
     made = plate(rng)
-    h, w = made.camera.height, made.camera.width
+    h = made.camera.height
+    w = made.camera.width
     near = 0.6 * made.surfaces[0].origin_m[2]
 
     def walks(k: int, depth: np.ndarray) -> np.ndarray:
@@ -507,18 +632,27 @@ def passer_by(rng: Rng) -> Stranger:
     return replace(made, frames=10, per_frame=walks)
 
 
-# ---- cameras and files -----------------------------------------------------------------------------------------------
+# ---- cameras and files
+# -----------------------------------------------------------------------------------------------
 
 
 @kind
 def distorted_lens(rng: Rng) -> Stranger:
-    cam = replace(camera(rng), distortion=(rng.uniform(-0.25, 0.15), rng.uniform(-0.03, 0.03), 1e-3, -1e-3, 0.0))
+    cam = replace(
+        camera(rng),
+        distortion=(rng.uniform(-0.25, 0.15), rng.uniform(-0.03, 0.03), 1e-3, -1e-3, 0.0),
+    )
     return plate(rng, cam=cam)
 
 
 @kind
 def resolutions(rng: Rng) -> Stranger:
-    return plate(rng, cam=camera(rng, (160, 120, 150.0), (224, 172, 205.0), (640, 480, 460.0), (1280, 720, 900.0)))
+    return plate(
+        rng,
+        cam=camera(
+            rng, (160, 120, 150.0), (224, 172, 205.0), (640, 480, 460.0), (1280, 720, 900.0)
+        ),
+    )
 
 
 def _unit(rng: Rng, unit_m: float, kind_: str = "png", invalid: float = 0) -> Stranger:
@@ -542,7 +676,9 @@ def tum_units(rng: Rng) -> Stranger:
 
 @kind
 def metres_float(rng: Rng) -> Stranger:
-    return _unit(rng, 1.0, str(rng.choice(["npy", "npz", "mat"])), float(rng.choice([np.nan, 0, -1])))
+    return _unit(
+        rng, 1.0, str(rng.choice(["npy", "npz", "mat"])), float(rng.choice([np.nan, 0, -1]))
+    )
 
 
 @kind
@@ -572,10 +708,15 @@ def clouds(rng: Rng) -> Stranger:
 @kind
 def clouds_mm(rng: Rng) -> Stranger:
     cam = camera(rng, CAMERAS[1], CAMERAS[3], CAMERAS[4])
-    return replace(plate(rng, cam=cam), frames=1, format=Format(str(rng.choice(["ply", "pcd", "xyz"])), 1e-3, np.nan))
+    return replace(
+        plate(rng, cam=cam),
+        frames=1,
+        format=Format(str(rng.choice(["ply", "pcd", "xyz"])), 1e-3, np.nan),
+    )
 
 
-# ---- nothing to find -------------------------------------------------------------------------------------------------
+# ---- nothing to find
+# -------------------------------------------------------------------------------------------------
 
 
 @kind
@@ -591,7 +732,10 @@ def rubble(rng: Rng) -> Stranger:
     cam = camera(rng, CAMERAS[1], CAMERAS[3], CAMERAS[4])
     stones = []
     for _ in range(60):
-        d, radius = rng.uniform(0.5, 0.9), rng.uniform(0.02, 0.07)
-        at = np.array([*(rng.uniform(-0.6, 0.6, 2) * d * np.array([cam.width, cam.height]) / cam.f_px), d])
+        d = rng.uniform(0.5, 0.9)
+        radius = rng.uniform(0.02, 0.07)
+        at = np.array(
+            [*(rng.uniform(-0.6, 0.6, 2) * d * np.array([cam.width, cam.height]) / cam.f_px), d]
+        )
         stones.append(Surface(at, np.eye(3), radius, radius, "sphere", radius, outline="disc"))
     return Stranger(stones, cam, usual(rng), doubtful=True)

@@ -1,4 +1,5 @@
-"""A stranger's recording: a view with a camera's faults, its true damage, and the files that a stranger would keep."""
+"""A stranger's recording: a view with a camera's faults, its true damage, and the files that a
+stranger would keep."""
 
 from __future__ import annotations
 
@@ -12,22 +13,26 @@ import cv2
 import numpy as np
 import scipy.io
 
-from strangers.world import Camera, Damage, Surface, View, cast
+from tests.strangers.world import Camera, Damage, Surface, View, cast
 
 CLEAR_D = 3 * 5.5
-"""A damage is clearly visible from three times the d' that an ideal observer needs (90 % found at about one false
-call a view: d' 5.5) ..."""
-CLEAR_PIXELS, CLEAR_PEAK, CLEAR_SHARE = 9, 3.0, 0.15
+"""A damage is clearly visible from three times the d' that an ideal observer needs (90 % found at
+about one false call a view: d' 5.5) ..."""
+CLEAR_PIXELS = 9
+CLEAR_PEAK = 3.0
+CLEAR_SHARE = 0.15
 """... where it has that many pixels, stands out of an averaged pixel's noise by that factor, and its radius is at most
 that share of the target's half width (wider is shape of the target, not damage)."""
 CLEAR_LOG_ODDS = 36.0
-"""A hole without return is clearly visible where chance alone would leave such a gap with odds of e^-36 or less."""
+"""A hole without return is clearly visible where chance alone would leave such a gap with odds of
+e^-36 or less."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """A camera's faults. ``white_m`` of one pixel in one frame; ``blur_px`` > 0 correlates it over neighbours and keeps
-    its size; ``tail``: Student's t with 3 degrees in place of a Gaussian; ``fixed_m`` the same in every frame."""
+    """A camera's faults. ``white_m`` of one pixel in one frame; ``blur_px`` > 0 correlates it over
+    neighbours and keeps its size; ``tail``: Student's t with 3 degrees in place of a Gaussian;
+    ``fixed_m`` the same in every frame."""
 
     white_m: float = 1e-3
     blur_px: float = 0.0
@@ -41,8 +46,9 @@ class Noise:
 
 @dataclass(frozen=True)
 class Format:
-    """The files: ``kind`` png, npy, npz, mat, ply, pcd or xyz; one stored unit in metres (floats store ``unit_m`` too);
-    what stands for no return; more arguments that the stranger would know to give."""
+    """The files: ``kind`` png, npy, npz, mat, ply, pcd or xyz; one stored unit in metres (floats
+    store ``unit_m`` too); what stands for no return; more arguments that the stranger would know
+    to give."""
 
     kind: str = "png"
     unit_m: float = 1e-3
@@ -52,8 +58,9 @@ class Format:
 
 @dataclass(frozen=True)
 class Truth:
-    """One true damage. Lengths in metres, camera frame; ``depth_m`` ranges over what may rightly be called its depth
-    (along the normal, along z), ``diameter_m`` likewise (at half depth, at the rim)."""
+    """One true damage. Lengths in metres, camera frame; ``depth_m`` ranges over what may rightly
+    be called its depth (along the normal, along z), ``diameter_m`` likewise (at half depth, at the
+    rim)."""
 
     centre_m: tuple[float, float, float]
     radius_m: float
@@ -66,11 +73,12 @@ class Truth:
 
 @dataclass(frozen=True)
 class Stranger:
-    """A scene and how it was recorded. ``ignored`` (h, w): pixels where a finding is neither right nor false, because
-    something real is there; ``doubtful``: no answer is right without a warning; ``per_frame(k, depth)`` changes the
-    noise-free depth of frame k; ``louder`` (h, w) multiplies the noise; from ``gone`` (h, w) nothing returns;
-    ``offset_m`` (h, w) is added to the depth. ``model``: the project's own camera that takes the frames, from phasors
-    without interreflection; ``noise`` then says only what is clearly visible in them."""
+    """A scene and how it was recorded. ``ignored`` (h, w): pixels where a finding is neither right
+    nor false, because something real is there; ``doubtful``: no answer is right without a warning;
+    ``per_frame(k, depth)`` changes the noise-free depth of frame k; ``louder`` (h, w) multiplies
+    the noise; from ``gone`` (h, w) nothing returns; ``offset_m`` (h, w) is added to the depth.
+    ``model``: the project's own camera that takes the frames, from phasors without
+    interreflection; ``noise`` then says only what is clearly visible in them."""
 
     surfaces: list[Surface]
     camera: Camera
@@ -86,12 +94,15 @@ class Stranger:
     model: str = ""
 
 
-def recorded(stranger: Stranger, rng: np.random.Generator) -> tuple[np.ndarray, View, tuple[Truth, ...]]:
+def recorded(
+    stranger: Stranger, rng: np.random.Generator
+) -> tuple[np.ndarray, View, tuple[Truth, ...]]:
     """(frames (n, h, w) in metres with NaN for no return, the noise-free view, the truth)."""
     view = cast(stranger.surfaces, stranger.camera)
     if stranger.model:
         return _simulated(stranger, int(rng.integers(1000))), view, _truths(stranger, view)
-    noise, shape = stranger.noise, view.depth_m.shape
+    noise = stranger.noise
+    shape = view.depth_m.shape
     clean = view.depth_m if stranger.offset_m is None else view.depth_m + stranger.offset_m
     if noise.mixing_px:
         clean = _mixed(clean, noise.mixing_px)
@@ -109,7 +120,8 @@ def recorded(stranger: Stranger, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
-    """Frames of the project's own camera model: phasors of ``finer`` x ``finer`` rays a pixel, light by r^-2."""
+    """Frames of the project's own camera model: phasors of ``finer`` x ``finer`` rays a pixel,
+    light by r^-2."""
     from harness.vocabulary.geometry import Region
     from scenes.optics import NoiseFreeView
     from scenes.sensor.camera import CameraConfig, load_camera
@@ -125,7 +137,9 @@ def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
     def pixels(fine: np.ndarray) -> np.ndarray:
         return fine.reshape(h, finer, w, finer).mean(axis=(1, 3))
 
-    phasor = np.stack([pixels(light * np.exp(turn * f)) for f in model.frequencies_hz]).astype(np.complex64)
+    phasor = np.stack([pixels(light * np.exp(turn * f)) for f in model.frequencies_hz]).astype(
+        np.complex64
+    )
     middle = range_m[finer // 2 :: finer, finer // 2 :: finer]
     view = NoiseFreeView(
         region=Region(0, h, 0, w),
@@ -147,23 +161,29 @@ def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
     return np.stack([frame.z_m for frame in unit_of.capture(stranger.frames, unit).frames()])
 
 
-def _field(rng: np.random.Generator, shape: tuple[int, ...], blur_px: float, tail: bool = False) -> np.ndarray:
+def _field(
+    rng: np.random.Generator, shape: tuple[int, ...], blur_px: float, tail: bool = False
+) -> np.ndarray:
     """A random field of deviation 1."""
     drawn = rng.standard_t(3, shape) / np.sqrt(3) if tail else rng.normal(size=shape)
     if not blur_px:
         return drawn
     size = 2 * int(np.ceil(2.5 * blur_px)) + 1
     kernel = cv2.getGaussianKernel(size, blur_px)
-    return cv2.sepFilter2D(drawn, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT) / float((kernel**2).sum())
+    return cv2.sepFilter2D(drawn, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT) / float(
+        (kernel**2).sum()
+    )
 
 
 def _gain(blur_px: float) -> float:
-    """How many times more a correlated field of deviation 1 holds at the lowest frequencies than a white one."""
+    """How many times more a correlated field of deviation 1 holds at the lowest frequencies than a
+    white one."""
     return max(1.0, 2 * np.sqrt(np.pi) * blur_px)
 
 
 def _mixed(depth: np.ndarray, blur_px: float) -> np.ndarray:
-    """Depth averaged over the pixel's footprint: flying pixels at every edge. Beyond the image it goes on straight."""
+    """Depth averaged over the pixel's footprint: flying pixels at every edge. Beyond the image it
+    goes on straight."""
     beyond = 4
     depth = np.pad(depth, beyond, mode="reflect", reflect_type="odd")
     known = np.isfinite(depth)
@@ -174,25 +194,35 @@ def _mixed(depth: np.ndarray, blur_px: float) -> np.ndarray:
 
 
 def _clusters(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
-    """Ragged patches of 2 to 6 pixels' radius from which nothing returns: a frame's bad spots, not holes."""
+    """Ragged patches of 2 to 6 pixels' radius from which nothing returns: a frame's bad spots, not
+    holes."""
     seeds = np.zeros(shape)
     for _ in range(count):
-        cv2.circle(seeds, (int(rng.integers(shape[1])), int(rng.integers(shape[0]))), int(rng.integers(2, 7)), 1.0, -1)
+        cv2.circle(
+            seeds,
+            (int(rng.integers(shape[1])), int(rng.integers(shape[0]))),
+            int(rng.integers(2, 7)),
+            1.0,
+            -1,
+        )
     return (seeds > 0) & (rng.random(shape) < 0.6)
 
 
 def _truths(stranger: Stranger, view: View) -> tuple[Truth, ...]:
     """Every damage, and whether it is clearly visible in this recording."""
-    noise, n = stranger.noise, stranger.frames
+    noise = stranger.noise
+    n = stranger.frames
     step = stranger.format.unit_m if stranger.format.kind == "png" else 0.0
     rounding = step**2 / 12 / (n if noise.white_m > step / 2 else 1)
     pixel = float(np.sqrt(noise.white_m**2 / n / (1 - noise.dropout) + noise.fixed_m**2 + rounding))
-    white, fixed = noise.white_m * _gain(noise.blur_px), noise.fixed_m * _gain(noise.fixed_px)
+    white = noise.white_m * _gain(noise.blur_px)
+    fixed = noise.fixed_m * _gain(noise.fixed_px)
     broad = float(np.sqrt(white**2 / n / (1 - noise.dropout) + fixed**2 + rounding))
     louder = np.ones(view.depth_m.shape) if stranger.louder is None else stranger.louder
     rate = min(max(noise.dropout**n, 1e-3), 1.0)
     gone = np.zeros(view.depth_m.shape, bool) if stranger.gone is None else stranger.gone
-    truths, i = [], 0
+    truths = []
+    i = 0
     for surface in stranger.surfaces:
         half = min(surface.half_x_m, surface.half_y_m)
         half = min(half, _seen_half_m(surface, stranger.camera))
@@ -205,12 +235,16 @@ def _truths(stranger: Stranger, view: View) -> tuple[Truth, ...]:
             known = signal[~lost]
             absent = lost.sum() > 0.5 * max(pixels.size, 1)
             if absent:
-                seen = lost.sum() >= CLEAR_PIXELS and lost.sum() * np.log(1 / rate) >= CLEAR_LOG_ODDS
+                seen = (
+                    lost.sum() >= CLEAR_PIXELS and lost.sum() * np.log(1 / rate) >= CLEAR_LOG_ODDS
+                )
             else:
                 d = np.sqrt(np.sum(known**2)) / broad / loud if known.size else 0.0
                 peak = float(np.percentile(np.abs(known), 90)) / pixel / loud if known.size else 0.0
                 seen = d >= CLEAR_D and peak >= CLEAR_PEAK and known.size >= CLEAR_PIXELS
-            truths.append(_truth(surface, damage, known, absent, bool(whole and seen), half, pixel * loud))
+            truths.append(
+                _truth(surface, damage, known, absent, bool(whole and seen), half, pixel * loud)
+            )
     return tuple(truths)
 
 
@@ -220,7 +254,13 @@ def _seen_half_m(surface: Surface, camera: Camera) -> float:
 
 
 def _truth(
-    surface: Surface, damage: Damage, known: np.ndarray, absent: bool, seen: bool, half_m: float, noise_m: float
+    surface: Surface,
+    damage: Damage,
+    known: np.ndarray,
+    absent: bool,
+    seen: bool,
+    half_m: float,
+    noise_m: float,
 ) -> Truth:
     extent = damage.radius_m + damage.length_m / 2
     along_z = float(np.percentile(np.abs(known), 90)) if known.size else abs(damage.depth_m)
@@ -237,19 +277,32 @@ def _truth(
         kind=kind,
         depth_m=(depths[0], depths[1]),
         diameter_m=(inner, 2 * extent),
-        clear=seen and (absent or damage.profile in ("flat", "through", "slot") or extent <= CLEAR_SHARE * 2 * half_m),
+        clear=seen
+        and (
+            absent
+            or damage.profile in ("flat", "through", "slot")
+            or extent <= CLEAR_SHARE * 2 * half_m
+        ),
         noise_m=noise_m,
     )
 
 
-# ---- files -----------------------------------------------------------------------------------------------------------
+# ---- files
+# -----------------------------------------------------------------------------------------------------------
 
 
 def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
-    """Write the frames as the stranger keeps them; returns the path that `harness.detect` is given."""
+    """Write the frames as the stranger keeps them; returns the path that `tofpod detect` is
+    given."""
     folder.mkdir(parents=True, exist_ok=True)
-    camera, form = stranger.camera, stranger.format
-    lens: dict[str, object] = {"fx": camera.f_px, "fy": camera.f_px, "cx": camera.cx_px, "cy": camera.cy_px}
+    camera = stranger.camera
+    form = stranger.format
+    lens: dict[str, object] = {
+        "fx": camera.f_px,
+        "fy": camera.f_px,
+        "cx": camera.cx_px,
+        "cy": camera.cy_px,
+    }
     lens |= {"width": camera.width, "height": camera.height}
     if any(camera.distortion):
         lens["distortion"] = list(camera.distortion)
@@ -258,7 +311,10 @@ def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
     stored = np.where(np.isfinite(stack), stack / form.unit_m, form.invalid)
     if form.kind == "png":
         for k, image in enumerate(stored):
-            cv2.imwrite(str(folder / f"depth_{k:03d}.png"), np.clip(np.round(image), 0, 65535).astype(np.uint16))
+            cv2.imwrite(
+                str(folder / f"depth_{k:03d}.png"),
+                np.clip(np.round(image), 0, 65535).astype(np.uint16),
+            )
         return folder
     path = folder / f"depth.{form.kind}"
     stored = stored.astype(np.float32)
@@ -274,7 +330,8 @@ def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
 
 
 def _clouds(stranger: Stranger, stored: np.ndarray, folder: Path) -> Path:
-    """Each frame as a cloud: binary PLY without a grid, organised binary PCD, or one text file of points."""
+    """Each frame as a cloud: binary PLY without a grid, organised binary PCD, or one text file of
+    points."""
     slopes = stranger.camera.slopes().astype(np.float32)
     kind, (h, w) = stranger.format.kind, stored.shape[1:]
     for k, z in enumerate(stored):
@@ -291,7 +348,9 @@ def _clouds(stranger: Stranger, stored: np.ndarray, folder: Path) -> Path:
                 "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
                 f"WIDTH {w}\nHEIGHT {h}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {w * h}\nDATA binary\n"
             )
-            path.write_bytes(head.encode() + struct.pack(f"<{points.size}f", *points.ravel().tolist()))
+            path.write_bytes(
+                head.encode() + struct.pack(f"<{points.size}f", *points.ravel().tolist())
+            )
         else:
             np.savetxt(path, points, fmt="%.5f")
             return path

@@ -1,4 +1,4 @@
-"""Score one answer of `harness.detect`: right, warned or wrong, and why."""
+"""Score one answer of `tofpod detect`: right, warned or wrong, and why."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from harness import detect
-from strangers.recording import Stranger, Truth
-from strangers.world import View
+from tests.strangers.recording import Stranger, Truth
+from tests.strangers.world import View
 
 NEAR_MM = 12.0
 FALSE_CALLS = 1
 """False findings that a right answer may hold; none of them on another surface than the target."""
 FACTOR = 1.5
 """A size is right within this factor of what may rightly be called the size ..."""
-PIXELS, SIGMAS = 2.0, 3.0
+PIXELS = 2.0
+SIGMAS = 3.0
 """... and two pixels, or three deviations of an averaged pixel."""
 RIM_PX = 4
 
@@ -44,8 +45,11 @@ class Score:
         return self.verdict == "right" and bool(self.warnings)
 
 
-def answered(path: Path, out: Path, arguments: tuple[str, ...] = ()) -> tuple[int, str, list[dict[str, str]]]:
-    """(exit code, all that was printed, rows of findings.csv) of the default command; a traceback is code 1."""
+def answered(
+    path: Path, out: Path, arguments: tuple[str, ...] = ()
+) -> tuple[int, str, list[dict[str, str]]]:
+    """(exit code, all that was printed, rows of findings.csv) of the default command; a traceback
+    is code 1."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
@@ -61,7 +65,12 @@ def answered(path: Path, out: Path, arguments: tuple[str, ...] = ()) -> tuple[in
 
 
 def scored(
-    stranger: Stranger, view: View, truths: tuple[Truth, ...], code: int, said: str, rows: list[dict[str, str]]
+    stranger: Stranger,
+    view: View,
+    truths: tuple[Truth, ...],
+    code: int,
+    said: str,
+    rows: list[dict[str, str]],
 ) -> Score:
     """Compare an answer with the truth."""
     lines = [line for line in said.splitlines() if line.strip()]
@@ -80,7 +89,9 @@ def scored(
     if missed:
         shown = ", ".join(_shown(truth) for truth in missed[:3])
         why.append(f"{len(missed)} of {len(clear)} missed ({shown})")
-    elsewhere, false = _unmatched(stranger, view, [r for r, truth in zip(rows, matched, strict=True) if truth is None])
+    elsewhere, false = _unmatched(
+        stranger, view, [r for r, truth in zip(rows, matched, strict=True) if truth is None]
+    )
     if elsewhere:
         why.append(f"{elsewhere} on another surface")
     if false > FALSE_CALLS:
@@ -91,7 +102,15 @@ def scored(
     verdict = "warned" if warnings and (why or stranger.doubtful) else "wrong" if why else "right"
     if stranger.doubtful and warnings and code == 0:
         verdict = "warned"
-    return Score(verdict, tuple(why), tuple(warnings), said, len(clear), len(clear) - len(missed), false + elsewhere)
+    return Score(
+        verdict,
+        tuple(why),
+        tuple(warnings),
+        said,
+        len(clear),
+        len(clear) - len(missed),
+        false + elsewhere,
+    )
 
 
 def _place(row: dict[str, str]) -> np.ndarray:
@@ -99,16 +118,23 @@ def _place(row: dict[str, str]) -> np.ndarray:
 
 
 def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
-    """The nearest damage whose centre is within its radius, at least 12 mm, across the line of sight."""
+    """The nearest damage whose centre is within its radius, at least 12 mm, across the line of
+    sight."""
     place = _place(row)
-    best, least = None, math.inf
+    best = None
+    least = math.inf
     for truth in truths:
         centre = 1e3 * np.array(truth.centre_m)
         # an error of the camera's range moves a place along its line of sight
         apart = float(np.hypot(*(place[:2] * centre[2] / place[2] - centre[:2])))
         deep = 0.0 if not math.isfinite(truth.depth_m[1]) else 1e3 * truth.depth_m[1]
-        if apart < max(NEAR_MM, 1e3 * truth.radius_m) and abs(place[2] - centre[2]) < 50 + deep and apart < least:
-            best, least = truth, apart
+        if (
+            apart < max(NEAR_MM, 1e3 * truth.radius_m)
+            and abs(place[2] - centre[2]) < 50 + deep
+            and apart < least
+        ):
+            best = truth
+            least = apart
     return best
 
 
@@ -120,9 +146,11 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
     for row in rows:
         x, y, z = _place(row) / 1e3
         if any(cam.distortion):
-            at_u, at_v = float(row["u_px"]), float(row["v_px"])
+            at_u = float(row["u_px"])
+            at_v = float(row["v_px"])
         else:
-            at_u, at_v = cam.f_px * x / z + cam.cx_px, cam.f_px * y / z + cam.cy_px
+            at_u = cam.f_px * x / z + cam.cx_px
+            at_v = cam.f_px * y / z + cam.cy_px
         near = np.hypot(u - at_u, v - at_v) <= RIM_PX
         if stranger.ignored is not None and (near & stranger.ignored).any():
             continue
@@ -135,9 +163,13 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
     return elsewhere, false
 
 
-def _misjudged(stranger: Stranger, rows: list[dict[str, str]], matched: list[Truth | None]) -> list[str]:
-    """Wrong signs and sizes of the clearly visible damages, each by the strongest finding at its place."""
-    why, done = [], set()
+def _misjudged(
+    stranger: Stranger, rows: list[dict[str, str]], matched: list[Truth | None]
+) -> list[str]:
+    """Wrong signs and sizes of the clearly visible damages, each by the strongest finding at its
+    place."""
+    why = []
+    done = set()
     for row, truth in zip(rows, matched, strict=True):
         if truth is None or not truth.clear or id(truth) in done:
             continue
@@ -154,7 +186,9 @@ def _misjudged(stranger: Stranger, rows: list[dict[str, str]], matched: list[Tru
         depth = abs(float(row["depth_mm"] or "nan"))
         low, high = (1e3 * d for d in truth.depth_m)
         slack = 1e3 * SIGMAS * truth.noise_m
-        judged = "no return" not in (row["kind"], truth.kind) and 2e3 * truth.radius_m >= 5 * pitch_mm
+        judged = (
+            "no return" not in (row["kind"], truth.kind) and 2e3 * truth.radius_m >= 5 * pitch_mm
+        )
         if judged and (depth < low / FACTOR - slack or depth > high * FACTOR + slack):
             why.append(f"depth {depth:.1f} mm of {low:.1f}..{high:.1f}")
     return why

@@ -1,8 +1,10 @@
-"""Surfaces, damage and a pinhole camera: noise-free depth images with known truth, by analytic ray casting.
+"""Surfaces, damage and a pinhole camera: noise-free depth images with known truth, by analytic ray
+casting.
 
-A surface is z = g(x, y) in a frame of its own (metres; z away from the camera at the origin) with an outline in x, y.
-Damage moves the surface along its normal inside a disc or a slot. Not modelled: interreflection, the light's falloff,
-and the walls of slots; a round hole's wall ends the rays that meet it.
+A surface is z = g(x, y) in a frame of its own (metres; z away from the camera at the origin) with
+an outline in x, y. Damage moves the surface along its normal inside a disc or a slot. Not
+modelled: interreflection, the light's falloff, and the walls of slots; a round hole's wall ends
+the rays that meet it.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 STEPS = 12
-"""Fixed-point steps to where a ray meets a height field; slopes below 0.5 leave less than 0.1 mm."""
+"""Fixed-point steps to where a ray meets a height field; slopes below 0.5 leave less than 0.1 mm.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,20 +38,26 @@ class Camera:
         seen = np.dstack([(u - self.cx_px) / self.f_px, (v - self.cy_px) / self.f_px])
         k1, k2, p1, p2, k3 = self.distortion
         rays = seen
-        for _ in range(50):  # OpenCV's own way: divide what is seen by the distortion of the last guess
-            x, y = rays[..., 0], rays[..., 1]
+        for _ in range(
+            50
+        ):  # OpenCV's own way: divide what is seen by the distortion of the last guess
+            x = rays[..., 0]
+            y = rays[..., 1]
             r2 = x * x + y * y
-            aside = np.dstack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+            aside = np.dstack(
+                [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+            )
             rays = (seen - aside) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))[..., None]
         return rays
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Displacement of a surface around (x_m, y_m) of its own frame; positive depth is away from the camera.
+    """Displacement of a surface around (x_m, y_m) of its own frame; positive depth is away from
+    the camera.
 
-    ``profile``: flat (a blind hole), bowl, cosine, cone, slot (``length_m`` along ``angle_rad``), through (what is
-    behind shows), absent (nothing returns).
+    ``profile``: flat (a blind hole), bowl, cosine, cone, slot (``length_m`` along ``angle_rad``),
+    through (what is behind shows), absent (nothing returns).
     """
 
     x_m: float
@@ -62,9 +71,10 @@ class Damage:
 
 @dataclass(frozen=True)
 class Surface:
-    """z = g(x, y) by ``shape``: plane, cylinder, sphere (``bend_m`` = radius; negative: seen from inside), saddle,
-    bent, waves (``bend_m`` = amplitude or rise, ``pitch_m`` = period). ``R`` has the surface's axes as columns in the
-    camera frame; ``outline``: box or disc, of the half extents."""
+    """z = g(x, y) by ``shape``: plane, cylinder, sphere (``bend_m`` = radius; negative: seen from
+    inside), saddle, bent, waves (``bend_m`` = amplitude or rise, ``pitch_m`` = period). ``R`` has
+    the surface's axes as columns in the camera frame; ``outline``: box or disc, of the half
+    extents."""
 
     origin_m: np.ndarray
     R: np.ndarray
@@ -111,7 +121,8 @@ class Surface:
 
 @dataclass(frozen=True)
 class Hit:
-    """Where the rays meet a surface: camera z (inf: nowhere), its own coordinates, and the rays in its frame."""
+    """Where the rays meet a surface: camera z (inf: nowhere), its own coordinates, and the rays in
+    its frame."""
 
     z_m: np.ndarray
     x_m: np.ndarray
@@ -134,16 +145,21 @@ def meet(surface: Surface, slopes: np.ndarray) -> Hit:
                 x = np.clip(start[0] + z * dx, -2 * surface.half_x_m, 2 * surface.half_x_m)
                 y = np.clip(start[1] + z * dy, -2 * surface.half_y_m, 2 * surface.half_y_m)
                 z = (surface.height_m(x, y) - start[2]) / dz
-        x, y = start[0] + z * dx, start[1] + z * dy
-        a, b = np.abs(x) / surface.half_x_m, np.abs(y) / surface.half_y_m
+        x = start[0] + z * dx
+        y = start[1] + z * dy
+        a = np.abs(x) / surface.half_x_m
+        b = np.abs(y) / surface.half_y_m
         inside = (np.hypot(a, b) < 1) if surface.outline == "disc" else (a < 1) & (b < 1)
         met = inside & (z > 0) & np.isfinite(z)
-        z, x, y = np.where(met, z, np.inf), np.where(met, x, np.nan), np.where(met, y, np.nan)
+        z = np.where(met, z, np.inf)
+        x = np.where(met, x, np.nan)
+        y = np.where(met, y, np.nan)
     return Hit(z, x, y, rays, start)
 
 
 def _round(surface: Surface, start: np.ndarray, ray: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Camera z where rays meet a cylinder along y or a sphere: the near side, or the far one seen from inside."""
+    """Camera z where rays meet a cylinder along y or a sphere: the near side, or the far one seen
+    from inside."""
     r = surface.bend_m
     s = start - np.array([0.0, 0.0, r])
     axes = (0, 2) if surface.shape == "cylinder" else (0, 1, 2)
@@ -156,8 +172,9 @@ def _round(surface: Surface, start: np.ndarray, ray: tuple[np.ndarray, ...]) -> 
 
 @dataclass(frozen=True)
 class View:
-    """One noise-free view. ``depth_m`` (h, w), NaN where nothing returns; ``on_target`` where the target is seen;
-    ``footprints``: of each damage its pixels (flat indices) and its signal there (metres along z; NaN: no return)."""
+    """One noise-free view. ``depth_m`` (h, w), NaN where nothing returns; ``on_target`` where the
+    target is seen; ``footprints``: of each damage its pixels (flat indices) and its signal there
+    (metres along z; NaN: no return)."""
 
     depth_m: np.ndarray
     on_target: np.ndarray
@@ -167,16 +184,22 @@ class View:
 
 
 def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
-    """Cast ``finer`` x ``finer`` rays a pixel; the nearest surface wins, and its damage is cut where it is seen."""
+    """Cast ``finer`` x ``finer`` rays a pixel; the nearest surface wins, and its damage is cut
+    where it is seen."""
     slopes = camera.slopes(finer)
     hits = [meet(surface, slopes) for surface in surfaces]
     z = np.stack([hit.z_m for hit in hits])
     nearest = z.argmin(axis=0)
     depth = z.min(axis=0)
-    feet, hidden = [], []
+    feet = []
+    hidden = []
     seen = np.isfinite(depth)
     for i, surface in enumerate(surfaces):
-        behind = np.delete(z, i, axis=0).min(axis=0) if len(surfaces) > 1 else np.full(depth.shape, np.inf)
+        behind = (
+            np.delete(z, i, axis=0).min(axis=0)
+            if len(surfaces) > 1
+            else np.full(depth.shape, np.inf)
+        )
         for damage in surface.damages:
             mine, signal = _signal(surface, hits[i], damage, behind)
             visible = mine & (nearest == i)
@@ -189,15 +212,19 @@ def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
     return View(depth, target, objects, tuple(feet), tuple(hidden))
 
 
-def _signal(surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _signal(
+    surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(pixels whose ray enters the damage, the change of camera z there; inf: no return)."""
     with np.errstate(invalid="ignore"):
-        qx, qy = hit.x_m - damage.x_m, hit.y_m - damage.y_m
+        qx = hit.x_m - damage.x_m
+        qy = hit.y_m - damage.y_m
         normal = surface.normal(hit.x_m, hit.y_m)
         rim = float(surface.height_m(np.array(damage.x_m), np.array(damage.y_m)))
         qz = surface.height_m(hit.x_m, hit.y_m) - rim
         if damage.profile == "slot":
-            c, s = np.cos(damage.angle_rad), np.sin(damage.angle_rad)
+            c = np.cos(damage.angle_rad)
+            s = np.sin(damage.angle_rad)
             along = np.clip(qx * c + qy * s, -damage.length_m / 2, damage.length_m / 2)
             rho = np.sqrt((qx - along * c) ** 2 + (qy - along * s) ** 2 + qz * qz)
         else:
@@ -205,7 +232,9 @@ def _signal(surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray) -> t
         inside = np.isfinite(hit.z_m) & (rho < damage.radius_m)
         into = sum(n * hit.rays[..., i] for i, n in enumerate(normal))
     s = np.where(inside, rho / damage.radius_m, 0.0)
-    height = {"bowl": 1 - s * s, "cosine": 0.5 + 0.5 * np.cos(np.pi * s), "cone": 1 - s}.get(damage.profile)
+    height = {"bowl": 1 - s * s, "cosine": 0.5 + 0.5 * np.cos(np.pi * s), "cone": 1 - s}.get(
+        damage.profile
+    )
     if height is not None:
         return inside, damage.depth_m * height / into
     if damage.profile == "absent":
@@ -220,9 +249,13 @@ def _signal(surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray) -> t
 
 
 def _to_the_wall(qx: np.ndarray, qy: np.ndarray, rays: np.ndarray, radius_m: float) -> np.ndarray:
-    """How far along z a ray that enters a round hole runs until it meets the wall (surface taken as flat there)."""
-    vx, vy = rays[..., 0], rays[..., 1]
-    a, b, c = vx * vx + vy * vy, qx * vx + qy * vy, qx * qx + qy * qy - radius_m**2
+    """How far along z a ray that enters a round hole runs until it meets the wall (surface taken
+    as flat there)."""
+    vx = rays[..., 0]
+    vy = rays[..., 1]
+    a = vx * vx + vy * vy
+    b = qx * vx + qy * vy
+    c = qx * qx + qy * qy - radius_m**2
     with np.errstate(all="ignore"):
         t = (-b + np.sqrt(b * b - a * c)) / a
     return np.where(a > 1e-12, t, np.inf)

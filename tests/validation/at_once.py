@@ -1,11 +1,13 @@
-"""Averages drawn at once against averages of frames on rendered thesis boards, a table of ratios: minutes.
+"""Averages drawn at once against averages of frames on rendered thesis boards, a table of ratios:
+minutes.
 
-Run ``python tests/validation/at_once.py --captures 400``. For each camera and board it renders
-the view, draws that many averages of 50 frames either way, and prints for even, uneven and listed pixels (see
-`scenes.sensor.amcw.at_once`) the ratios, at once over frame by frame, of the variance of z between captures, of the
-sample variance and of the share beyond three deviations; the correlation with neighbours both ways; and the mean's and
-the count's difference in standard errors, root mean square over pixels (1 where there is none) and largest.
-Whole-frame errors are off, as they are drawn the same way in both.
+Run ``python tests/validation/at_once.py --captures 400``. For each camera and board it renders the
+view, draws that many averages of 50 frames either way, and prints for even, uneven and listed
+pixels (see `scenes.sensor.amcw.at_once`) the ratios, at once over frame by frame, of the variance
+of z between captures, of the sample variance and of the share beyond three deviations; the
+correlation with neighbours both ways; and the mean's and the count's difference in standard
+errors, root mean square over pixels (1 where there is none) and largest. Whole-frame errors are
+off, as they are drawn the same way in both.
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ import sys
 
 import numpy as np
 
-from detectors.average import AverageConfig
-from harness.engine.trial import averages_of
+from detectors.averages.average import AverageConfig
+from harness.trials.trial import averages_of
 from scenes.optics import RenderConfig
 from scenes.render.view import render_view
 from scenes.sensor.amcw.at_once import EVEN, UNEVEN, AtOnce
@@ -41,21 +43,26 @@ def unit_before(name: str, board: str) -> SimulatedUnit:
     """A unit before the thesis' board with holes of a kind."""
     chosen = BOARDS[board]
     target = ThesisTargetConfig.model_validate(chosen or {}).declare()
-    camera, config = (
-        camera_of(CameraConfig(name=name)),
-        CameraConfig(name=name, effects=EffectsConfig(frame_jumps=False)),
+    camera = camera_of(CameraConfig(name=name))
+    config = CameraConfig(name=name, effects=EffectsConfig(frame_jumps=False))
+    view = render_view(
+        build_target(target if chosen else target.hole_free()), camera.optics, RENDER
     )
-    view = render_view(build_target(target if chosen else target.hole_free()), camera.optics, RENDER)
     return SimulatedUnit(camera, config, view)
 
 
-def drawn(unit: SimulatedUnit, captures: int, exact: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def drawn(
+    unit: SimulatedUnit, captures: int, exact: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """z, count and sample variance (captures, h, w) of averages."""
     clouds = [
-        averages_of(unit.capture(FRAMES, 1, number, int(exact)), [FRAMES], AverageConfig(), exact=exact)[FRAMES]
+        averages_of(
+            unit.capture(FRAMES, 1, number, int(exact)), [FRAMES], AverageConfig(), exact=exact
+        )[FRAMES]
         for number in range(captures)
     ]
-    z_m, count = np.stack([cloud.points_m[..., 2] for cloud in clouds]), np.stack([cloud.count for cloud in clouds])
+    z_m = np.stack([cloud.points_m[..., 2] for cloud in clouds])
+    count = np.stack([cloud.count for cloud in clouds])
     return z_m, count, np.stack([cloud.variance_m2 for cloud in clouds])
 
 
@@ -82,7 +89,9 @@ def row(pixels: np.ndarray, frames: tuple[np.ndarray, ...], at_once: tuple[np.nd
     loose = np.minimum(*(one.var(axis=0) for one in scatter)) > 0.5
     counts = "-"
     if loose.any():
-        errors = np.sqrt(sum(one[:, loose].var(axis=0, ddof=1) for one in scatter) / len(scatter[0]))
+        errors = np.sqrt(
+            sum(one[:, loose].var(axis=0, ddof=1) for one in scatter) / len(scatter[0])
+        )
         apart = (scatter[0][:, loose].mean(axis=0) - scatter[1][:, loose].mean(axis=0)) / errors
         counts = f"{np.sqrt((apart**2).mean()):.2f}, {np.abs(apart).max():.1f}"
     return (
@@ -99,18 +108,26 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--cameras", nargs="+", default=["azure_kinect_nfov", "kinect_v2"])
     parser.add_argument("--boards", nargs="+", default=list(BOARDS), choices=list(BOARDS))
     options = parser.parse_args(arguments)
-    print("camera, board, pixels | variance | sample variance | beyond 3 | lags 1 to 4 | mean | count")
+    print(
+        "camera, board, pixels | variance | sample variance | beyond 3 | lags 1 to 4 | mean | count"
+    )
     for name in options.cameras:
         for board in options.boards:
             unit = unit_before(name, board)
             summer = unit.at_once
             assert isinstance(summer, AtOnce)
-            frames, at_once = drawn(unit, options.captures, True), drawn(unit, options.captures, False)
+            frames = drawn(unit, options.captures, True)
+            at_once = drawn(unit, options.captures, False)
             kind = summer.linear.kind.reshape(unit.exposure.shape)[unit.cut]
             for group, pixels in (
                 ("even", kind == EVEN),
                 ("uneven", kind == UNEVEN),
-                ("listed", np.isin(np.arange(summer.linear.z.size), summer.listed).reshape(summer.shape)[unit.cut]),
+                (
+                    "listed",
+                    np.isin(np.arange(summer.linear.z.size), summer.listed).reshape(summer.shape)[
+                        unit.cut
+                    ],
+                ),
             ):
                 print(f"{name}, {board}, {group} {row(pixels, frames, at_once)}", flush=True)
     return 0

@@ -1,10 +1,12 @@
-"""The simulated Azure Kinect beside a real one: ``python tests/validation/azure_walls.py FOLDER [--out docs]``.
+"""The simulated Azure Kinect beside a real one: ``python tests/validation/azure_walls.py FOLDER
+[--out docs]``.
 
-FOLDER holds frames of a static camera (16-bit PNG, whole millimetres, 640 x 576, NFOV unbinned) before plaster walls,
-and ``wall_mask.png``. Each wall's plane is fitted, the same plane is simulated, and one analysis is applied to both:
-temporal deviation against range and angle, spatial correlation of the temporal noise, and the fixed pattern.
-Writes ``azure_walls.svg`` and ``azure_walls.md``. Nothing is fitted to make the two agree: the camera's file is used as
-it stands, and both walls have the albedo of its calibration point.
+FOLDER holds frames of a static camera (16-bit PNG, whole millimetres, 640 x 576, NFOV unbinned)
+before plaster walls, and ``wall_mask.png``. Each wall's plane is fitted, the same plane is
+simulated, and one analysis is applied to both: temporal deviation against range and angle, spatial
+correlation of the temporal noise, and the fixed pattern. Writes ``azure_walls.svg`` and
+``azure_walls.md``. Nothing is fitted to make the two agree: the camera's file is used as it
+stands, and both walls have the albedo of its calibration point.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from detectors.recordings import open_capture
-from harness.scorecard.bench import (
+from harness.stills.statistics import (
     LAGS,
     FixedPattern,
     correlation,
@@ -40,23 +42,28 @@ from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
 from scenes.sensor.source import SimulatedUnit
 
 LENS_CENTRE_PX = (332.0, 326.0)
-"""The frames come without intrinsics; this is where the unit's optical axis is thought to lie. The rest is nominal."""
+"""The frames come without intrinsics; this is where the unit's optical axis is thought to lie. The
+rest is nominal."""
 EDGE_PX = 3
-"""Pixels nearer to a wall's edge are left out: their 5x5 window (2 px) holds light from beyond it."""
+"""Pixels nearer to a wall's edge are left out: their 5x5 window (2 px) holds light from beyond it.
+"""
 FIELD_DEG = 32.5
-"""Half the specification's smaller angle of view (75 x 65 degrees): a cone that is lit whatever the field's shape."""
+"""Half the specification's smaller angle of view (75 x 65 degrees): a cone that is lit whatever
+the field's shape."""
 BIN_M = 0.1
 LEAST_PIXELS = 300
 """Some 12 independent windows: the deviation of 22 frames is then known to 5 %."""
 NOISE_ONLY = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "frame_jumps": True})
-"""With the jitter of whole frames; `walls_camera` takes out their rare jumps, which these captures do not hold."""
+"""With the jitter of whole frames; `walls_camera` takes out their rare jumps, which these captures
+do not hold."""
 PATTERNED = NOISE_ONLY.model_copy(update={"fixed_pattern": True})
 UNIT_SEEDS = (1, 2, 3, 4, 5)
 
 
 @dataclass(frozen=True)
 class Wall:
-    """One wall as recorded: ``mask`` (h, w) of its pixels in ``region``, ``slopes`` (h, w, 2), ``z_m`` (n, h, w)."""
+    """One wall as recorded: ``mask`` (h, w) of its pixels in ``region``, ``slopes`` (h, w, 2),
+    ``z_m`` (n, h, w)."""
 
     name: str
     region: Region
@@ -66,7 +73,8 @@ class Wall:
 
     @cached_property
     def plane(self) -> tuple[float, float, float]:
-        """(distance in m, slope along x, slope along y) of z = d + sx x + sy y, so 1/z = (1 - sx X - sy Y)/d."""
+        """(distance in m, slope along x, slope along y) of z = d + sx x + sy y, so 1/z = (1 - sx X
+        - sy Y)/d."""
         plane = fit_plane(self.z_m.mean(axis=0)[self.mask], self.slopes[self.mask])
         return plane.distance_m, plane.slope_x, plane.slope_y
 
@@ -83,7 +91,8 @@ class Wall:
 
 @dataclass(frozen=True)
 class SigmaBin:
-    """Temporal deviation (rms over pixels) of a part of a wall; ``at``: its middle, in metres or degrees."""
+    """Temporal deviation (rms over pixels) of a part of a wall; ``at``: its middle, in metres or
+    degrees."""
 
     at: float
     pixels: int
@@ -98,7 +107,8 @@ class SigmaBin:
 
 @dataclass(frozen=True)
 class WallCheck:
-    """All numbers of one wall. ``correlation`` maps (who, common jitter kept) to (x and y, lags 1 to 5)."""
+    """All numbers of one wall. ``correlation`` maps (who, common jitter kept) to (x and y, lags 1
+    to 5)."""
 
     wall: Wall
     by_range: list[SigmaBin]
@@ -112,7 +122,8 @@ class WallCheck:
     share_in_polygon: float
 
 
-# ---------------------------------------------------------------- the walls, measured and simulated
+# ---------------------------------------------------------------- the walls, measured and
+# simulated
 
 
 def walls_camera() -> AmcwCamera:
@@ -124,19 +135,23 @@ def walls_camera() -> AmcwCamera:
 
 
 def without_polygon(camera: AmcwCamera) -> AmcwCamera:
-    """The same camera without its illuminated polygon, so that every measured pixel has a simulated one beside it."""
+    """The same camera without its illuminated polygon, so that every measured pixel has a
+    simulated one beside it."""
     data = camera.to_data()
     data["emitter"]["mask_slopes"]["value"] = [[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]]
     return AmcwCamera.from_data(data)
 
 
 def read_walls(folder: Path, camera: AmcwCamera) -> list[Wall]:
-    """The walls of a folder from left to right. Raises UserError where the frames or their mask cannot be used."""
+    """The walls of a folder from left to right. Raises UserError where the frames or their mask
+    cannot be used."""
     lens = camera.nominal_lens
     capture = open_capture([folder], lens=lens)
     mask = cv2.imread(str(folder / "wall_mask.png"), cv2.IMREAD_GRAYSCALE)
     if mask is None or mask.shape != (lens.height, lens.width):
-        raise UserError(f"{folder / 'wall_mask.png'}: no mask of {lens.width} x {lens.height} pixels")
+        raise UserError(
+            f"{folder / 'wall_mask.png'}: no mask of {lens.width} x {lens.height} pixels"
+        )
     z_m = np.stack([frame.z_m for frame in capture.frames()]).astype(float)
     labels, _ = ndimage.label((mask > 0) & np.isfinite(z_m).all(axis=0), np.ones((3, 3)))
     if labels.max() == 0:
@@ -150,8 +165,12 @@ def read_walls(folder: Path, camera: AmcwCamera) -> list[Wall]:
         if far.sum() >= LEAST_PIXELS:
             walls.append(Wall("", region, far, slopes[rows, columns], z_m[:, rows, columns]))
     walls.sort(key=lambda wall: wall.region.col0)
-    names = ("left", "right") if len(walls) == 2 else [f"wall {i}" for i in range(1, len(walls) + 1)]
-    return [Wall(name, w.region, w.mask, w.slopes, w.z_m) for name, w in zip(names, walls, strict=True)]
+    names = (
+        ("left", "right") if len(walls) == 2 else [f"wall {i}" for i in range(1, len(walls) + 1)]
+    )
+    return [
+        Wall(name, w.region, w.mask, w.slopes, w.z_m) for name, w in zip(names, walls, strict=True)
+    ]
 
 
 def simulate(wall: Wall, camera: AmcwCamera, albedo: float, config: CameraConfig) -> np.ndarray:
@@ -159,7 +178,9 @@ def simulate(wall: Wall, camera: AmcwCamera, albedo: float, config: CameraConfig
     lens = camera.nominal_lens
     distance_m, slope_x, slope_y = wall.plane
     outer = wall.region.grown(camera.optics.margin_px, lens.height, lens.width)
-    unit = SimulatedUnit(camera, config, plane_view(camera, outer, distance_m, albedo, slope_x, slope_y))
+    unit = SimulatedUnit(
+        camera, config, plane_view(camera, outer, distance_m, albedo, slope_x, slope_y)
+    )
     cut = wall.region.within(unit.region)
     frames = unit.capture(len(wall.z_m), 1, "walls", wall.name, config.unit_seed).frames()
     return np.stack([frame.z_m[cut] for frame in frames]).astype(float)
@@ -177,13 +198,15 @@ def sigma_bins(
     for b in np.unique(number[where]):
         part = where & (number == b)
         if part.sum() >= LEAST_PIXELS:
-            measured, simulated = (temporal_sigma_m(z, part) for z in (wall.z_m, simulated_m))
+            measured = temporal_sigma_m(wall.z_m, part)
+            simulated = temporal_sigma_m(simulated_m, part)
             bins.append(SigmaBin(float((b + 0.5) * width), int(part.sum()), measured, simulated))
     return bins
 
 
 def needed_albedo(wall: Wall, camera: AmcwCamera, start: float) -> float:
-    """The albedo at which the simulated deviation of the wall's lit pixels would be the measured one (not used)."""
+    """The albedo at which the simulated deviation of the wall's lit pixels would be the measured
+    one (not used)."""
     measured = temporal_sigma_m(wall.z_m, wall.inner)
 
     def excess(log_albedo: float) -> float:
@@ -202,7 +225,8 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
     average = wall.z_m.mean(axis=0)
     outside = AmcwImager(camera, CameraConfig(), wall.region, wall.slopes).outside_mask
     patterned = (
-        simulate(wall, everywhere, albedo, CameraConfig(unit_seed=seed, effects=PATTERNED)) for seed in UNIT_SEEDS
+        simulate(wall, everywhere, albedo, CameraConfig(unit_seed=seed, effects=PATTERNED))
+        for seed in UNIT_SEEDS
     )
     return WallCheck(
         wall,
@@ -214,7 +238,10 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
             for who, z in (("measured", wall.z_m), ("simulated", z_m))
             for jitter in (True, False)
         },
-        (float(wall.z_m[:, wall.mask].mean(1).std(ddof=1)), float(z_m[:, wall.mask].mean(1).std(ddof=1))),
+        (
+            float(wall.z_m[:, wall.mask].mean(1).std(ddof=1)),
+            float(z_m[:, wall.mask].mean(1).std(ddof=1)),
+        ),
         needed_albedo(wall, everywhere, albedo),
         fixed_pattern(wall.z_m, wall.mask, wall.slopes),
         [fixed_pattern(z, wall.mask, wall.slopes) for z in patterned],
@@ -238,9 +265,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The program: print the table, write the figure and the page."""
     from azure_walls_page import figure, page, table
 
-    parser = argparse.ArgumentParser(description="Compare the simulated Azure Kinect with frames of real walls.")
+    parser = argparse.ArgumentParser(
+        description="Compare the simulated Azure Kinect with frames of real walls."
+    )
     parser.add_argument("folder", type=Path, help="frames (16-bit PNG, mm) and wall_mask.png")
-    parser.add_argument("--out", type=Path, default=Path("docs"), help="where the page and figure go (docs)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs"), help="where the page and figure go (docs)"
+    )
     given = parser.parse_args(arguments)
 
     def body() -> int:

@@ -26,9 +26,10 @@ WINDOW_PX = 5
 
 
 def white_before_m(pattern: FixedPattern) -> float:
-    """The part of a pattern that is white before the engine's window of 5, told by its triangle up to lag 5; below 0
-    where the estimate of its variance is."""
-    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth field the rest
+    """The part of a pattern that is white before the engine's window of 5, told by its triangle up
+    to lag 5; below 0 where the estimate of its variance is."""
+    # c(0) - c(k) = p^2 k/5 + q k^2 - r k^4 up to the window: white noise makes the line, a smooth
+    # field the rest
     k = np.arange(1.0, WINDOW_PX + 1)
     rows = np.column_stack([k / WINDOW_PX, k**2, k**4])
     falls = pattern.covariance_m2[0] - pattern.covariance_m2[1 : WINDOW_PX + 1]
@@ -38,8 +39,11 @@ def white_before_m(pattern: FixedPattern) -> float:
 
 def length_px(pattern: FixedPattern) -> float:
     """Length l of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12."""
-    lag, relative = np.arange(13), pattern.covariance_m2[:13] / pattern.covariance_m2[0]
-    found = optimize.least_squares(lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0])
+    lag = np.arange(13)
+    relative = pattern.covariance_m2[:13] / pattern.covariance_m2[0]
+    found = optimize.least_squares(
+        lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0]
+    )
     return float(abs(found.x[1]))
 
 
@@ -72,7 +76,11 @@ def _sigma_rows(check: WallCheck) -> list[list[str]]:
     rows = []
     for b in check.by_range:
         lit = inner.get(b.at)
-        cells = [str(lit.pixels), _mm(lit.measured_m), _mm(lit.simulated_m), f"{lit.ratio:.2f}"] if lit else ["-"] * 4
+        cells = (
+            [str(lit.pixels), _mm(lit.measured_m), _mm(lit.simulated_m), f"{lit.ratio:.2f}"]
+            if lit
+            else ["-"] * 4
+        )
         whole = [str(b.pixels), _mm(b.measured_m), _mm(b.simulated_m), f"{b.ratio:.2f}"]
         rows.append([check.wall.name, f"{b.at - 0.05:.1f}-{b.at + 0.05:.1f}", *cells, *whole])
     return rows
@@ -82,14 +90,31 @@ SIGMA_HEAD = [
     *("wall", "z / m", "lit cone: pixels", "measured / mm", "simulated / mm", "ratio"),
     *("whole wall: pixels", "measured / mm", "simulated / mm", "ratio"),
 ]
-CORRELATION_HEAD = ["wall", "axis", "lag", "measured", "simulated", "measured, jitter off", "simulated, jitter off"]
+CORRELATION_HEAD = [
+    "wall",
+    "axis",
+    "lag",
+    "measured",
+    "simulated",
+    "measured, jitter off",
+    "simulated, jitter off",
+]
 PATTERN_HEAD = ["wall", "quantity", "measured", "simulated, units 1 to 5", "measured / simulated"]
 
 
 def _correlation_rows(check: WallCheck) -> list[list[str]]:
-    columns = [check.correlation[who, jitter] for jitter in (True, False) for who in ("measured", "simulated")]
+    columns = [
+        check.correlation[who, jitter]
+        for jitter in (True, False)
+        for who in ("measured", "simulated")
+    ]
     return [
-        [check.wall.name, "xy"[axis], str(lag + 1), *(f"{round(c[axis, lag], 2) + 0.0:.2f}" for c in columns)]
+        [
+            check.wall.name,
+            "xy"[axis],
+            str(lag + 1),
+            *(f"{round(c[axis, lag], 2) + 0.0:.2f}" for c in columns),
+        ]
         for axis in (0, 1)
         for lag in range(columns[0].shape[1])
     ]
@@ -103,9 +128,12 @@ def _pattern_rows(check: WallCheck) -> list[list[str]]:
     ]
     rows = []
     for name, value, unit in kinds:
-        real, ours = value(check.pattern), [value(p) / unit for p in check.simulated_patterns]
+        real = value(check.pattern)
+        ours = [value(p) / unit for p in check.simulated_patterns]
         spread = " ".join(f"{v:.2f}" for v in ours)
-        rows.append([check.wall.name, name, f"{real / unit:.2f}", spread, f"{real / unit / _rms(ours):.2f}"])
+        rows.append(
+            [check.wall.name, name, f"{real / unit:.2f}", spread, f"{real / unit / _rms(ours):.2f}"]
+        )
     return rows
 
 
@@ -123,7 +151,11 @@ def table(checks: Sequence[WallCheck]) -> str:
     ):
         lines = [head, *(row for check in checks for row in rows_of(check))]
         widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-        parts.append("\n".join("  ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)) for line in lines))
+        parts.append(
+            "\n".join(
+                "  ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)) for line in lines
+            )
+        )
     return "\n\n".join(parts)
 
 
@@ -147,20 +179,36 @@ def figure(checks: Sequence[WallCheck]) -> str:
 
 def _draw_sigma(axes: Any, checks: Sequence[WallCheck]) -> None:
     for check, colour, marker in zip(checks, WALL_COLOURS, "os", strict=False):
-        for name, value, style in (("measured", "measured_m", "-"), ("simulated", "simulated_m", "--")):
+        for name, value, style in (
+            ("measured", "measured_m", "-"),
+            ("simulated", "simulated_m", "--"),
+        ):
             bins: list[SigmaBin] = check.by_range_inner
             face = colour if name == "measured" else "white"
-            x, y = [b.at for b in bins], [getattr(b, value) / MM for b in bins]
-            axes.plot(x, y, style, marker=marker, color=colour, mfc=face, label=f"{check.wall.name} wall, {name}")
+            x = [b.at for b in bins]
+            y = [getattr(b, value) / MM for b in bins]
+            axes.plot(
+                x,
+                y,
+                style,
+                marker=marker,
+                color=colour,
+                mfc=face,
+                label=f"{check.wall.name} wall, {name}",
+            )
     axes.set(
-        title="Temporal deviation, lit cone", xlabel="distance z / m", ylabel="standard deviation / mm", ylim=(0, None)
+        title="Temporal deviation, lit cone",
+        xlabel="distance z / m",
+        ylabel="standard deviation / mm",
+        ylim=(0, None),
     )
     axes.legend(loc="lower right")
 
 
 def _draw_ratio(axes: Any, checks: Sequence[WallCheck]) -> None:
     for check, colour, marker in zip(checks, WALL_COLOURS, "os", strict=False):
-        x, y = [b.at for b in check.by_angle], [b.ratio for b in check.by_angle]
+        x = [b.at for b in check.by_angle]
+        y = [b.ratio for b in check.by_angle]
         axes.plot(x, y, "-", marker=marker, color=colour, label=f"{check.wall.name} wall")
     axes.set(
         title="Deviation, simulated by measured",
@@ -178,7 +226,9 @@ def _draw_correlation(axes: Any, check: WallCheck) -> None:
         for axis, marker, shift in ((0, "o", -0.06), (1, "s", 0.06)):
             c = check.correlation[who, False][axis]
             face = colour if axis == 0 else "white"
-            axes.plot(lags + shift, c, marker, color=colour, mfc=face, label=f"{who}, along {'xy'[axis]}")
+            axes.plot(
+                lags + shift, c, marker, color=colour, mfc=face, label=f"{who}, along {'xy'[axis]}"
+            )
     axes.set(
         title=f"Temporal noise, {check.wall.name} wall, jitter off",
         xlabel="lag / px",
@@ -197,7 +247,9 @@ def _draw_pattern(axes: Any, check: WallCheck) -> None:
     axes.plot(lags, check.pattern.covariance_m2 / MM**2, "o-", ms=4, color=INK, label="measured")
     axes.axhline(0, color=GREY, lw=0.8)
     axes.set(
-        title=f"Fixed pattern, {check.wall.name} wall", xlabel="lag / px (mean of x and y)", ylabel="covariance / mm²"
+        title=f"Fixed pattern, {check.wall.name} wall",
+        xlabel="lag / px (mean of x and y)",
+        ylabel="covariance / mm²",
     )
     axes.legend(loc="upper right")
 
@@ -207,7 +259,13 @@ def _draw_pattern(axes: Any, check: WallCheck) -> None:
 
 def page(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     """The documentation page, in Markdown."""
-    parts = [_set_up(checks, camera), _temporal(checks), _spatial(checks), _pattern(checks, camera), _why(checks)]
+    parts = [
+        _set_up(checks, camera),
+        _temporal(checks),
+        _spatial(checks),
+        _pattern(checks, camera),
+        _why(checks),
+    ]
     return "\n\n".join(_reflowed(block) for part in parts for block in part.split("\n\n")) + "\n"
 
 
@@ -217,13 +275,16 @@ def _reflowed(block: str) -> str:
         return block
     items = re.split(r"\n(?=- )", block)
     return "\n".join(
-        textwrap.fill(" ".join(item.split()), 118, subsequent_indent="  " if item.startswith("- ") else "")
+        textwrap.fill(
+            " ".join(item.split()), 118, subsequent_indent="  " if item.startswith("- ") else ""
+        )
         for item in items
     )
 
 
 def _set_up(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
-    lens, albedo = camera.nominal_lens, camera.photons.calibration_albedo.value
+    lens = camera.nominal_lens
+    albedo = camera.photons.calibration_albedo.value
     planes = _listed(
         f"the {c.wall.name} wall is {c.wall.z_m[:, c.wall.mask].mean(0).min():.2f} to "
         f"{c.wall.z_m[:, c.wall.mask].mean(0).max():.2f} m away and {_tilt_deg(c):.0f} degrees from frontal "
@@ -286,11 +347,14 @@ def _spatial(checks: Sequence[WallCheck]) -> str:
     rows = [row for check in checks for row in _correlation_rows(check)]
     gaps = {
         jitter: max(
-            np.abs(c.correlation["measured", jitter] - c.correlation["simulated", jitter]).max() for c in checks
+            np.abs(c.correlation["measured", jitter] - c.correlation["simulated", jitter]).max()
+            for c in checks
         )
         for jitter in (True, False)
     }
-    real, ours = (_listed(f"{_mm(c.jitter_m[i])} mm ({c.wall.name})" for c in checks) for i in (0, 1))
+    real, ours = (
+        _listed(f"{_mm(c.jitter_m[i])} mm ({c.wall.name})" for c in checks) for i in (0, 1)
+    )
     return f"""## Spatial correlation of the temporal noise
 
 {_markdown(CORRELATION_HEAD, rows)}

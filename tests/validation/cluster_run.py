@@ -1,8 +1,10 @@
-"""What a trial costs beside its own work on a cluster: ``python tests/validation/cluster_run.py --trials 20000``.
+"""What a trial costs beside its own work on a cluster: ``python tests/validation/cluster_run.py
+--trials 20000``.
 
-A `dask scheduler` and `dask worker` processes are started separately; the plan is real and cheap: one frame of a board
-at 2.3 m, rendered once, and the blind detector. Printed: rate, shares of the workers' time, processor time of driver
-and scheduler, bytes over the network, and what the journal and the tables cost.
+A `dask scheduler` and `dask worker` processes are started separately; the plan is real and cheap:
+one frame of a board at 2.3 m, rendered once, and the blind detector. Printed: rate, shares of the
+workers' time, processor time of driver and scheduler, bytes over the network, and what the journal
+and the tables cost.
 """
 
 from __future__ import annotations
@@ -18,18 +20,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
+    sys.path[:0] = [
+        str(Path(__file__).resolve().parents[2]),
+        str(Path(__file__).resolve().parents[1]),
+    ]
 
 import psutil
-from cluster_processes import Processes, processes, square, until
 
-from harness.engine.cluster import ClusterEngine
-from harness.engine.journal import Journal
-from harness.engine.plan import SweepPlan, plan_of
-from harness.engine.run import run_plan
-from harness.engine.tables import tables_of
-from harness.engine.work import Ended, Job, Limits, Outcome, code_of
 from harness.experiment.load import load_experiment
+from harness.programs.cluster.engine import ClusterEngine
+from harness.runs.engines import code_of
+from harness.runs.jobs import Ended, Job, Limits, Outcome
+from harness.runs.journal import Journal
+from harness.runs.plan import SweepPlan, plan_of
+from harness.runs.run import run_plan
+from harness.runs.tables import tables_of
+from tests.support.cluster_processes import Processes, processes, square, until
 
 CHEAP = """\
 name: cheap
@@ -48,7 +54,9 @@ repeats: TRIALS
 
 def main() -> int:
     """The program."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--trials", type=int, default=20_000)
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
@@ -59,12 +67,18 @@ def main() -> int:
     print(json.dumps(said, indent=2))
     print("\nA million trials, hours, by what bounds them (one render for a thousand trials):")
     for cores in (1, 64, 1024):
-        print(f"{cores:5} cores: " + ", ".join(f"{what} {hours:.2f}" for what, hours in scaled(said, cores).items()))
+        print(
+            f"{cores:5} cores: "
+            + ", ".join(f"{what} {hours:.2f}" for what, hours in scaled(said, cores).items())
+        )
     return 0
 
 
-def scaled(said: dict[str, float], cores: int, trials: float = 1e6, per_render: float = 1000.0) -> dict[str, float]:
-    """Hours of each part of a large run: what workers share, and what one driver and one scheduler do alone."""
+def scaled(
+    said: dict[str, float], cores: int, trials: float = 1e6, per_render: float = 1000.0
+) -> dict[str, float]:
+    """Hours of each part of a large run: what workers share, and what one driver and one scheduler
+    do alone."""
     hours = {
         "renders": trials / per_render * said["render_s"] / cores,
         "trials": trials * said["trial_ms"] / 1e3 / cores,
@@ -82,7 +96,9 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
     experiment = load_experiment(home / "cheap.yaml")
     plan = plan_of(experiment, home / "cache")
     journal = Journal(home / "journal")
-    with ClusterEngine(cluster.address, Limits(60.0, 2000), workers, code_of(["blind"]), home) as engine:
+    with ClusterEngine(
+        cluster.address, Limits(60.0, 2000), workers, code_of(["blind"]), home
+    ) as engine:
         until(lambda: engine.room("renders") > workers)
         bare = bare_rate(engine)
         scheduler = psutil.Process(cluster.scheduler.pid)
@@ -90,13 +106,21 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
 
         def look(now: Outcome) -> None:
             if now.trials.done:
-                mine, theirs = processor_s(psutil.Process()), processor_s(scheduler)
-                steady[1:] = [Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)]
+                mine = processor_s(psutil.Process())
+                theirs = processor_s(scheduler)
+                steady[1:] = [
+                    Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)
+                ]
 
         outcome = run_plan(plan, journal, engine, look)
-    assert len(outcome.finished) == trials and not outcome.failures, (len(outcome.finished), outcome.failures[:2])
+    assert len(outcome.finished) == trials and not outcome.failures, (
+        len(outcome.finished),
+        outcome.failures[:2],
+    )
     first, last = steady
-    wall, count, work = (getattr(last, name) - getattr(first, name) for name in ("at_s", "trials", "work_s"))
+    wall = last.at_s - first.at_s
+    count = last.trials - first.trials
+    work = last.work_s - first.work_s
     return {
         "trials": trials,
         "workers": workers,
@@ -115,7 +139,8 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
 
 @dataclass(frozen=True)
 class Look:
-    """At one moment: trials done, work of all workers on them, processor time of driver and scheduler."""
+    """At one moment: trials done, work of all workers on them, processor time of driver and
+    scheduler."""
 
     at_s: float
     trials: int
@@ -126,7 +151,9 @@ class Look:
 
 def bare_rate(engine: ClusterEngine, count: int = 4000) -> float:
     """Jobs a second that do nothing; bundles have grown by the time that it counts."""
-    began, left, ended = 0.0, 2 * count, 0
+    began = 0.0
+    left = 2 * count
+    ended = 0
     while ended < 2 * count:
         while left > 0 and engine.room("trials") > 0:
             engine.submit(Job(f"empty {left}", "trials", square, (left,)))
@@ -143,7 +170,8 @@ def processor_s(process: psutil.Process) -> float:
 
 
 def sizes(plan: SweepPlan, journal: Journal, outcome: Outcome) -> dict[str, float]:
-    """Bytes of what is sent for a trial, alone and in a bundle of 32, of its answer, and of what is stored."""
+    """Bytes of what is sent for a trial, alone and in a bundle of 32, of its answer, and of what
+    is stored."""
     group = plan.groups[0]
     tasks = [task for _, task in group.trials(group.batches[0], {}, range(32))]
     entries = [journal.read(key) for key in outcome.finished[:100]]
@@ -151,15 +179,20 @@ def sizes(plan: SweepPlan, journal: Journal, outcome: Outcome) -> dict[str, floa
     return {
         "bytes_of_a_task": len(pickle.dumps(tasks[0])),
         "bytes_of_a_task_in_a_bundle": round(len(pickle.dumps(tasks)) / len(tasks)),
-        "bytes_of_a_record_sent": round(sum(len(pickle.dumps(record)) for record in records) / len(records)),
-        "bytes_of_a_journal_entry": round(sum(map(journal.size, outcome.finished)) / len(outcome.finished)),
+        "bytes_of_a_record_sent": round(
+            sum(len(pickle.dumps(record)) for record in records) / len(records)
+        ),
+        "bytes_of_a_journal_entry": round(
+            sum(map(journal.size, outcome.finished)) / len(outcome.finished)
+        ),
         "files_of_the_journal": len(list(journal.folder.iterdir())),
         "bytes_of_a_view": max(job.path.stat().st_size for job in plan.renders),
     }
 
 
 def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[str, float]:
-    """Milliseconds a trial to write a record, to read it again, and to make tables; and the tables' memory."""
+    """Milliseconds a trial to write a record, to read it again, and to make tables; and the
+    tables' memory."""
     keys = outcome.finished
     began = time.monotonic()
     entries = [entry for key in keys[:2000] if (entry := journal.read(key)) is not None]
@@ -171,7 +204,8 @@ def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[
             copied.write(key, Ended(**vars(entry)))
         write = (time.monotonic() - began) / len(entries)
     process = psutil.Process()
-    before, began = process.memory_info().rss, time.monotonic()
+    before = process.memory_info().rss
+    began = time.monotonic()
     tables = tables_of((journal.read(key).record for key in keys), experiment)  # type: ignore[union-attr, misc, arg-type]
     spent = time.monotonic() - began
     with contextlib.suppress(AttributeError):

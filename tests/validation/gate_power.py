@@ -1,11 +1,14 @@
-"""``python tests/validation/gate_power.py``: how often the gate fails without a reason, and what growth it sees.
+"""``python tests/validation/gate_power.py``: how often the gate fails without a reason, and what
+growth it sees.
 
-Whole studies are drawn from a model of a detector: a damage's score grows with a power of its size, times the luck of
-its place (the same whenever the board is inspected again) and of its board, plus noise of each inspection; the highest
-false score of a hole-free board is Gumbel distributed. Thresholds are calibrated on boards of their own, as a study
-does it, so the luck of that calibration is in the result. The baseline and the study differ in the draw of the noise
-alone; or also in the camera's noise, by which all scores of damage fall, since they are in units of it; or in how much
-luck places have, by which the curve flattens about the same a50; or in the threshold that it finds at.
+Whole studies are drawn from a model of a detector: a damage's score grows with a power of its
+size, times the luck of its place (the same whenever the board is inspected again) and of its
+board, plus noise of each inspection; the highest false score of a hole-free board is Gumbel
+distributed. Thresholds are calibrated on boards of their own, as a study does it, so the luck of
+that calibration is in the result. The baseline and the study differ in the draw of the noise
+alone; or also in the camera's noise, by which all scores of damage fall, since they are in units
+of it; or in how much luck places have, by which the curve flattens about the same a50; or in the
+threshold that it finds at.
 """
 
 from __future__ import annotations
@@ -22,8 +25,14 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.intervals import threshold_for_rate
-from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
-from harness.evaluation.study.verdict import compare_studies
+from harness.evaluation.study.record import (
+    Calibrated,
+    Inspected,
+    SetUpRecord,
+    StudyRecord,
+    Unflawed,
+)
+from harness.programs.gate.verdict import compare_studies
 
 AREA_M2 = 0.054
 NORMAL_90 = 1.2816
@@ -36,11 +45,13 @@ SHIFTS = (1 / 1.5, 0.85, 1.1, 1.2, 1.3)
 
 @dataclass(frozen=True)
 class Model:
-    """Scores in units of the deviation that the detector counts in; numbers as regression.yaml gives for one frame.
+    """Scores in units of the deviation that the detector counts in; numbers as regression.yaml
+    gives for one frame.
 
-    ``sizes_mm``: smallest and largest; the score is ``score`` at ``size_mm`` and grows with its ``power``. ``place``,
-    ``of_board``: deviations of the score's logarithm; ``noise`` of each inspection; ``false_score`` and
-    ``false_spread`` of the Gumbel distribution of a hole-free board's highest score.
+    ``sizes_mm``: smallest and largest; the score is ``score`` at ``size_mm`` and grows with its
+    ``power``. ``place``, ``of_board``: deviations of the score's logarithm; ``noise`` of each
+    inspection; ``false_score`` and ``false_spread`` of the Gumbel distribution of a hole-free
+    board's highest score.
     """
 
     depth: bool
@@ -64,7 +75,8 @@ MODELS = (
 
 @dataclass(frozen=True)
 class Size:
-    """Boards with damage, damages on each, hole-free boards to judge and to calibrate, set-ups: of regression.yaml."""
+    """Boards with damage, damages on each, hole-free boards to judge and to calibrate, set-ups: of
+    regression.yaml."""
 
     boards: int = 24
     holes: int = 10
@@ -75,8 +87,9 @@ class Size:
 
 @dataclass(frozen=True)
 class Change:
-    """What changed: the camera's ``noise``; ``flatter``: growth of a90 over a50 by more luck of places; ``bias``: the
-    detector finds at this multiple of the threshold that it was calibrated to."""
+    """What changed: the camera's ``noise``; ``flatter``: growth of a90 over a50 by more luck of
+    places; ``bias``: the detector finds at this multiple of the threshold that it was calibrated
+    to."""
 
     noise: float = 1.0
     flatter: float = 1.0
@@ -85,15 +98,21 @@ class Change:
 
 def study(size: Size, boards_seed: int, noise_seed: int, change: Change = Change()) -> StudyRecord:
     """A study of the detector as it is, or as it became by ``change``."""
-    set_ups = tuple(_set_up(size, boards_seed, noise_seed, place, change) for place in range(size.set_ups))
+    set_ups = tuple(
+        _set_up(size, boards_seed, noise_seed, place, change) for place in range(size.set_ups)
+    )
     return StudyRecord("model", "", 15.0, RATE_PER_M2, {}, set_ups)
 
 
-def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, change: Change) -> SetUpRecord:
+def _set_up(
+    size: Size, boards_seed: int, noise_seed: int, number: int, change: Change
+) -> SetUpRecord:
     model = MODELS[number % len(MODELS)]
-    # ln(a90 / a50) is the 90th percentile of the luck's logarithm over the power with which scores grow.
+    # ln(a90 / a50) is the 90th percentile of the luck's logarithm over the power with which scores
+    # grow.
     place = model.place + model.power * np.log(change.flatter) / NORMAL_90
-    of_boards, noise = (np.random.default_rng(key) for key in ((boards_seed, 1), (boards_seed, noise_seed, number, 2)))
+    of_boards = np.random.default_rng((boards_seed, 1))
+    noise = np.random.default_rng((boards_seed, noise_seed, number, 2))
     n = size.boards * size.holes
     board = np.repeat(np.arange(size.boards), size.holes)
     size_mm = of_boards.uniform(*model.sizes_mm, n)
@@ -101,13 +120,14 @@ def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, change: 
     luck += model.of_board * of_boards.standard_normal(size.boards)[board]
     signal = model.score / change.noise * (size_mm / model.size_mm) ** model.power * np.exp(luck)
     signal = np.abs(signal + model.noise * noise.standard_normal(n))
-    calibration, judged = (
-        model.false_score + model.false_spread * noise.gumbel(size=count)
-        for count in (size.calibration_boards, size.hole_free_boards)
+    calibration = model.false_score + model.false_spread * noise.gumbel(
+        size=size.calibration_boards
     )
+    judged = model.false_score + model.false_spread * noise.gumbel(size=size.hole_free_boards)
     threshold = threshold_for_rate(calibration, AREA_M2, RATE_PER_M2).value
     names = np.tile([str(1 + hole) for hole in range(size.holes)], size.boards)
-    zero, repeat = np.zeros(n), np.zeros(n, int)
+    zero = np.zeros(n)
+    repeat = np.zeros(n, int)
     sizes = (np.full(n, 10.0), size_mm) if model.depth else (size_mm, np.full(n, 12.7))
     return SetUpRecord(
         variant=f"set-up {number}",
@@ -121,14 +141,18 @@ def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, change: 
         failed=0,
         targets_digest=str(boards_seed),
         frames_digest=f"{boards_seed} {noise_seed}",
-        inspected=Inspected(board, names, repeat, *sizes, zero, zero, signal > change.bias * threshold, signal),
+        inspected=Inspected(
+            board, names, repeat, *sizes, zero, zero, signal > change.bias * threshold, signal
+        ),
         unflawed=Unflawed(
             np.arange(size.hole_free_boards),
             np.zeros(size.hole_free_boards, int),
             (judged > change.bias * threshold).astype(int),
             np.full(size.hole_free_boards, AREA_M2),
         ),
-        calibrated=Calibrated(*np.zeros((2, len(calibration)), int), calibration, *np.zeros((2, len(calibration)))),
+        calibrated=Calibrated(
+            *np.zeros((2, len(calibration)), int), calibration, *np.zeros((2, len(calibration)))
+        ),
     )
 
 
@@ -137,7 +161,9 @@ def fails(baseline: StudyRecord, found: StudyRecord) -> bool:
     return any(row.is_worse for row in compare_studies(baseline, found).rows)
 
 
-def share(size: Size, times: int, change: Change = Change(), *, other_boards: bool = False) -> float:
+def share(
+    size: Size, times: int, change: Change = Change(), *, other_boards: bool = False
+) -> float:
     """Share of ``times`` checks that fail, each with boards and noise of its own."""
     failing = 0
     for draw in range(times):
@@ -147,22 +173,35 @@ def share(size: Size, times: int, change: Change = Change(), *, other_boards: bo
 
 
 def main() -> None:
-    """Print what stands in the documentation of `harness.check`."""
+    """Print what stands in the documentation of `harness.programs.gate.check`."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quiet", type=int, default=500, help="checks in which nothing changes but the noise")
-    parser.add_argument("--changed", type=int, default=60, help="checks for each change, and on other boards")
+    parser.add_argument(
+        "--quiet", type=int, default=500, help="checks in which nothing changes but the noise"
+    )
+    parser.add_argument(
+        "--changed", type=int, default=60, help="checks for each change, and on other boards"
+    )
     options = parser.parse_args()
-    began, size = time.perf_counter(), Size()
+    began = time.perf_counter()
+    size = Size()
     print(size)
     changes = {
         **{f"the camera's noise times {noise:.2f}": Change(noise=noise) for noise in NOISES},
-        **{f"a90 grows by {growth:.2f}, a50 does not": Change(flatter=growth) for growth in FLATTER},
+        **{
+            f"a90 grows by {growth:.2f}, a50 does not": Change(flatter=growth) for growth in FLATTER
+        },
         **{f"finds at {shift:.2f} of its threshold": Change(bias=shift) for shift in SHIFTS},
     }
     for what, change in changes.items():
-        print(f"{what}: {share(size, options.changed, change):.2f} of {options.changed} checks fail", flush=True)
+        print(
+            f"{what}: {share(size, options.changed, change):.2f} of {options.changed} checks fail",
+            flush=True,
+        )
     print(f"another noise: {share(size, options.quiet):.4f} of {options.quiet}", flush=True)
-    print(f"other boards: {share(size, options.changed, other_boards=True):.3f} of {options.changed}", flush=True)
+    print(
+        f"other boards: {share(size, options.changed, other_boards=True):.3f} of {options.changed}",
+        flush=True,
+    )
     print(f"{time.perf_counter() - began:.0f} s")
 
 

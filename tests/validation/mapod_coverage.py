@@ -1,12 +1,15 @@
-"""How often a study's corrected limit lies above the true a90: ``python tests/validation/mapod_coverage.py``.
+"""How often a study's corrected limit lies above the true a90: ``python
+tests/validation/mapod_coverage.py``.
 
-Studies of a simulated camera are drawn from a curve with a50 = 4 and a90 = 5 mm, at places of their sizes that differ.
-The real curve is ``k`` times as far to the right and its rise ``w`` times as wide. Each campaign draws hits of real
-holes spread evenly over the drills from it, and corrects a study of its own, of which nothing but hits is known:
-campaigns that share a study miss together, so that 100 of 10 studies would tell the share to 0.04, not to 0.02.
-``covered``: share of campaigns whose combined a90/95 is at or over the true a90, with its exact 95 % interval; the
-quoted one, of a contradicted study the larger of combined and measured, is never smaller. Nominal: 95 %. Beside it
-stand the combined limit as a multiple of the true a90, and that of the real hits alone.
+Studies of a simulated camera are drawn from a curve with a50 = 4 and a90 = 5 mm, at places of
+their sizes that differ. The real curve is ``k`` times as far to the right and its rise ``w`` times
+as wide. Each campaign draws hits of real holes spread evenly over the drills from it, and corrects
+a study of its own, of which nothing but hits is known: campaigns that share a study miss together,
+so that 100 of 10 studies would tell the share to 0.04, not to 0.02. ``covered``: share of
+campaigns whose combined a90/95 is at or over the true a90, with its exact 95 % interval; the
+quoted one, of a contradicted study the larger of combined and measured, is never smaller. Nominal:
+95 %. Beside it stand the combined limit as a multiple of the true a90, and that of the real hits
+alone.
 """
 
 from __future__ import annotations
@@ -25,10 +28,10 @@ if __name__ == "__main__":
 
 from harness.evaluation.intervals import clopper_pearson
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import curve_through, even_sizes
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import PodStatement, state_hits
-from harness.evaluation.pod.transfer import LIMIT_AT, Transfer
+from harness.programs.inspections.design_statistics import curve_through, even_sizes
+from harness.programs.inspections.mapod import LIMIT_AT, Transfer
 from harness.vocabulary.errors import UserError
 
 DRILLS_MM = 2.0, 12.0
@@ -38,9 +41,9 @@ MEASURED = 40
 
 @dataclass(frozen=True)
 class Coverage:
-    """A case: factors ``k`` and ``w``, real ``holes``; ``covered``: share of ``campaigns``. Limits as multiples of the
-    true a90: ``median`` and 90 % quantile ``high`` of the combined ones; median of the ``measured`` ones, infinite
-    where half of the campaigns demonstrate none."""
+    """A case: factors ``k`` and ``w``, real ``holes``; ``covered``: share of ``campaigns``. Limits
+    as multiples of the true a90: ``median`` and 90 % quantile ``high`` of the combined ones;
+    median of the ``measured`` ones, infinite where half of the campaigns demonstrate none."""
 
     k: float
     w: float
@@ -53,7 +56,8 @@ class Coverage:
 
 
 def wrong_by(curve: PodCurve, k: float, w: float) -> PodCurve:
-    """The true curve of a simulation that is wrong by factors k in size and w in the width of the rise."""
+    """The true curve of a simulation that is wrong by factors k in size and w in the width of the
+    rise."""
     half = curve.size_at(0.5)
     if curve.log_size:
         shift = np.log(half) - curve.mu
@@ -63,16 +67,23 @@ def wrong_by(curve: PodCurve, k: float, w: float) -> PodCurve:
 
 def of_hits(size: np.ndarray, hit: np.ndarray) -> Inspections:
     """Inspections as a file would give them."""
-    return Inspections(Path("drawn"), "size", "hit", size, hit.astype(float), None, np.arange(len(size)))
+    return Inspections(
+        Path("drawn"), "size", "hit", size, hit.astype(float), None, np.arange(len(size))
+    )
 
 
-def drawn_studies(curve: PodCurve, number: int, targets: int, random: np.random.Generator) -> list[PodStatement]:
-    """Statements of studies of ``targets`` simulated holes; those without a rising curve are drawn again."""
+def drawn_studies(
+    curve: PodCurve, number: int, targets: int, random: np.random.Generator
+) -> list[PodStatement]:
+    """Statements of studies of ``targets`` simulated holes; those without a rising curve are drawn
+    again."""
     studies: list[PodStatement] = []
     while len(studies) < number:
         size = random.uniform(*DRILLS_MM, targets)
         try:
-            studies.append(state_hits(of_hits(size, random.random(targets) < curve.pod(size)), tested=False))
+            studies.append(
+                state_hits(of_hits(size, random.random(targets) < curve.pod(size)), tested=False)
+            )
         except UserError:
             continue
     return studies
@@ -91,26 +102,44 @@ def combined_limits(study: PodStatement, size: np.ndarray, hits: np.ndarray) -> 
             weights = np.exp(value - value.max(axis=1, keepdims=True))[:, order]
             below = np.cumsum(weights, axis=1)
             shares = zip(below, weights, strict=True)
-            limits.append([np.interp(LIMIT_AT * sums[-1], sums - own / 2, sizes[order]) for sums, own in shares])
+            limits.append(
+                [
+                    np.interp(LIMIT_AT * sums[-1], sums - own / 2, sizes[order])
+                    for sums, own in shares
+                ]
+            )
     return np.max(limits, axis=0)
 
 
 def coverage(
-    curve: PodCurve, cases: Sequence[tuple[float, float]], holes: int, *, campaigns: int, targets: int = 64
+    curve: PodCurve,
+    cases: Sequence[tuple[float, float]],
+    holes: int,
+    *,
+    campaigns: int,
+    targets: int = 64,
 ) -> list[Coverage]:
-    """Coverage of each case (k, w) with so many real ``holes``; each campaign corrects another study of ``targets``."""
+    """Coverage of each case (k, w) with so many real ``holes``; each campaign corrects another
+    study of ``targets``."""
     random = np.random.default_rng(1823)
-    size, truths = even_sizes(holes, DRILLS_MM), [wrong_by(curve, *case) for case in cases]
+    size = even_sizes(holes, DRILLS_MM)
+    truths = [wrong_by(curve, *case) for case in cases]
     chances = np.array([truth.pod(size) for truth in truths])
     hits = random.random((campaigns, len(cases), holes)) < chances
     studies = drawn_studies(curve, campaigns, targets, random)
-    limits = np.stack([combined_limits(study, size, some) for study, some in zip(studies, hits, strict=True)])
+    limits = np.stack(
+        [combined_limits(study, size, some) for study, some in zip(studies, hits, strict=True)]
+    )
     rows = []
     for number, (case, truth) in enumerate(zip(cases, truths, strict=True)):
         true_mm = truth.size_at(0.9)
         alone = [measured_limit(size, hit) for hit in hits[:MEASURED, number]]
         scaled = limits[:, number] / true_mm
-        sizes = float(np.median(scaled)), float(np.quantile(scaled, 0.9)), float(np.median(alone)) / true_mm
+        sizes = (
+            float(np.median(scaled)),
+            float(np.quantile(scaled, 0.9)),
+            float(np.median(alone)) / true_mm,
+        )
         rows.append(Coverage(*case, holes, campaigns, float((scaled >= 1).mean()), *sizes))
     return rows
 
@@ -128,7 +157,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--holes", type=int, nargs="+", default=[24, 60])
     parser.add_argument("--targets", type=int, default=64, help="simulated holes of each study")
-    parser.add_argument("--campaigns", type=int, default=300, help="of each case, each with a study of its own")
+    parser.add_argument(
+        "--campaigns", type=int, default=300, help="of each case, each with a study of its own"
+    )
     parser.add_argument("--link", default="logit")
     parser.add_argument("--log", action=argparse.BooleanOptionalAction, default=True)
     given = parser.parse_args()

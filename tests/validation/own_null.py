@@ -1,13 +1,17 @@
-"""False calls counted against those expected by a capture's own null, a table: some 20 minutes on two free cores.
+"""False calls counted against those expected by a capture's own null, a table: some 20 minutes on
+two free cores.
 
-Run ``python tests/validation/own_null.py --cache FOLDER [--boards 50]``. Boards are drawn at random before three
-cameras, each before a unit of its own: hole-free, the same with flat objects lying on them, and drilled. On each, with
-1 and with 50 frames, `detectors.null.own_threshold` sets the threshold at which 1 and 3 false calls are expected.
-Counted are the findings that are neither a hole (centres within 15 mm, as in the studies) nor an object or its edge.
-Expected is the number asked for, in the share of the judged area where a finding would be counted. ``asked``: over the
-boards whose own null was trusted; the rest is told as ``refused``.
+Run ``python tests/validation/own_null.py --cache FOLDER [--boards 50]``. Boards are drawn at
+random before three cameras, each before a unit of its own: hole-free, the same with flat objects
+lying on them, and drilled. On each, with 1 and with 50 frames,
+`detectors.findings.null.own_threshold` sets the threshold at which 1 and 3 false calls are
+expected. Counted are the findings that are neither a hole (centres within 15 mm, as in the
+studies) nor an object or its edge. Expected is the number asked for, in the share of the judged
+area where a finding would be counted. ``asked``: over the boards whose own null was trusted; the
+rest is told as ``refused``.
 
-Objects are put into the averaged cloud, with edges blurred over 1 pixel: their light is not rendered.
+Objects are put into the averaged cloud, with edges blurred over 1 pixel: their light is not
+rendered.
 """
 
 from __future__ import annotations
@@ -22,10 +26,10 @@ import numpy as np
 from scipy import ndimage
 
 from detectors import load_detector
-from detectors.average import AverageConfig
+from detectors.averages.average import AverageConfig
+from detectors.findings.null import own_threshold
 from detectors.interface import Detector
-from detectors.null import own_threshold
-from harness.engine.trial import averages_of
+from harness.trials.trial import averages_of
 from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import RenderConfig
@@ -43,13 +47,15 @@ ASKED = (1.0, 3.0)
 DISTANCES_M = (0.55, 0.7, 0.9)
 HIT_M = 15 * MM
 FIRST_UNIT = 1000
-"""Units and noise of their own: the settings of `detectors.null` were chosen on these boards before other units."""
+"""Units and noise of their own: the settings of `detectors.findings.null` were chosen on these
+boards before other units."""
 RENDER = RenderConfig(hole_noise_mm=0.3)
 
 
 @dataclass(frozen=True)
 class Board:
-    """An averaged view. ``excused`` (h, w) bool: where a finding is right, or near enough to be counted as such."""
+    """An averaged view. ``excused`` (h, w) bool: where a finding is right, or near enough to be
+    counted as such."""
 
     cloud: Cloud
     excused: np.ndarray
@@ -60,7 +66,12 @@ def family(number: int) -> DrawnTargetConfig:
     return DrawnTargetConfig.model_validate(
         {
             "seed": 5,
-            "damage": {"kind": "through", "per_board": 8, "diameter_mm": [2.0, 8.0], "sizes": "uniform"},
+            "damage": {
+                "kind": "through",
+                "per_board": 8,
+                "diameter_mm": [2.0, 8.0],
+                "sizes": "uniform",
+            },
             "distance_m": DISTANCES_M[number % len(DISTANCES_M)],
             "distance_jitter_mm": 50.0,
             "tilt_deg": 12.0,
@@ -73,13 +84,22 @@ def boards(camera_name: str, kind: str, number: int, cache: Path) -> dict[int, B
     camera = camera_of(CameraConfig(name=camera_name))
     role: Purpose = "damaged" if kind == "drilled" else "hole_free"
     target = family(number).drawn(role, number).at_wavelength(camera.optics.wavelength_nm)
-    view, _ = cached_view(target if kind == "drilled" else target.hole_free(), camera.optics, RENDER, cache)
-    unit = SimulatedUnit(camera, CameraConfig(name=camera_name, unit_seed=FIRST_UNIT + number), view)
-    clouds = averages_of(unit.capture(max(FRAMES), 7, role, number), FRAMES, AverageConfig(), exact=False)
+    view, _ = cached_view(
+        target if kind == "drilled" else target.hole_free(), camera.optics, RENDER, cache
+    )
+    unit = SimulatedUnit(
+        camera, CameraConfig(name=camera_name, unit_seed=FIRST_UNIT + number), view
+    )
+    clouds = averages_of(
+        unit.capture(max(FRAMES), 7, role, number), FRAMES, AverageConfig(), exact=False
+    )
     if kind == "objects":
         return {n: with_objects(cloud, target, number) for n, cloud in clouds.items()}
     holes = holes_near(target, next(iter(clouds.values()))) if kind == "drilled" else None
-    return {n: Board(c, np.zeros(c.valid.shape, bool) if holes is None else holes) for n, c in clouds.items()}
+    return {
+        n: Board(c, np.zeros(c.valid.shape, bool) if holes is None else holes)
+        for n, c in clouds.items()
+    }
 
 
 def holes_near(target: TargetConfig, cloud: Cloud) -> np.ndarray:
@@ -94,28 +114,39 @@ def holes_near(target: TargetConfig, cloud: Cloud) -> np.ndarray:
 
 
 def with_objects(cloud: Cloud, target: TargetConfig, number: int) -> Board:
-    """One to three rectangles of 12 to 40 mm, 4 to 30 mm thick, flat or tilted, on the target's face."""
+    """One to three rectangles of 12 to 40 mm, 4 to 30 mm thick, flat or tilted, on the target's
+    face."""
     random = random_stream(11, "objects", number)
     pixel_m = target.pose.distance_m / (cloud.lens.fx if cloud.lens else 500.0)
     height, width = cloud.valid.shape
-    rise_m, covered = np.zeros((height, width)), np.zeros((height, width), bool)
+    rise_m = np.zeros((height, width))
+    covered = np.zeros((height, width), bool)
     v, u = np.mgrid[:height, :width] * pixel_m
     for _ in range(int(random.integers(1, 4))):
         place = random.uniform(0.25, 0.75, 2) * (height * pixel_m, width * pixel_m)
-        half, turn = random.uniform(6 * MM, 20 * MM, 2), random.uniform(0, np.pi)
+        half = random.uniform(6 * MM, 20 * MM, 2)
+        turn = random.uniform(0, np.pi)
         along = (v - place[0]) * np.cos(turn) + (u - place[1]) * np.sin(turn)
         across = (u - place[1]) * np.cos(turn) - (v - place[0]) * np.sin(turn)
         inside = (np.abs(along) < half[0]) & (np.abs(across) < half[1])
-        thick_m = random.uniform(4 * MM, 30 * MM) * (1.0 + random.uniform(-0.4, 0.4) * along / half[0])
+        thick_m = random.uniform(4 * MM, 30 * MM) * (
+            1.0 + random.uniform(-0.4, 0.4) * along / half[0]
+        )
         rise_m = np.where(inside, thick_m, rise_m)
         covered |= inside
-    points = cloud.points_m * (1.0 - ndimage.gaussian_filter(rise_m, 1.0) / cloud.points_m[..., 2])[..., None]
+    points = (
+        cloud.points_m
+        * (1.0 - ndimage.gaussian_filter(rise_m, 1.0) / cloud.points_m[..., 2])[..., None]
+    )
     margin = round(HIT_M / 2 / pixel_m)
-    return Board(replace(cloud, points_m=points), ndimage.binary_dilation(covered, iterations=margin))
+    return Board(
+        replace(cloud, points_m=points), ndimage.binary_dilation(covered, iterations=margin)
+    )
 
 
 def counts(board: Board, detector: Detector) -> Iterator[tuple[float, int] | None]:
-    """For each of `ASKED` what is expected and what is counted; None where the own null is not trusted."""
+    """For each of `ASKED` what is expected and what is counted; None where the own null is not
+    trusted."""
     evidence = detector.analyse(board.cloud)
     for asked in ASKED:
         own = own_threshold(detector, board.cloud, evidence, asked)
@@ -131,7 +162,9 @@ def counts(board: Board, detector: Detector) -> Iterator[tuple[float, int] | Non
 
 def main(arguments: list[str]) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python tests/validation/own_null.py", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python tests/validation/own_null.py", description=__doc__
+    )
     parser.add_argument("--cache", type=Path, required=True, help="where renders are kept")
     parser.add_argument("--boards", type=int, default=50, help="of each camera and kind")
     parser.add_argument("--cameras", nargs="+", default=CAMERAS, choices=CAMERAS)
@@ -140,16 +173,24 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     detector = load_detector(options.detector, {"crop": {"kind": "auto"}})
     options.cache.mkdir(parents=True, exist_ok=True)
-    print("camera, kind, frames | asked | boards | refused | expected | counted | ratio +- standard error")
+    print(
+        "camera, kind, frames | asked | boards | refused | expected | counted | ratio +- standard error"
+    )
     for name in options.cameras:
         for kind in options.kinds:
             every = [boards(name, kind, number, options.cache) for number in range(options.boards)]
             for frames in FRAMES:
                 told = [list(counts(board[frames], detector)) for board in every]
                 for number, asked in enumerate(ASKED):
-                    rows = np.array([row[number] for row in told if row[number] is not None], float).reshape(-1, 2)
+                    rows = np.array(
+                        [row[number] for row in told if row[number] is not None], float
+                    ).reshape(-1, 2)
                     expected, counted = rows.sum(axis=0)
-                    error = rows[:, 1].std(ddof=1) * np.sqrt(len(rows)) / expected if len(rows) > 1 else np.nan
+                    error = (
+                        rows[:, 1].std(ddof=1) * np.sqrt(len(rows)) / expected
+                        if len(rows) > 1
+                        else np.nan
+                    )
                     print(
                         f"{name}, {kind}, {frames} | {asked:g} | {len(rows)} | {len(told) - len(rows)} |"
                         f" {expected:.1f} | {counted:.0f} | {counted / expected:.2f} +- {error:.2f}",

@@ -1,9 +1,10 @@
 """How often the bound on a90 lies above the true a90: ``python tests/validation/pod_coverage.py``.
 
-Each study draws hits for sizes spread evenly over 0.5 to 10 mm from a known curve and bounds a90 from above: by a fit
-of the true link and scale with each method; then, as programs do, without that knowledge: by the model with the least
-deviance ("best of 8"), and by the largest bound over the models near it ("as used"). A bound that is not demonstrated
-claims nothing false, so it counts as above. Studies without a rising curve are counted apart. Nominal: 95 %.
+Each study draws hits for sizes spread evenly over 0.5 to 10 mm from a known curve and bounds a90
+from above: by a fit of the true link and scale with each method; then, as programs do, without
+that knowledge: by the model with the least deviance ("best of 8"), and by the largest bound over
+the models near it ("as used"). A bound that is not demonstrated claims nothing false, so it counts
+as above. Studies without a rising curve are counted apart. Nominal: 95 %.
 """
 
 from __future__ import annotations
@@ -19,7 +20,13 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.hit_miss import METHOD, choose_model, fit_hit_miss, largest_bound, near_models
+from harness.evaluation.pod.hit_miss import (
+    METHOD,
+    choose_model,
+    fit_hit_miss,
+    largest_bound,
+    near_models,
+)
 from harness.vocabulary.errors import UserError
 
 UNKNOWN = np.zeros((2, 2))
@@ -31,14 +38,16 @@ TRUTHS = (
     PodCurve("cloglog", False, 5.0, 1.5, UNKNOWN),
     PodCurve("logit", True, float(np.log(3.5)), 0.25, UNKNOWN),
 )
-SMALLEST_MM, LARGEST_MM = 0.5, 10.0
+SMALLEST_MM = 0.5
+LARGEST_MM = 10.0
 CHOSEN = ("best of 8", "as used")
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """``above``: studies whose bound is at or over the true a90; ``undemonstrated`` those of them without a finite
-    bound; ``separated``: studies fitted by Firth's penalty; ``refused``: no rising curve, left out of ``studies``."""
+    """``above``: studies whose bound is at or over the true a90; ``undemonstrated`` those of them
+    without a finite bound; ``separated``: studies fitted by Firth's penalty; ``refused``: no
+    rising curve, left out of ``studies``."""
 
     method: str
     studies: int

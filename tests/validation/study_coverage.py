@@ -1,10 +1,11 @@
 """How often bounds on a90 hold where boards matter: ``python tests/validation/study_coverage.py``.
 
-Each study has boards of eight damages with diameters spread over 1 to 14 mm; a damage is found with probability
-logistic((a - 6 mm - shift of its board) / 0.8 mm), shifts normal with the deviation stated. The true a90 is that of
-damage on a board drawn at random. Beside the likelihood ratio bound, which takes damages as independent, stand the
-same with its criterion multiplied by the boards' design effect where that is above 1, and the 95 % percentile of boards
-drawn again. Nominal coverage: 95 %.
+Each study has boards of eight damages with diameters spread over 1 to 14 mm; a damage is found
+with probability logistic((a - 6 mm - shift of its board) / 0.8 mm), shifts normal with the
+deviation stated. The true a90 is that of damage on a board drawn at random. Beside the likelihood
+ratio bound, which takes damages as independent, stand the same with its criterion multiplied by
+the boards' design effect where that is above 1, and the 95 % percentile of boards drawn again.
+Nominal coverage: 95 %.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.limit import design_effect, refitted_sizes, targets_of
 from harness.vocabulary.errors import UserError
 
-A50_MM, WIDTH_MM = 6.0, 0.8
+A50_MM = 6.0
+WIDTH_MM = 0.8
 SIZES_MM = (1.0, 14.0)
 HOLES = 8
 DRAWS = 300
@@ -34,7 +36,8 @@ DRAWS = 300
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares of ``studies`` whose bound is at or over the true a90, and medians of bounds and design effect."""
+    """Shares of ``studies`` whose bound is at or over the true a90, and medians of bounds and
+    design effect."""
 
     boards: int
     shift_mm: float
@@ -50,7 +53,8 @@ class Coverage:
 
 
 def true_a90(shift_mm: float) -> float:
-    """a90 of damage on a board drawn at random: the mean of the boards' curves, by Gauss and Hermite."""
+    """a90 of damage on a board drawn at random: the mean of the boards' curves, by Gauss and
+    Hermite."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
 
     def excess(a: float) -> float:
@@ -63,8 +67,11 @@ def true_a90(shift_mm: float) -> float:
 def coverage(boards: int, shift_mm: float, studies: int, seed: int) -> Coverage:
     """Draw and judge ``studies`` studies of so many boards."""
     rng = np.random.default_rng(seed)
-    true_mm, rows, refused = true_a90(shift_mm), [], 0
-    board, hole = np.repeat(np.arange(boards), HOLES), np.tile(np.arange(HOLES), boards)
+    true_mm = true_a90(shift_mm)
+    rows = []
+    refused = 0
+    board = np.repeat(np.arange(boards), HOLES)
+    hole = np.tile(np.arange(HOLES), boards)
     for _ in range(studies):
         size = rng.permutation(np.linspace(*SIZES_MM, boards * HOLES))
         shift = shift_mm * rng.standard_normal(boards)[board]
@@ -97,11 +104,15 @@ def coverage(boards: int, shift_mm: float, studies: int, seed: int) -> Coverage:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print one line a setting."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--studies", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
-    print("boards  shift/mm  a90/mm  covered: ratio  with effect  percentile  median/mm: ratio  with effect  effect")
+    print(
+        "boards  shift/mm  a90/mm  covered: ratio  with effect  percentile  median/mm: ratio  with effect  effect"
+    )
     for boards in (20, 60):
         for shift_mm in (0.0, 1.0, 2.0):
             one = coverage(boards, shift_mm, options.studies, options.seed)

@@ -1,10 +1,12 @@
-"""What is left of the light transport's error, and what it costs: ``python tests/validation/transport.py``.
+"""What is left of the light transport's error, and what it costs: ``python
+tests/validation/transport.py``.
 
-The thesis target at 0.7 m before the Azure Kinect, in a room with floor and back wall. Each view is rendered as an
-experiment would, and compared in range (frequencies fused by least squares) with a reference that knows neither nodes
-on the face nor a budget: paths of up to 24 reflections through 32 x 32 sub-rays of every compared pixel. Then
-mitransient's ``transient_path`` renders the hole-free board at a number of paths that it can afford; its variance is
-extrapolated by 1/n to our error. Prints Markdown tables.
+The thesis target at 0.7 m before the Azure Kinect, in a room with floor and back wall. Each view
+is rendered as an experiment would, and compared in range (frequencies fused by least squares) with
+a reference that knows neither nodes on the face nor a budget: paths of up to 24 reflections
+through 32 x 32 sub-rays of every compared pixel. Then mitransient's ``transient_path`` renders the
+hole-free board at a number of paths that it can afford; its variance is extrapolated by 1/n to our
+error. Prints Markdown tables.
 """
 
 from __future__ import annotations
@@ -28,7 +30,13 @@ from harness.vocabulary.geometry import MM, Lens
 from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig, wave_numbers
 from scenes.render.direct import OffFace, cast
 from scenes.render.scene import LitScene, lit_scene, load_mitsuba
-from scenes.render.view import PathWork, gather_in_pixels, range_change_m, range_noise_m, render_view
+from scenes.render.view import (
+    PathWork,
+    gather_in_pixels,
+    range_change_m,
+    range_noise_m,
+    render_view,
+)
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import Target, build_target
 from scenes.target.thesis import ThesisTargetConfig
@@ -38,17 +46,21 @@ SIDE = 32
 LONGEST = 24
 """Reflections of the reference's paths; those of experiments have RenderConfig's."""
 FACE_TIMES = 8
-"""Paths of the reference on the face for one in a hole: they leave the scene soon, and the error is small."""
+"""Paths of the reference on the face for one in a hole: they leave the scene soon, and the error
+is small."""
 AMPLITUDE_GATE = 0.03
-"""Of a plane of albedo 1 at 1 m: 35 electrons of the Azure Kinect's 1168, above the noise of one frame."""
+"""Of a plane of albedo 1 at 1 m: 35 electrons of the Azure Kinect's 1168, above the noise of one
+frame."""
 FILTER_PIXELS = 25
-"""Pixels under the camera's 5 x 5 window, if its weights were all equal: more than mitransient can be credited with."""
+"""Pixels under the camera's 5 x 5 window, if its weights were all equal: more than mitransient can
+be credited with."""
 
 
 @dataclass(frozen=True)
 class Error:
-    """Error of range over some pixels against the reference, mm: root mean square with the reference's own noise taken
-    off, mean with its standard error, and what the render itself told of its noise."""
+    """Error of range over some pixels against the reference, mm: root mean square with the
+    reference's own noise taken off, mean with its standard error, and what the render itself told
+    of its noise."""
 
     title: str
     pixels: int
@@ -82,17 +94,22 @@ def rendered(facts: dict[str, Any], *, holes: bool = True) -> Scene:
     """The thesis target rendered twice; the second, with warm kernels, counts."""
     declared = ThesisTargetConfig.from_data({"name": "thesis", **facts}).declare()
     target = build_target(declared if holes else declared.hole_free())
-    optics, config = load_camera("azure_kinect_nfov").optics, RenderConfig()
+    optics = load_camera("azure_kinect_nfov").optics
+    config = RenderConfig()
     render_view(target, optics, config)
     (view, cpu_s), wall_s = _timed(lambda: _cpu(lambda: render_view(target, optics, config)))
-    return Scene(target, optics, lit_scene(load_mitsuba(), target.parts, optics), view, wall_s, cpu_s)
+    return Scene(
+        target, optics, lit_scene(load_mitsuba(), target.parts, optics), view, wall_s, cpu_s
+    )
 
 
 def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) -> Error:
-    """The render against the reference over (at most so many, evenly picked) pixels of a mask (h, w)."""
+    """The render against the reference over (at most so many, evenly picked) pixels of a mask (h,
+    w)."""
     rows, cols = np.nonzero(here)
     picked = slice(None, None, max(len(rows) // most, 1))
-    rows, cols = rows[picked], cols[picked]
+    rows = rows[picked]
+    cols = cols[picked]
     frequencies = scene.optics.frequencies_hz
     footprint = Quadrilaterals(scene.optics.lens, scene.view.region)
     slopes = footprint.slopes(rows, cols, footprint.grid(SIDE))
@@ -100,11 +117,15 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
     turned = hits.amplitude * np.exp(1j * wave_numbers(frequencies)[:, None] * hits.path_m)
     direct = turned.reshape(len(frequencies), -1, SIDE**2).mean(axis=-1)
     count = np.full(len(rows), SIDE**2)
-    rays = OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
+    rays = OffFace(
+        np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32)
+    )
     light = gather_in_pixels(scene.lit, rays, PathWork(frequencies, LONGEST, seed=777), paths)
     total = direct + light.mean(axis=0, dtype=complex)[:-1]
     reference_m = range_noise_m(light[:, :-1], total, frequencies)
-    error_m = range_change_m(scene.view.phasor[:, rows, cols].astype(complex) - total, total, frequencies)
+    error_m = range_change_m(
+        scene.view.phasor[:, rows, cols].astype(complex) - total, total, frequencies
+    )
     rms_m = np.sqrt(max((error_m**2).mean() - (reference_m**2).mean(), 0.0))
     return Error(
         title=title,
@@ -120,16 +141,25 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
 def in_holes(scene: Scene) -> np.ndarray:
     """(h, w): pixels whose central ray goes through a hole's mouth."""
     rays = np.concatenate([scene.view.slopes, np.ones((*scene.view.slopes.shape[:2], 1))], axis=-1)
-    normal, middle = scene.target.T_camera_board[:3, 2], scene.target.T_camera_board[:3, 3]
+    normal = scene.target.T_camera_board[:3, 2]
+    middle = scene.target.T_camera_board[:3, 3]
     on_plane = rays * ((middle @ normal) / (rays @ normal))[..., None]
-    apart = [np.linalg.norm(on_plane - hole.centre_camera_m, axis=-1) for hole in scene.target.truth]
-    return np.any([far < hole.diameter_m / 2 for far, hole in zip(apart, scene.target.truth, strict=True)], axis=0)
+    apart = [
+        np.linalg.norm(on_plane - hole.centre_camera_m, axis=-1) for hole in scene.target.truth
+    ]
+    return np.any(
+        [far < hole.diameter_m / 2 for far, hole in zip(apart, scene.target.truth, strict=True)],
+        axis=0,
+    )
 
 
 def face_parts(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Masks (h, w) of a hole-free board: whole pixels of one surface, pixels at edges of tape, pixels on its rim."""
+    """Masks (h, w) of a hole-free board: whole pixels of one surface, pixels at edges of tape,
+    pixels on its rim."""
     names = scene.view.surface_names
-    board = np.isin(scene.view.surface, [k for k, name in enumerate(names) if name == "board" or "tape" in name])
+    board = np.isin(
+        scene.view.surface, [k for k, name in enumerate(names) if name == "board" or "tape" in name]
+    )
     whole = scene.view.coverage == 1
     inner = ndimage.binary_erosion(board, np.ones((3, 3), bool), iterations=2)
     return board & whole & inner, board & ~whole & inner, board & ~inner
@@ -137,7 +167,8 @@ def face_parts(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Rival:
-    """mitransient on the same board: noise of range of a pixel at ``paths`` each, and what that took."""
+    """mitransient on the same board: noise of range of a pixel at ``paths`` each, and what that
+    took."""
 
     paths: int
     noise_mm: float
@@ -146,10 +177,12 @@ class Rival:
 
 
 def rival(scene: Scene, paths: int, runs: int = 8) -> Rival:
-    """Spread of mitransient's range over seeds, on whole pixels of the board, by a lens as wide as the region."""
+    """Spread of mitransient's range over seeds, on whole pixels of the board, by a lens as wide as
+    the region."""
     from transport_oracle import oracle
 
-    view, lens = scene.view, scene.optics.lens
+    view = scene.view
+    lens = scene.optics.lens
     h, w = view.range_m.shape
     narrow = Lens(w, h, lens.fx, lens.fx, (w - 1) / 2, (h - 1) / 2)
     optics = replace(scene.optics, lens=narrow)
@@ -162,10 +195,17 @@ def rival(scene: Scene, paths: int, runs: int = 8) -> Rival:
         (phasors, cpu_s), wall_s = _timed(
             lambda: _cpu(lambda: np.stack([other.phasors(paths, s, bounces) for s in seeds]))
         )
-    middle = phasors[:, :, h // 4 : -h // 4, w // 8 : -w // 8].reshape(runs, len(optics.frequencies_hz), -1)
+    middle = phasors[:, :, h // 4 : -h // 4, w // 8 : -w // 8].reshape(
+        runs, len(optics.frequencies_hz), -1
+    )
     mean = middle.mean(axis=0)
     spread_m = range_change_m(middle - mean, mean, optics.frequencies_hz)
-    return Rival(paths, float(np.sqrt((spread_m**2).sum(axis=0).mean() / (runs - 1))) / MM, cpu_s / runs, wall_s / runs)
+    return Rival(
+        paths,
+        float(np.sqrt((spread_m**2).sum(axis=0).mean() / (runs - 1))) / MM,
+        cpu_s / runs,
+        wall_s / runs,
+    )
 
 
 def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -182,7 +222,10 @@ def errors(free: Scene, holed: dict[str, Scene], paths: int, most: int) -> list[
     """The table of errors: parts of the hole-free face, then the holes of each kind."""
     titles = ("face, whole pixels", "face, edges of tape", "face, outermost pixels")
     many = FACE_TIMES * paths
-    rows = [compared(free, title, here, many, most) for title, here in zip(titles, face_parts(free), strict=True)]
+    rows = [
+        compared(free, title, here, many, most)
+        for title, here in zip(titles, face_parts(free), strict=True)
+    ]
     for title, scene in holed.items():
         inside = in_holes(scene)
         lit = inside & (np.abs(scene.view.phasor).mean(axis=0) > AMPLITUDE_GATE)
@@ -194,7 +237,9 @@ def errors(free: Scene, holed: dict[str, Scene], paths: int, most: int) -> list[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "--paths",
         type=int,
@@ -211,21 +256,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "backing at 20 mm": rendered({}),
         "backing at 50 mm": rendered({"backing_distance_mm": 50.0}),
     }
-    print("| where | pixels | error, mm rms | mean error, mm | reported noise, mm | reference's noise, mm |")
+    print(
+        "| where | pixels | error, mm rms | mean error, mm | reported noise, mm | reference's noise, mm |"
+    )
     print("|---|---|---|---|---|---|")
     table = errors(free, holed, options.paths, options.pixels)
     print("\n".join(row.row() for row in table))
     print("\n| view | seconds | processor seconds |\n|---|---|---|")
     for title, scene in {"hole-free": free, **holed}.items():
         print(f"| {title} | {scene.wall_s:.2f} | {scene.cpu_s:.2f} |")
-    other, ours_mm = rival(free, options.rival_paths), table[0].rms_mm
+    other = rival(free, options.rival_paths)
+    ours_mm = table[0].rms_mm
     needed = other.paths * (other.noise_mm / ours_mm) ** 2
     cpu_s = other.cpu_s * needed / other.paths
-    print(f"\nmitransient: {other.paths} paths a pixel leave {other.noise_mm:.3f} mm in {other.cpu_s:.2f} processor s")
+    print(
+        f"\nmitransient: {other.paths} paths a pixel leave {other.noise_mm:.3f} mm in {other.cpu_s:.2f} processor s"
+    )
     print(
         f"({other.wall_s:.2f} s); our {ours_mm:.4f} mm would take {needed:.3g} paths, {cpu_s:.3g} processor s by 1/n:"
     )
-    print(f"{cpu_s / free.cpu_s:.0f} times ours, {cpu_s / free.cpu_s / FILTER_PIXELS:.0f} with the filter credited.")
+    print(
+        f"{cpu_s / free.cpu_s:.0f} times ours, {cpu_s / free.cpu_s / FILTER_PIXELS:.0f} with the filter credited."
+    )
     return 0
 
 

@@ -1,9 +1,10 @@
-"""Light transport by mitransient (Royo, Crespo and Garcia-Sierra: transient rendering for Mitsuba 3), as an oracle.
+"""Light transport by mitransient (Royo, Crespo and Garcia-Sierra: transient rendering for Mitsuba
+3), as an oracle.
 
-Its ``transient_path`` walks the same meshes with its own path tracer, its own emitters and its own films: one that sums
-phasors, and one that keeps a time histogram. What is ours here is a list of frequencies in place of the former's
-contiguous ones, the Fourier sum over the latter, and the way from the lens to the near clip plane, on which a
-perspective camera's rays start.
+Its ``transient_path`` walks the same meshes with its own path tracer, its own emitters and its own
+films: one that sums phasors, and one that keeps a time histogram. What is ours here is a list of
+frequencies in place of the former's contiguous ones, the Fourier sum over the latter, and the way
+from the lens to the near clip plane, on which a perspective camera's rays start.
 """
 
 from __future__ import annotations
@@ -19,17 +20,20 @@ from scenes.render.scene import LitScene
 from scenes.target.mesh import TargetPart
 
 NEAR_CLIP_M = 1e-3
-BINS, BIN_M = 3_000, 4e-3
-"""The histogram's: 12 m of path. A bin is 0.017 rad at 198 MHz, so the place of a path within it matters: a mean over a
-hundred pixels errs by 5e-4 rad, alike in all runs unless their bins start at different places."""
+BINS = 3_000
+BIN_M = 4e-3
+"""The histogram's: 12 m of path. A bin is 0.017 rad at 198 MHz, so the place of a path within it
+matters: a mean over a hundred pixels errs by 5e-4 rad, alike in all runs unless their bins start
+at different places."""
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """mitransient's view of a scene by a lens without distortion and with its centre in the middle.
+    """mitransient's view of a scene by a lens without distortion and with its centre in the
+    middle.
 
-    The emitter is isotropic where the optics' cone is all directions, else a spot whose edge falls linearly in the
-    angle (ours: in its cosine).
+    The emitter is isotropic where the optics' cone is all directions, else a spot whose edge falls
+    linearly in the angle (ours: in its cosine).
     """
 
     mi: Any
@@ -39,7 +43,8 @@ class Oracle:
     _histogram_from_m: float | None
 
     def phasors(self, paths: int, seed: int, bounces: int) -> np.ndarray:
-        """(f, h, w) phasors of all light, in the units and with the sign of `scenes.optics`, from ``paths`` a pixel."""
+        """(f, h, w) phasors of all light, in the units and with the sign of `scenes.optics`, from
+        ``paths`` a pixel."""
         import drjit as dr
 
         integrator = self.mi.load_dict(
@@ -64,7 +69,8 @@ class Oracle:
         return np.moveaxis(values, -1, 0) * np.exp(1j * wave[:, None, None] * clipped_m)
 
     def _transformed(self, histogram: np.ndarray) -> np.ndarray:
-        """(h, w, f): the histogram (h, w, BINS) of path lengths as phasors; light is spread evenly over its bin."""
+        """(h, w, f): the histogram (h, w, BINS) of path lengths as phasors; light is spread evenly
+        over its bin."""
         wave = 2 * np.pi * np.array(self._frequencies) / SPEED_OF_LIGHT_AIR
         middle_m = self._histogram_from_m + (np.arange(BINS) + 0.5) * BIN_M
         turned = np.exp(1j * middle_m[:, None] * wave) * np.sinc(wave * BIN_M / (2 * np.pi))
@@ -72,16 +78,22 @@ class Oracle:
 
 
 def oracle(
-    lit: LitScene, optics: Optics, frequencies_hz: tuple[float, ...], *, histogram_from_m: float | None = None
+    lit: LitScene,
+    optics: Optics,
+    frequencies_hz: tuple[float, ...],
+    *,
+    histogram_from_m: float | None = None,
 ) -> Oracle:
-    """An oracle for a scene that stands in Mitsuba already, by its phasor film or by a histogram of path lengths.
+    """An oracle for a scene that stands in Mitsuba already, by its phasor film or by a histogram
+    of path lengths.
 
     Raises ImportError where mitransient is not installed.
     """
     import mitransient  # type: ignore[import-untyped]  # registers its plugins
     from mitransient.utils import ArrayXf  # type: ignore[import-untyped]
 
-    mi, lens = lit.mi, optics.lens
+    mi = lit.mi
+    lens = optics.lens
     assert mitransient.__name__
     assert not any(lens.distortion)
     assert (lens.cx, lens.cy) == ((lens.width - 1) / 2, (lens.height - 1) / 2)
@@ -112,7 +124,9 @@ def oracle(
         "sampler": {"type": "independent"},
     }
     shapes = {f"shape_{k}": _mesh(mi, part) for k, part in enumerate(lit.parts)}
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes}
+    )
     return Oracle(mi, optics, scene, frequencies_hz, histogram_from_m)
 
 
@@ -122,11 +136,15 @@ def _mesh(mi: Any, part: TargetPart) -> Any:
     if part.texture_850 is not None:
         bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
         reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
-    properties, textured = mi.Properties(), part.uv is not None
+    properties = mi.Properties()
+    textured = part.uv is not None
     material = {"type": "diffuse", "reflectance": reflectance}
     properties["material"] = mi.load_dict({"type": "twosided", "material": material})
-    vertices, faces = np.asarray(part.mesh.vertices, np.float32), np.asarray(part.mesh.faces, np.uint32)
-    mesh = mi.Mesh(part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties)
+    vertices = np.asarray(part.mesh.vertices, np.float32)
+    faces = np.asarray(part.mesh.faces, np.uint32)
+    mesh = mi.Mesh(
+        part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties
+    )
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
     if part.uv is not None:

@@ -1,10 +1,12 @@
-"""How often a new unit of the camera keeps to the limit over units: ``python tests/validation/units_coverage.py``.
+"""How often a new unit of the camera keeps to the limit over units: ``python
+tests/validation/units_coverage.py``.
 
-Each study has boards of eight holes with diameters uniform over 2 to 8 mm, all inspected by the same units. A hole is
-found where ln a plus what is its own (normal, shared by all units) plus noise exceeds the unit's ln a50, normal about
-that of 4 mm with the spread stated. Hits of two units correlate as on simulated boards: 0.82 of the variance is
-the hole's. Coverage is the share of new units whose a90 lies below the limit, by the normal distribution of units,
-averaged over studies; nominal 95 %. "one unit": the same for a90/95 of one unit alone.
+Each study has boards of eight holes with diameters uniform over 2 to 8 mm, all inspected by the
+same units. A hole is found where ln a plus what is its own (normal, shared by all units) plus
+noise exceeds the unit's ln a50, normal about that of 4 mm with the spread stated. Hits of two
+units correlate as on simulated boards: 0.82 of the variance is the hole's. Coverage is the share
+of new units whose a90 lies below the limit, by the normal distribution of units, averaged over
+studies; nominal 95 %. "one unit": the same for a90/95 of one unit alone.
 """
 
 from __future__ import annotations
@@ -23,13 +25,20 @@ from scipy.stats import norm
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.units import over_units
 
-A50_MM, WIDTH, OF_HOLE = 4.0, 0.116, 0.82
-"""``WIDTH``: standard deviation of what is the hole's and of noise together, on the scale of ln a: a90 is 4.64 mm."""
-SIZES_MM, HOLES = (2.0, 8.0), 8
+A50_MM = 4.0
+WIDTH = 0.116
+OF_HOLE = 0.82
+"""``WIDTH``: standard deviation of what is the hole's and of noise together, on the scale of ln a:
+a90 is 4.64 mm."""
+SIZES_MM = (2.0, 8.0)
+HOLES = 8
 
 
-def coverage(units: int, boards: int, spread: float, studies: int, seed: int) -> tuple[float, float, float, float]:
-    """Return the coverage of the limit over units and of that of one unit, and the medians of both in mm."""
+def coverage(
+    units: int, boards: int, spread: float, studies: int, seed: int
+) -> tuple[float, float, float, float]:
+    """Return the coverage of the limit over units and of that of one unit, and the medians of both
+    in mm."""
     rng = np.random.default_rng([seed, units, boards, round(1e4 * spread)])
     ln_a90 = np.log(A50_MM) + norm.ppf(0.9) * WIDTH
     found = []
@@ -39,7 +48,8 @@ def coverage(units: int, boards: int, spread: float, studies: int, seed: int) ->
         unit = np.repeat(np.arange(units), boards * HOLES)
         ln_a50 = (np.log(A50_MM) + spread * rng.standard_normal(units))[unit]
         noise = WIDTH * np.sqrt(1 - OF_HOLE) * rng.standard_normal(len(unit))
-        hit, target = np.log(size_mm) + own + noise > ln_a50, np.tile(np.arange(boards * HOLES), units)
+        hit = np.log(size_mm) + own + noise > ln_a50
+        target = np.tile(np.arange(boards * HOLES), units)
         fit = fit_hit_miss(size_mm, hit, link="probit", log_size=True, inspections=target)
         limits = over_units(size_mm, hit, target, unit, fit.curve, bound(fit))
         found.append((limits.new_unit.value, limits.a90_95_mm[0]))
@@ -52,7 +62,9 @@ def coverage(units: int, boards: int, spread: float, studies: int, seed: int) ->
 
 def main(arguments: list[str] | None = None) -> int:
     """Print one line a setting."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--studies", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)

@@ -1,1 +1,2 @@
-"""Probability of detection by the field's standard (MIL-HDBK-1823A): pure statistics of any inspection data."""
+"""Probability of detection by the field's standard (MIL-HDBK-1823A): pure statistics of any
+inspection data."""

@@ -1,9 +1,11 @@
-"""A probability of detection curve, its four links, and the likelihood of hits and misses under them.
+"""A probability of detection curve, its four links, and the likelihood of hits and misses under
+them.
 
-POD(a) = F((x - mu) / sigma), x = a or ln a. So mu is the 50 % size for logit and probit only; sigma is the width. For
-all links, ln F and ln(1 - F) are concave, so the likelihood has one maximum if hits and misses overlap; if they do not,
-Firth's penalty makes the estimate finite. Sources: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 4.3;
-Firth, Biometrika 80 (1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
+POD(a) = F((x - mu) / sigma), x = a or ln a. So mu is the 50 % size for logit and probit only;
+sigma is the width. For all links, ln F and ln(1 - F) are concave, so the likelihood has one
+maximum if hits and misses overlap; if they do not, Firth's penalty makes the estimate finite.
+Sources: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 4.3; Firth, Biometrika 80
+(1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
 
 from __future__ import annotations
 
@@ -15,20 +17,26 @@ import numpy as np
 from scipy import optimize, special
 
 LARGEST_PREDICTOR = 500.0
-"""Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does not overflow."""
+"""Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does
+not overflow."""
 
-_F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
+_F_AND_INVERSE: dict[
+    str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]
+] = {
     "logit": (special.expit, special.logit),
     "probit": (special.ndtr, special.ndtri),
     "cloglog": (lambda t: -np.expm1(-np.exp(t)), lambda p: np.log(-np.log1p(-p))),
     "loglog": (lambda t: np.exp(-np.exp(-t)), lambda p: -np.log(-np.log(p))),
 }
 LINKS = tuple(_F_AND_INVERSE)
-CELLS = 2**17  # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
+CELLS = (
+    2**17
+)  # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
-    """Return F(t) for one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t)) (loglog)."""
+    """Return F(t) for one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t))
+    (loglog)."""
     with np.errstate(over="ignore"):
         return np.asarray(_F_AND_INVERSE[link][0](np.asarray(t, float)))
 
@@ -39,34 +47,49 @@ def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
 
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in both tails."""
-    t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)  # `np.clip` takes five times as long
+    """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in
+    both tails."""
+    t = np.minimum(
+        np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR
+    )  # `np.clip` takes five times as long
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
-        log_hit, log_miss = np.minimum(t, 0.0) - tail, np.minimum(-t, 0.0) - tail
+        log_hit = np.minimum(t, 0.0) - tail
+        log_miss = np.minimum(-t, 0.0) - tail
         return log_hit, log_miss, log_hit + log_miss
     if link == "probit":
         return special.log_ndtr(t), special.log_ndtr(-t), -0.5 * t * t - 0.5 * np.log(2.0 * np.pi)
     signed = t if link == "cloglog" else -t
     hazard = np.exp(signed)
-    log_none, log_any = -hazard, np.log(-np.expm1(-hazard))
-    return (log_any, log_none, signed - hazard) if link == "cloglog" else (log_none, log_any, signed - hazard)
+    log_none = -hazard
+    log_any = np.log(-np.expm1(-hazard))
+    return (
+        (log_any, log_none, signed - hazard)
+        if link == "cloglog"
+        else (log_none, log_any, signed - hazard)
+    )
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of the predictor's shape."""
     t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)
     if link == "logit":  # the most common link: the ratios are the probabilities themselves
-        hit, miss = special.expit(t), special.expit(-t)
+        hit = special.expit(t)
+        miss = special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
-    bend = {"probit": lambda: -t, "cloglog": lambda: 1.0 - np.exp(t), "loglog": lambda: np.exp(-t) - 1.0}[link]()
+    bend = {
+        "probit": lambda: -t,
+        "cloglog": lambda: 1.0 - np.exp(t),
+        "loglog": lambda: np.exp(-t) - 1.0,
+    }[link]()
     return np.exp(log_density - log_hit), np.exp(log_density - log_miss), bend
 
 
 @dataclass(frozen=True)
 class PodCurve:
-    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``: (2, 2)."""
+    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``:
+    (2, 2)."""
 
     link: str
     log_size: bool
@@ -87,7 +110,8 @@ class PodCurve:
 
 @dataclass(frozen=True)
 class Bound:
-    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why`` gives the reason."""
+    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why``
+    gives the reason."""
 
     pod: float
     confidence: float
@@ -101,8 +125,10 @@ class Bound:
         return bool(np.isfinite(self.value))
 
 
-STEPS, PLAIN_STEPS = 200, 12
-"""Most steps, with halvings, of a problem; number of plain Newton steps before: five or six usually suffice."""
+STEPS = 200
+PLAIN_STEPS = 12
+"""Most steps, with halvings, of a problem; number of plain Newton steps before: five or six
+usually suffice."""
 TOLERANCE = 1e-7  # a search ends with a smaller step: every Newton step squares the error
 CLIMBED = 6  # number of steep starts that are tried in the search for a penalised maximum
 PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
@@ -111,9 +137,10 @@ PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
 
 @dataclass(frozen=True, eq=False)
 class HitsAndMisses:
-    """Hits and misses of one or several (d) studies on the same rows. ``design`` (n, p): columns of the predictor.
-    ``hits``, ``misses``: (n,) or (d, n) counts. ``penalty`` (a number, or (d,)): multiple of Jeffreys' prior, with p =
-    2 only: None for no penalty, 1 for Firth's, k if every target has k rows."""
+    """Hits and misses of one or several (d) studies on the same rows. ``design`` (n, p): columns
+    of the predictor. ``hits``, ``misses``: (n,) or (d, n) counts. ``penalty`` (a number, or (d,)):
+    multiple of Jeffreys' prior, with p = 2 only: None for no penalty, 1 for Firth's, k if every
+    target has k rows."""
 
     design: np.ndarray
     hits: np.ndarray
@@ -128,48 +155,70 @@ class HitsAndMisses:
         return np.asarray(self.design[:, 1])
 
     def value(self, b: np.ndarray) -> np.ndarray:
-        """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several studies (d,) at (d, p)."""
+        """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several
+        studies (d,) at (d, p)."""
         found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
         value = (self.hits * found + self.misses * missed).sum(axis=-1)
         if self.penalty is not None:
             weight = (self.hits + self.misses) * np.exp(2.0 * density - logs[0] - logs[1])
-            total, cross, square = weight.sum(-1), weight @ self.z, weight @ self.z**2
+            total = weight.sum(-1)
+            cross = weight @ self.z
+            square = weight @ self.z**2
             with np.errstate(divide="ignore", invalid="ignore"):
                 prior = 0.5 * (np.log(total) + np.log(np.maximum(square - cross**2 / total, 0.0)))
             value = value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf)
         return np.asarray(value)
 
     def step(self, b: np.ndarray) -> np.ndarray:
-        """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps. They are meaningless
-        if the information is singular, in studies that diverge to infinity."""
+        """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps.
+        They are meaningless if the information is singular, in studies that diverge to infinity.
+        """
         up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
         slope = self.hits * up - self.misses * down
         with np.errstate(all="ignore"):
             if self.penalty is not None:
-                z, weight = self.z, (self.hits + self.misses) * up * down
-                total, cross, square = weight.sum(axis=1), weight @ z, weight @ z**2
+                z = self.z
+                weight = (self.hits + self.misses) * up * down
+                total = weight.sum(axis=1)
+                cross = weight @ z
+                square = weight @ z**2
                 determinant = total * (square - cross**2 / total)
-                leverage = weight * (square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2)
+                leverage = weight * (
+                    square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2
+                )
                 leverage /= determinant[:, None]
-                slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (2.0 * bend - up + down)
-                first, second = slope.sum(axis=1), slope @ z
-                along = np.stack([square * first - cross * second, total * second - cross * first], axis=1)
+                slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (
+                    2.0 * bend - up + down
+                )
+                first = slope.sum(axis=1)
+                second = slope @ z
+                along = np.stack(
+                    [square * first - cross * second, total * second - cross * first], axis=1
+                )
                 return np.asarray(along / determinant[:, None])
             if self.link == "logit":  # the same in fewer operations
                 weight = (self.hits + self.misses) * up * down
             else:
-                weight = self.hits * up * np.maximum(up - bend, 0.0) + self.misses * down * np.maximum(down + bend, 0.0)
+                weight = self.hits * up * np.maximum(
+                    up - bend, 0.0
+                ) + self.misses * down * np.maximum(down + bend, 0.0)
             p = self.design.shape[1]
             if p == 1:
                 return np.asarray((slope @ self.design) / (weight @ self.design**2))
             products = (self.design[:, :, None] * self.design[:, None, :]).reshape(-1, p * p)
             information = (weight @ products).reshape(-1, p, p)
-            ridge = (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(p)
-            return np.asarray(np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0])
+            ridge = (
+                1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-300
+            ) * np.eye(p)
+            return np.asarray(
+                np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0]
+            )
 
     def of(self, rows: np.ndarray) -> HitsAndMisses:
         """Return the studies ``rows``."""
-        penalty = None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
+        penalty = (
+            None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
+        )
         return replace(self, hits=self.hits[rows], misses=self.misses[rows], penalty=penalty)
 
     def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,12 +233,16 @@ def ascend(
     start: np.ndarray,
     tolerance: float = TOLERANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Climb from ``start`` (d, p) to maxima (d, p) and their values (d,), by ``value_and_step(places (k, p), which
-    (k,))``. A step that lowers the value is halved. A problem without a maximum ends at its last step."""
-    place, moving = start.copy(), np.arange(len(start))
+    """Climb from ``start`` (d, p) to maxima (d, p) and their values (d,), by
+    ``value_and_step(places (k, p), which (k,))``. A step that lowers the value is halved. A
+    problem without a maximum ends at its last step."""
+    place = start.copy()
+    moving = np.arange(len(start))
     best, step = value_and_step(place, moving)
     for _ in range(STEPS):
-        moving = moving[np.abs(step[moving]).max(axis=1) > tolerance * (1.0 + np.abs(place[moving]).max(axis=1))]
+        moving = moving[
+            np.abs(step[moving]).max(axis=1) > tolerance * (1.0 + np.abs(place[moving]).max(axis=1))
+        ]
         if not len(moving):
             break
         trial = place[moving] + step[moving]
@@ -203,10 +256,11 @@ def ascend(
 
 
 def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Return the coefficients (d, p) with the largest likelihood of several studies, from ``start`` (p,); without a
-    penalty. If hits and misses of a study do not overlap, its coefficients are those of the last step. Plain Newton
-    steps need no values and nearly always reach the maximum. The other studies are searched again, and so are those
-    that end lower than they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
+    """Return the coefficients (d, p) with the largest likelihood of several studies, from
+    ``start`` (p,); without a penalty. If hits and misses of a study do not overlap, its
+    coefficients are those of the last step. Plain Newton steps need no values and nearly always
+    reach the maximum. The other studies are searched again, and so are those that end lower than
+    they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
     place = np.tile(np.asarray(start, float), (len(data.hits), 1))
     moving = np.arange(len(place))
     for _ in range(PLAIN_STEPS):
@@ -224,50 +278,73 @@ def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE)
 
 
 def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several studies; they are finite
-    for separated data too. Logit and probit have one maximum. For cloglog and loglog, the highest of those is returned
-    that are reached from a flat start, the gap between largest miss and smallest hit, and the best `CLIMBED` others."""
-    z, hits = data.z, data.hits
+    """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several
+    studies; they are finite for separated data too. Logit and probit have one maximum. For cloglog
+    and loglog, the highest of those is returned that are reached from a flat start, the gap
+    between largest miss and smallest hit, and the best `CLIMBED` others."""
+    z = data.z
+    hits = data.hits
     below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
     gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
-    # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several widths through
-    # both its ends and its middle.
+    # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several
+    # widths through both its ends and its middle.
     widths = [(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)]
-    widths += [(np.full_like(gap, slope), share) for slope in np.geomspace(1.5, 150.0, 9) for share in (0.0, 0.5, 1.0)]
-    steep = np.array([np.stack([-slope * (below + share * gap), slope], axis=1) for slope, share in widths])
+    widths += [
+        (np.full_like(gap, slope), share)
+        for slope in np.geomspace(1.5, 150.0, 9)
+        for share in (0.0, 0.5, 1.0)
+    ]
+    steep = np.array(
+        [np.stack([-slope * (below + share * gap), slope], axis=1) for slope, share in widths]
+    )
     if data.link in ("logit", "probit"):
         return ascend(data.climb, steep[0], tolerance)[0]
     share = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
     flat = np.stack([link_ppf(data.link, share), np.ones(len(hits))], axis=1)
     rows = np.arange(len(hits))
-    # the start with the highest value can lie in the basin of a lower maximum, so several of the best are climbed
+    # the start with the highest value can lie in the basin of a lower maximum, so several of the
+    # best are climbed
     order = np.argsort([-data.value(start) for start in steep], axis=0, kind="stable")
     starts = (flat, steep[0], *(steep[k, rows] for k in order[:CLIMBED]))
     places, values = zip(*(ascend(data.climb, start, tolerance) for start in starts), strict=True)
     return np.asarray(np.array(places)[np.argmax(values, axis=0), rows])
 
 
-def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) -> tuple[float, float]:
-    """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is
-    ``level`` at ``z0``, and the slope there. ``slope``: start of the search, such as that of a neighbour."""
+def profile(
+    data: HitsAndMisses, z0: float, level: float, slope: float = 1.0
+) -> tuple[float, float]:
+    """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0)
+    whose predictor is ``level`` at ``z0``, and the slope there. ``slope``: start of the search,
+    such as that of a neighbour."""
     if data.penalty is not None:  # concavity is not proved, so the search begins with a grid
 
         def rising(s: np.ndarray) -> np.ndarray:
             return data.value(np.stack([level - np.exp(s) * z0, np.exp(s)], axis=-1))
 
-        return max(_largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))), slope
-    line = replace(data, design=data.z[:, None] - z0, offset=level, hits=data.hits[None], misses=data.misses[None])
-    # far out, only slopes near that of the line through the mean probability have a likelihood that is not tiny
+        return max(
+            _largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))
+        ), slope
+    line = replace(
+        data,
+        design=data.z[:, None] - z0,
+        offset=level,
+        hits=data.hits[None],
+        misses=data.misses[None],
+    )
+    # far out, only slopes near that of the line through the mean probability have a likelihood
+    # that is not tiny
     rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
     starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
-    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5)
+    best, _ = ascend(
+        line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5
+    )
     best = np.maximum(best, 0.0)
     return float(line.value(best)[0]), float(best[0, 0])
 
 
 def flat_maximum(data: HitsAndMisses, highest: float) -> float:
-    """Return the largest (penalised) log-likelihood of one study's flat curves, with a predictor of at most
-    ``highest``: the limit of `profile` as ``z0`` grows to infinity."""
+    """Return the largest (penalised) log-likelihood of one study's flat curves, with a predictor
+    of at most ``highest``: the limit of `profile` as ``z0`` grows to infinity."""
     if data.penalty is None:
         rate = data.hits.sum() / (data.hits + data.misses).sum()
         return float(data.value(np.array([min(highest, float(link_ppf(data.link, rate))), 0.0])))
@@ -277,7 +354,8 @@ def flat_maximum(data: HitsAndMisses, highest: float) -> float:
 
 
 def _largest(function: Callable[[np.ndarray], np.ndarray], grid: np.ndarray) -> float:
-    """Return the largest value of a function of one number, refined around the best point of a grid."""
+    """Return the largest value of a function of one number, refined around the best point of a
+    grid."""
     best = int(np.argmax(function(grid)))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     how: dict[str, Any] = {"bounds": ends, "method": "bounded", "options": {"xatol": 1e-9}}

@@ -1,16 +1,18 @@
-"""Probability of detection from hits and misses: a binomial regression on size, by MIL-HDBK-1823A appendix G.
+"""Probability of detection from hits and misses: a binomial regression on size, by MIL-HDBK-1823A
+appendix G.
 
-Rows with the same identity in ``inspections`` are one target and count as fully dependent, as the handbook has it. With
-k rows per target, the covariance and the criterion of the likelihood ratio are multiplied by k; if k differs between
-targets, rows are weighted so that each target counts once. The bound is one-sided: the largest a90 of all (mu, sigma)
-with 2 (llmax - ll) <= chi2(confidence, 1) = 3.841 (G.3 of the handbook), which equals the profile likelihood of a90 at
-that criterion. Not modelled: targets that differ in anything but size, inspectors, and hits by chance or misses at any
-size, for which `floor_ceiling_tests` tests.
+Rows with the same identity in ``inspections`` are one target and count as fully dependent, as the
+handbook has it. With k rows per target, the covariance and the criterion of the likelihood ratio
+are multiplied by k; if k differs between targets, rows are weighted so that each target counts
+once. The bound is one-sided: the largest a90 of all (mu, sigma) with 2 (llmax - ll) <=
+chi2(confidence, 1) = 3.841 (G.3 of the handbook), which equals the profile likelihood of a90 at
+that criterion. Not modelled: targets that differ in anything but size, inspectors, and hits by
+chance or misses at any size, for which `floor_ceiling_tests` tests.
 
-The bound of a model holds if that model is true. If the data choose among eight models, the bound of the best model
-covers 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So `largest_bound` takes the largest of
-all models that the data hardly distinguish from the best (`near_models`): 95.6 to 99 %
-(``tests/validation/pod_coverage.py``)."""
+The bound of a model holds if that model is true. If the data choose among eight models, the bound
+of the best model covers 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So
+`largest_bound` takes the largest of all models that the data hardly distinguish from the best
+(`near_models`): 95.6 to 99 % (``tests/validation/pod_coverage.py``)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,18 +44,25 @@ from harness.vocabulary.errors import UserError
 Beyond = Literal["floor", "ceiling", "both"]
 METHOD = "likelihood ratio"
 EXACT = 1e-9  # tolerance of the coefficients of a single study
-STEEPEST = 1e3  # largest slope in standardised sizes: a curve that rises within a thousandth of their spread is a step
+# largest slope in standardised sizes: a curve that rises within a thousandth of their spread is a
+# step
+STEEPEST = 1e3
 NEAR_DEVIANCE = 2.0
-"""Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
-best. With equally many parameters, it is a difference of 2 in AIC (Burnham and Anderson 2002, 2.6)."""
-STARTS = 10  # points of a coarse grid from which the search for the maximum with floor or ceiling starts
+"""Largest excess over the least deviance, with one inspection per target, of a model that is
+hardly worse than the best. With equally many parameters, it is a difference of 2 in AIC (Burnham
+and Anderson 2002, 2.6)."""
+STARTS = (
+    # points of a coarse grid from which the search for the maximum with floor or ceiling starts
+    10
+)
 
 
 @dataclass(frozen=True, eq=False)
 class HitMissFit:
-    """A fitted curve, POD = F(b0 + b1 x) with x = size or ln size, and its basis. ``covariance`` (2, 2): of b0 and b1,
-    multiplied by ``repeats`` = n / targets. Deviances count every row, without the penalty of ``method`` "Firth".
-    ``place`` (2,): intercept and slope in z = (x - centre) / spread. ``data``: defines the likelihood."""
+    """A fitted curve, POD = F(b0 + b1 x) with x = size or ln size, and its basis. ``covariance``
+    (2, 2): of b0 and b1, multiplied by ``repeats`` = n / targets. Deviances count every row,
+    without the penalty of ``method`` "Firth". ``place`` (2,): intercept and slope in z = (x -
+    centre) / spread. ``data``: defines the likelihood."""
 
     curve: PodCurve
     b0: float
@@ -76,8 +85,9 @@ class HitMissFit:
 
 @dataclass(frozen=True)
 class FloorCeilingTest:
-    """A test whether POD = floor + (ceiling - floor) F fits better. ``p_value``: from the mixture of chi-squares for a
-    parameter on its boundary. ``floor``, ``ceiling``: maximum likelihood estimates."""
+    """A test whether POD = floor + (ceiling - floor) F fits better. ``p_value``: from the mixture
+    of chi-squares for a parameter on its boundary. ``floor``, ``ceiling``: maximum likelihood
+    estimates."""
 
     beyond: Beyond
     p_value: float
@@ -98,53 +108,88 @@ def fit_hit_miss(
     log_size: bool = False,
     inspections: ArrayLike | None = None,
 ) -> HitMissFit:
-    """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the target of each row. If
-    hits and misses do not overlap, the likelihood has no maximum: Firth's penalised likelihood is used, with a note.
-    Raises `UserError` for values that cannot be fitted and for a POD that does not grow with size."""
+    """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the
+    target of each row. If hits and misses do not overlap, the likelihood has no maximum: Firth's
+    penalised likelihood is used, with a note. Raises `UserError` for values that cannot be fitted
+    and for a POD that does not grow with size."""
     x, hits = _checked(size, hit, link, log_size)
-    n, rows_each = len(x), rows_of_target(x, inspections)
+    n = len(x)
+    rows_each = rows_of_target(x, inspections)
     targets = round(float((1 / rows_each).sum()))
-    repeats, centre, spread = n / targets, float(x.mean()), float(x.std())
+    repeats = n / targets
+    centre = float(x.mean())
+    spread = float(x.std())
     weight = repeats / rows_each  # every target counts the same, however often it was inspected
     rate = float(np.average(hits, weights=weight))
-    # Complete and quasi-complete separation in either direction: Albert and Anderson, Biometrika 71 (1984).
+    # Complete and quasi-complete separation in either direction: Albert and Anderson, Biometrika
+    # 71 (1984).
     separated = bool(x[~hits].max() <= x[hits].min() or x[hits].max() <= x[~hits].min())
     design = np.column_stack([np.ones_like(x), (x - centre) / spread])
-    found, penalty = weight * hits, repeats if separated else None
+    found = weight * hits
+    penalty = repeats if separated else None
     several = HitsAndMisses(design, found[None], (weight - found)[None], link, penalty)
     notes: tuple[str, ...] = ()
     if separated:
         place = penalised_maxima(several, EXACT)[0]
         if x[hits].mean() < x[~hits].mean():
             place[1] = 0.0
-        notes = ("no miss is larger than any hit (separation), so Firth's penalised likelihood is used",)
+        notes = (
+            "no miss is larger than any hit (separation), so Firth's penalised likelihood is used",
+        )
     else:
         place = maxima(several, np.array([float(link_ppf(link, np.array(rate))), 0.0]), EXACT)[0]
     if place[1] <= 0:
         fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
-        raise UserError("the probability of detection does not grow with size: the slope is not positive", fix=fix)
+        raise UserError(
+            "the probability of detection does not grow with size: the slope is not positive",
+            fix=fix,
+        )
     single = HitsAndMisses(design, found, weight - found, link)
     log_likelihood = float(single.value(place))
     unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
     b0, b1 = (float(b) for b in unscale @ place)
     of_hit, of_miss, density = logs_of_link(link, design @ place)
-    information = (design.T * (weight * np.exp(2.0 * density - of_hit - of_miss))) @ design  # expected, of (b0, b1)
+    information = (
+        design.T * (weight * np.exp(2.0 * density - of_hit - of_miss))
+    ) @ design  # expected, of (b0, b1)
     covariance = unscale @ (np.linalg.pinv(information) * repeats) @ unscale.T
-    slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
+    slopes = np.array(
+        [[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]]
+    )  # of mu = -b0 / b1 and sigma = 1 / b1
     if targets < n:
-        notes += (f"{n} inspections of {targets} targets count as {targets} (variance multiplied by {repeats:.4g})",)
+        notes += (
+            f"{n} inspections of {targets} targets count as {targets} (variance multiplied by {repeats:.4g})",
+        )
         if np.ptp(rows_each):
-            notes += (f"{rows_each.min()} to {rows_each.max()} inspections per target: each target counts once",)
+            notes += (
+                f"{rows_each.min()} to {rows_each.max()} inspections per target: each target counts once",
+            )
     curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T)
     null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
-    numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
+    numbers = (
+        b0,
+        b1,
+        covariance,
+        -2.0 * log_likelihood,
+        null,
+        log_likelihood,
+        n,
+        int(hits.sum()),
+        targets,
+        repeats,
+    )
     method: Literal["ML", "Firth"] = "Firth" if separated else "ML"
-    return HitMissFit(curve, *numbers, method, notes, centre, spread, place, replace(single, penalty=penalty))
+    return HitMissFit(
+        curve, *numbers, method, notes, centre, spread, place, replace(single, penalty=penalty)
+    )
 
 
-def choose_model(size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | None = None) -> tuple[HitMissFit, ...]:
-    """Fit every link with a and, if all sizes are positive, with ln a; least deviance first. The order does not depend
-    on the limits: a model chosen because its limit is small has no coverage."""
+def choose_model(
+    size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | None = None
+) -> tuple[HitMissFit, ...]:
+    """Fit every link with a and, if all sizes are positive, with ln a; least deviance first. The
+    order does not depend on the limits: a model chosen because its limit is small has no coverage.
+    """
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
     fit = partial(fit_hit_miss, size, hit, inspections=inspections)
     fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, LINKS)]
@@ -152,24 +197,28 @@ def choose_model(size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | No
 
 
 def near_models(fits: Sequence[HitMissFit]) -> tuple[HitMissFit, ...]:
-    """Return the fits of the same hits whose deviance is within `NEAR_DEVIANCE` of the least, in the same order."""
+    """Return the fits of the same hits whose deviance is within `NEAR_DEVIANCE` of the least, in
+    the same order."""
     least = min(fit.deviance for fit in fits)
     return tuple(fit for fit in fits if fit.deviance <= least + NEAR_DEVIANCE * fit.repeats)
 
 
 def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
-    """Test three or four parameters against the two of ``fit`` by the likelihood ratio. A floor of 0 and a ceiling of 1
-    lie on the boundary: the distribution is 1/2 chi2(0) + 1/2 chi2(1) for either, and 1/4, 1/2, 1/4 of chi2(0),
-    chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, without their correlation). No test
-    of separated data."""
-    tests, sides = [], (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
+    """Test three or four parameters against the two of ``fit`` by the likelihood ratio. A floor of
+    0 and a ceiling of 1 lie on the boundary: the distribution is 1/2 chi2(0) + 1/2 chi2(1) for
+    either, and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for both (Self and Liang, JASA 82
+    (1987), 605, cases 5 and 7, without their correlation). No test of separated data."""
+    tests = []
+    sides = (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
     cases: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
     for beyond, floor, ceiling in cases if fit.method == "ML" else ():
         place, value = _search(fit.data, np.append(fit.place, [0.0, 1.0]), floor, ceiling)
         statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
         p_one, p_two = stats.chi2.sf(statistic, [1, 2])
         tail = 0.5 * p_one if beyond != "both" else 0.5 * p_one + 0.25 * p_two
-        tests.append(FloorCeilingTest(beyond, float(tail) if statistic > 1e-9 else 1.0, *place[2:].tolist()))
+        tests.append(
+            FloorCeilingTest(beyond, float(tail) if statistic > 1e-9 else 1.0, *place[2:].tolist())
+        )
     return tuple(tests)
 
 
@@ -185,8 +234,11 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
     return float(data.hits @ np.log(p_hit) + data.misses @ np.log(p_miss)), gradient
 
 
-def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float) -> np.ndarray:
-    """Return the log-likelihoods (m,) of curves with floor and ceiling, from their shares (m, n) of hits and misses."""
+def _of_shares(
+    data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float
+) -> np.ndarray:
+    """Return the log-likelihoods (m,) of curves with floor and ceiling, from their shares (m, n)
+    of hits and misses."""
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
     p_miss = np.maximum((1.0 - ceiling) + (ceiling - floor) * miss, 1e-300)
     return np.asarray(np.log(p_hit) @ data.hits + np.log(p_miss) @ data.misses)
@@ -195,7 +247,8 @@ def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: 
 def _search(
     data: HitsAndMisses, plain: np.ndarray, floor: tuple[float, float], ceiling: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """Return the likeliest curve (4,) with floor and ceiling in these ranges, from the best points of a coarse grid."""
+    """Return the likeliest curve (4,) with floor and ceiling in these ranges, from the best points
+    of a coarse grid."""
     floors = sorted({float(np.clip(f, *floor)) for f in (0.02, 0.1, 0.25)})
     ceilings = sorted({float(np.clip(c, *ceiling)) for c in (0.75, 0.9, 0.98)})
     middles = np.append(np.quantile(data.z, np.linspace(0.04, 0.96, 16)), -plain[0] / plain[1])
@@ -223,13 +276,19 @@ def _search(
     return likeliest.x, -float(likeliest.fun)
 
 
-def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tuple[np.ndarray, np.ndarray]:
+def _checked(
+    size: ArrayLike, hit: ArrayLike, link: str, log_size: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Return x (n,) and hits (n,) as booleans. Raises UserError for the user's mistake."""
-    sizes, hits = np.asarray(size, float), np.asarray(hit, float)
+    sizes = np.asarray(size, float)
+    hits = np.asarray(hit, float)
     if link not in LINKS:
         raise UserError(f"link {link!r} is not known", legal=", ".join(LINKS))
     if sizes.ndim != 1 or sizes.shape != hits.shape:
-        raise UserError(f"sizes {sizes.shape} and hits {hits.shape} differ in shape", legal="one hit for each size")
+        raise UserError(
+            f"sizes {sizes.shape} and hits {hits.shape} differ in shape",
+            legal="one hit for each size",
+        )
     if not np.isfinite(sizes).all():
         raise UserError(f"size {np.flatnonzero(~np.isfinite(sizes))[0]} is not a finite number")
     if not np.isin(hits, (0.0, 1.0)).all():
@@ -237,16 +296,22 @@ def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tupl
         raise UserError(f"hit {at} is {hits[at]:g}", legal="0 (missed) or 1 (found)")
     if hits.all() or not hits.any():
         every = "found" if len(hits) and hits.all() else "missed"
-        raise UserError(f"every target was {every}: there is no curve to fit", fix="inspect sizes on both sides of it")
+        raise UserError(
+            f"every target was {every}: there is no curve to fit",
+            fix="inspect sizes on both sides of it",
+        )
     if log_size and sizes.min() <= 0:
-        raise UserError(f"size {sizes.min():g} has no logarithm", legal="sizes > 0", fix="fit size itself")
+        raise UserError(
+            f"size {sizes.min():g} has no logarithm", legal="sizes > 0", fix="fit size itself"
+        )
     if np.ptp(sizes) == 0:
         raise UserError(f"all sizes are {sizes[0]:g}: POD against size needs more than one")
     return np.log(sizes) if log_size else sizes, hits == 1.0
 
 
 def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarray:
-    """Return for each row (n,) the number of rows of its target; every row is a target if ``inspections`` is None."""
+    """Return for each row (n,) the number of rows of its target; every row is a target if
+    ``inspections`` is None."""
     if inspections is None:
         return np.ones(len(size), int)
     names = np.asarray(inspections).astype(str)
@@ -254,18 +319,25 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
         raise UserError(f"{len(names)} target names for {len(size)} rows", legal="one for each row")
     _, first, target = np.unique(names, return_index=True, return_inverse=True)
     if np.any(differs := size != size[first][target]):
-        raise UserError(f"target {names[differs][0]} has more than one size", legal="one size for each target")
+        raise UserError(
+            f"target {names[differs][0]} has more than one size", legal="one size for each target"
+        )
     return np.bincount(target)[target]
 
 
-FARTHEST = 2.0**40  # largest distance from the estimate, in spreads of the sizes, at which a bound is sought
+FARTHEST = (
+    2.0**40
+)  # largest distance from the estimate, in spreads of the sizes, at which a bound is sought
 DIRECTIONS = 240  # points on the outline of the confidence set that determine a band
 REACH = 10  # most doublings of a distance, from 2 to 2000 standard errors
 
 
-def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0) -> Bound:
-    """Return the upper bound on the size with this POD; infinite, with the reason, if there is none. ``design_effect``:
-    factor of variance and criterion for targets in clusters (Rao and Scott, Annals of Statistics 12 (1984), 46)."""
+def bound(
+    fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0
+) -> Bound:
+    """Return the upper bound on the size with this POD; infinite, with the reason, if there is
+    none. ``design_effect``: factor of variance and criterion for targets in clusters (Rao and
+    Scott, Annals of Statistics 12 (1984), 46)."""
     if not 0 < pod < 1:
         raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
     x, why = _likelihood_bound(fit, pod, criterion(confidence) * design_effect * fit.repeats)
@@ -277,17 +349,26 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
     return Bound(pod, confidence, METHOD, value)
 
 
-def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower crosses 90 % at a90/95."""
-    x = np.log(np.maximum(sizes, np.finfo(float).tiny)) if fit.curve.log_size else np.asarray(sizes, float)
+def band(
+    fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower
+    crosses 90 % at a90/95."""
+    x = (
+        np.log(np.maximum(sizes, np.finfo(float).tiny))
+        if fit.curve.log_size
+        else np.asarray(sizes, float)
+    )
     outline = _outline(fit, criterion(confidence) * fit.repeats)
     predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
-    low, high = (link_cdf(fit.curve.link, edge) for edge in (predictors.min(axis=0), predictors.max(axis=0)))
+    low = link_cdf(fit.curve.link, predictors.min(axis=0))
+    high = link_cdf(fit.curve.link, predictors.max(axis=0))
     return low, high
 
 
 def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = ()) -> Bound:
-    """Return the largest a90/95 of several models; infinite if any of them has none. ``design_effects``: by model."""
+    """Return the largest a90/95 of several models; infinite if any of them has none.
+    ``design_effects``: by model."""
     effects = design_effects or [1.0] * len(fits)
     bounds = (bound(fit, design_effect=effect) for fit, effect in zip(fits, effects, strict=True))
     return max(bounds, key=lambda limit: limit.value)
@@ -301,25 +382,33 @@ def criterion(confidence: float) -> float:
 
 
 def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
-    """Return the largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and the reason."""
-    data, place, level = fit.data, fit.place, float(link_ppf(fit.curve.link, np.array(pod)))
+    """Return the largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and
+    the reason."""
+    data = fit.data
+    place = fit.place
+    level = float(link_ppf(fit.curve.link, np.array(pod)))
     z_best = (fit.curve.mu + fit.curve.sigma * level - fit.centre) / fit.spread
     top = float(data.value(place))
     flat = 2.0 * (top - flat_maximum(data, level))
     if flat <= allowed:
-        return float("inf"), f"a constant probability is not rejected (ratio {flat:.2f} <= {allowed:.2f})"
+        return float(
+            "inf"
+        ), f"a constant probability is not rejected (ratio {flat:.2f} <= {allowed:.2f})"
     slope = place[1]
 
     @cache
     def excess(z: float) -> float:
-        """Return the root of the ratio, which grows about linearly with z, minus the root of the criterion."""
+        """Return the root of the ratio, which grows about linearly with z, minus the root of the
+        criterion."""
         nonlocal slope
         value, slope = profile(data, z, level, slope)
         return float(np.sqrt(max(2.0 * (top - value), 0.0)) - np.sqrt(allowed))
 
-    low, reach = 0.0, 0.25
+    low = 0.0
+    reach = 0.25
     while excess(z_best + reach) <= 0:
-        low, reach = reach, 2.0 * reach
+        low = reach
+        reach = 2.0 * reach
         if reach > FARTHEST:
             return float("inf"), "the likelihood ratio set is unbounded"
     z = optimize.brentq(excess, z_best + low, z_best + reach, xtol=1e-10)
@@ -327,27 +416,37 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
 
 
 def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
-    """Return (b0, b1) (n, 2), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0."""
-    data, best = fit.data, fit.place
+    """Return (b0, b1) (n, 2), in standardised sizes, on the outline of 2 (llmax - ll) <=
+    ``allowed`` with b1 >= 0."""
+    data = fit.data
+    best = fit.place
     scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
     metric = scale @ (fit.covariance / fit.repeats) @ scale.T
     try:
         root = np.linalg.cholesky(metric)
-    except np.linalg.LinAlgError:  # the covariance of a step is singular: use any metric that spans both directions
+    except (
+        np.linalg.LinAlgError
+    ):  # the covariance of a step is singular: use any metric that spans both directions
         spread, directions = np.linalg.eigh(metric)
         root = directions * np.sqrt(np.maximum(spread, 1e-4 * max(float(spread[-1]), 1e-8)))
     angle = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)
     step = np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T
     with np.errstate(divide="ignore"):
         farthest = np.where(step[:, 1] < 0, -best[1] / step[:, 1], np.inf)
-    lowest, which = float(data.value(best)) - 0.5 * allowed, np.arange(DIRECTIONS)
+    lowest = float(data.value(best)) - 0.5 * allowed
+    which = np.arange(DIRECTIONS)
 
     def excess(distance: np.ndarray, along: np.ndarray) -> np.ndarray:
-        places, at_once = best + distance[..., None] * step[along], max(1, CELLS // len(data.z))
+        places = best + distance[..., None] * step[along]
+        at_once = max(1, CELLS // len(data.z))
         starts = range(0, max(len(places), 1), at_once)
-        return np.concatenate([data.value(places[first : first + at_once]) for first in starts]) - lowest
+        return (
+            np.concatenate([data.value(places[first : first + at_once]) for first in starts])
+            - lowest
+        )
 
-    inside, outside = np.zeros(DIRECTIONS), np.minimum(farthest, 2.0)
+    inside = np.zeros(DIRECTIONS)
+    outside = np.minimum(farthest, 2.0)
     for _ in range(REACH):
         further = (excess(outside, which) > 0) & (outside < farthest)
         if not further.any():
@@ -356,6 +455,9 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
         outside = np.where(further, np.minimum(2.0 * outside, farthest), outside)
     crossed = excess(outside, which) < 0
     outside[crossed] = elementwise.find_root(
-        excess, (inside[crossed], outside[crossed]), args=(which[crossed],), tolerances={"xrtol": 1e-9, "fatol": 1e-9}
+        excess,
+        (inside[crossed], outside[crossed]),
+        args=(which[crossed],),
+        tolerances={"xrtol": 1e-9, "fatol": 1e-9},
     ).x
     return np.asarray(best + outside[:, None] * step)

@@ -1,1 +1,2 @@
-"""Detection limits of studies: inspections and their outcomes, curves and bounds over boards, comparisons."""
+"""Detection limits of studies: inspections and their outcomes, curves and bounds over boards,
+comparisons."""

@@ -1,5 +1,6 @@
-"""The record of a study: every inspection of every set-up, which suffices for limits and comparisons. It is stored as
-``study.json`` in a result folder and as the baseline of a gate; the classes here declare, check and write the file."""
+"""The record of a study: every inspection of every set-up, which suffices for limits and
+comparisons. It is stored as ``study.json`` in a result folder and as the baseline of a gate; the
+classes here declare, check and write the file."""
 
 from __future__ import annotations
 
@@ -29,23 +30,32 @@ from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
 
-RECORD_VERSION = 2  # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
-OLDEST_VERSION = 1  # still read: if no damage is found only by missing returns, its hits are those of today
-LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
+RECORD_VERSION = (
+    2  # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
+)
+OLDEST_VERSION = (
+    1  # still read: if no damage is found only by missing returns, its hits are those of today
+)
+LEGAL = "a study.json, or a baseline that tofpod check --update wrote"
 AGAIN = "run the study again, which rewrites the file; do not edit it by hand"
 
 
 @dataclass(frozen=True)
 class StoredColumn:
-    """A column of a table: an array in memory, a list of ``value`` in JSON, where null stands for NaN."""
+    """A column of a table: an array in memory, a list of ``value`` in JSON, where null stands for
+    NaN."""
 
     dtype: type
     value: Any
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         listed = core_schema.list_schema(handler.generate_schema(self.value), strict=True)
         return core_schema.no_info_after_validator_function(
-            lambda values: np.array([np.nan if value is None else value for value in values], self.dtype),
+            lambda values: np.array(
+                [np.nan if value is None else value for value in values], self.dtype
+            ),
             listed,
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda column: [None if value != value else value for value in column.tolist()]
@@ -55,11 +65,15 @@ class StoredColumn:
 
 def _one_table(table: Any) -> Any:
     """Refuse columns of different lengths, and repeated rows."""
-    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
+    columns = {
+        name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)
+    }
     lengths = {len(column): f"{name} {len(column)}" for name, column in columns.items()}
     if len(lengths) > 1:
         raise ValueError(f"columns of different lengths: {', '.join(lengths.values())}")
-    named = [column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")]
+    named = [
+        column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")
+    ]
     if len(set(zip(*named, strict=True))) < len(table.board):
         raise ValueError("the same inspection occurs twice")
     return table
@@ -93,10 +107,11 @@ FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """Inspections of damage, one per row: each damage of each board for every repeat of the noise. True values:
-    ``diameter_mm`` (of long damage the width or length, as ``size_of`` says), ``depth_mm`` removed, ``x_mm``, ``y_mm``
-    on the board. ``signal`` (n,): the highest score within the hit radius; NaN if no pixel there was judged.
-    ``by_depth``, ``by_no_return`` (n,) bool: hits by each kind of finding; None if hits were counted by depth alone."""
+    """Inspections of damage, one per row: each damage of each board for every repeat of the noise.
+    True values: ``diameter_mm`` (of long damage the width or length, as ``size_of`` says),
+    ``depth_mm`` removed, ``x_mm``, ``y_mm`` on the board. ``signal`` (n,): the highest score
+    within the hit radius; NaN if no pixel there was judged. ``by_depth``, ``by_no_return`` (n,)
+    bool: hits by each kind of finding; None if hits were counted by depth alone."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -114,9 +129,14 @@ class Inspected:
 
     @property
     def limit_of(self) -> str:
-        """The name of the limits' size: depth if only depth varies, else diameter, width or length."""
+        """The name of the limits' size: depth if only depth varies, else diameter, width or
+        length."""
         one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
-        return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else self.size_of
+        return (
+            "depth"
+            if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max()
+            else self.size_of
+        )
 
     @property
     def size_mm(self) -> np.ndarray:
@@ -126,8 +146,9 @@ class Inspected:
 
 @dataclass(frozen=True, eq=False)
 class Unflawed:
-    """Runs on boards of one kind, hole-free or damaged, that set no threshold, (m,) each. ``calls``: false calls on
-    ``area_m2`` of judged face. ``no_return_calls``: those without return among them, or None."""
+    """Runs on boards of one kind, hole-free or damaged, that set no threshold, (m,) each.
+    ``calls``: false calls on ``area_m2`` of judged face. ``no_return_calls``: those without return
+    among them, or None."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -139,9 +160,10 @@ class Unflawed:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int. ``score`` (k,): of the highest pixel; above
-    it, the run has no finding. ``x_mm``, ``y_mm`` (k,): place of that pixel on the board, NaN if it is off the board.
-    ``u_px``, ``v_px`` (k,): its column and row on the sensor, or None."""
+    """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int. ``score`` (k,): of the
+    highest pixel; above it, the run has no finding. ``x_mm``, ``y_mm`` (k,): place of that pixel
+    on the board, NaN if it is off the board. ``u_px``, ``v_px`` (k,): its column and row on the
+    sensor, or None."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -155,11 +177,12 @@ class Calibrated:
 
 @dataclass(frozen=True, eq=False)
 class SetUpRecord:
-    """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold``: in the detector's
-    units; ``threshold_mm``: NaN without a scale. ``calibration_runs``: number of hole-free runs on separate boards that
-    set it (0: given). ``failed``: trials that raised. ``targets_digest``: identifies boards and damage;
-    ``frames_digest``: also camera, noise seed and simulating code. ``calibrated``, ``beside``: findings of calibration
-    runs, and of runs on the damaged boards, if kept. ``units``: if more than one, repeat r of a damaged board shows
+    """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold``:
+    in the detector's units; ``threshold_mm``: NaN without a scale. ``calibration_runs``: number of
+    hole-free runs on separate boards that set it (0: given). ``failed``: trials that raised.
+    ``targets_digest``: identifies boards and damage; ``frames_digest``: also camera, noise seed
+    and simulating code. ``calibrated``, ``beside``: findings of calibration runs, and of runs on
+    the damaged boards, if kept. ``units``: if more than one, repeat r of a damaged board shows
     unit r modulo ``units``, and every other board has a unit of its own."""
 
     __pydantic_config__ = FORM
@@ -189,8 +212,9 @@ class SetUpRecord:
 
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
-    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not used): the rule for a hit. ``false_calls_per_m2``:
-    the thresholds' rate; None if they were given. ``provenance``: commit, dirty, versions, seed."""
+    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not used): the rule for a hit.
+    ``false_calls_per_m2``: the thresholds' rate; None if they were given. ``provenance``: commit,
+    dirty, versions, seed."""
 
     __pydantic_config__ = FORM
     name: Name
@@ -198,14 +222,18 @@ class StudyRecord:
     hit_radius_mm: Size
     false_calls_per_m2: Size | None
     provenance: Mapping[str, Any]
-    set_ups: Annotated[tuple[SetUpRecord, ...], Field(min_length=1), AfterValidator(_no_set_up_twice)]
+    set_ups: Annotated[
+        tuple[SetUpRecord, ...], Field(min_length=1), AfterValidator(_no_set_up_twice)
+    ]
     hit_overlap: Size | None = None
 
     @property
     def hit_rule(self) -> str:
         """Rule for a hit, as the end of a sentence that begins with a damage."""
         long = any(set_up.inspected.size_of != "diameter" for set_up in self.set_ups)
-        centre = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
+        centre = (
+            "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
+        )
         rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {centre}"
         if self.hit_overlap is None:
             return rule
@@ -213,13 +241,15 @@ class StudyRecord:
         return f"{rule}, or at least {share} of a finding's pixels lie on it or 2 pixels beside it"
 
     def to_data(self) -> dict[str, Any]:
-        """Return the record as JSON's types; NaN becomes None, and a column or table that is None is left out."""
+        """Return the record as JSON's types; NaN becomes None, and a column or table that is None
+        is left out."""
         data = TypeAdapter(StudyRecord).dump_python(self, mode="json", exclude_none=True)
         return {"record_version": RECORD_VERSION, "false_calls_per_m2": None, **data}
 
 
 def record_text(record: StudyRecord) -> str:
-    """Return the record as JSON text with one set-up per line, so that a changed baseline differs in few lines."""
+    """Return the record as JSON text with one set-up per line, so that a changed baseline differs
+    in few lines."""
     data = record.to_data()
     lines = ",\n  ".join(json.dumps(set_up, sort_keys=True) for set_up in data.pop("set_ups"))
     head = json.dumps(data, sort_keys=True, indent=1)[:-2]
@@ -227,11 +257,14 @@ def record_text(record: StudyRecord) -> str:
 
 
 def read_record(path: Path) -> StudyRecord:
-    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError if there is
-    none, if it is not a record or is damaged (with set-up and field), and if it has another version."""
+    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises
+    UserError if there is none, if it is not a record or is damaged (with set-up and field), and if
+    it has another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
-        data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # NaN is allowed in the record's columns
+        data = strict_json(
+            bounded_bytes(file, RECORD_BYTES), nan=True
+        )  # NaN is allowed in the record's columns
     except OSError as error:
         fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error
@@ -239,7 +272,14 @@ def read_record(path: Path) -> StudyRecord:
         raise UserError(f"{file}: is not JSON ({error})", legal=LEGAL, fix=AGAIN) from error
     if not isinstance(data, dict) or "record_version" not in data:
         raise UserError(f"{file}: is not the record of a study", legal=LEGAL)
-    check_version(data.pop("record_version"), RECORD_VERSION, file, "a record", oldest=OLDEST_VERSION, again=AGAIN)
+    check_version(
+        data.pop("record_version"),
+        RECORD_VERSION,
+        file,
+        "a record",
+        oldest=OLDEST_VERSION,
+        again=AGAIN,
+    )
     try:
         return TypeAdapter(StudyRecord).validate_python(data)
     except ValidationError as error:
@@ -247,11 +287,15 @@ def read_record(path: Path) -> StudyRecord:
 
 
 def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
-    """Return the set-up with this label, or the only one. Raises UserError if there is none, or none is named."""
+    """Return the set-up with this label, or the only one. Raises UserError if there is none, or
+    none is named."""
     by_label = {record.label: record for record in study.set_ups}
-    name, known = name or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
+    name = name or (next(iter(by_label)) if len(by_label) == 1 else None)
+    known = "; ".join(by_label)
     if name is None:
-        raise UserError(f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."')
+        raise UserError(
+            f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."'
+        )
     if name not in by_label:
         near = nearest(name, by_label)
         meant = f"; did you mean {near!r}?" if near else ""
@@ -260,11 +304,17 @@ def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
 
 
 def _mistake(error: ValidationError, data: Any) -> str:
-    """Describe the first mistake in a study's data in one sentence, with its place, and count the rest."""
+    """Describe the first mistake in a study's data in one sentence, with its place, and count the
+    rest."""
     first, *others = error.errors(include_url=False)
     path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
-    where, value = ".".join(map(str, path)), first.get("input")
-    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(set_up := data["set_ups"][path[1]], dict):
+    where = ".".join(map(str, path))
+    value = first.get("input")
+    if (
+        path[:1] == ["set_ups"]
+        and len(path) > 1
+        and isinstance(set_up := data["set_ups"][path[1]], dict)
+    ):
         where += f" (set-up {set_up.get('variant')}, frames {set_up.get('frames')})"
     given = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
     text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]

@@ -1,12 +1,14 @@
 """Limits over units of a camera: each unit's own, and the limit of a new, randomly drawn unit.
 
-All units inspect the same boards, so their limits differ only by unit and noise. The logarithms of the units' a90 are
-assumed to be normal (a random effect of the unit). With 95 % confidence, that of a new unit lies less than t(0.95, U -
-1) s sqrt(1 + 1 / U) above their mean, where s is the standard deviation of U units. The mean has an error from the
-boards, which all units share: that of a90/95 over boards, ln(a90/95) - ln(a90). Both are independent, and their margins
-are combined as the root of the sum of squares (Zou and Donner, Statistics in Medicine 27 (2008), 1693).
-``tests/validation/units_coverage.py`` measures how often a new unit is within the limit. Not modelled: units that
-differ in more than their fixed pattern (temperature, age, a maker's change of parts)."""
+All units inspect the same boards, so their limits differ only by unit and noise. The logarithms of
+the units' a90 are assumed to be normal (a random effect of the unit). With 95 % confidence, that
+of a new unit lies less than t(0.95, U - 1) s sqrt(1 + 1 / U) above their mean, where s is the
+standard deviation of U units. The mean has an error from the boards, which all units share: that
+of a90/95 over boards, ln(a90/95) - ln(a90). Both are independent, and their margins are combined
+as the root of the sum of squares (Zou and Donner, Statistics in Medicine 27 (2008), 1693).
+``tests/validation/units_coverage.py`` measures how often a new unit is within the limit. Not
+modelled: units that differ in more than their fixed pattern (temperature, age, a maker's change of
+parts)."""
 
 from dataclasses import dataclass
 
@@ -23,9 +25,10 @@ METHOD = "prediction of a new unit over units and boards"
 
 @dataclass(frozen=True, eq=False)
 class OverUnits:
-    """``a90_mm``, ``a90_95_mm`` (u,): of each unit alone, with the link and axis of all units; infinite for a unit
-    without one. ``spread``: standard deviation of ln a90 between units, including the noise of their hits.
-    ``new_unit``: upper bound, at 95 % confidence, on the a90 of a new unit."""
+    """``a90_mm``, ``a90_95_mm`` (u,): of each unit alone, with the link and axis of all units;
+    infinite for a unit without one. ``spread``: standard deviation of ln a90 between units,
+    including the noise of their hits. ``new_unit``: upper bound, at 95 % confidence, on the a90 of
+    a new unit."""
 
     a90_mm: np.ndarray
     a90_95_mm: np.ndarray
@@ -39,10 +42,16 @@ class OverUnits:
 
 
 def over_units(
-    size_mm: np.ndarray, hit: np.ndarray, target: np.ndarray, unit: np.ndarray, curve: PodCurve, limit: Bound
+    size_mm: np.ndarray,
+    hit: np.ndarray,
+    target: np.ndarray,
+    unit: np.ndarray,
+    curve: PodCurve,
+    limit: Bound,
 ) -> OverUnits:
-    """Judge inspections, one per row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``. ``curve``: of all
-    units; ``limit``: its a90/95 over boards. If a unit found all or nothing, no limit of a new unit is demonstrated."""
+    """Judge inspections, one per row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``.
+    ``curve``: of all units; ``limit``: its a90/95 over boards. If a unit found all or nothing, no
+    limit of a new unit is demonstrated."""
     found = []
     for number in np.unique(unit):
         own = unit == number
@@ -57,10 +66,14 @@ def over_units(
     with np.errstate(invalid="ignore"):
         spread = float(np.log(a90_mm).std(ddof=1)) if np.isfinite(a90_mm).all() else np.inf
     margin = float(t.ppf(CONFIDENCE, units - 1)) * spread * np.sqrt(1 + 1 / units)
-    value, why = np.inf, f"not demonstrated: {limit.why.removeprefix('not demonstrated: ')}"
+    value = np.inf
+    why = f"not demonstrated: {limit.why.removeprefix('not demonstrated: ')}"
     if not np.isfinite(spread):
-        why = "not demonstrated: a unit found every damage or none, so that units cannot be compared"
+        why = (
+            "not demonstrated: a unit found every damage or none, so that units cannot be compared"
+        )
     elif limit.demonstrated:
         a90 = float(curve.size_at(POD))
-        value, why = a90 * float(np.exp(np.hypot(np.log(limit.value / a90), margin))), ""
+        value = a90 * float(np.exp(np.hypot(np.log(limit.value / a90), margin)))
+        why = ""
     return OverUnits(a90_mm, a90_95_mm, spread, Bound(POD, CONFIDENCE, METHOD, value, why))

@@ -1,1 +1,2 @@
-"""Reads and validates declarations that users write in YAML, and reports every problem with its place."""
+"""Reads and validates declarations that users write in YAML, and reports every problem with its
+place."""

@@ -1,4 +1,5 @@
-"""Translates pydantic's errors into problems with a place, the legal values and the nearest legal word."""
+"""Translates pydantic's errors into problems with a place, the legal values and the nearest legal
+word."""
 
 import difflib
 import json
@@ -12,12 +13,31 @@ from pydantic import ValidationError
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.yaml_source import MAX_PROBLEMS, DeclarationError, KeyPath, Place, Problem, Source
+from harness.vocabulary.declaration.yaml_source import (
+    MAX_PROBLEMS,
+    DeclarationError,
+    KeyPath,
+    Place,
+    Problem,
+    Source,
+)
 from harness.vocabulary.errors import UserError
 
-YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}  # Booleans of YAML 1.1, text in YAML 1.2
-LEAST_HELD = 3  # Least letters of a word that is searched for within others; shorter words match too often
-WORDS = {"Input should be": "it should be", "an object": "a mapping", "valid array": "list", "valid tuple": "list"}
+YES_AND_NO = {
+    "yes": "true",
+    "on": "true",
+    "no": "false",
+    "off": "false",
+}  # Booleans of YAML 1.1, text in YAML 1.2
+LEAST_HELD = (
+    3  # Least letters of a word that is searched for within others; shorter words match too often
+)
+WORDS = {
+    "Input should be": "it should be",
+    "an object": "a mapping",
+    "valid array": "list",
+    "valid tuple": "list",
+}
 WORDS |= {"valid string": "text", "valid boolean": "true or false", " in strict mode": ""}
 WORDS |= {"be a true": "be true", "be a text": "be text"}
 """Replaces pydantic's words with those of YAML."""
@@ -25,14 +45,21 @@ WORDS |= {"be a true": "be true", "be a text": "be text"}
 C = TypeVar("C", bound=Config)
 
 
-def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C | None, list[Problem]]:
-    """Validate a source's data, and free data at ``splices`` against the models that belong there. Returns all problems
-    and the declaration, whose spliced data is completed with defaults (None if there is any problem)."""
+def validated(
+    model: type[C], source: Source, splices: shape.Splices
+) -> tuple[C | None, list[Problem]]:
+    """Validate a source's data, and free data at ``splices`` against the models that belong there.
+    Returns all problems and the declaration, whose spliced data is completed with defaults (None
+    if there is any problem)."""
     problems: list[Problem] = []
-    declared, data, config = shape.Declared(model, source.data, splices), source.data, None
+    declared = shape.Declared(model, source.data, splices)
+    data = source.data
+    config = None
     for path, spliced in splices.items():
         try:
-            data = with_value_at(data, path, spliced.from_data(shape.get(data, path) or {}).to_data())
+            data = with_value_at(
+                data, path, spliced.from_data(shape.get(data, path) or {}).to_data()
+            )
         except ValidationError as error:
             problems += problems_of(error, declared, source, path)
     try:
@@ -43,7 +70,8 @@ def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C
 
 
 def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
-    """Return data with a value set at a path; unchanged if the path passes anything but mappings and lists."""
+    """Return data with a value set at a path; unchanged if the path passes anything but mappings
+    and lists."""
     if not path:
         return value
     inner = with_value_at(shape.child(data, path[0]), path[1:], value)
@@ -53,10 +81,14 @@ def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
 
 
 def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
-    """Return the declaration in a file whose ``key`` selects one of ``models``. Raises DeclarationError."""
-    name, place = source.data.get(key), source.place_of((key,))
+    """Return the declaration in a file whose ``key`` selects one of ``models``. Raises
+    DeclarationError."""
+    name = source.data.get(key)
+    place = source.place_of((key,))
     if name is None:
-        problems = [Problem(f"the file lacks the key `{key}`", place, legal="one of " + ", ".join(models))]
+        problems = [
+            Problem(f"the file lacks the key `{key}`", place, legal="one of " + ", ".join(models))
+        ]
     elif not isinstance(name, str) or name not in models:
         problems = [wrong_choice((key,), name, list(models), place)]
     else:
@@ -67,8 +99,9 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
 
 
 def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str | None = None) -> C:
-    """Validate plain data from command line options and return it as a declaration. Raises a single UserError with all
-    problems under the heading ``what``; ``within`` is the key that precedes each path there."""
+    """Validate plain data from command line options and return it as a declaration. Raises a
+    single UserError with all problems under the heading ``what``; ``within`` is the key that
+    precedes each path there."""
     try:
         return model.from_data(data)
     except ValidationError as error:
@@ -77,24 +110,36 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
         whole = data if within is None else {within: data}
         source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
         declared = shape.Declared(Config if base else model, whole, {base: model} if base else {})
-        problems = [replace(each, place=None) for each in problems_of(error, declared, source, base)]
+        problems = [
+            replace(each, place=None) for each in problems_of(error, declared, source, base)
+        ]
         lines = dict.fromkeys(str(each).replace("\n", "\n  ") for each in problems)
         raise UserError(f"{what}:\n  " + "\n  ".join(lines)) from error
 
 
-def problems_of(error: ValidationError, declared: shape.Declared, source: Source, base: KeyPath = ()) -> list[Problem]:
-    """Return the first `MAX_PROBLEMS` problems of a ValidationError whose locations start at ``base``. pydantic's
-    locations mix keys of the data with labels of union branches. For a union without a discriminator, only the errors
-    of the intended branch are reported; if that branch is unclear, the union as a whole is the problem."""
+def problems_of(
+    error: ValidationError, declared: shape.Declared, source: Source, base: KeyPath = ()
+) -> list[Problem]:
+    """Return the first `MAX_PROBLEMS` problems of a ValidationError whose locations start at
+    ``base``. pydantic's locations mix keys of the data with labels of union branches. For a union
+    without a discriminator, only the errors of the intended branch are reported; if that branch is
+    unclear, the union as a whole is the problem."""
     alone: list[tuple[KeyPath, Any]] = []
     unions: dict[KeyPath, list[tuple[str, KeyPath, Any]]] = defaultdict(list)
     for detail in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
         path: KeyPath = ()
-        label, location, data = None, (*base, *detail["loc"]), declared.data
+        label = None
+        location = (*base, *detail["loc"])
+        data = declared.data
         for number, key in enumerate(location, start=1):
-            known = key in data if isinstance(data, Mapping) else isinstance(data, list) and key in range(len(data))
+            known = (
+                key in data
+                if isinstance(data, Mapping)
+                else isinstance(data, list) and key in range(len(data))
+            )
             if known or (detail["type"] == "missing" and number == len(location)):
-                path, data = (*path, key), shape.child(data, key)
+                path = (*path, key)
+                data = shape.child(data, key)
             else:
                 label = label or (path, str(key))
         if label:
@@ -103,7 +148,9 @@ def problems_of(error: ValidationError, declared: shape.Declared, source: Source
             alone.append((path, detail))
     problems = []
     for path, errors in unions.items():
-        labels, data, slot = {label for label, _, _ in errors}, shape.get(declared.data, path), declared.at(path)
+        labels = {label for label, _, _ in errors}
+        data = shape.get(declared.data, path)
+        slot = declared.at(path)
         meant = labels if len(labels) == 1 else set[str]()
         if isinstance(data, dict):
             meant = meant or {getattr(shape.model_for(slot, data), "__name__", "")} & labels
@@ -118,10 +165,16 @@ def problems_of(error: ValidationError, declared: shape.Declared, source: Source
 
 def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source) -> Problem:
     """Describe one of pydantic's errors, at a path in the data, in the user's terms."""
-    value, slot, place = shape.get(source.data, path), declared.at(path), source.place_of(path)
-    kind, legal, kinds, fix = error["type"], shape.legal_at(slot), shape.kinds_of(slot), None
+    value = shape.get(source.data, path)
+    slot = declared.at(path)
+    place = source.place_of(path)
+    kind = error["type"]
+    legal = shape.legal_at(slot)
+    kinds = shape.kinds_of(slot)
+    fix = None
     if kind == "missing":
-        parent, name = path[:-1], path[-1]
+        parent = path[:-1]
+        name = path[-1]
         inside = f"`{dotted(parent)}` lacks" if parent else "the file lacks"
         if isinstance(name, int):
             return Problem(f"{inside} item number {name + 1}", source.place_of(parent), legal)
@@ -129,25 +182,39 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     if kind == "extra_forbidden":
         within = path[:-1]
         taken = shape.get(source.data, within)
-        return unknown_key(str(path[-1]), within, declared.names(within), source.key_place_of(path), taken)
+        return unknown_key(
+            str(path[-1]), within, declared.names(within), source.key_place_of(path), taken
+        )
     if kinds and not isinstance(value, dict):
         message = f"`{dotted(path)}` is {shown(value)}, not a mapping"
-        return Problem(message, place, legal=f"a mapping with `{kinds[0]}`: one of {', '.join(kinds[1])}")
+        return Problem(
+            message, place, legal=f"a mapping with `{kinds[0]}`: one of {', '.join(kinds[1])}"
+        )
     if kinds and kind in ("union_tag_invalid", "union_tag_not_found"):
-        key, tags = kinds[0], list(kinds[1])
+        key = kinds[0]
+        tags = list(kinds[1])
         if key in value:
             return wrong_choice((*path, key), value[key], tags, source.place_of((*path, key)))
         near = nearest(key, value)
         message = f"`{dotted(path)}` lacks the key `{key}`, which selects its kind"
         fix = f"rename `{near}` to `{key}`" if near else None
-        return Problem(message, source.key_place_of(path), legal="one of " + ", ".join(tags), fix=fix)
+        return Problem(
+            message, source.key_place_of(path), legal="one of " + ", ".join(tags), fix=fix
+        )
     if kind == "literal_error" and (choices := shape.choices_of(slot)):
         return wrong_choice(path, value, choices, place)
     if kind in ("value_error", "assertion_error"):
-        message = (f"`{dotted(path)}`: " if path else "") + str(error.get("ctx", {}).get("error", error["msg"]))
+        message = (f"`{dotted(path)}`: " if path else "") + str(
+            error.get("ctx", {}).get("error", error["msg"])
+        )
         # the message of a whole mapping's validator is complete; a list of keys would not help
         return Problem(message, place, legal=None if isinstance(value, dict) else legal)
-    if isinstance(value, dict | list) and kind in ("model_type", "dict_type", "tuple_type", "list_type"):
+    if isinstance(value, dict | list) and kind in (
+        "model_type",
+        "dict_type",
+        "tuple_type",
+        "list_type",
+    ):
         return Problem(f"`{dotted(path)}` is {shown(value)}", place, legal)
     if kind.startswith("int_") and isinstance(value, float) and value.is_integer():
         fix = f"write {int(value)} without a decimal point or exponent"
@@ -156,17 +223,22 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     text = re.sub(r"valid dictionary( or (instance of|object to) .*)?$", "mapping", error["msg"])
     for old, new in WORDS.items():
         text = text.replace(old, new)
-    return Problem(f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", place, legal, fix=fix)
+    return Problem(
+        f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", place, legal, fix=fix
+    )
 
 
 def nearest(word: object, words: Iterable[object]) -> str | None:
-    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most similar spelling, else
-    the shortest that contains the word (three letters or more), as realsense_l515 contains l515; None if neither."""
+    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most
+    similar spelling, else the shortest that contains the word (three letters or more), as
+    realsense_l515 contains l515; None if neither."""
     folded = {str(known).lower().replace("-", "_"): str(known) for known in words}
     sought = str(word).lower().replace("-", "_")
     found = difflib.get_close_matches(sought, folded, n=1)
     if not found and len(sought) >= LEAST_HELD:
-        found = sorted((known for known in folded if sought in known), key=lambda known: (len(known), known))
+        found = sorted(
+            (known for known in folded if sought in known), key=lambda known: (len(known), known)
+        )
     return folded[found[0]] if found else None
 
 
@@ -181,21 +253,35 @@ def shown(value: Any) -> str:
         noun = "mapping" if isinstance(value, dict) else "list"
         return f"a {noun}" if value else f"an empty {noun}"
     text = json.dumps(value, ensure_ascii=False)
-    text = text.replace("Infinity", ".inf").replace("NaN", ".nan") if isinstance(value, float) else text
+    text = (
+        text.replace("Infinity", ".inf").replace("NaN", ".nan")
+        if isinstance(value, float)
+        else text
+    )
     return text if len(text) <= 40 else text[:39] + "…"
 
 
-def wrong_choice(path: Sequence[str | int], value: Any, choices: Iterable[Any], place: Place) -> Problem:
+def wrong_choice(
+    path: Sequence[str | int], value: Any, choices: Iterable[Any], place: Place
+) -> Problem:
     """Return the problem for a value that is not among its legal ``choices``."""
     words = [shape.plain(choice) for choice in choices]
     message = f"`{dotted(path)}` is {shown(value)}, which is none of the legal values"
-    return Problem(message, place, legal="one of " + ", ".join(words), nearest=nearest(value, words))
+    return Problem(
+        message, place, legal="one of " + ", ".join(words), nearest=nearest(value, words)
+    )
 
 
 def unknown_key(
     name: str, where: KeyPath, legal: Sequence[str], place: Place | None, taken: Iterable[str] = ()
 ) -> Problem:
-    """Return the problem for an illegal key in the mapping at ``where``, which already has the keys ``taken``."""
+    """Return the problem for an illegal key in the mapping at ``where``, which already has the
+    keys ``taken``."""
     inside = f" in `{dotted(where)}`" if where else ""
     free = [key for key in legal if key not in set(taken)]
-    return Problem(f"unknown key `{name}`{inside}", place, ", ".join(legal) or "no key here", nearest(name, free))
+    return Problem(
+        f"unknown key `{name}`{inside}",
+        place,
+        ", ".join(legal) or "no key here",
+        nearest(name, free),
+    )

@@ -1,5 +1,6 @@
-"""The structure that a declaration's models require, read from the annotations of their fields. A *splice* places a
-model where another model holds free data, such as the settings of a detector that is chosen by name."""
+"""The structure that a declaration's models require, read from the annotations of their fields. A
+*splice* places a model where another model holds free data, such as the settings of a detector
+that is chosen by name."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +15,8 @@ from pydantic.fields import FieldInfo
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.yaml_source import KeyPath
 
-LONGEST_NOTE = 100  # Characters of the longest field description that a message repeats as a statement of limits
+# Characters of the longest field description that a message repeats as a statement of limits
+LONGEST_NOTE = 100
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 Splices = Mapping[KeyPath, type[Config]]
 
@@ -29,7 +31,11 @@ class Slot:
     @property
     def models(self) -> tuple[type[BaseModel], ...]:
         """The alternatives that are models."""
-        return tuple(kind for kind, _ in self.branches if isinstance(kind, type) and issubclass(kind, BaseModel))
+        return tuple(
+            kind
+            for kind, _ in self.branches
+            if isinstance(kind, type) and issubclass(kind, BaseModel)
+        )
 
 
 @dataclass(frozen=True)
@@ -42,31 +48,38 @@ class Declared:
 
     def at(self, path: KeyPath) -> Slot | None:
         """Return the slot at ``path``, or None if a key on the way is unknown."""
-        slot, data = slot_of(self.model), self.data
+        slot = slot_of(self.model)
+        data = self.data
         for depth, key in enumerate(path, start=1):
             spliced = self.splices.get(path[:depth])
             below = slot_of(spliced) if spliced else _below(slot, data, key)
             if below is None:
                 return None
-            slot, data = below, child(data, key)
+            slot = below
+            data = child(data, key)
         return slot
 
     def names(self, path: KeyPath) -> tuple[str, ...]:
-        """Return the legal keys of the mapping at ``path``: the fields of its model, or the keys of free data."""
+        """Return the legal keys of the mapping at ``path``: the fields of its model, or the keys
+        of free data."""
         data = get(self.data, path)
         model = model_for(self.at(path), data)
         return tuple(model.model_fields if model else data if isinstance(data, Mapping) else ())
 
     def paths(self, path: KeyPath = (), depth: int = 8) -> Iterator[KeyPath]:
-        """Yield every path that can be set: model fields down to ``depth`` levels, and the list items in the data."""
+        """Yield every path that can be set: model fields down to ``depth`` levels, and the list
+        items in the data."""
         data = get(self.data, path)
-        for key in (range(len(data)) if isinstance(data, list) else self.names(path)) if depth else ():
+        for key in (
+            (range(len(data)) if isinstance(data, list) else self.names(path)) if depth else ()
+        ):
             yield (*path, key)
             yield from self.paths((*path, key), depth - 1)
 
 
 DeclaredOf = Callable[[Any], Declared]
-"""A function that returns what is declared for given data; the data decides which detector's settings belong in it."""
+"""A function that returns what is declared for given data; the data decides which detector's
+settings belong in it."""
 
 
 def slot_of(annotation: Any, field: FieldInfo | None = None) -> Slot:
@@ -74,20 +87,28 @@ def slot_of(annotation: Any, field: FieldInfo | None = None) -> Slot:
     return Slot(tuple(_branches(annotation, tuple(field.metadata) if field else ())), field)
 
 
-def _branches(annotation: Any, metadata: tuple[Any, ...]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+def _branches(
+    annotation: Any, metadata: tuple[Any, ...]
+) -> Iterator[tuple[Any, Mapping[str, Any]]]:
     if get_origin(annotation) is Annotated:
         inner, *more = get_args(annotation)
-        yield from _branches(inner, (*metadata, *(m for x in more for m in getattr(x, "metadata", (x,)))))
+        yield from _branches(
+            inner, (*metadata, *(m for x in more for m in getattr(x, "metadata", (x,))))
+        )
     elif get_origin(annotation) in (Union, UnionType):
         for member in get_args(annotation):
             yield from _branches(member, metadata)
     else:
         names = (*BOUNDS, "min_length", "max_length", "pattern")
-        yield annotation, {n: v for m in metadata for n in names if (v := getattr(m, n, None)) is not None}
+        yield (
+            annotation,
+            {n: v for m in metadata for n in names if (v := getattr(m, n, None)) is not None},
+        )
 
 
 def kinds_of(slot: Slot | None) -> tuple[str, Mapping[str, type[BaseModel]]] | None:
-    """Return the key that distinguishes the models of a slot, and the model for each value; None without such a key."""
+    """Return the key that distinguishes the models of a slot, and the model for each value; None
+    without such a key."""
     return _kinds(slot.models) if slot else None
 
 
@@ -95,7 +116,10 @@ def kinds_of(slot: Slot | None) -> tuple[str, Mapping[str, type[BaseModel]]] | N
 def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[BaseModel]]] | None:
     for key in models[0].model_fields if len(models) > 1 else ():
         fields = [model.model_fields.get(key) for model in models]
-        tags = [get_args(f.annotation) if f and get_origin(f.annotation) is Literal else () for f in fields]
+        tags = [
+            get_args(f.annotation) if f and get_origin(f.annotation) is Literal else ()
+            for f in fields
+        ]
         found = {str(tag): model for model, mine in zip(models, tags, strict=True) for tag in mine}
         if all(tags) and len(found) == sum(map(len, tags)):
             return key, found
@@ -103,15 +127,22 @@ def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[
 
 
 def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
-    """Return the model that a mapping is meant to fill: by its kind, or else the model with most keys in common."""
-    kinds, given = kinds_of(slot), data if isinstance(data, Mapping) else {}
+    """Return the model that a mapping is meant to fill: by its kind, or else the model with most
+    keys in common."""
+    kinds = kinds_of(slot)
+    given = data if isinstance(data, Mapping) else {}
     if kinds and str(given.get(kinds[0])) in kinds[1]:
         return kinds[1][str(given[kinds[0]])]
-    return max(slot.models if slot else (), key=lambda m: len(given.keys() & m.model_fields.keys()), default=None)
+    return max(
+        slot.models if slot else (),
+        key=lambda m: len(given.keys() & m.model_fields.keys()),
+        default=None,
+    )
 
 
 def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
-    """Return the slot one key (or index) deeper, given the data at this level; None if the key is unknown."""
+    """Return the slot one key (or index) deeper, given the data at this level; None if the key is
+    unknown."""
     model = model_for(slot, data)
     if model is not None and isinstance(key, str):
         field = model.model_fields.get(key)
@@ -129,17 +160,25 @@ def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
 
 
 def default_at(slot: Slot | None) -> tuple[Any, ...]:
-    """Return a field's default as plain data, () if it has none. A model's default has only the keys that are needed,
-    so that a preset can fill in the others."""
+    """Return a field's default as plain data, () if it has none. A model's default has only the
+    keys that are needed, so that a preset can fill in the others."""
     if slot is None or slot.field is None or slot.field.is_required():
         return ()
     default = slot.field.get_default(call_default_factory=True)
     if not isinstance(default, Config):
         return (json.loads(json.dumps(default)),)
     fields = type(default).model_fields
-    constant = {n: getattr(default, n) for n, f in fields.items() if len(choices_of(slot_of(f.annotation))) == 1}
+    constant = {
+        n: getattr(default, n)
+        for n, f in fields.items()
+        if len(choices_of(slot_of(f.annotation))) == 1
+    }
     least = {**constant, **default.model_dump(mode="json", exclude_defaults=True)}
-    return (least if type(default).from_data(json.loads(json.dumps(least))) == default else default.to_data(),)
+    return (
+        least
+        if type(default).from_data(json.loads(json.dumps(least))) == default
+        else default.to_data(),
+    )
 
 
 def get(data: Any, path: KeyPath) -> Any:
@@ -153,7 +192,11 @@ def child(data: Any, key: str | int) -> Any:
     """Return the value under a key or index, or None if there is none."""
     if isinstance(data, Mapping):
         return data.get(key)
-    return data[key] if isinstance(data, list) and isinstance(key, int) and 0 <= key < len(data) else None
+    return (
+        data[key]
+        if isinstance(data, list) and isinstance(key, int) and 0 <= key < len(data)
+        else None
+    )
 
 
 def choices_of(slot: Slot | None) -> tuple[Any, ...]:
@@ -166,13 +209,16 @@ def legal_at(slot: Slot | None) -> str | None:
     """Describe in words what a slot accepts: type, bounds, choices, and the field's description."""
     if slot is None:
         return None
-    words = " or ".join(filter(None, dict.fromkeys(_words(kind, limits) for kind, limits in slot.branches)))
+    words = " or ".join(
+        filter(None, dict.fromkeys(_words(kind, limits) for kind, limits in slot.branches))
+    )
     note = (slot.field.description if slot.field else None) or ""
     return f"{words} ({note})" if words and 0 < len(note) <= LONGEST_NOTE else words or None
 
 
 def _words(kind: Any, limits: Mapping[str, Any]) -> str:
-    origin, arguments = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    arguments = get_args(kind)
     if origin is Literal:
         return ("one of " if len(arguments) > 1 else "") + ", ".join(map(plain, arguments))
     if isinstance(kind, type) and issubclass(kind, BaseModel):
@@ -183,27 +229,49 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
     if origin is tuple and arguments[-1] is not Ellipsis:
         return "a list of " + ", ".join(legal_at(slot_of(each)) or "a value" for each in arguments)
     if origin in (tuple, list):
-        least, most, inner = limits.get("min_length"), limits.get("max_length"), legal_at(slot_of(arguments[0]))
-        count = f"at most {most}" if not least else f"{least} to {most}" if most else f"at least {least}"
-        return "a list" + (f" ({count} items)" if least or most else "") + (f", each {inner}" if inner else "")
+        least = limits.get("min_length")
+        most = limits.get("max_length")
+        inner = legal_at(slot_of(arguments[0]))
+        count = (
+            f"at most {most}"
+            if not least
+            else f"{least} to {most}"
+            if most
+            else f"at least {least}"
+        )
+        return (
+            "a list"
+            + (f" ({count} items)" if least or most else "")
+            + (f", each {inner}" if inner else "")
+        )
     if kind is str:
         return f"text that matches {limits['pattern']}" if "pattern" in limits else "text"
-    words = {int: "a whole number", float: "a number", bool: "true or false", NoneType: "null"}.get(kind, "")
-    bounds = {n: f"{limits[n]:g}" if isinstance(limits[n], float) else str(limits[n]) for n in BOUNDS if n in limits}
+    words = {int: "a whole number", float: "a number", bool: "true or false", NoneType: "null"}.get(
+        kind, ""
+    )
+    bounds = {
+        n: f"{limits[n]:g}" if isinstance(limits[n], float) else str(limits[n])
+        for n in BOUNDS
+        if n in limits
+    }
     if {"ge", "le"} <= bounds.keys():
         return f"{words} from {bounds['ge']} to {bounds['le']}"
     return f"{words} {' and '.join(f'{BOUNDS[name]} {bound}' for name, bound in bounds.items())}".strip()
 
 
-def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot, type[BaseModel]]]:
-    """Yield every key below a model: its path (items as ``key[]``, kinds as ``key[kind=name]``), its slot, and the
-    model that declares it."""
+def every_key(
+    model: type[BaseModel], before: str = ""
+) -> Iterator[tuple[str, Slot, type[BaseModel]]]:
+    """Yield every key below a model: its path (items as ``key[]``, kinds as ``key[kind=name]``),
+    its slot, and the model that declares it."""
     for name, field in model.model_fields.items():
-        path, slot = f"{before}{name}", slot_of(field.annotation, field)
+        path = f"{before}{name}"
+        slot = slot_of(field.annotation, field)
         yield path, slot, model
         for kind, _ in slot.branches:
             if get_origin(kind) in (tuple, list):
-                path, slot = f"{path}[]", slot_of(get_args(kind)[0])
+                path = f"{path}[]"
+                slot = slot_of(get_args(kind)[0])
                 break
         kinds = kinds_of(slot)
         if kinds is not None:

@@ -1,7 +1,9 @@
-"""Reads YAML 1.2 as plain data with the place of every key and value, so that all problems are shown at their places.
+"""Reads YAML 1.2 as plain data with the place of every key and value, so that all problems are
+shown at their places.
 
-Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Deliberately
-unsupported: merge keys (``<<``, not part of YAML 1.2), tags, several documents, and keys that are not text."""
+Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is
+seen. Deliberately unsupported: merge keys (``<<``, not part of YAML 1.2), tags, several documents,
+and keys that are not text."""
 
 from __future__ import annotations
 
@@ -23,14 +25,19 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
 
-SHOWN_COLUMNS = 110  # Characters of a source line that a message shows; longer lines are cut around the caret
-MAX_PROBLEMS = 100  # Most problems that a message lists, and most that are searched for in a single mapping
+SHOWN_COLUMNS = (
+    110  # Characters of a source line that a message shows; longer lines are cut around the caret
+)
+MAX_PROBLEMS = (
+    100  # Most problems that a message lists, and most that are searched for in a single mapping
+)
 
 
 @dataclass(frozen=True)
 class Place:
-    """A position in a text. ``line`` and ``column`` count from 1, in characters; ``width`` is that of the caret. A
-    ``line`` of 0 means an argument of the command line; ``line_text`` is then the whole argument."""
+    """A position in a text. ``line`` and ``column`` count from 1, in characters; ``width`` is that
+    of the caret. A ``line`` of 0 means an argument of the command line; ``line_text`` is then the
+    whole argument."""
 
     origin: str
     line: int
@@ -45,17 +52,25 @@ class Place:
 
     def excerpt(self) -> list[str]:
         """Return the source line and a line with a caret under the place, both indented."""
-        start = max(0, self.column - 1 - SHOWN_COLUMNS // 2) if len(self.line_text) > SHOWN_COLUMNS else 0
+        start = (
+            max(0, self.column - 1 - SHOWN_COLUMNS // 2)
+            if len(self.line_text) > SHOWN_COLUMNS
+            else 0
+        )
         cut = self.line_text[start : start + SHOWN_COLUMNS]
         shown = "".join(letter if letter.isprintable() else " " for letter in cut)
         offset = self.column - 1 - start
         width = max(1, min(self.width, len(shown) - offset))
-        return [f"{self.line or '':>5} | {shown}".rstrip(), f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}"]
+        return [
+            f"{self.line or '':>5} | {shown}".rstrip(),
+            f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}",
+        ]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A mistake: message, place, legal values, the nearest legal word, and a second place that is involved."""
+    """A mistake: message, place, legal values, the nearest legal word, and a second place that is
+    involved."""
 
     message: str
     place: Place | None
@@ -66,12 +81,18 @@ class Problem:
     other_says: str = ""
 
     def __str__(self) -> str:
-        lines = [f"{self.place.head}: {self.message}", *self.place.excerpt()] if self.place else [self.message]
+        lines = (
+            [f"{self.place.head}: {self.message}", *self.place.excerpt()]
+            if self.place
+            else [self.message]
+        )
         if self.other:
             lines += [f"  {self.other_says} {self.other.head}", *self.other.excerpt()]
         lines += [f"  did you mean: {self.nearest}"] if self.nearest else []
         if self.legal:
-            lines += textwrap.wrap(self.legal, 118, initial_indent="  legal: ", subsequent_indent=" " * 9)
+            lines += textwrap.wrap(
+                self.legal, 118, initial_indent="  legal: ", subsequent_indent=" " * 9
+            )
         return "\n".join(lines + ([f"  to do: {self.fix}"] if self.fix else []))
 
 
@@ -82,7 +103,9 @@ class DeclarationError(UserError):
         self.origin, self.problems = origin, in_order(problems)
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         lines = [*map(str, self.problems[:MAX_PROBLEMS])]
-        lines += [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
+        lines += (
+            [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
+        )
         super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(lines))
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -90,7 +113,8 @@ class DeclarationError(UserError):
 
 
 def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
-    """Return the problems sorted by place, without duplicates: without place first, then the command line's."""
+    """Return the problems sorted by place, without duplicates: without place first, then the
+    command line's."""
     unique = {(problem.place, problem.message): problem for problem in problems}.values()
 
     def position(problem: Problem) -> tuple[int, int]:
@@ -100,8 +124,11 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
     return tuple(sorted(unique, key=position))
 
 
-KeyPath = tuple[str | int, ...]  # Position of a value in the data: keys of mappings and indices of lists
-MAX_BYTES = 500_000  # An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
+KeyPath = tuple[
+    str | int, ...
+]  # Position of a value in the data: keys of mappings and indices of lists
+# An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
+MAX_BYTES = 500_000
 MAX_NODES = 50_000  # Values after aliases are expanded; this stops an alias bomb
 MAX_DEPTH = 40  # Levels of nesting; the schema needs 8
 _TAG = "tag:yaml.org,2002:"
@@ -119,30 +146,43 @@ class Source:
     keys: Mapping[KeyPath, Place]
 
     def place_of(self, path: KeyPath) -> Place:
-        """Return the place of a value, or of the innermost enclosing value if it is not in the text (a default)."""
+        """Return the place of a value, or of the innermost enclosing value if it is not in the
+        text (a default)."""
         while path and path not in self.values:
             path = path[:-1]
         return self.values[path]
 
     def key_place_of(self, path: KeyPath) -> Place:
-        """Return the place of a key, or else of the innermost enclosing key or value that has a place."""
+        """Return the place of a key, or else of the innermost enclosing key or value that has a
+        place."""
         while path and path not in self.keys and path not in self.values:
             path = path[:-1]
         return self.keys[path] if path in self.keys else self.values[path]
 
-    def with_value(self, path: KeyPath, data: Any, donor: Source, donor_path: KeyPath = ()) -> Source:
-        """Return this source with new ``data``, whose value at ``path`` came from ``donor`` at ``donor_path``."""
-        depth, merged = len(donor_path), []
+    def with_value(
+        self, path: KeyPath, data: Any, donor: Source, donor_path: KeyPath = ()
+    ) -> Source:
+        """Return this source with new ``data``, whose value at ``path`` came from ``donor`` at
+        ``donor_path``."""
+        depth = len(donor_path)
+        merged = []
         for own, donated in ((self.values, donor.values), (self.keys, donor.keys)):
             kept = {at: place for at, place in own.items() if at[: len(path)] != path}
-            merged.append(kept | {path + at[depth:]: p for at, p in donated.items() if at[:depth] == donor_path})
+            merged.append(
+                kept
+                | {path + at[depth:]: p for at, p in donated.items() if at[:depth] == donor_path}
+            )
         merged[1][path] = donor.place_of(donor_path)
         return Source(self.origin, self.text, data, *merged)
 
 
 def read_yaml(path: Path) -> Source:
-    """Read a file whose top level is a mapping. Raises DeclarationError with every problem and its place."""
-    path, place, legal, fix = Path(path), None, None, None
+    """Read a file whose top level is a mapping. Raises DeclarationError with every problem and its
+    place."""
+    path = Path(path)
+    place = None
+    legal = None
+    fix = None
     try:
         with path.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)
@@ -152,12 +192,18 @@ def read_yaml(path: Path) -> Source:
             if isinstance(source.data, dict):
                 return source
             kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
-            message, place, legal = f"the file {kind}", source.place_of(()), "keys and values, as in `name: thesis`"
+            message = f"the file {kind}"
+            place = source.place_of(())
+            legal = "keys and values, as in `name: thesis`"
         else:
-            message, legal = "the file is too large for a declaration", f"at most {MAX_BYTES} bytes"
+            message = "the file is too large for a declaration"
+            legal = f"at most {MAX_BYTES} bytes"
     except FileNotFoundError:
-        found = sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-        message, legal = "there is no such file", ", ".join(found[:10]) or None
+        found = (
+            sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        )
+        message = "there is no such file"
+        legal = ", ".join(found[:10]) or None
     except IsADirectoryError:
         message = "this is a folder, not a YAML file"
     except OSError as error:
@@ -166,21 +212,26 @@ def read_yaml(path: Path) -> Source:
         lines = content[: error.start].decode("utf-8", errors="replace").split("\n")
         rest = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
         place = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + rest)
-        message, fix = f"byte 0x{content[error.start]:02x} is not UTF-8", "save the file as UTF-8"
+        message = f"byte 0x{content[error.start]:02x} is not UTF-8"
+        fix = "save the file as UTF-8"
     raise DeclarationError(str(path), [Problem(message, place, legal=legal, fix=fix)])
 
 
 def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
-    """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text is an argument of the
-    command line, so that places have no line number. Raises DeclarationError."""
-    starts, lines = [0, *(match.end() for match in re.finditer("\n", text))], text.split("\n")
+    """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text
+    is an argument of the command line, so that places have no line number. Raises
+    DeclarationError."""
+    starts = [0, *(match.end() for match in re.finditer("\n", text))]
+    lines = text.split("\n")
 
     def place(index: int, end: int) -> Place:
         """Return the place of the characters from ``index`` to ``end``, counted after ``start``."""
         index = min(index + start, len(text))
         line = bisect_right(starts, index) - 1
         width = max(1, min(end + start, starts[line] + len(lines[line])) - index)
-        return Place(origin, 0 if is_argument else line + 1, index - starts[line] + 1, lines[line], width)
+        return Place(
+            origin, 0 if is_argument else line + 1, index - starts[line] + 1, lines[line], width
+        )
 
     if version := _OTHER_VERSION.search(text):
         at = place(version.start() - start, version.end())
@@ -198,11 +249,18 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         message, limit, index = error.args
         problem = Problem(message, place(index, index + 1), legal=f"at most {limit}")
     except MarkedYAMLError as error:
-        mark, context = error.problem_mark or error.context_mark, error.context_mark
+        mark = error.problem_mark or error.context_mark
+        context = error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
-        begun = place(context.index, context.index + 1) if context and mark and context.index != mark.index else None
+        begun = (
+            place(context.index, context.index + 1)
+            if context and mark and context.index != mark.index
+            else None
+        )
         what = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
-        problem = Problem(f"not valid YAML: {what}", where, other=begun, other_says="which began at")
+        problem = Problem(
+            f"not valid YAML: {what}", where, other=begun, other_says="which began at"
+        )
     except ReaderError as error:
         index = int(error.position)
         letter = f"U+{ord(text[start + index]):04X}"
@@ -214,27 +272,37 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
 
 def to_yaml(data: Any) -> str:
     """Return plain data as YAML 1.2 with the order of keys kept; `parse_yaml` inverts it."""
-    writer, stream = YAML(), StringIO()
-    writer.default_flow_style, writer.width = False, 120
+    writer = YAML()
+    stream = StringIO()
+    writer.default_flow_style = False
+    writer.width = 120
     writer.dump(data, stream)
     return stream.getvalue()
 
 
 class _TooMuch(Exception):
-    """A declaration exceeds a limit. Its arguments are the message, the limit, and the character where that happens."""
+    """A declaration exceeds a limit. Its arguments are the message, the limit, and the character
+    where that happens."""
 
 
 class _BoundedParser(Parser):
-    """Refuses a text before the composer recurses too deeply, the scanner becomes slow, or nodes fill the memory."""
+    """Refuses a text before the composer recurses too deeply, the scanner becomes slow, or nodes
+    fill the memory."""
 
     depth = nodes = 0
 
     def get_event(self) -> Any:
         event = super().get_event()
-        self.depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        self.depth += isinstance(event, CollectionStartEvent) - isinstance(
+            event, CollectionEndEvent
+        )
         self.nodes += isinstance(event, NodeEvent)  # keys count too
         if self.depth > MAX_DEPTH or self.nodes > 2 * MAX_NODES:
-            excess = ("nested too deeply", MAX_DEPTH) if self.depth > MAX_DEPTH else ("too many values", MAX_NODES)
+            excess = (
+                ("nested too deeply", MAX_DEPTH)
+                if self.depth > MAX_DEPTH
+                else ("too many values", MAX_NODES)
+            )
             raise _TooMuch(*excess, event.start_mark.index)
         return event
 
@@ -256,7 +324,9 @@ class _Builder:
         if len(self.problems) >= MAX_PROBLEMS or self._nodes > MAX_NODES + 1:
             return None
         if self._nodes > MAX_NODES:
-            return self._refuse("too many values", place, f"at most {MAX_NODES} values after aliases are expanded")
+            return self._refuse(
+                "too many values", place, f"at most {MAX_NODES} values after aliases are expanded"
+            )
         if any(node is outer for outer in within):
             return self._refuse("an alias refers to a value that contains it", place)
         if len(within) >= MAX_DEPTH:
@@ -264,30 +334,44 @@ class _Builder:
         if isinstance(node, MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, path, (*within, node))
         if isinstance(node, SequenceNode) and node.tag == _TAG + "seq":
-            return [self.build(item, (*path, index), (*within, node)) for index, item in enumerate(node.value)]
+            return [
+                self.build(item, (*path, index), (*within, node))
+                for index, item in enumerate(node.value)
+            ]
         return self._scalar(node, place)
 
-    def _mapping(self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]) -> dict[str, Any]:
+    def _mapping(
+        self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]
+    ) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            at, before = self._of(key_node), len(self.problems)
+            at = self._of(key_node)
+            before = len(self.problems)
             if key_node.tag == _TAG + "merge":
                 fix = "write the keys out, or use an alias for a whole value"
-                self.problems.append(Problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix))
+                self.problems.append(
+                    Problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix)
+                )
                 continue
             key = self._scalar(key_node, at) if isinstance(key_node, ScalarNode) else None
             if isinstance(key, str) and key not in result:
                 self.keys[(*path, key)] = at
                 result[key] = self.build(value_node, (*path, key), within)
             elif isinstance(key, str):
-                first, message = self.keys[(*path, key)], f"duplicate key `{key}`"
-                self.problems.append(Problem(message, at, other=first, other_says="already written at", fix="keep one"))
+                first = self.keys[(*path, key)]
+                message = f"duplicate key `{key}`"
+                self.problems.append(
+                    Problem(
+                        message, at, other=first, other_says="already written at", fix="keep one"
+                    )
+                )
             elif len(self.problems) == before:
                 self._refuse("a key must be text", at, "text; put quotes around numbers")
         return result
 
     def _scalar(self, node: Node, place: Place) -> Any:
-        kind, text = str(node.tag).removeprefix(_TAG), node.value
+        kind = str(node.tag).removeprefix(_TAG)
+        text = node.value
         try:
             if not isinstance(node, ScalarNode):
                 pass
@@ -297,14 +381,20 @@ class _Builder:
                 return {"true": True, "false": False}[text.lower()]
             elif kind in ("int", "float"):
                 digits = text.lower().replace("_", "").replace(".inf", "inf").replace(".nan", "nan")
-                return float(digits) if kind == "float" else int(digits, 0 if re.match("[-+]?0[ox]", digits) else 10)
+                return (
+                    float(digits)
+                    if kind == "float"
+                    else int(digits, 0 if re.match("[-+]?0[ox]", digits) else 10)
+                )
             elif kind in ("str", "timestamp"):  # YAML 1.2 has no dates: they are text
                 text.encode()
                 return text
         except (ValueError, KeyError):
             return self._refuse(f"{text[:40]!r} cannot be read as {kind}", place)
         tag = str(node.tag).replace(_TAG, "!!")
-        return self._refuse(f"the tag {tag} is not supported", place, "plain mappings, lists, text and numbers")
+        return self._refuse(
+            f"the tag {tag} is not supported", place, "plain mappings, lists, text and numbers"
+        )
 
     def _refuse(self, message: str, place: Place, legal: str | None = None) -> None:
         self.problems.append(Problem(message, place, legal=legal))

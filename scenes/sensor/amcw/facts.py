@@ -1,4 +1,5 @@
-"""The numbers of a continuous-wave imager, as in its file, and the phase unwrapping that its frequencies allow."""
+"""The numbers of a continuous-wave imager, as in its file, and the phase unwrapping that its
+frequencies allow."""
 
 from __future__ import annotations
 
@@ -30,10 +31,11 @@ from scenes.sensor.facts import (
 
 
 class UnwrapTable(NamedTuple):
-    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path. ``lattice`` (f,) float32:
-    integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal to m, which sum the
-    wrapped phases to whole numbers. These are a key of the wrap counts: ``sizes`` and ``offset`` (f - 1,) int32 of the
-    keys, ``wraps`` (f, keys) float32, -1 for none. ``metres_per_turn`` (f,) float32. ``unambiguous_m``: c / 2 f_0."""
+    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path.
+    ``lattice`` (f,) float32: integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32:
+    integer rows orthogonal to m, which sum the wrapped phases to whole numbers. These are a key of
+    the wrap counts: ``sizes`` and ``offset`` (f - 1,) int32 of the keys, ``wraps`` (f, keys)
+    float32, -1 for none. ``metres_per_turn`` (f,) float32. ``unambiguous_m``: c / 2 f_0."""
 
     lattice: np.ndarray
     combination: np.ndarray
@@ -45,8 +47,11 @@ class UnwrapTable(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]) -> UnwrapTable:
-    """Return the table for one to three frequencies. Raises UserError if they have no common base frequency."""
+def unwrap_table(
+    frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]
+) -> UnwrapTable:
+    """Return the table for one to three frequencies. Raises UserError if they have no common base
+    frequency."""
     lattice, base_hz = _integer_ratios(frequencies_hz)
     combination = _orthogonal_rows(lattice)
     counts = _wrap_counts(lattice)
@@ -58,7 +63,11 @@ def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squar
     table = np.full((np.prod(sizes, dtype=int), lattice.size), -1, np.float32)
     table[(keys + offset) @ strides] = counts
     unambiguous_m = SPEED_OF_LIGHT_AIR / (2 * base_hz)
-    weights = lattice / (lattice**2).sum() if fusion == "least_squares" else np.full(lattice.size, 1 / lattice.sum())
+    weights = (
+        lattice / (lattice**2).sum()
+        if fusion == "least_squares"
+        else np.full(lattice.size, 1 / lattice.sum())
+    )
     return UnwrapTable(
         lattice.astype(np.float32),
         combination.astype(np.float32),
@@ -87,35 +96,61 @@ def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
     """Return the wrap counts (n, f) that occur within the unambiguous range."""
     distance = (np.arange(0, 1, 1 / (64 * int(lattice.max()))) + 1e-9)[:, None] * lattice
     errors = sorted(
-        product((-noise_turns, 0.0, noise_turns), repeat=lattice.size), key=lambda e: -sum(abs(x) for x in e)
+        product((-noise_turns, 0.0, noise_turns), repeat=lattice.size),
+        key=lambda e: -sum(abs(x) for x in e),
     )
-    wraps = np.concatenate([np.floor(distance + np.array(error)) for error in errors]).astype(np.int64)
+    wraps = np.concatenate([np.floor(distance + np.array(error)) for error in errors]).astype(
+        np.int64
+    )
     return wraps[(wraps >= 0).all(axis=1) & (wraps < lattice).all(axis=1)]
 
 
 def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
-    """Return the shortest independent integer rows t (f - 1, f) with t . m = 0 that distinguish all wrap counts."""
+    """Return the shortest independent integer rows t (f - 1, f) with t . m = 0 that distinguish
+    all wrap counts."""
     if lattice.size < 3:
-        return np.array([[-lattice[1], lattice[0]]]) if lattice.size == 2 else np.empty((0, 1), np.int64)
-    rows = [np.array(t) for t in product(range(-reach, reach + 1), repeat=3) if any(t) and np.dot(t, lattice) == 0]
+        return (
+            np.array([[-lattice[1], lattice[0]]])
+            if lattice.size == 2
+            else np.empty((0, 1), np.int64)
+        )
+    rows = [
+        np.array(t)
+        for t in product(range(-reach, reach + 1), repeat=3)
+        if any(t) and np.dot(t, lattice) == 0
+    ]
     rows.sort(key=lambda t: (int((t**2).sum()), tuple(-t)))
-    # a pair that spans the whole orthogonal lattice has |t1 x t2| = |m|; a longer cross product would confuse wraps
+    # a pair that spans the whole orthogonal lattice has |t1 x t2| = |m|; a longer cross product
+    # would confuse wraps
     for second in rows[1:]:
         if (np.cross(rows[0], second) ** 2).sum() == (lattice**2).sum():
             return np.stack([rows[0], second])
-    raise UserError(f"modulation frequency ratios {lattice.tolist()} cannot be unwrapped within {reach} turns")
+    raise UserError(
+        f"modulation frequency ratios {lattice.tolist()} cannot be unwrapped within {reach} turns"
+    )
 
 
-Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
-Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
-Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
-WIDEST_PX = 2128  # row with the filter's window: `kernels.STRIDE`, repeated here so that declarations compile nothing
+Contrasts = Annotated[
+    Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)
+]
+Window = Annotated[
+    Fact[int],
+    checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1),
+]
+Phases = Annotated[
+    Fact[int],
+    checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3),
+]
+# row with the filter's window: `kernels.STRIDE`, repeated here so that declarations compile
+# nothing
+WIDEST_PX = 2128
 
 
 class EmitterFacts(ConeFacts):
-    """The light source: a point beside the lens with uniform intensity in its cone. ``irradiance_w_m2``: on a facing
-    surface on the axis at 1 m; only a reference for ambient light. ``mask_slopes``: corners (x/z, y/z),
-    counter-clockwise in the image's axes, of a convex polygon outside which the camera gives no range."""
+    """The light source: a point beside the lens with uniform intensity in its cone.
+    ``irradiance_w_m2``: on a facing surface on the axis at 1 m; only a reference for ambient
+    light. ``mask_slopes``: corners (x/z, y/z), counter-clockwise in the image's axes, of a convex
+    polygon outside which the camera gives no range."""
 
     irradiance_w_m2: Positive
     mask_slopes: Fact[tuple[tuple[float, float], ...]] | None = None
@@ -123,7 +158,8 @@ class EmitterFacts(ConeFacts):
     @model_validator(mode="after")
     def _mask_is_convex(self) -> EmitterFacts:
         if self.mask_slopes is not None:
-            # corners of a convex area turn one way: counter-clockwise in axes x right, y down, as in the file
+            # corners of a convex area turn one way: counter-clockwise in axes x right, y down, as
+            # in the file
             x, y = np.diff([*self.mask_slopes.value, *self.mask_slopes.value[:2]], axis=0).T
             if len(x) < 4 or not (x[:-1] * y[1:] - y[:-1] * x[1:] > 0).all():
                 what = "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
@@ -132,8 +168,9 @@ class EmitterFacts(ConeFacts):
 
 
 class ScatterFacts(Config):
-    """Light that reaches the wrong pixels: the lens blurs by a Gaussian of deviation ``blur_px``, and a share of the
-    light is spread by a Gaussian of ``stray_px`` instead. A ghost image at a distance is not modelled."""
+    """Light that reaches the wrong pixels: the lens blurs by a Gaussian of deviation ``blur_px``,
+    and a share of the light is spread by a Gaussian of ``stray_px`` instead. A ghost image at a
+    distance is not modelled."""
 
     blur_px: NonNegative
     stray_share: Share
@@ -141,8 +178,9 @@ class ScatterFacts(Config):
 
 
 class ColourFacts(Config):
-    """The colour camera, to whose pixels depth images may be aligned. ``turn_deg`` (a rotation vector) and ``shift_mm``
-    map points of the depth camera's frame to its frame. ``distortion``: as for every lens."""
+    """The colour camera, to whose pixels depth images may be aligned. ``turn_deg`` (a rotation
+    vector) and ``shift_mm`` map points of the depth camera's frame to its frame. ``distortion``:
+    as for every lens."""
 
     turn_deg: Fact[tuple[float, float, float]]
     shift_mm: Fact[tuple[float, float, float]]
@@ -160,8 +198,9 @@ class ColourFacts(Config):
 
 
 class ModulationFacts(Config):
-    """Continuous-wave modulation, one value per frequency except ``phases``. ``contrast``: the fundamental's amplitude
-    over the mean light. ``wiggling_residual``: share of harmonics left after calibration and by bandwidth."""
+    """Continuous-wave modulation, one value per frequency except ``phases``. ``contrast``: the
+    fundamental's amplitude over the mean light. ``wiggling_residual``: share of harmonics left
+    after calibration and by bandwidth."""
 
     frequencies_hz: PositiveEach
     phases: Phases
@@ -172,21 +211,26 @@ class ModulationFacts(Config):
     def _one_value_each(self) -> ModulationFacts:
         count = len(self.frequencies_hz.value)
         if not 1 <= count <= 3 or len(set(self.frequencies_hz.value)) != count:
-            raise ValueError(f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3, all different")
+            raise ValueError(
+                f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3, all different"
+            )
         for key in ("contrast", "wiggling_residual"):
             if len(getattr(self, key).value) != count:
                 raise ValueError(f"{key} needs one value for each of the {count} frequencies_hz")
         try:
             unwrap_table(self.frequencies_hz.value, "least_squares")
         except UserError as mistake:
-            raise ValueError(f"frequencies_hz: {mistake.message}; legal: {mistake.legal}") from mistake
+            raise ValueError(
+                f"frequencies_hz: {mistake.message}; legal: {mistake.legal}"
+            ) from mistake
         return self
 
 
 class PhotonFacts(Config):
-    """The photon budget: one gain, calibrated at one point. ``signal_electrons``: in both wells in one exposure, from
-    albedo 1, facing, on the axis at 1 m. ``full_well_electrons``: of one well (None: only the converter saturates).
-    ``exposure_ends_electrons``: in both wells when a pixel's exposure ends; its sample is scaled to the full length."""
+    """The photon budget: one gain, calibrated at one point. ``signal_electrons``: in both wells in
+    one exposure, from albedo 1, facing, on the axis at 1 m. ``full_well_electrons``: of one well
+    (None: only the converter saturates). ``exposure_ends_electrons``: in both wells when a pixel's
+    exposure ends; its sample is scaled to the full length."""
 
     signal_electrons: Positive
     calibration_sigma_mm: Positive
@@ -213,8 +257,9 @@ class FixedPatternFacts(SmoothPatternFacts):
 
 
 class ResidualByAmplitudeFacts(Config):
-    """The lattice residual allowed to dim pixels: ``scale_turns`` A^``slope`` of the brightest frequency's amplitude A,
-    at most ``greatest_turns`` and at least the engine's ``lattice_residual_turns``."""
+    """The lattice residual allowed to dim pixels: ``scale_turns`` A^``slope`` of the brightest
+    frequency's amplitude A, at most ``greatest_turns`` and at least the engine's
+    ``lattice_residual_turns``."""
 
     scale_turns: Positive
     slope: Fact[float]
@@ -222,9 +267,10 @@ class ResidualByAmplitudeFacts(Config):
 
 
 class FlyingPixelFacts(Config):
-    """The gate on the finished range image, 3x3. A pixel is removed if its neighbours reach more than ``near_mm``
-    nearer and ``far_mm`` farther, either more than ``most_mm``, and their summed amplitudes scatter by
-    ``relative_deviation`` of their mean or more (with a mean of at least ``least_mean_units``)."""
+    """The gate on the finished range image, 3x3. A pixel is removed if its neighbours reach more
+    than ``near_mm`` nearer and ``far_mm`` farther, either more than ``most_mm``, and their summed
+    amplitudes scatter by ``relative_deviation`` of their mean or more (with a mean of at least
+    ``least_mean_units``)."""
 
     relative_deviation: NonNegative
     least_mean_units: NonNegative
@@ -234,13 +280,15 @@ class FlyingPixelFacts(Config):
 
 
 class EngineFacts(LimitFacts):
-    """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is not applied.
-    ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
-    ``spatial_sigma_px``: Gaussian of the window; None: a box. A centre not brighter than ``dim_amplitude_units`` gets
-    weights by distance alone; if ``drop_dim_neighbours``, a brighter centre ignores dimmer neighbours.
-    ``edge_threshold``: limit of the sum over the window of (1 - cos dphi)/2, ``edges_in`` any of the frequencies or
-    their mean; ``edges_to_dim``: whether it includes such dim neighbours. ``amplitude_gains`` multiply each frequency's
-    amplitude before all gates. ``limits_along``: direction of the limits of range."""
+    """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left
+    out is not applied. ``filter_on``: each phasor counts by its weight alone (``unit_phasors``),
+    or by its amplitude too (``phasors``). ``spatial_sigma_px``: Gaussian of the window; None: a
+    box. A centre not brighter than ``dim_amplitude_units`` gets weights by distance alone; if
+    ``drop_dim_neighbours``, a brighter centre ignores dimmer neighbours. ``edge_threshold``: limit
+    of the sum over the window of (1 - cos dphi)/2, ``edges_in`` any of the frequencies or their
+    mean; ``edges_to_dim``: whether it includes such dim neighbours. ``amplitude_gains`` multiply
+    each frequency's amplitude before all gates. ``limits_along``: direction of the limits of
+    range."""
 
     window_px: Window
     filter_on: Fact[Literal["unit_phasors", "phasors"]]
@@ -287,9 +335,13 @@ class AmcwCamera(CameraFacts):
     def _parts_fit_each_other(self) -> AmcwCamera:
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
-            raise ValueError(f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}")
+            raise ValueError(
+                f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}"
+            )
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
-            raise ValueError("engine.amplitude_gains needs one value for each of modulation.frequencies_hz")
+            raise ValueError(
+                "engine.amplitude_gains needs one value for each of modulation.frequencies_hz"
+            )
         return self
 
     @property
@@ -299,12 +351,15 @@ class AmcwCamera(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render; light reaches a pixel through the engine's windows and the lens's blur."""
+        """Optics for the render; light reaches a pixel through the engine's windows and the lens's
+        blur."""
         blur_px = int(np.ceil(3 * self.scatter.blur_px.value)) if self.scatter else 0
         return self.optics_with(
             **self.emitter.optics(),
             frequencies_hz=self.frequencies_hz,
-            margin_px=self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0) + blur_px,
+            margin_px=self.engine.window_px.value // 2
+            + (1 if self.engine.flying_pixels else 0)
+            + blur_px,
             farthest_m=self.engine.max_range_mm.value * MM,
             limits_along=self.engine.limits_along.value,
         )

@@ -1,4 +1,5 @@
-"""The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round. Compiled loops, float32."""
+"""The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round. Compiled loops,
+float32."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,24 +12,35 @@ from scenes.sensor.amcw.facts import UnwrapTable
 from scenes.sensor.normals import FAST
 
 f4 = np.float32
-HALF, ONE, TWO, FOUR, INFINITE, NAN = (f4(x) for x in (0.5, 1, 2, 4, np.inf, np.nan))
-PI, HALF_PI, TWO_PI = f4(math.pi), f4(0.5 * math.pi), f4(2.0 * math.pi)
+HALF = f4(0.5)
+ONE = f4(1)
+TWO = f4(2)
+FOUR = f4(4)
+INFINITE = f4(np.inf)
+NAN = f4(np.nan)
+PI = f4(math.pi)
+HALF_PI = f4(0.5 * math.pi)
+TWO_PI = f4(2.0 * math.pi)
 ATAN = tuple(map(f4, (-0.0040540580, 0.0218612288, -0.0559098861, 0.0964200441)))
 ATAN += tuple(map(f4, (-0.1390853351, 0.1994653599, -0.3332985605, 0.9999993329)))
-"""Minimax odd polynomial of the arctangent on 0..1, highest power first (Remez, |error| < 1.2e-7 rad)."""
+"""Minimax odd polynomial of the arctangent on 0..1, highest power first (Remez, |error| < 1.2e-7
+rad)."""
 BLOCK = 1024
-VALID, SATURATED, OUTSIDE_MASK = map(np.int32, (Reason.VALID, Reason.SATURATED, Reason.OUTSIDE_MASK))
+VALID, SATURATED, OUTSIDE_MASK = map(
+    np.int32, (Reason.VALID, Reason.SATURATED, Reason.OUTSIDE_MASK)
+)
 LOW_AMPLITUDE, LOW_REFLECTIVITY = map(np.int32, (Reason.LOW_AMPLITUDE, Reason.LOW_REFLECTIVITY))
 AMPLITUDE_RATIO, UNWRAP = map(np.int32, (Reason.AMPLITUDE_RATIO, Reason.UNWRAP))
 EDGE, OUT_OF_RANGE = map(np.int32, (Reason.EDGE, Reason.OUT_OF_RANGE))
 
 
 class Gates(NamedTuple):
-    """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0. ``edge``: sum of (1 - cos
-    dphi)/2, in the mean of the frequencies if ``edge_mean`` is 1, else in any. Residual limit in turns: ``residual``,
-    or ``residual_scale`` A^``residual_slope`` of the greatest amplitude A, within ``residual`` and ``residual_most``.
-    ``ratio``: (greatest - least) / greatest amplitude. ``least`` amplitude and ``total`` in units, ``reflectivity`` in
-    units m^2. Range counts along the optical axis if ``axial`` is 1, else along the ray."""
+    """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0. ``edge``:
+    sum of (1 - cos dphi)/2, in the mean of the frequencies if ``edge_mean`` is 1, else in any.
+    Residual limit in turns: ``residual``, or ``residual_scale`` A^``residual_slope`` of the
+    greatest amplitude A, within ``residual`` and ``residual_most``. ``ratio``: (greatest - least)
+    / greatest amplitude. ``least`` amplitude and ``total`` in units, ``reflectivity`` in units
+    m^2. Range counts along the optical axis if ``axial`` is 1, else along the ray."""
 
     edge: np.float32
     edge_mean: np.float32
@@ -56,8 +68,9 @@ class FlyingGate(NamedTuple):
 
 
 class DepthEngine(NamedTuple):
-    """The gates and tables that are applied after the filter. ``geometry`` (3, n), of each pixel's unit ray u and the
-    emitter at e: u.e, e.e, u_z. ``outside_mask`` (n,) bool: pixels outside the emitter's polygon."""
+    """The gates and tables that are applied after the filter. ``geometry`` (3, n), of each pixel's
+    unit ray u and the emitter at e: u.e, e.e, u_z. ``outside_mask`` (n,) bool: pixels outside the
+    emitter's polygon."""
 
     geometry: np.ndarray
     outside_mask: np.ndarray
@@ -68,7 +81,8 @@ class DepthEngine(NamedTuple):
 
 @numba.njit(inline="always", **FAST)
 def turns(re: np.float32, im: np.float32) -> np.float32:
-    """Return the phase of (re, im) in turns, 0 <= t < 1; polynomial arctangent, error below 2e-7 turns."""
+    """Return the phase of (re, im) in turns, 0 <= t < 1; polynomial arctangent, error below 2e-7
+    turns."""
     ax = abs(re)
     ay = abs(im)
     big = max(ax, ay)
@@ -97,9 +111,12 @@ def _add_scaled(scale: np.float32, plane: np.ndarray, total: np.ndarray) -> None
 
 
 @numba.njit(**FAST)
-def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, residual2: np.ndarray) -> None:
-    """Convert wrapped phases (f, >= n) in turns, unwrapped in place, to half the light's path (n,) in metres, with the
-    squared lattice residual (n,) in turns^2, infinite if no wrap counts fit."""
+def half_path(
+    turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, residual2: np.ndarray
+) -> None:
+    """Convert wrapped phases (f, >= n) in turns, unwrapped in place, to half the light's path (n,)
+    in metres, with the squared lattice residual (n,) in turns^2, infinite if no wrap counts fit.
+    """
     n_frequencies = turn.shape[0]
     key = np.zeros(n, np.int32)
     sums = np.empty(n, np.float32)
@@ -108,7 +125,8 @@ def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, 
         for f in range(n_frequencies):
             _add_scaled(lattice.combination[row, f], turn[f, :n], sums)
         # another whole number of each pixel's key; -1 if the key is not in the table
-        size, offset = lattice.sizes[row], lattice.offset[row]
+        size = lattice.sizes[row]
+        offset = lattice.offset[row]
         for i in range(np.uint64(n)):
             digit = offset - np.int32(np.floor(sums[i] + HALF))
             outside = (digit < np.int32(0)) | (digit >= size) | (key[i] < np.int32(0))
@@ -122,22 +140,25 @@ def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, 
         residual2[i] = INFINITE if unknown else f4(0)
         key[i] = np.int32(0) if unknown else key[i]
     for f in range(n_frequencies):
-        wraps, ours = lattice.wraps[f], turn[f, :n]
+        wraps = lattice.wraps[f]
+        ours = turn[f, :n]
         for i in range(np.uint64(n)):
             ours[i] += wraps[np.uint64(key[i])]
         _add_scaled(lattice.metres_per_turn[f], ours, half)
         _add_scaled(lattice.lattice[f] / norm, ours, common)
     for f in range(n_frequencies):
-        ours, m = turn[f, :n], lattice.lattice[f]
+        ours = turn[f, :n]
+        m = lattice.lattice[f]
         for i in range(np.uint64(n)):
             r = ours[i] - m * common[i]
             residual2[i] += r * r
 
 
 class GateInputs(NamedTuple):
-    """Quantities of a pixel for the gates: amplitudes; the squared lattice residual, infinite if no wrap counts fit;
-    range, and the limited range, along ray or axis. If noise leaves an interval, each gate gets its worse (or better)
-    end; hence ``greatest`` beside ``brightest``, and ``low`` beside ``high``."""
+    """Quantities of a pixel for the gates: amplitudes; the squared lattice residual, infinite if
+    no wrap counts fit; range, and the limited range, along ray or axis. If noise leaves an
+    interval, each gate gets its worse (or better) end; hence ``greatest`` beside ``brightest``,
+    and ``low`` beside ``high``."""
 
     edge: Any
     least: Any
@@ -152,7 +173,8 @@ class GateInputs(NamedTuple):
 
 @numba.njit(inline="always", **FAST)
 def residual_limit(gates, brightest):  # type: ignore[no-untyped-def]
-    """Return the largest lattice residual in turns of a pixel with a greatest amplitude ``brightest``."""
+    """Return the largest lattice residual in turns of a pixel with a greatest amplitude
+    ``brightest``."""
     if gates.residual_slope == f4(0):
         return gates.residual
     by_amplitude = gates.residual_scale * np.exp(gates.residual_slope * np.log(brightest))
@@ -161,7 +183,8 @@ def residual_limit(gates, brightest):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", **FAST)
 def first_failed(gates, limit, at):  # type: ignore[no-untyped-def]
-    """Return the code of the first gate that a pixel with a `residual_limit` fails, or VALID: the table of gates."""
+    """Return the code of the first gate that a pixel with a `residual_limit` fails, or VALID: the
+    table of gates."""
     # the first gate that fails gives the reason, so gates are tried from the last to the first
     code = LOW_REFLECTIVITY if at.total * at.range_m * at.range_m < gates.reflectivity else VALID
     code = code if (at.low_m >= gates.nearest_m) & (at.high_m <= gates.farthest_m) else OUT_OF_RANGE
@@ -186,10 +209,15 @@ def first_failed_each(gates, at):  # type: ignore[no-untyped-def]
 
 
 def ranges_of(
-    filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, engine: DepthEngine, errors_m: np.ndarray
+    filtered: np.ndarray,
+    edge: np.ndarray,
+    saturated: np.ndarray,
+    engine: DepthEngine,
+    errors_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres (of invalid pixels too), the first gate
-    that each pixel fails, and the sum of amplitudes, (n,) each. ``errors_m`` (n,) is added to half the path."""
+    """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres (of invalid pixels
+    too), the first gate that each pixel fails, and the sum of amplitudes, (n,) each. ``errors_m``
+    (n,) is added to half the path."""
     n = len(errors_m)
     out = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
     _range_and_gates(filtered, edge, saturated, *engine[:4], errors_m.astype(f4), *out)
@@ -200,7 +228,8 @@ def ranges_of(
 def _range_and_gates(  # type: ignore[no-untyped-def]
     filtered, edge, saturated, geometry, outside_mask, lattice, gates, errors_m, z_m, reason, total
 ):
-    """Run `ranges_of`: r = (4 s^2 - e.e) / (4 s - 2 u.e) of half the path s by the emitter at e, along u."""
+    """Run `ranges_of`: r = (4 s^2 - e.e) / (4 s - 2 u.e) of half the path s by the emitter at e,
+    along u."""
     n_frequencies, _, n = filtered.shape
     turn = np.empty((n_frequencies, BLOCK), np.float32)
     # loops over one array are vectorised, as no other can overlap it
@@ -225,17 +254,38 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
         _reasons(block[CODE, :length], saturated[these], outside_mask[these], reason[these])
 
 
-AMPLITUDE, GAP, LEAST, GREATEST, TOTAL, STEEPEST, STEPS, HALF_PATH, RESIDUAL, ERROR, ALONG, EMITTER, COSINE = range(13)
-LIMIT, RANGE, CODE = 13, 14, 15
-"""Rows of a block: the first two of a frequency, five of all frequencies; the two before the last of `DepthEngine`."""
+(
+    AMPLITUDE,
+    GAP,
+    LEAST,
+    GREATEST,
+    TOTAL,
+    STEEPEST,
+    STEPS,
+    HALF_PATH,
+    RESIDUAL,
+    ERROR,
+    ALONG,
+    EMITTER,
+    COSINE,
+) = range(13)
+LIMIT = 13
+RANGE = 14
+CODE = 15
+"""Rows of a block: the first two of a frequency, five of all frequencies; the two before the last
+of `DepthEngine`."""
 
 
 @numba.njit(**FAST)
 def _fold(block, first):  # type: ignore[no-untyped-def]
-    """Take another frequency's amplitude and edge sum into the extremes and sums over the frequencies."""
+    """Take another frequency's amplitude and edge sum into the extremes and sums over the
+    frequencies."""
     for i in range(np.uint64(BLOCK)):
-        a, e = block[AMPLITUDE * BLOCK + i], block[GAP * BLOCK + i]
-        least, greatest, steepest = block[LEAST * BLOCK + i], block[GREATEST * BLOCK + i], block[STEEPEST * BLOCK + i]
+        a = block[AMPLITUDE * BLOCK + i]
+        e = block[GAP * BLOCK + i]
+        least = block[LEAST * BLOCK + i]
+        greatest = block[GREATEST * BLOCK + i]
+        steepest = block[STEEPEST * BLOCK + i]
         block[LEAST * BLOCK + i] = a if first or a < least else least
         block[GREATEST * BLOCK + i] = a if first or a > greatest else greatest
         block[STEEPEST * BLOCK + i] = e if first or e > steepest else steepest
@@ -254,7 +304,9 @@ def _judge(block, gates, n_frequencies):  # type: ignore[no-untyped-def]
         range_m = (FOUR * path * path - block[EMITTER * BLOCK + i]) / ratio
         z = range_m * block[COSINE * BLOCK + i]
         limited = z if gates.axial > f4(0) else range_m
-        least, greatest, total = block[LEAST * BLOCK + i], block[GREATEST * BLOCK + i], block[TOTAL * BLOCK + i]
+        least = block[LEAST * BLOCK + i]
+        greatest = block[GREATEST * BLOCK + i]
+        total = block[TOTAL * BLOCK + i]
         r2 = block[RESIDUAL * BLOCK + i]
         at = GateInputs(edge, least, greatest, total, r2, greatest, range_m, limited, limited)
         block[CODE * BLOCK + i] = f4(first_failed(gates, block[LIMIT * BLOCK + i], at))
@@ -270,9 +322,10 @@ def _reasons(code, saturated, outside_mask, reason):  # type: ignore[no-untyped-
 
 @numba.njit(**FAST)
 def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore[no-untyped-def]
-    """Find pixels between a nearer and a farther surface in the finished image. ``z_m``, ``total`` and ``reason`` (m,
-    t): t frames of m pixels. ``pixels`` (p,): those to check. ``near`` (p, 9): their neighbours and themselves, -1 for
-    none. Writes ``flying`` (p, t) bool. Neighbours whose phases fit a distance count, even out of range."""
+    """Find pixels between a nearer and a farther surface in the finished image. ``z_m``, ``total``
+    and ``reason`` (m, t): t frames of m pixels. ``pixels`` (p,): those to check. ``near`` (p, 9):
+    their neighbours and themselves, -1 for none. Writes ``flying`` (p, t) bool. Neighbours whose
+    phases fit a distance count, even out of range."""
     window = np.empty(9, np.float32)
     for p in range(pixels.size):
         i = pixels[p]
@@ -281,7 +334,9 @@ def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore
             if reason[i, t] != VALID:
                 continue
             z = z_m[i, t]
-            nearest, farthest, size = z, z, 0
+            nearest = z
+            farthest = z
+            size = 0
             for j in near[p]:
                 if j < 0:
                     continue
@@ -295,7 +350,9 @@ def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore
             if between and max(z - nearest, farthest - z) > gate.most_m:
                 sample = window[:size]
                 # amplitudes scatter by at least the gate's share of their mean
-                flying[p, t] = sample.std() >= gate.relative_deviation * max(sample.mean(), gate.least_mean)
+                flying[p, t] = sample.std() >= gate.relative_deviation * max(
+                    sample.mean(), gate.least_mean
+                )
 
 
 @numba.njit(**FAST)

@@ -23,27 +23,36 @@ from scenes.sensor.facts import (
     checked,
 )
 
-SMOOTHING_REACH = 2.5  # deviations at which the smoothing's weights end: 0.04 of the central weight
-NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
+# deviations at which the smoothing's weights end: 0.04 of the central weight
+SMOOTHING_REACH = 2.5
+# seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
+NS = 1e-9
+MRAD = 1e-3
+MW = 1e-3
 
 
 class BeamFacts(Config):
-    """The beam at rest: round, Gaussian in angle. ``power_mw``: mean over the code, a reference for ambient light."""
+    """The beam at rest: round, Gaussian in angle. ``power_mw``: mean over the code, a reference
+    for ambient light."""
 
-    fwhm_mrad: Annotated[Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)]
+    fwhm_mrad: Annotated[
+        Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)
+    ]
     power_mw: Positive
 
 
 class ScanFacts(Config):
-    """The raster: a column is one sweep, a point every ``point_ns``. ``sweep_jitter_mm``: error of a whole sweep."""
+    """The raster: a column is one sweep, a point every ``point_ns``. ``sweep_jitter_mm``: error of
+    a whole sweep."""
 
     point_ns: Positive
     sweep_jitter_mm: NonNegative
 
 
 class CodeFacts(Config):
-    """The code, and its correlation's pulse, assumed Gaussian. ``band_floor``: the spectrum ends at the last line above
-    this share of its maximum. ``integration_ns``: duration of the return that makes one point."""
+    """The code, and its correlation's pulse, assumed Gaussian. ``band_floor``: the spectrum ends
+    at the last line above this share of its maximum. ``integration_ns``: duration of the return
+    that makes one point."""
 
     period_ns: Positive
     correlation_fwhm_ns: Positive
@@ -52,9 +61,10 @@ class CodeFacts(Config):
 
 
 class LidarPhotonFacts(Config):
-    """The photon budget in primary electrons, before the avalanche, of one point's integration. ``signal_electrons``:
-    from albedo 1 facing the camera at 1 m on the axis. ``amplifier_electrons``: standard deviation. ``room_albedo``:
-    mean over the field, whose ambient light the detector sees. ``calibration_*``: published points to fit."""
+    """The photon budget in primary electrons, before the avalanche, of one point's integration.
+    ``signal_electrons``: from albedo 1 facing the camera at 1 m on the axis.
+    ``amplifier_electrons``: standard deviation. ``room_albedo``: mean over the field, whose
+    ambient light the detector sees. ``calibration_*``: published points to fit."""
 
     signal_electrons: Positive
     excess_noise_factor: Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
@@ -70,21 +80,27 @@ class LidarPhotonFacts(Config):
 
 
 class LidarEngineFacts(OutputFacts):
-    """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights of the average over
-    neighbours along columns, then along rows; 0: none. ``agree_deviations``: largest difference of a neighbour's half
-    path. ``least_agreeing``: share of the weights that must agree. ``confidence_electrons``: least strength."""
+    """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights of
+    the average over neighbours along columns, then along rows; 0: none. ``agree_deviations``:
+    largest difference of a neighbour's half path. ``least_agreeing``: share of the weights that
+    must agree. ``confidence_electrons``: least strength."""
 
-    smoothing_px: Annotated[Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)]
+    smoothing_px: Annotated[
+        Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)
+    ]
     agree_deviations: Positive
     least_agreeing: Share
     confidence_electrons: NonNegative
 
 
 class ScannedLidar(CameraFacts):
-    """A lidar that sends one beam per pixel, one after another; pixels are directions at the transmitter."""
+    """A lidar that sends one beam per pixel, one after another; pixels are directions at the
+    transmitter."""
 
     kind: Literal["scanned_lidar"]
-    receiver: Annotated[ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")]
+    receiver: Annotated[
+        ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")
+    ]
     beam: BeamFacts
     scan: ScanFacts
     code: CodeFacts
@@ -99,9 +115,13 @@ class ScannedLidar(CameraFacts):
         if self.integration_points > 3:
             raise ValueError("code.integration_ns may span at most three times scan.point_ns")
         if self.engine.min_range_mm.value * MM >= self.unambiguous_m:
-            raise ValueError("engine.min_range_mm must lie within the range of one period of the code")
+            raise ValueError(
+                "engine.min_range_mm must lie within the range of one period of the code"
+            )
         if len(self.weights) < 3:
-            raise ValueError("code.period_ns must be longer: fewer than three spectral lines are within the band")
+            raise ValueError(
+                "code.period_ns must be longer: fewer than three spectral lines are within the band"
+            )
         return self
 
     @property
@@ -121,7 +141,8 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """Spectrum (K,) of the correlation's pulse on lines 1..K of the comb; 1 at frequency 0, which is removed."""
+        """Spectrum (K,) of the correlation's pulse on lines 1..K of the comb; 1 at frequency 0,
+        which is removed."""
         deviation_s = self.code.correlation_fwhm_ns.value * NS / FWHM_PER_DEVIATION
         last_hz = np.sqrt(-2 * np.log(self.code.band_floor.value)) / (2 * np.pi * deviation_s)
         lines = np.arange(1, int(last_hz * self.period_s) + 1)
@@ -135,16 +156,23 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def field_sr(self) -> float:
-        """Solid angle of the field as a flat aperture sees it: foreshortened by the cosine to the axis."""
+        """Solid angle of the field as a flat aperture sees it: foreshortened by the cosine to the
+        axis."""
         lens = self.nominal_lens
         slopes = lens.region_slopes(lens.whole)
         return float((1 / (1 + (slopes**2).sum(axis=-1)) ** 2).sum() / (lens.fx * lens.fy))
 
     def ambient_electrons(self, irradiance_uw_cm2_nm: float) -> float:
-        """Return the electrons of an integration from ambient light of that irradiance on the whole field. The field's
-        solid angle sends a E / pi times it; the beam of power P sends, from albedo 1 at 1 m, P / pi."""
+        """Return the electrons of an integration from ambient light of that irradiance on the
+        whole field. The field's solid angle sends a E / pi times it; the beam of power P sends,
+        from albedo 1 at 1 m, P / pi."""
         irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * self.photons.band_nm.value
-        by_beam = irradiance_w_m2 * self.photons.room_albedo.value * self.field_sr / (self.beam.power_mw.value * MW)
+        by_beam = (
+            irradiance_w_m2
+            * self.photons.room_albedo.value
+            * self.field_sr
+            / (self.beam.power_mw.value * MW)
+        )
         return self.photons.signal_electrons.value * by_beam
 
     @cached_property
@@ -159,7 +187,8 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: pixels are beams from the origin; the receiver takes the place of an emitter."""
+        """Optics for the render: pixels are beams from the origin; the receiver takes the place of
+        an emitter."""
         smoothed_px = max(len(taps) // 2 for taps in self.smoothing_taps)
         return self.optics_with(
             **self.receiver.optics(),

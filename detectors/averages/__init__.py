@@ -1,0 +1,1 @@
+"""Frames become one cloud: averages, noise, flat fields."""

@@ -1,0 +1,1 @@
+"""What lies off the surface: clusters, thresholds, sizes, missing returns."""

@@ -1,0 +1,1 @@
+"""The detectors, found by name through `detectors.BUILT_IN`."""

@@ -1,1 +1,0 @@
-"""Rigid registration of views of one target: the pose of each relative to the first, its uncertainty, and failures."""

@@ -1,0 +1,1 @@
+"""The undamaged surface of a cloud: fitted shapes, their choice, references."""

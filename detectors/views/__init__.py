@@ -1,0 +1,1 @@
+"""Several views of a target: marks, registration, one merged map."""

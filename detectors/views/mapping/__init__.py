@@ -1,0 +1,2 @@
+"""Merging registered views into one cloud: the thesis' grid, a fused map with its variance, a
+volume."""

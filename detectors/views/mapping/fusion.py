@@ -1,0 +1,423 @@
+"""Fusion in the target's frame: registered views to one 2.5-D map over the fitted surface, with
+its variance.
+
+Each pixel's depth counts as a height over the surface at the place where its *ray meets the
+surface*. On an intact surface that is the point itself; at a hole it is the mouth, which therefore
+has the same place in all views. In a slanted view, points at the bottom of a wide hole or in front
+of the surface are displaced.
+
+View i measures a cell's height as h + e_i + f(p_i) + g_i. e_i: noise that the sensor's law and the
+registration's covariance explain. f: the camera's fixed pattern, a function of the *pixel* p_i
+that sees the cell. g_i: an error that is fixed for a view and cell. Half the mean square
+difference of two views is noise + var g + var f (1 - exp(-(|p_i - p_j| / length)^exponent)), a
+variogram with nugget and sill (Matheron 1963; Cressie 1993). It is fitted to medians, because
+views see different parts of damage. Views that look through the same pixels share f.
+
+Not modelled: errors that all views share in all pixels, or registrations to one reference; a
+pattern that varies over the sensor; changes of the blur. If views are no farther apart than the
+pattern's length, its sill is extrapolated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.special import gammaincinv
+
+from detectors.averages.average import pixel_medians
+from detectors.averages.noise import rounding_left_m2
+from detectors.surfaces.surface import SurfaceConfig, fit_surface
+from detectors.views.mapping import placing
+from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert, transform_points
+
+CELLS = 2000
+# distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median
+CLASSES = 12
+PER_CLASS = 100
+LENGTHS = (
+    24  # number of trial lengths, geometric from a pixel to the largest distance between views
+)
+EXPONENTS = (1.0, 1.5, 2.0)
+"""A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2),
+not pointed (1)."""
+MEDIAN_SQUARE = 0.45494  # median of the square of a standard normal deviate
+MEDIAN_ERROR = 2.33  # relative standard error of the median of n such squares, times the root of n
+GATE_SIGMAS = (
+    # an observation this many deviations from the median of at least three views is an outlier
+    5.0
+)
+
+
+@dataclass(frozen=True)
+class BetweenViews:
+    """Differences between views. ``own_m2``: variance of the error of a view and cell.
+    ``pattern_m2``: variance of the fixed pattern, with covariance exp(-(distance /
+    ``length_px``)^``exponent``) between pixels. ``noise_share``: share of the sensor law's
+    variance that is noise; below 1 only if the law is from a single frame."""
+
+    own_m2: float = 0.0
+    pattern_m2: float = 0.0
+    length_px: float = 1.0
+    exponent: float = 1.0
+    noise_share: float = 1.0
+
+
+def between_views(
+    heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
+) -> BetweenViews:
+    """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances
+    that the ``sensor`` and ``other`` (lens, registration) explain; and the direction ``looks_px``
+    (k, h, w, 2), in pixels, in which each view sees each cell. ``repeated``: the sensor's
+    variances come from repeated frames. All zero with too little overlap."""
+    several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
+    chosen = several[:: max(1, len(several) // CELLS)]
+    values = (heights, sensor, other, looks_px)
+    flat, sensor, other, looks = (v.reshape(len(v), -1, *v.shape[3:])[:, chosen] for v in values)
+    i, j = np.triu_indices(len(heights), 1)
+    both = np.isfinite(flat[i] - flat[j])
+    if both.sum() < PER_CLASS:
+        return BetweenViews()
+    apart = np.linalg.norm(looks[i] - looks[j], axis=-1)[both]
+    columns = (
+        apart,
+        (flat[i] - flat[j])[both] ** 2,
+        *(0.5 * (v[i] + v[j])[both] for v in (sensor, other)),
+    )
+    parts = np.array_split(
+        np.argsort(apart, kind="stable"), min(CLASSES, max(1, len(apart) // PER_CLASS))
+    )
+    distance, square, of_sensor, of_other = (
+        np.array([np.median(c[part]) for part in parts]) for c in columns
+    )
+    half_square = np.maximum(0.5 * square / MEDIAN_SQUARE, 1e-16)
+    # k - 1 of the k (k - 1) / 2 differences of k views are independent
+    error = half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(apart) / len(parts))
+    known = (half_square - of_other - (of_sensor if repeated else 0.0)) / error
+    first = (np.ones_like(distance) if repeated else of_sensor) / error
+    level, sill, length, exponent = _law(first, 1.0 / error, distance, known, repeated)
+    if repeated:
+        return BetweenViews(level, sill, length, exponent)
+    return BetweenViews(0.0, sill, length, exponent, min(max(level, 0.01), 1.0))
+
+
+def _law(
+    first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
+) -> tuple[float, float, float, float]:
+    """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the
+    law with the least chi square plus Schwarz's penalty: none (if it ``may_vanish``), ``first``
+    alone, or both terms."""
+    penalty = float(np.log(max(len(distance), 2)))
+    (level,), misfit = nnls(first[:, None], known)
+    best = (float(misfit) ** 2 + penalty, float(level), 0.0, 1.0, 1.0)
+    if may_vanish and known @ known <= best[0]:
+        best = (float(known @ known), 0.0, 0.0, 1.0, 1.0)
+    for exponent, length in product(
+        EXPONENTS, np.geomspace(1.0, max(1.0, float(distance.max())), LENGTHS)
+    ):
+        rise = 1.0 - np.exp(-((distance / length) ** exponent))
+        (level, sill), misfit = nnls(np.column_stack([first, rise * unit]), known)
+        if misfit**2 + 4.0 * penalty < best[0]:
+            best = (
+                float(misfit) ** 2 + 4.0 * penalty,
+                float(level),
+                float(sill),
+                float(length),
+                exponent,
+            )
+    return best[1:]
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """Values of each cell (h, w). ``height_m``: mean deviation from the fitted surface along z,
+    positive behind; NaN where no view counts. ``variance_m2``: of an intact surface's height, from
+    sensor, lens, registration and further differences between views. ``temporal_m2``: the part of
+    it that more frames would lower. ``seen_by`` (k, h, w) bool: views that count. ``shares`` (k,
+    h, w): their weights, with sum 1. ``rejected``: number of outliers."""
+
+    cell_m: float
+    height_m: np.ndarray
+    variance_m2: np.ndarray
+    temporal_m2: np.ndarray
+    seen_by: np.ndarray
+    shares: np.ndarray
+    rejected: int
+    between: BetweenViews
+
+
+def combine(
+    heights: np.ndarray,
+    sensor: np.ndarray,
+    other: np.ndarray,
+    looks_px: np.ndarray,
+    repeated: bool,
+    cell_m: float,
+) -> SurfaceMap:
+    """Combine the views' heights (k, h, w); arguments as in `between_views`. The weight of a view
+    is the inverse of its own variance. (The best weights under the covariance can be negative,
+    which fails at a hole seen by only some views.) The variance of the mean includes the
+    covariance of views."""
+    between = between_views(heights, sensor, other, looks_px, repeated)
+    temporal = between.noise_share * sensor
+    own = temporal + other + between.own_m2
+    rejected = _outliers(heights, own + between.pattern_m2)
+    used = np.isfinite(heights) & ~rejected
+    known = used.any(axis=0)
+    weights = np.where(used, 1.0 / (own + between.pattern_m2), 0.0)
+    with np.errstate(invalid="ignore"):
+        shares = np.nan_to_num(weights / weights.sum(axis=0))
+    squares = shares**2
+    shared = between.pattern_m2 * squares.sum(axis=0)
+    if between.pattern_m2 > 0:
+        for i, j in combinations(range(len(heights)), 2):
+            apart = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
+            shared += (
+                2.0
+                * between.pattern_m2
+                * shares[i]
+                * shares[j]
+                * np.exp(-(apart**between.exponent))
+            )
+    height = np.where(known, np.where(used, shares * heights, 0.0).sum(axis=0), np.nan)
+    alone = np.where(known, np.where(used, squares * own, 0.0).sum(axis=0), np.nan)
+    by_frames = np.where(known, np.where(used, squares * temporal, 0.0).sum(axis=0), np.nan)
+    return SurfaceMap(
+        cell_m, height, alone + shared, by_frames, used, shares, int(rejected.sum()), between
+    )
+
+
+def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Return (k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the
+    robust spread of the views if larger) from the median of at least three views that cannot be
+    damage: in front of the fitted surface, where damage would have hidden it from the others; or
+    behind it, but alone among their neighbours."""
+    deviation = heights - pixel_medians(heights)
+    limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
+    several = np.isfinite(heights).sum(axis=0) >= 3
+    rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)
+    k, row, column = np.nonzero(several & (deviation > limit))
+    padded = np.pad(heights, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+    near = np.stack(
+        [padded[k, row + down, column + right] for down in range(3) for right in range(3)]
+    )
+    rejected[k, row, column] = near[4] - pixel_medians(near) > limit[k, row, column]
+    return rejected
+
+
+# standard deviation of a pixel's direction: the reprojection error of a well calibrated lens
+LATERAL_PX = 0.1
+SMOOTH_POINTS = 8192
+BINS = 16
+PER_BIN = 40
+# number of pixels for the law: the median of a class is then known to 7 % from three frames
+SAMPLED = 16_384
+LEAST_M2 = (
+    1e-14  # least variance, so that no weight is infinite: no point is known better than to 0.1 um
+)
+
+
+def fuse(
+    views: Sequence[placing.ChosenView], cell_m: float | None
+) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
+    """Return the map as an organised cloud, its frame in the first view's (4, 4), further results,
+    and notes. The cloud's ``variance_m2`` over ``count`` is the temporal part of the variance,
+    ``mean_variance_m2`` the whole with rounding (None for a single view, which cannot know it).
+    Raises UserError if the points do not determine a surface or the map would have too many cells.
+    """
+    T_reference_map = placing.T_reference_map_of(views[0])
+    surface = placing.common_surface(views, T_reference_map)
+    placed = [placing.place(view, T_reference_map, surface) for view in views]
+    grid = placing.grid_over(placed, cell_m)
+    x, y = grid.places()
+    z = surface.evaluate(x, y)
+    # gradient times a small displacement is the change of height along z
+    gradient = surface.gradients(x, y, grid.step)
+    points = np.stack([x, y, z], axis=-1)
+
+    observed = []
+    repeated = True
+    for view in placed:
+        cloud = view.chosen.cloud
+        inside = view.chosen.inside
+        raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
+        variance, by_frames = depth_noise(cloud, inside, _roughness(view))
+        repeated &= by_frames
+        slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
+        unknown = np.full(inside.shape, np.nan)
+        colour = [unknown] * 3 if cloud.rgb is None else list(np.moveaxis(cloud.rgb, -1, 0))
+        amplitude = unknown if cloud.amplitude is None else cloud.amplitude
+        images = (view.deviation_m, variance * slope2, cloud.count, *colour, amplitude)
+        values = raster.at_cells(np.stack([image.ravel() for image in images], axis=-1))
+        rays = points - view.T_map_view[:3, 3]
+        per_range = (rays * gradient).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+        across = np.maximum((gradient**2).sum(axis=-1) - per_range**2, 0.0)
+        correlation = _neighbour_correlation(view)
+        kept = correlation + (1.0 - correlation) * raster.concentration
+        in_view = rays @ view.T_map_view[:3, :3]
+        by_sensor = values[..., 1] * kept * per_range**2
+        by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
+        by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
+        look_px = in_view[..., :2] / in_view[..., 2:] / views[0].slope_step
+        observed.append((values[..., 0], by_sensor, by_others, look_px, values[..., 2:]))
+    heights, sensor, other, looks_px, more = (
+        np.stack(each) for each in zip(*observed, strict=True)
+    )
+    found = combine(heights, sensor, other, looks_px, repeated, grid.step)
+
+    clouds = [view.cloud for view in views]
+    samples = np.round(np.where(found.seen_by, more[..., 0], 0.0).sum(axis=0)).astype(np.int32)
+    means = (found.shares[..., None] * np.nan_to_num(more)).sum(axis=0)
+    known = np.isfinite(found.height_m)
+    shares = found.shares.sum(axis=(1, 2)) / found.shares.sum()
+    pixel_m = np.sqrt(shares @ np.stack([view.pixel_m for view in placed]) ** 2)
+    points[..., 2] += found.height_m
+    points[~known] = np.nan
+    merged = Cloud(
+        points_m=points,
+        reason=np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8),
+        count=samples,
+        variance_m2=found.temporal_m2 * samples,
+        region=Region(0, grid.shape[0], 0, grid.shape[1]),
+        z_step_m=0.0,
+        n_frames=sum(cloud.n_frames for cloud in clouds),
+        rgb=None
+        if any(cloud.rgb is None for cloud in clouds)
+        else np.round(means[..., 1:4]).astype(np.uint8),
+        amplitude=None
+        if any(c.amplitude is None for c in clouds)
+        else np.where(known, means[..., 4], np.nan),
+        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        projection="parallel",
+        mean_variance_m2=found.variance_m2 if len(views) > 1 else None,
+        map_views=MapViews(
+            np.stack([view.T_map_view for view in placed]), shares, (pixel_m[0], pixel_m[1])
+        ),
+    )
+    return merged, T_reference_map, found, _notes(views, found)
+
+
+def _roughness(view: placing.PlacedView) -> np.ndarray:
+    """Return z minus the view's own smooth surface (h, w); computed only if frames do not repeat."""
+    inside = view.chosen.inside
+    rough = np.full(inside.shape, np.nan)
+    if not (view.chosen.cloud.count[inside] > 1).any():
+        x, y = view.places_m[inside].T
+        z = view.deviation_m[inside]
+        every = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
+        rough[inside] = z - fit_surface(x[every], y[every], z[every], SurfaceConfig()).evaluate(
+            x, y
+        )
+    return rough
+
+
+def _neighbour_correlation(view: placing.PlacedView) -> float:
+    """Return the correlation of neighbouring pixels' deviations, 0..1, from medians; 1 without a
+    pixel grid."""
+    if not view.chosen.cloud.organised:
+        return 1.0
+    d = view.deviation_m
+    single = _median(np.abs(d - _median(d)))
+    step = _median(np.concatenate([np.abs(np.diff(d, axis=axis)).ravel() for axis in (0, 1)]))
+    if not (single > 0 and np.isfinite(step)):
+        return 1.0
+    return float(np.clip(1.0 - 0.5 * (step / single) ** 2, 0.0, 1.0))
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of an even sample of the finite values; NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known[:: max(1, len(known) // SMOOTH_POINTS)])) if len(known) else np.nan
+
+
+def _registration_variance(
+    view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
+) -> np.ndarray:
+    """Return the variance (h, w) that the registration gives to displacements w x (p - centre) + t
+    of points (h, w, 3) along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0
+    without a covariance."""
+    if not view.known_covariance:
+        return np.zeros(points_m.shape[:2])
+    turn = np.kron(np.eye(2), T_reference_map[:3, :3])
+    centre = transform_points(invert(T_reference_map), view.registration.centre_m)
+    lever = np.concatenate([np.cross(points_m - centre, along), along], axis=-1)
+    spread = ((lever @ (turn.T @ view.registration.covariance @ turn)) * lever).sum(axis=-1)
+    return np.asarray(np.maximum(spread, 0.0))
+
+
+def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str, ...]:
+    between = found.between
+    notes = [
+        "one view: its variance excludes errors that are constant in a view (pattern, wiggling)"
+    ]
+    if len(views) > 1:
+        notes = [
+            f"fixed pattern {1e3 * np.sqrt(between.pattern_m2):.3f} mm over {between.length_px:.1f} px of the sensor,"
+            f" other differences between views {1e3 * np.sqrt(between.own_m2):.3f} mm"
+        ]
+    without = [view.name for view in views if not view.known_covariance]
+    if without:
+        notes.append(
+            f"views without a covariance count among those differences: {', '.join(without)}"
+        )
+    if found.rejected:
+        notes.append(
+            f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations were outliers"
+        )
+    return tuple(notes)
+
+
+def depth_noise(
+    cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if
+    it comes from the sample variances of repeated frames inside the target. The law is v = k q + c
+    with q = 1 / amplitude^2 (phase noise: Lange and Seitz 2001), or the range to the fourth if a
+    tenth of the points has no amplitude; a pixel's own sample variance would favour pixels that
+    are quiet by chance. ``deviation_m`` (h, w): z minus the view's own smooth surface, whose
+    squares replace the variances for a single frame. Not modelled: shared noise, multipath,
+    pattern."""
+    q = (cloud.points_m**2).sum(axis=-1) ** 2
+    valid = cloud.valid
+    if cloud.amplitude is not None:
+        known = valid & (np.nan_to_num(cloud.amplitude) > 0)
+        if known.sum() >= 0.9 * valid.sum():
+            q = 1.0 / np.where(known, cloud.amplitude, np.nan) ** 2
+            q[valid & ~known] = np.median(q[known])
+    used = inside & (cloud.count > 1) & np.isfinite(cloud.variance_m2)
+    repeated = bool(used.sum() >= PER_BIN)
+    if repeated:
+        samples = cloud.variance_m2[used]
+        freedom = cloud.count[used] - 1.0
+    else:
+        used = inside & np.isfinite(deviation_m)
+        # one sample has the variance of a single frame: it is divided by their number below
+        samples = deviation_m[used] ** 2 * cloud.count[used]
+        freedom = np.ones(int(used.sum()))
+    slope = 0.0
+    constant = LEAST_M2
+    typical = 1.0
+    if used.any():
+        thinned = slice(None, None, max(1, len(samples) // SAMPLED))
+        numbers, where = np.unique(freedom[thinned], return_inverse=True)
+        samples = samples[thinned] / (2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers)[where]
+        x = q[used][thinned]
+        # medians of classes of q make the fit robust against damage in the view
+        parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))
+        typical = float(np.median(x))
+        middle = np.array([np.median(x[part]) for part in parts]) / typical
+        height = np.maximum([np.median(samples[part]) for part in parts], LEAST_M2)
+        # the relative error of each median is the same
+        slope, constant = nnls(
+            np.column_stack([middle, np.ones(len(parts))]) / height[:, None], np.ones(len(parts))
+        )[0]
+    frame = slope * q / typical + constant
+    left = 0.0
+    if cloud.z_step_m > 0 and repeated:
+        # any average keeps an error of rounding that no scatter shows; if frames repeat exactly,
+        # it is the whole error
+        left = rounding_left_m2(
+            cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0)
+        )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.maximum(frame / cloud.count + left, LEAST_M2), repeated

@@ -1,0 +1,339 @@
+"""Groups of pixels whose colour differs from the target's own colour: candidates for marks, with
+their rims.
+
+A smooth polynomial fitted over the target removes uneven light. The scatter of the remainder
+(minimum covariance determinant, Rousseeuw 1985) measures the variation of the target's own colour;
+the threshold is extrapolated from its tail to a given rate of false pixels. Marks may cover a
+quarter of the target. Not modelled: hard shadows."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from detectors.averages.noise import sigma_of
+from detectors.masks import grown, parts_with, shrunk
+from detectors.surfaces.surface import SurfaceConfig, fit_surface
+from harness.vocabulary.geometry import Cloud
+
+FALSE_RATE = 1e-5
+"""Share of the target's own pixels beyond the threshold by the extrapolated tail. Real tails have
+ten (Gauss) to a hundred (Laplace) times as many, which form no mark, because a mark has nine
+pixels that touch."""
+# degree of the polynomial: the light of one lamp, or of two of different colour, bends once over a
+# board
+DEGREE = 2
+SAMPLE = 4096
+STEPS = 6
+CORE = 0.6
+"""Number of pixels in the fit, number of steps of the scatter, and share of the pixels on which
+the scatter rests."""
+CORE_SHRINKS = {
+    1: 0.2146,
+    2: 0.3891,
+}  # variance of the innermost part (`CORE`) of a Gaussian in one and two dimensions
+GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
+"""Distances that a share `FALSE_RATE` of a Gaussian exceeds, in one and two dimensions."""
+# reach of a camera's smearing of colour: JPEG stores one value for 2 x 2 pixels, in blocks of
+# eight
+NEARBY_PX = 16
+TAIL = (
+    0.4,
+    0.7,
+)  # quantiles from which the tail is extrapolated; pixels above them may belong to marks
+
+
+def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shares (n, 2) of red and blue in the sum of the channels of colours (n, 3) uint8,
+    and the variance (n,) of each from rounding to whole counts. Half a count is added, so that
+    black has a share."""
+    counts = rgb.astype(np.float64) + 0.5
+    total = counts.sum(axis=1)
+    return counts[:, [0, 2]] / total[:, None], 1.0 / 12.0 / total**2
+
+
+def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the logarithm (n, 1) of the mean of the channels, and its variance (n,) from
+    rounding."""
+    mean = rgb.astype(np.float64).mean(axis=1) + 0.5
+    return np.log(mean)[:, None], 1.0 / 36.0 / mean**2
+
+
+def stand_out(
+    features: np.ndarray, rounding: np.ndarray, xy: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance (n,) of pixels from the target's own colour: in deviations of its
+    scatter (the contrast), and in units of the threshold (the margin). ``features`` (n, p), p 1 or
+    2. ``rounding`` (n,): their variance from whole counts; all noise is assumed to grow in
+    proportion to it. ``xy`` (n, 2): any smooth co-ordinates."""
+    stride = max(1, len(features) // SAMPLE)
+    (x, y), (some_x, some_y) = xy.T, xy[::stride].T
+    # marks may cover a quarter, all at one end
+    smooth = SurfaceConfig(degree=DEGREE, method="lts")
+    offset = np.stack(
+        [f - fit_surface(some_x, some_y, f[::stride], smooth).evaluate(x, y) for f in features.T],
+        axis=1,
+    )
+    darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
+    apart = (offset / darkness[:, None])[::stride]
+    p = features.shape[1]
+    # covariance (p, p) of the bulk about the backdrop, scaled like the innermost part of a
+    # Gaussian
+    scatter = np.diag([max(sigma_of(each), 1e-6) ** 2 for each in apart.T])
+    for _ in range(STEPS):
+        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(scatter), apart)
+        core = apart[square <= np.quantile(square, CORE)]
+        scatter = core.T @ core / len(core) / CORE_SHRINKS[p] + 1e-12 * np.eye(p)
+    scatter += np.median(rounding) * np.eye(p)
+    contrast = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(scatter), offset))
+    distance = contrast / darkness
+    # the tail is a Weibull through the quantiles `TAIL`, between a Gaussian (shape 2 in two
+    # dimensions) and an exponential (shape 1), and never below the Gaussian
+    middle, outer = np.quantile(distance[::stride], TAIL)
+    logs = [-np.log(1.0 - share) for share in TAIL]
+    shape = np.log(logs[1] / logs[0]) / np.log(outer / middle) if 0 < middle < outer else 2.0
+    tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / float(np.clip(shape, 1.0, 2.0)))
+    return contrast, distance / max(tail, GAUSSIAN_LIMITS[p])
+
+
+def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
+    """Return (h, w) bool: those ``chosen`` pixels whose contrast exceeds half of the largest
+    nearby (of medians of 3 x 3), so that a group ends half way along its edge."""
+    beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
+    greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((2 * NEARBY_PX + 1,) * 2, np.uint8))
+    return np.asarray(chosen & (beyond > 0.5 * greatest))
+
+
+LEAST_PIXELS = 9
+MOST_BLOBS = 200
+"""Fewest pixels of a mark, three by three (fewer have no inside), and the most groups that are
+examined."""
+# widths of the band around a group that is searched for a mixed rim, and of its surroundings
+RIM_PX = 2
+RING_PX = 8
+MIXED_SHARE = 0.15
+"""Share of the rim, two pixels wide, with colours between 0.2 and 0.8 of the way from one colour
+to the other: 0.6 / 2 if a colour is the mean over the pixel's area, and 0 if it is the colour at
+the pixel's centre."""
+SHARE_SIGMA = 0.1
+"""Standard deviation of a rim pixel's share of area: the camera's transfer curve and the lens's
+blur are unknown."""
+ALIKE = 0.35
+"""A pixel has a blob's colour if its distance to it is below this share of its distance to the
+surroundings' colour."""
+CUT_SHARE = 0.05
+"""A blob continues beyond the target if more than this share of the pixels around it have its
+colour but lie off it."""
+# shifts of the lattice along each axis, over which the error of a centroid is averaged
+SHIFTS = 12
+RECTANGULAR = 0.85
+"""Least share of the smallest enclosing rectangle that a rectangle's pixels fill; those of an
+ellipse fill 0.79."""
+SIZES = 5
+TURNS = np.array([-1.0, 0.0, 1.0]) / 3
+"""Number of outlines between one pixel and the next, in width and height; rotations, in pixels
+over the length."""
+
+
+@dataclass(frozen=True)
+class Blob:
+    """``pixels`` (n,): flat indices. ``weights`` (n,): their share of the blob's colour, 0..1.
+    ``grid`` (n, 2): their places on a grid of unit step. ``grid_covariance`` (2, 2): of the
+    centroid there. ``surroundings`` (m,): flat indices of the target's points on and around it.
+    ``contrast`` (3,): logarithm of its colour over that of its surroundings by channel, in which
+    the light cancels. ``doubt``: that it is cut, else empty."""
+
+    pixels: np.ndarray
+    weights: np.ndarray
+    grid: np.ndarray
+    grid_covariance: np.ndarray
+    surroundings: np.ndarray
+    contrast: np.ndarray
+    doubt: str = ""
+
+
+def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
+    """Return the connected groups of ``coloured`` (h, w) pixels, largest first; single missing
+    pixels do not separate them. Whether rims have mixed colours is a property of the camera, so it
+    is decided for all groups together."""
+    closed = cv2.morphologyEx(coloured.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    order = 1 + np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]
+    large = [label for label in order if boxes[label, cv2.CC_STAT_AREA] >= LEAST_PIXELS]
+    windows = [_window(cloud, inside, coloured, labels, label, boxes[label]) for label in large]
+    rims = np.concatenate([np.zeros(0), *(rim for rim, _ in windows)])
+    mixed = len(rims) > 0 and bool(np.mean((rims > 0.2) & (rims < 0.8)) >= MIXED_SHARE)
+    blobs = [blob for _, settled in windows if (blob := settled(mixed)) is not None]
+    # a blob that shares pixels with a larger one is part of it
+    taken = np.zeros(inside.size, dtype=bool)
+    kept = []
+    for blob in sorted(blobs, key=lambda b: -float(b.weights.sum())):
+        own = blob.pixels[blob.weights > 0.5]
+        if not taken[own].any():
+            kept.append(blob)
+        taken[own] = True
+    return kept
+
+
+def _window(
+    cloud: Cloud,
+    inside: np.ndarray,
+    coloured: np.ndarray,
+    labels: np.ndarray,
+    label: int,
+    box: np.ndarray,
+) -> tuple[np.ndarray, Callable[[bool], Blob | None]]:
+    """Return the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on
+    both sides of its border, and a function that makes a blob of the group once it is known
+    whether rims are mixed."""
+    left, top, width, height, area = (int(value) for value in box)
+    margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
+    row = max(top - margin, 0)
+    column = max(left - margin, 0)
+    cut = (slice(row, top + height + margin), slice(column, left + width + margin))
+    assert cloud.rgb is not None
+    target = inside[cut]
+    others = coloured[cut]
+    group = (labels[cut] == label) & others
+    core = _eroded(group)
+    core = core if core.sum() >= LEAST_PIXELS else group
+    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
+    if ring.sum() < LEAST_PIXELS:  # the target's own colour is not visible around it
+        return np.zeros(0), lambda mixed: None
+    rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
+    other = np.median(rgb[ring], axis=0)
+    span = np.median(rgb[core], axis=0) - other
+    share = (rgb - other) @ span / max(float(span @ span), 1e-12)
+    # mosaic and JPEG make neighbours share colour: the scatter of equivalent independent pixels
+    strays = float(
+        np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2)))
+    )
+    # the threshold that found the group only knows the target's colour and leaves gaps at low
+    # contrast: take the connected pixels nearer to the group's colour, as far as the surroundings
+    # reach
+    group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
+    rim = grown(group, 1) & ~_eroded(group) & target
+
+    def settled(mixed: bool) -> Blob | None:
+        """Return the blob, pixels weighted by their share of the group's colour if rims are mixed;
+        None if too few."""
+        weights = group.astype(float)
+        if mixed:
+            near = grown(group, RIM_PX) & target & ~(others & ~group)
+            weights = np.where(near, np.clip(share, 0.0, 1.0), 0.0)
+        v, u = np.nonzero((weights > 0.5) & target)
+        if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
+            return None
+        # whether the group may continue where the target has no points
+        around = grown(group, 1) & ~group
+        alike = np.linalg.norm(rgb - other - span, axis=-1) < ALIKE * np.linalg.norm(span)
+        on = around & alike & ~target
+        last_row = inside.shape[0] - 1 - row
+        last_column = inside.shape[1] - 1 - column
+        doubt = ""
+        if on.sum() > max(2.0, CUT_SHARE * around.sum()):
+            by_crop = (on & cloud.valid[cut]).sum() > on.sum() / 2
+            doubt = "cut by the crop's edge" if by_crop else "without range in parts of it"
+        elif u.min() == -column or v.min() == -row or u.max() == last_column or v.max() == last_row:
+            doubt = "cut by the picture's edge"
+        used_v, used_u = np.nonzero((weights > 0) & target)
+        grid = np.stack([used_u, used_v], axis=1).astype(float)
+        if mixed:
+            # the rim's weights err by `SHARE_SIGMA` and by the scatter of the surroundings'
+            # colours
+            arm = np.argwhere(rim)[:, ::-1] - np.argwhere(group)[:, ::-1].mean(axis=0)
+            covariance = (
+                (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / max(float(weights.sum()), 1.0) ** 2
+            )
+        else:
+            covariance = region_covariance_px2(grid)
+        own, around = (
+            (v + row) * inside.shape[1] + u + column
+            for v, u in ((used_v, used_u), np.nonzero(target))
+        )
+        # a count is added to each colour, so that black has a logarithm
+        contrast = np.log((other + span + 1.0) / (other + 1.0))
+        return Blob(own, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
+
+    return share[rim], settled
+
+
+def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return colours (h, w, 3) as if the light at the group's middle fell everywhere: each channel
+    is divided by a plane fitted to the ring. Otherwise uneven light along a group would weight its
+    two ends differently."""
+    v, u = np.mgrid[0 : rgb.shape[0], 0 : rgb.shape[1]]
+    middle_v = float(v[group].mean())
+    middle_u = float(u[group].mean())
+    basis = np.stack(
+        [np.ones(rgb.shape[:2]), (u - middle_u) / rgb.shape[1], (v - middle_v) / rgb.shape[0]],
+        axis=-1,
+    )
+    plane = np.linalg.lstsq(basis[ring], rgb[ring], rcond=1e-9)[0]
+    light = basis @ plane / np.maximum(plane[0], 1.0)
+    return np.asarray(rgb / np.clip(light, 0.5, 2.0))
+
+
+def _eroded(mask: np.ndarray) -> np.ndarray:
+    """Remove one pixel along the mask's border; the area beyond the window counts as outside."""
+    return shrunk(np.pad(mask, 1), 3)[1:-1, 1:-1]
+
+
+def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
+    """Return the covariance (2, 2) of the centroid of the lattice points within convex polygons
+    (..., n, 2), vertices in order, over all shifts of the lattice and all polygons."""
+    centred = polygon_px - _area_and_centre(polygon_px)[1][..., None, :]
+    shift = (
+        np.stack(np.meshgrid(np.arange(SHIFTS), np.arange(SHIFTS)), axis=-1).reshape(-1, 2) + 0.5
+    ) / SHIFTS
+    # polygons by shifts, then the lattice's rows, then edges
+    x, y = np.moveaxis(centred.reshape(-1, 1, 1, *centred.shape[-2:]) + shift[:, None, None], -1, 0)
+    row = np.arange(np.floor(y.min()), np.ceil(y.max()) + 1)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = (row - y) / (np.roll(y, -1, axis=-1) - y)
+        crossed = np.where(
+            (part >= 0) & (part <= 1), x + part * (np.roll(x, -1, axis=-1) - x), np.nan
+        )
+    first = np.ceil(np.fmin.reduce(crossed, axis=-1))
+    last = np.floor(np.fmax.reduce(crossed, axis=-1))
+    number = np.nan_to_num(np.maximum(last - first + 1, 0))
+    sums = np.stack([np.nan_to_num(number * (first + last) / 2), number * row[:, 0]], axis=-1).sum(
+        axis=-2
+    )
+    error = (sums / number.sum(axis=-1, keepdims=True) - shift).reshape(-1, 2)
+    return np.asarray(error.T @ error / len(error))
+
+
+def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
+    """Return the covariance (2, 2) of the centroid of a region known only by its pixel positions
+    (m, 2), not all on a line. It is represented by its convex outline, or by its smallest
+    rectangle if it fills that. Its size and slope are known to a part of a pixel and decide
+    whether errors of opposite edges add or cancel, so the covariance is the mean over outlines up
+    to a pixel larger and rotated by up to a pixel."""
+    hull = cv2.convexHull(pixels.astype(np.float32))
+    box_middle, size, angle = cv2.minAreaRect(hull)
+    # the outermost pixel centres lie half a pixel inside the region
+    if len(pixels) > RECTANGULAR * (size[0] + 1) * (size[1] + 1):
+        outline = cv2.boxPoints((box_middle, (size[0] + 1, size[1] + 1), angle)).astype(np.float64)
+    else:
+        outline = hull[:, 0].astype(np.float64)
+    area, centre = _area_and_centre(outline)
+    # with the same area as the pixels
+    outline = centre + (outline - centre) * np.sqrt(len(pixels) / abs(float(area)))
+    extent = np.ptp(outline, axis=0)
+    middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
+    steps = np.arange(SIZES)
+    sizes = 1.0 + np.stack([steps, 2 * steps % SIZES], axis=1) / SIZES / extent
+    cosine = np.cos(TURNS / extent.max())
+    sine = np.sin(TURNS / extent.max())
+    axes = np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), -1, 0)
+    return centroid_covariance_px2(((outline - middle) * sizes[:, None, None, :]) @ axes)
+
+
+def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signed areas (...,) and centroids (..., 2) of polygons (..., n, 2)."""
+    following = np.roll(x, -1, axis=-2)
+    cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
+    area = cross.sum(axis=-1) / 2
+    return area, ((x + following) * cross[..., None]).sum(axis=-2) / (6 * area[..., None])

@@ -1,0 +1,106 @@
+"""The table of the atlas: limits at any distance and number of frames, interpolated between
+computed set-ups."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from harness.programs.atlas.limits import Answer, LimitSurface, Outside
+from harness.records.schema import Column, Estimate, Table
+
+DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent"}
+"""Names of kinds of damage in words; other kinds keep their name."""
+DISTANCES = 25  # number of distances on a curve; their logarithms are evenly spaced
+
+
+@dataclass(frozen=True)
+class Row:
+    """The answer of a surface at a place, with the title of its camera and the size in question
+    (or NaN)."""
+
+    surface: LimitSurface
+    title: str
+    place: Mapping[str, float]
+    answer: Answer
+    size_mm: float = np.nan
+
+    @property
+    def damage(self) -> str:
+        """The kind of damage with its depth, such as ``blind hole 6 mm deep``."""
+        depth = self.place.get("depth_mm")
+        return damage_words(self.surface.kind) + ("" if depth is None else f" {depth:g} mm deep")
+
+
+def damage_words(kind: str) -> str:
+    """Return the name of a kind of damage."""
+    return DAMAGE.get(kind, kind.replace("_", " "))
+
+
+def _a90(row: Row) -> Estimate:
+    answer = row.answer
+    a90_mm = answer.largest_mm * 1.001 if np.isnan(answer.a90_mm) else answer.a90_mm
+    return Estimate(
+        a90_mm, answer.low_mm, answer.high_mm, np.nan_to_num(answer.largest_mm, nan=np.inf)
+    )
+
+
+ATLAS = Table(
+    "atlas",
+    "one row per camera, damage, detector, distance and number of frames: the limit that the atlas states",
+    (
+        Column("camera", "camera", "title", "title of the camera"),
+        Column("camera_name", "", "surface.camera", "name of the camera in experiments"),
+        Column("damage", "damage", "damage", "kind of damage, with its depth"),
+        Column("detector", "detector", "surface.detector", "name of the detector"),
+        Column("distance_m", "distance (m)", lambda row: row.place["distance_m"], "distance of the target"),
+        Column("frames", "frames", lambda row: int(row.place["frames"]), "number of averaged frames"),
+        Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's albedo, if it varies"),
+        Column("depth_mm", "", lambda row: row.place.get("depth_mm"), "depth of the damage, if it has one"),
+        Column("a90_mm", "a90 (mm)", _a90, "size found 90 % of the time, with the 95 % interval of the surface; beyond "
+               "the largest inspected size if all neighbouring set-ups miss such damage; empty if one of them has no "
+               "limit", interval=True),
+        Column("largest_mm", "", "answer.largest_mm", "largest inspected size; empty if a90 is unknown"),
+        Column("surface_error", "", "surface.error", "rms error of ln a90 when each set-up is left out in turn"),
+        Column("found", "found?", lambda row: "" if np.isnan(row.size_mm) else row.answer.verdict(row.size_mm),
+               "whether damage of the given size is found nine times out of ten: yes, no or undecided"),
+    ),
+    title="the atlas: size found 90 % of the time",
+    left=3,
+)  # fmt: skip
+
+
+def rows_at(
+    surfaces: Iterable[LimitSurface],
+    titles: Mapping[str, str],
+    place: Mapping[str, float],
+    size_mm: float = np.nan,
+) -> tuple[list[Row], list[tuple[str, str]]]:
+    """Return the rows at a place, smallest limit first, and (reason, camera title) for surfaces
+    without an answer."""
+    rows = []
+    refused = []
+    for surface in surfaces:
+        own = {axis: place[axis] for axis in surface.grid if axis in place}
+        try:
+            rows.append(Row(surface, titles[surface.camera], own, surface.at(**own), size_mm))
+        except Outside as reason:
+            refused.append((str(reason), titles[surface.camera]))
+    rows.sort(key=lambda row: (np.isnan(row.answer.a90_mm), row.answer.a90_mm, row.title))
+    return rows, refused
+
+
+def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[Row]:
+    """Return rows for every surface at `DISTANCES` distances and each computed number of frames,
+    depth and albedo."""
+    rows = []
+    for surface in surfaces:
+        ends = surface.grid["distance_m"]
+        held = [axis for axis in surface.grid if axis != "distance_m"]
+        for values in product(*(surface.grid[axis] for axis in held)):
+            for distance_m in np.round(np.geomspace(ends[0], ends[-1], DISTANCES), 4):
+                place = dict(zip(held, values, strict=True))
+                place["distance_m"] = float(np.clip(distance_m, ends[0], ends[-1]))
+                rows.append(Row(surface, titles[surface.camera], place, surface.at(**place)))
+    return rows

@@ -1,0 +1,399 @@
+"""The camera file that reproduces the captures: the refitted model of a known camera, or an
+empirical camera.
+
+A refitted model has the unit's own lens, gain, fixed pattern, displaced frames and, if the
+captures show it, gate for faint pixels; all other numbers are those of the known camera. The
+surfaces' albedo is stated and not measured."""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+from harness.programs.camera import measure
+from harness.programs.camera.measure import Characteristics, StillCapture
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_text
+from harness.vocabulary.geometry import MM, Lens
+from scenes.closed_form import image_view
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.calibration import with_number
+from scenes.sensor.camera import (
+    AnyCamera,
+    CameraConfig,
+    EffectsConfig,
+    camera_names,
+    camera_of,
+    guessed_precision,
+    is_camera_path,
+    load_camera,
+    numbers_of_lens,
+    read_camera,
+)
+from scenes.sensor.empirical.facts import EmpiricalCamera
+from scenes.sensor.source import SimulatedUnit
+from scenes.sensor.unit import taps_of
+
+SEED = 1
+UNIT = CameraConfig(
+    effects=EffectsConfig().model_copy(update={"unit_offset": False, "warm_up_drift": False})
+)
+"""Effects of a simulated unit that captures of a real unit also show."""
+STEPS = 5
+CLOSE = 0.01
+FARTHEST = 100.0
+FEW_FRAMES = 12
+"""Most steps of the fit of the gain, the relative error at which it ends, its largest change, and
+frames per step."""
+# width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian
+EDGE_SHARE = 2.56
+UNKNOWN = "not determined by the captures"
+
+
+def camera_of_size(lens: Lens) -> str:
+    """Return the only simulated camera with the lens's size, if possible not a guessed one; else
+    raise UserError."""
+    sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
+    fitting = [
+        name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)
+    ]
+    known = [name for name in fitting if not guessed_precision(load_camera(name))]
+    if len(known or fitting) == 1:
+        return (known or fitting)[0]
+    wrong = f"{lens.width} x {lens.height} pixels"
+    size = "record the camera's own depth images, not those of a"
+    raise UserError(
+        f"several cameras have {wrong}: {', '.join(fitting)}"
+        if fitting
+        else f"no simulated camera has {wrong}",
+        legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
+        fix="name the capture's camera with --camera"
+        if fitting
+        else f"{size} colour camera or of another mode",
+    )
+
+
+def with_lens(name: str, lens: Lens) -> AnyCamera:
+    """Return a known camera with the capture's lens. Raises UserError for an unknown camera or
+    another size."""
+    own = load_camera(name).nominal_lens
+    if (own.width, own.height) != (lens.width, lens.height):
+        raise UserError(
+            f"the capture has {lens.width} x {lens.height} pixels, but {name} has {own.width} x {own.height}",
+            legal="a capture in the simulated mode of the camera, not aligned to another camera's pixels",
+            fix="name the capture's camera, or record the camera's own depth images",
+        )
+    return camera_of(CameraConfig(name=name, numbers=numbers_of_lens(lens)))
+
+
+class Stated(NamedTuple):
+    """A number of a camera file; the tag O means "measured on the owner's captures"."""
+
+    section: str
+    key: str
+    value: Any
+    source: str
+    tag: str = "O"
+
+
+def write_camera(
+    path: Path, title: str, like: str | None, found: Characteristics, albedo: float, rate: Stated
+) -> AnyCamera:
+    """Write the camera file, refitted from a known camera ``like`` or empirical, and return the
+    camera. Raises UserError if the known camera has another image size, or if the file cannot be
+    written."""
+    names = ", ".join(capture.name for capture in found.captures)
+    source = f"measured by tofpod characterise on {names}, {date.today().isoformat()}"
+    own = _refitted(like, found, albedo, source) if like else _empirical(found, albedo, source)
+    facts = [*_of_unit(found, source), *own]
+    if like and is_camera_path(like):
+        like = os.path.relpath(like, path.parent)  # a path is relative to the file that names it
+    lines = [
+        "# Tags: O measured on the owner's captures, M assumed.",
+        *(f"# {doubt}" for doubt in found.doubts),
+    ]
+    kind = f"like: {json.dumps(like)}" if like else "kind: empirical"
+    lines += [f"name: {path.stem}", f"title: {json.dumps(title)}", kind]
+    for section in dict.fromkeys(fact.section for fact in (*facts, rate)):
+        lines += [f"{section}:"] if section else []
+        for fact in (*facts, rate):
+            text = f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: {json.dumps(fact.source)}}}"
+            lines += (
+                [f"{'  ' if section else ''}{fact.key}: {text}"] if fact.section == section else []
+            )
+    write_text(path, "\n".join(lines) + "\n")
+    return read_camera(path)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple | np.ndarray):
+        return f"[{', '.join(map(_text, value))}]"
+    return str(value) if isinstance(value, int) else repr(float(f"{float(value):.5g}"))
+
+
+def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
+    """Yield the numbers that files of both kinds take from the captures."""
+    lens = found.captures[0].lens
+    jumps_m = found.jumps_m
+    for key in ("width", "height", "fx", "fy", "cx", "cy"):
+        yield Stated("lens", f"{key}_px", getattr(lens, key), f"lens of the recording; {source}")
+    distortion = lens.distortion if any(lens.distortion) else ()
+    yield Stated("lens", "distortion", distortion, f"lens of the recording; {source}")
+    yield Stated(
+        "unit",
+        "jump_rate",
+        len(jumps_m) / found.frames,
+        f"{len(jumps_m)} of {found.frames} frames; {source}",
+    )
+    yield Stated("unit", "jump_mm", jumps_m.mean() / MM if len(jumps_m) else 0.0, source)
+    yield Stated("unit", "jitter_mm", found.jitter_m / MM, source)
+    yield Stated("engine", "output_step_mm", _step_mm(found), f"step of the stored depth; {source}")
+
+
+def _step_mm(found: Characteristics) -> float:
+    """Return the rounding step of the stored captures; a micrometre for numbers that are not
+    rounded."""
+    return found.captures[0].step_m / MM or 1e-3
+
+
+def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
+    law = found.law
+    pattern = found.pattern
+    drops = found.dropouts
+    edge = found.edge
+    yield Stated(
+        "", "wavelength_nm", 850.0, f"selects the albedo of simulated surfaces; {UNKNOWN}", "M"
+    )
+    for key, value in (
+        ("offset_mm", 0.0),
+        ("drift_mm", 0.0),
+        ("drift_min", 20.0),
+        ("drift_ramp", 0.0),
+    ):
+        yield Stated(
+            "unit", key, value, f"constant error and drift after power-on are {UNKNOWN}", "M"
+        )
+    recorded = (
+        (law.light_at_1m, source)
+        if found.has_amplitude
+        else (1.0, "amplitudes are not recorded", "M")
+    )
+    yield Stated("light", "amplitude_at_1m", *recorded)
+    yield Stated("light", "albedo", albedo, "assumed of the recorded surface", "M")
+    yield Stated("noise", "range_mm", law.range_m / MM, source)
+    yield Stated("noise", "sigma_mm", law.sigma_m / MM, source)
+    for key, value, error in zip(
+        ("range_exponent", "brightness_exponent"), law.exponents, law.errors, strict=True
+    ):
+        origin = (
+            (f"standard error {error:.2g}; {source}", "O")
+            if np.isfinite(error)
+            else (f"assumed: {UNKNOWN}", "M")
+        )
+        yield Stated("noise", key, value, *origin)
+    doubt = (
+        "not determined without a flat surface"
+        if pattern is None
+        else "; ".join((source, *pattern.field.warnings))
+    )
+    yield Stated(
+        "fixed_pattern", "deviation_mm", 0.0 if pattern is None else pattern.field.rms_m / MM, doubt
+    )
+    shared = np.ones((2, 1)) if found.pattern_correlation is None else found.pattern_correlation
+    for section, both, reason in (
+        ("noise", found.correlation, source),
+        ("fixed_pattern", shared, doubt),
+    ):
+        yield Stated(section, "rows", taps_of(both[1]), reason)
+        yield Stated(section, "columns", taps_of(both[0]), reason)
+    yield Stated("dropouts", "amplitude", np.nan_to_num(drops.amplitude, nan=1.0), source)
+    yield Stated(
+        "dropouts",
+        "share",
+        drops.share,
+        f"of {int(drops.pixels.sum())} pixels on surfaces; {source}",
+    )
+    origin = (
+        (f"{edge.lines} lines of pixels across edges; {source}", "O")
+        if edge
+        else (f"edges are {UNKNOWN}", "M")
+    )
+    blurred = edge is not None and edge.flying_px > 0.05
+    yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *origin)
+    yield Stated(
+        "edge",
+        "blur_px",
+        (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0,
+        *origin,
+    )
+    yield Stated(
+        "edge",
+        "least_step_mm",
+        20.0,
+        "smaller steps are assumed to lose no return; not measured",
+        "M",
+    )
+    yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {UNKNOWN}", "M")
+    yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {UNKNOWN}", "M")
+
+
+# ---------------------------------------------------------------- a known camera's model, refitted
+
+
+def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
+    camera = with_lens(like, found.captures[0].lens)
+    if isinstance(camera, EmpiricalCamera) or not found.surfaces:
+        what = (
+            "is an empirical camera"
+            if found.surfaces
+            else "needs flat surfaces for the fit, but none was found"
+        )
+        raise UserError(
+            f"--like {like}: {what}", fix="leave out --like to write an empirical camera"
+        )
+    for key, value in _field(camera, found) if isinstance(camera, AmcwCamera) else ():
+        camera = with_number(camera, "emitter", key, value)
+        yield Stated("emitter", key, value, f"covers every pixel with a return; {source}")
+    camera, gain = _gain(
+        with_number(camera, "engine", "output_step_mm", _step_mm(found)), found, albedo
+    )
+    yield Stated(
+        "photons",
+        "signal_electrons",
+        gain,
+        f"gives the temporal noise at albedo {albedo:g}; {source}",
+    )
+    again = simulated(camera, found, albedo, FEW_FRAMES)
+    own = measure.characteristics(again).pattern
+    if found.pattern is not None and own is not None:
+        times = found.pattern.field.rms_m / max(own.field.rms_m, 1e-9)
+        doubt = "; ".join(
+            (f"{times:.3g} times the known camera's; {source}", *found.pattern.field.warnings)
+        )
+        for key, fact in camera.fixed_pattern.to_data().items():
+            if key.endswith("_mm"):
+                yield Stated("fixed_pattern", key, fact["value"] * times, doubt)
+    level = found.dropouts.amplitude
+    share = found.dropouts.share
+    if share.max() >= 0.5 > share.min() and isinstance(camera, AmcwCamera):
+        falling = np.argsort(-share)
+        faint = float(np.exp(np.interp(-0.5, -share[falling], np.log(level[falling]))))
+        pairs = zip(found.captures, again, strict=True)
+        ratios = [(a.amplitude / b.amplitude)[a.steady & b.steady] for a, b in pairs]  # type: ignore[operator]
+        origin = f"half of the pixels with amplitude {faint:.4g} have no return; {source}"
+        yield Stated(
+            "engine",
+            "min_amplitude_units",
+            faint / float(np.nanmedian(np.concatenate(ratios))),
+            origin,
+        )
+
+
+def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, Any]]:
+    """Yield the emitter's numbers that exclude pixels with a return, widened: the lit polygon, and
+    the angle at which the cone's light ends; the light fades over as many degrees as before."""
+    often = [np.isfinite(capture.z_m).mean(axis=0) >= 0.5 for capture in found.captures]
+    seen = np.concatenate(
+        [capture.slopes[mask] for capture, mask in zip(found.captures, often, strict=True)]
+    )
+    if camera.emitter.mask_slopes is not None:
+        around = ConvexHull(np.round([*camera.emitter.mask_slopes.value, *seen], 3))
+        yield "mask_slopes", tuple(map(tuple, around.points[around.vertices]))
+    full_deg = camera.emitter.full_half_angle_deg.value
+    cutoff_deg = camera.emitter.cutoff_half_angle_deg.value
+    widest_deg = float(np.degrees(np.arctan(np.linalg.norm(seen, axis=1).max())))
+    if widest_deg > cutoff_deg:
+        yield "cutoff_half_angle_deg", widest_deg + cutoff_deg - full_deg
+
+
+def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
+    """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on
+    the logarithms."""
+    wanted = {(face.capture, face.number): face.temporal.value for face in found.surfaces}
+    tried = []
+    gain = start = camera.photons.signal_electrons.value
+    for _ in range(STEPS):
+        camera = with_number(camera, "photons", "signal_electrons", gain)
+        own = [
+            face
+            for stack in simulated(camera, found, albedo, FEW_FRAMES)
+            for face in measure.surfaces_of(stack)
+        ]
+        ratios = [np.log(face.temporal.value / wanted[face.capture, face.number]) for face in own]
+        tried.append(
+            (np.log(gain), float(np.mean(ratios)) if ratios else 1.0)
+        )  # too dim counts as too noisy
+        if abs(tried[-1][1]) < CLOSE:
+            break
+        slope = (
+            -0.6
+            if len(tried) < 2
+            else (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0] or 1.0)
+        )
+        ahead = tried[-1][0] - tried[-1][1] / min(slope, -0.2)
+        gain = float(np.exp(np.clip(ahead, np.log(start / FARTHEST), np.log(start * FARTHEST))))
+    return camera, float(np.exp(tried[-1][0]))
+
+
+def simulated(
+    camera: AnyCamera, found: Characteristics, albedo: float, frames: int | None = None
+) -> list[StillCapture]:
+    """Return the captures as a unit of the camera would have recorded them: the same surfaces (by
+    smooth fits) with the recorded brightness and the same number of frames, or ``frames``. Not
+    simulated: relief finer than the fits, light between surfaces, the emitter's shadow behind an
+    edge, and the scene beside the surfaces."""
+    return [
+        _again(camera, still, albedo, frames or len(still.z_m), n)
+        for n, still in enumerate(found.captures)
+    ]
+
+
+def _again(
+    camera: AnyCamera, capture: StillCapture, albedo: float, frames: int, number: int
+) -> StillCapture:
+    z_m = capture.mean_m
+    lens = camera.nominal_lens
+    config = UNIT.model_copy(update={"name": camera.name})
+    if capture.planes:
+        labels = np.zeros(z_m.shape, int)
+        for place, (_, mask) in enumerate(capture.planes, start=1):
+            labels[mask] = place
+        distance, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
+        labels = np.where(distance <= measure.WIDEST_PX / 2, labels[tuple(nearest)], 0)
+        halves = labels[None]
+        if not isinstance(camera, EmpiricalCamera):  # its edges are steps between pixels
+            # half of each pixel along an edge lies on the other surface, which is the mean over
+            # all positions of edges
+            halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
+        z_m = np.full(halves.shape, np.nan)
+        for place, shape_m in enumerate(capture.shapes_m, start=1):
+            z_m = np.where(halves == place, shape_m, z_m)
+    light = (
+        albedo * capture.cosine / (z_m * capture.stretch) ** 2 / (z_m.size / capture.cosine.size)
+    )
+    light *= camera.optics.cone(capture.slopes)
+    unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light))
+    if capture.amplitude is not None:
+        ratio = capture.amplitude / measure.mean_amplitude(
+            [next(iter(unit.capture(1, SEED).frames())).amplitude]
+        )
+        ratio = np.clip(
+            np.nan_to_num(ratio / np.nanmedian(ratio[capture.steady]), nan=1.0), 0.02, 50.0
+        )
+        unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light * ratio))
+    taken = list(unit.capture(frames, SEED, "own camera", number).frames())
+    amplitude = (
+        measure.mean_amplitude([frame.amplitude for frame in taken])
+        if capture.amplitude is not None
+        else None
+    )
+    return replace(
+        capture, z_m=np.stack([f.z_m for f in taken]), amplitude=amplitude, step_m=camera.z_step_m
+    )

@@ -1,0 +1,180 @@
+"""``tofpod characterise``: measures your own camera on static captures, as a page and a camera
+file."""
+
+import argparse
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from harness.inspection.arguments import add_reading, read_poses, reading_of, refuse_repeats
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
+
+CAMERA_FILE = "my_camera.yaml"
+# relative error of the simulated noise above which the camera file counts as wrong
+REPEATED = 0.15
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("paths", nargs="+", type=Path, metavar="PATH", help="captures by one camera in one mode")
+    add(
+        "--out",
+        required=True,
+        type=Path,
+        metavar="DIR",
+        help="folder for the page, the tables and my_camera.yaml",
+    )
+    like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
+    add("--like", metavar="CAMERA", help=like)
+    add_reading(add)
+    add(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="camera pose for each PATH, as for tofpod detect",
+    )
+    add("--albedo", type=float, default=0.6, help="assumed albedo of the surfaces (default: 0.6)")
+    add(
+        "--rate",
+        type=float,
+        metavar="FPS",
+        help="frames per second (default: that of --like, or 30)",
+    )
+    add(
+        "--title",
+        default="my camera",
+        help="the camera's and the unit's name on page and certificate",
+    )
+    add(
+        "--certificate",
+        action="store_true",
+        help="write also a certificate of two pages, certificate.html and .json",
+    )
+    study = "results folder of a study (tofpod sweep or tofpod implant), whose limits the certificate quotes"
+    add("--study", type=Path, metavar="DIR", help=study)
+    about = "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
+    add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
+
+
+@program(
+    _options,
+    "Measure a depth camera on static captures, preferably of a matte wall that fills the view: noise "
+    "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
+    "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
+    "Each PATH is a capture of 50 frames or more, in any format that tofpod detect reads, in order of time. Captures "
+    "at several distances, with the camera moved sideways by 30 mm or more, show the most.",
+    epilog="example: tofpod characterise near far --like azure_kinect_nfov --out my_camera",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
+    import numpy as np
+
+    from harness.evaluation.study.record import read_record
+    from harness.inspection.arguments import opened_as
+    from harness.inspection.output import print_notes, print_warnings
+    from harness.programs.camera.camera_file import (
+        Stated,
+        camera_of_size,
+        simulated,
+        with_lens,
+        write_camera,
+    )
+    from harness.programs.camera.certificate import write_certificate
+    from harness.programs.camera.measure import characteristics, read_still
+    from harness.programs.camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
+    from scenes.sensor.camera import load_camera
+
+    if not 0 < options.albedo <= 1:
+        raise UserError(f"--albedo {options.albedo:g}", legal="a number above 0, up to 1")
+    if not options.certificate and (options.study or options.about):
+        raise UserError(
+            "--study and --about need --certificate", fix="add --certificate, or leave them out"
+        )
+    if malformed := [text for text in options.about if not text.partition("=")[2]]:
+        raise UserError(
+            f"--about {malformed[0]}: is not KEY=TEXT", legal="such as --about firmware=1.6"
+        )
+    if options.rate is not None and not options.rate > 0:
+        raise UserError(f"--rate {options.rate:g}", legal="a number above 0 (frames per second)")
+    study = read_record(options.study) if options.study else None
+    poses = read_poses(options.poses, len(options.paths)) if options.poses else None
+    refuse_repeats(options.paths)
+    recordings = [
+        opened_as(options.like, [path], options.intrinsics, **reading_of(options))
+        for path in options.paths
+    ]
+    captures = list(map(read_still, recordings))
+    if options.like:
+        with_lens(
+            options.like, captures[0].lens
+        )  # a camera with another image size cannot be refitted
+    found = characteristics(captures, poses)
+    rate_of = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
+    if options.like and not options.rate:
+        rate_of = (
+            load_camera(options.like).unit.frames_per_second.value,
+            f"of {options.like}",
+            "M",
+        )
+    rate = Stated("unit", "frames_per_second", *rate_of)
+    names = ", ".join(capture.name for capture in captures)
+    print("fitting the camera file ..", file=sys.stderr)
+    camera = write_camera(
+        options.out / CAMERA_FILE, options.title, options.like, found, options.albedo, rate
+    )
+    print("simulating the captures from it ..", file=sys.stderr)
+    twin = characteristics(simulated(camera, found, options.albedo), poses)
+    sources = {MEASURED: found, SIMULATED: twin}
+    known = options.like
+    with suppress(UserError):  # no camera has this image size, or it sees none of the surfaces
+        known = known or camera_of_size(captures[0].lens)
+        sources[KNOWN] = characteristics(
+            simulated(with_lens(known, captures[0].lens), found, options.albedo), poses
+        )
+    rows = beside(found, twin, sources.get(KNOWN))
+    label = load_camera(known).title if known else ""
+    noise = ", ".join(
+        f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in found.surfaces[:3]
+    )
+    answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
+    warnings = [
+        *(warning for recording in recordings for warning in recording.warnings),
+        *found.doubts,
+    ]
+    repeated = []
+    for figure in ("fill rate", "temporal noise"):
+        off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
+        worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
+        if worst > REPEATED:
+            wrong = f"the {figure} of {CAMERA_FILE} differs from the captures by up to {100 * worst:.0f} %"
+            warnings.insert(0, f"{wrong}: limits that are simulated with it are also wrong")
+        elif noise:
+            repeated.append(f"the {figure} within {100 * worst:.1g} %")
+    answer += f" {CAMERA_FILE} reproduces {' and '.join(repeated)}." if repeated else ""
+    print_warnings(warnings)
+    for recording, capture in zip(recordings, captures, strict=True):
+        print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")
+        print_notes(recording.notes)
+    page = options.out / "characterise.html"
+    title = f"{options.title}, characterised"
+    facts = {"like": options.like, "camera_file": CAMERA_FILE}
+    write_page(page, sources, rows, title, answer, label, command, facts, warnings)
+    if options.certificate:
+        lens = captures[0].lens
+        size = f"{lens.width} x {lens.height} pixels" + (
+            f", as {options.like}" if options.like else ""
+        )
+        about = {
+            "unit": options.title,
+            "mode": size,
+            "firmware": "not recorded",
+            "warm-up": "not stated",
+        }
+        about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
+        write_certificate(options.out, found, about, poses, study, command)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

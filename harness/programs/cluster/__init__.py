@@ -1,0 +1,1 @@
+"""Sweeps on many machines: the Dask engine, and `tofpod merge`, which joins shards."""

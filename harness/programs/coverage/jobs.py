@@ -1,0 +1,302 @@
+"""A part in front of a camera, patch by patch: its noise, the signal of damage there, and how
+often damage is found.
+
+The noise at a place is the detector's unit of score there, in metres: constant if the detector has
+one scale for the whole part, else measured nearby. The signal of damage and its scatter are
+learned from the detector's own scores on boards of the family, in random poses as wide as those
+requested. Not modelled: the direction of the undamaged part's error at a place (the unit's
+pattern, the surface's misfit), light of other parts, sizes in missing returns."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from harness.experiment.schema import Experiment, ExperimentConfig, Point, SimulatedSource
+from harness.programs.coverage.statistics import Findable, Patches, ScoredDamage, Seen, findable
+from harness.runs.estimate import progress_display
+from harness.runs.jobs import JobEngine
+from harness.runs.journal import Journal
+from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
+from harness.runs.run import render_missing, run_plan, values_of
+from harness.trials.judge import detector_of
+from harness.trials.setup import load_set_up
+from harness.trials.trial import PointTask, TrialTask, cloud_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
+from scenes.target.custom import BoardConfig, PoseConfig
+from scenes.target.drawn import DrawnTargetConfig
+from scenes.target.truth import Damage, face_of
+
+# damaged boards to learn from, and averages in which each is inspected
+BOARDS = 40
+LOOKS = 3
+STEEPEST_DEG = 60.0  # largest tilt of these boards about either axis
+# averages for noise; sides of squares for the unit of score, for missing pixels
+DRAWS = 2
+AROUND_PX = 31
+NEAR_PX = 15
+MOST_PATCHES = 3000
+SAME_MM = 1e-6  # sizes that differ by less are equal; if all are, the size of damage is its depth
+ON_FACE_M = (
+    5 * MM
+    # a patch is visible if its z and the view's differ by less, or by less than two pixels on the
+    # slope
+)
+
+Pose = tuple[
+    float, float, float
+]  # Distance in metres, tilts of the part about its x and y in degrees
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A set-up in front of a part. ``task``: has the threshold. ``found``: the signal's law.
+    ``seen``: by pose."""
+
+    point: Point
+    task: PointTask
+    patches: Patches
+    found: Findable
+    seen: dict[Pose, Seen]
+
+
+def survey(
+    experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine
+) -> list[Survey]:
+    """Return a survey for each set-up. Views and trials in ``cache`` and ``folder`` are not made
+    again. Raises UserError if a point has no threshold, and as `declared` and `findable` do."""
+    plan = SweepPlan(
+        tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups)
+    )
+    journal = Journal(folder / "journal")
+    scores = dict[tuple[str, int, int, str], list[float]]()
+    with progress_display() as report:
+        outcome = run_plan(plan, journal, engine, report)
+    for entry in map(journal.read, outcome.finished):
+        for row in (entry.record or {}).get("holes", ()) if entry else ():
+            place = (row["variant"], row["frames"], row["board"], row["hole"])
+            missed = np.inf if row["no_return"] else np.nan
+            scores.setdefault(place, []).append(row["score"] if row["detected"] else missed)
+    surveys = []
+    for group in plan.groups:
+        source, family = declared(group.points[0].config)
+        patches = patches_of(family.board)
+        target = family.drawn("hole_free", 0)
+        wholes = [_bare(batch) for batch in group.then]
+        configs = [
+            PoseConfig(distance_m=distance_m, tilt_x_deg=x, tilt_y_deg=y)
+            for distance_m, x, y in poses
+        ]
+        placed = (target.model_copy(update={"pose": pose}) for pose in configs)
+        views = [batch_of(board, "hole_free", source, cache, 0) for board in placed]
+        if lost := render_missing(
+            (job for batch in (*wholes, *views) for job in batch.renders), engine
+        ):
+            raise UserError(f"a view could not be rendered: {lost[0].in_short}")
+        for point in group.points:
+            if point.digest not in outcome.thresholds:
+                why = next(
+                    (failure.in_short for failure in outcome.failures), "no hole-free run ended"
+                )
+                raise UserError(f"{point.label or point.variant} has no threshold: {why}")
+            task = point_task(
+                point, outcome.thresholds[point.digest], group.learned.get(point.digest)
+            )
+            pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
+            boards = values_of(_board_seen, pairs, engine)
+            inspections = _inspections([each for each in boards if each is not None], point, scores)
+            found = findable(inspections, outcome.thresholds[point.digest])
+            blind = np.full(len(patches.areas_m2), np.inf)
+            seen = values_of(
+                _part_seen, [(view, task, group.seed, patches) for view in views], engine
+            )
+            seen = [
+                Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each
+                for each in seen
+            ]
+            surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
+    return surveys
+
+
+def patches_of(board: BoardConfig) -> Patches:
+    """Return the face of a board in about `MOST_PATCHES` patches that are square in plan."""
+    sides_m = np.array([board.width_mm, board.height_mm]) * MM
+    counts = np.maximum(np.rint(sides_m / np.sqrt(sides_m.prod() / MOST_PATCHES)), 2).astype(int)
+    x, y = (
+        (np.arange(n) + 0.5) * side / n - side / 2
+        for n, side in zip(counts.tolist(), sides_m, strict=True)
+    )
+    face = face_of(board)
+    points = face.point(*np.meshgrid(x, y)).reshape(-1, 3)
+    points = points[np.isfinite(points[:, 2])]
+    normals = face.axis(points[:, 0], points[:, 1])
+    kept = normals[:, 2] > 0
+    return Patches(points[kept], normals[kept], sides_m.prod() / counts.prod() / normals[kept, 2])
+
+
+def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConfig]:
+    """Return the source and the family of boards. Raises UserError if there is no study of these
+    in single views."""
+    source = config.simulated
+    if (
+        isinstance(source.target, DrawnTargetConfig)
+        and config.study is not None
+        and source.views is None
+    ):
+        return source, source.target
+    fix = "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as experiments/pipe.yaml does"
+    raise UserError(f"{config.name}: is not a study of drawn damage in single views", fix=fix)
+
+
+def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
+    """Raise UserError for a size outside the declared range, that of depths if all sizes in plan
+    are equal."""
+    damage = declared(config)[1].damage
+    low, high = damage.size_mm
+    word = damage.size_of
+    if high - low < SAME_MM and damage.depths_mm:
+        word, (low, high) = "depth", damage.depths_mm
+    if size_mm is not None and not low <= size_mm <= high:
+        fix = "change the damage's range in the experiment: sizes that are not inspected have no limit"
+        what = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
+        raise UserError(what, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
+
+
+def _widened(group: Group, poses: Sequence[Pose]) -> Group:
+    """Return the group with damaged boards in poses that reach as far as those given, and as the
+    face is curved."""
+    source, family = declared(group.points[0].config)
+    bent_deg = float(np.degrees(np.arccos(patches_of(family.board).normals[:, 2].min())))
+    tilt_deg = min(
+        family.tilt_deg + bent_deg + max(max(abs(x), abs(y)) for _, x, y in poses), STEEPEST_DEG
+    )
+    near_m, far_m = (end(distance_m for distance_m, _, _ in poses) for end in (min, max))
+    jitter_mm = family.distance_jitter_mm + (far_m - near_m) / 2 / MM
+    wide = {
+        "tilt_deg": tilt_deg,
+        "distance_m": (near_m + far_m) / 2,
+        "distance_jitter_mm": jitter_mm,
+    }
+    family = family.model_copy(update=wide)
+    cache = group.then[0].renders[0].folder
+    then = tuple(
+        batch_of(family.drawn("damaged", n), "damaged", source, cache, n) for n in range(BOARDS)
+    )
+    often = [
+        replace(point, config=point.config.model_copy(update={"repeats": LOOKS}))
+        for point in group.points
+    ]
+    return replace(group, points=tuple(often), then=then)
+
+
+def _bare(batch: Batch) -> Batch:
+    """Return a damaged batch's board without its damage."""
+    (job,), (ref,) = batch.renders, batch.set_ups
+    job = replace(job, target=job.target.hole_free())
+    ref = replace(ref, view_path=str(job.path), damaged=False)
+    return replace(batch, role="hole_free", renders=(job,), set_ups=(ref,))
+
+
+def _inspections(
+    boards: Sequence[Any], point: Point, scores: Mapping[tuple[str, int, int, str], Sequence[float]]
+) -> ScoredDamage:
+    """Return all inspections of the damages of boards (`_board_seen`)."""
+    facts = list[tuple[float, ...]]()
+    for number, damages in boards:
+        for damage, seen in damages:
+            place = (point.variant, point.config.capture.frames, number, str(damage.id))
+            own = len(facts)
+            sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
+            facts += [(own, *sizes_mm, *seen, score) for score in scores.get(place, ())]
+    if not facts:
+        raise UserError(
+            f"{point.label or point.variant}: no damaged board was judged",
+            fix="check the detector's crop",
+        )
+    numbers, plan_mm, depth_mm, *seen, score = np.array(facts).T
+    size_of = boards[0][1][0][0].size_of
+    word, size_mm = (
+        ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
+    )
+    return ScoredDamage(word, numbers, size_mm, Seen(*seen), score)
+
+
+def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
+    """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over
+    score, rms around each pixel; larger if some pixels or averages are not judged, infinite if
+    most are not."""
+    fields = []
+    for repeat in range(DRAWS):
+        task = TrialTask(
+            batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board
+        )
+        evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(
+            cloud_of(task, point)
+        )
+        known = np.isfinite(evidence.score)
+        fields.append(
+            [
+                known,
+                *(
+                    np.where(known, image**2, 0.0)
+                    for image in (evidence.residual_m, evidence.score)
+                ),
+            ]
+        )
+    known, *squares = np.mean(fields, axis=0)
+    square, of_score = (ndimage.uniform_filter(image, AROUND_PX) for image in squares)
+    judged = (known >= 0.5) & (square > 0) & (of_score > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(
+            judged, np.sqrt(square / of_score / ndimage.uniform_filter(known, NEAR_PX)), np.inf
+        )
+
+
+def _board_seen(
+    batch: Batch, whole: Batch, point: PointTask, seed: int
+) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
+    """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board
+    without damage."""
+    set_up = load_set_up(batch.set_ups[0])
+    unit_m = _unit_m(whole, point, seed)
+    found = []
+    for damage in set_up.truth:
+        range_m = float(np.linalg.norm(damage.centre_camera_m))
+        cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
+        about_m = float(np.median(unit_m.ravel()[set_up.outlines[damage.id]]))
+        found.append((damage, (about_m, cosine, range_m)))
+    return batch.board or 0, found
+
+
+def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
+    """Return the view and the noise of the patches of an undamaged part."""
+    set_up = load_set_up(view.set_ups[0])
+    deviation_m = _unit_m(view, point, seed)
+    points_m = transform_points(set_up.T_camera_board, patches.points_m)
+    range_m = np.linalg.norm(points_m, axis=1)
+    cosine = (
+        -(rotate_vectors(set_up.T_camera_board, patches.normals) * points_m).sum(axis=1) / range_m
+    )
+    region = set_up.unit.region
+    camera = set_up.unit.camera
+    lens = camera.nominal_lens
+    u, v = np.rint(lens.project(points_m)).astype(int).T - [[region.col0], [region.row0]]
+    seen = (
+        camera.images(points_m)
+        & (cosine > 0)
+        & (u >= 0)
+        & (v >= 0)
+        & (u < region.shape[1])
+        & (v < region.shape[0])
+    )
+    u = np.where(seen, u, 0)
+    v = np.where(seen, v, 0)
+    # an object in front of a patch has another z
+    slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
+    reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
+    seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
+    return Seen(np.where(seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)

@@ -1,0 +1,1 @@
+"""`tofpod efficiency`: detectors of a study compared with an ideal observer."""

@@ -1,0 +1,183 @@
+"""A detector's efficiency: the share of the ideal observer's signal that it uses.
+
+Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a
+probit curve of ln d'. If a detector needs d'_p to find a share p and the ideal observer
+d'_p,ideal, its efficiency is (d'_p,ideal / d'_p)^2: the share of independent pixels, or of frames
+without a fixed pattern, that the ideal observer needs for the same result (Tanner and Birdsall, J.
+Acoust. Soc. Am. 30 (1958), 922). It is unknown if d'_p was not inspected. Hits by missing returns
+are left out, as the ideal observer does not use these."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
+from harness.evaluation.pod.curve import HitsAndMisses, PodCurve, maxima
+from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.study.limit import (
+    DRAWS,
+    SetUpLimit,
+    Targets,
+    crossings,
+    refitted_sizes,
+    weights_in_blocks,
+)
+from harness.programs.efficiency.ideal_observer import SHARES, IdealDamages
+from harness.vocabulary.errors import UserError
+
+LINK = "probit"
+# least d'; smaller ones are raised to it: such damage is never found and must not decide the curve
+LEAST_INDEX = 0.05
+HARDLY = 0.5  # fewest expected hits, and misses, for a curve
+HEAVY = 1.0  # excess kurtosis from which the noise no longer counts as Gaussian
+# largest share of a board's pixels within damage that may return nothing without a warning
+MOST_LOST = 0.01
+
+
+@dataclass(frozen=True)
+class Level:
+    """Both observers at one share of damages found. ``ideal_mm``: the ideal observer's size, or
+    the smallest inspected if none is missed (``at_most``). ``ideal_index``, ``index``: d' that
+    each needs, NaN if unknown."""
+
+    ideal_mm: float
+    ideal_mm_interval: Interval
+    at_most: bool
+    ideal_index: float
+    index: float
+    index_interval: Interval
+    efficiency: float
+    interval: Interval
+
+
+@dataclass(frozen=True, eq=False)
+class Efficiency:
+    """A set-up's detector and the ideal observer, at shares of 50 % (``half``) and 90 %
+    (``most``). ``size_mm``, ``index``, ``pod`` (ideal observer's), ``hits``, ``inspections``: (n,)
+    of each damage. ``curve``: the detector's POD against d'; None if there is none, and ``why``.
+    """
+
+    limit: SetUpLimit
+    ideal: IdealDamages
+    half: Level
+    most: Level
+    board: np.ndarray
+    hole: np.ndarray
+    size_mm: np.ndarray
+    index: np.ndarray
+    threshold: np.ndarray
+    pod: np.ndarray
+    hits: np.ndarray
+    inspections: np.ndarray
+    curve: PodCurve | None
+    why: str
+
+
+def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the values (2, d) of x (n,) with POD of 50 and 90 % on probit curves of ln x through
+    shares ``pod`` (n,) with weights (d, n); infinite if hardly any is found, the smallest x if
+    hardly any is missed."""
+    log = np.log(x)
+    centre = float(log.mean())
+    spread = float(log.std()) or 1.0
+    design = np.column_stack([np.ones_like(log), (log - centre) / spread])
+    hits = weights * pod
+    misses = weights * (1.0 - pod)
+    found = np.full((2, len(weights)), np.inf)
+    known = (hits.sum(axis=1) > HARDLY) & (misses.sum(axis=1) > HARDLY)
+    fitted = maxima(HitsAndMisses(design, hits[known], misses[known], LINK), np.array([0.0, 1.0]))
+    found[:, known] = np.exp(centre + spread * crossings(fitted, LINK, SHARES))
+    found[:, misses.sum(axis=1) <= HARDLY] = x.min()
+    return found
+
+
+def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
+    """Compare a detector's hits with the ideal observer on the damages that both judged."""
+    seen = limit.record.inspected
+    hit = seen.hit if seen.by_depth is None else seen.by_depth
+    place = {
+        key: number
+        for number, key in enumerate(zip(ideal.board.tolist(), ideal.hole.tolist(), strict=True))
+    }
+    rows = np.array(
+        [place[key] for key in zip(seen.board.tolist(), seen.hole.tolist(), strict=True)]
+    )
+    kept, first, which = np.unique(rows, return_index=True, return_inverse=True)
+    size_mm = seen.diameter_mm[first]
+    pod = ideal.pod[kept]
+    index = np.maximum(ideal.index[kept], LEAST_INDEX)
+    hits = np.bincount(which, hit)
+    inspections = np.bincount(which).astype(float)
+    again = weights_in_blocks(DRAWS, (ideal.board[kept], "damaged"))
+    weights = np.vstack([np.ones(len(kept)), *(weights for (weights,) in again)])
+    ideal_mm = expected_sizes(size_mm, pod, weights)
+    known = np.isfinite(ideal.needed[:, kept])
+    with np.errstate(invalid="ignore"):
+        ideal_index = (np.where(known, ideal.needed[:, kept], 0.0) @ weights.T) / (
+            known @ weights.T
+        )
+    curve = None
+    why = ""
+    needed = np.full((2, 1 + DRAWS), np.nan)
+    try:
+        curve = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which).curve
+        targets = Targets(ideal.board[kept], index, hits, inspections)
+        needed[:, 0] = [curve.size_at(share) for share in SHARES]
+        needed[:, 1:] = refitted_sizes(targets, curve, SHARES)
+        inside = (needed[:, 0] >= index.min()) & (needed[:, 0] <= index.max())
+        needed[~inside] = np.nan
+        if not inside.all():
+            wanted = " and ".join(f"{100 * share:.0f} %" for share in np.array(SHARES)[~inside])
+            why = f"the d' at which {wanted} are found was not inspected ({index.min():.2g} to {index.max():.3g})"
+    except UserError as error:
+        why = error.message
+    all_found = bool((1.0 - pod).sum() <= HARDLY)
+    half, most = (
+        _level(*each, all_found) for each in zip(ideal_mm, ideal_index, needed, strict=True)
+    )
+    board = ideal.board[kept]
+    hole = ideal.hole[kept]
+    exact = ideal.index[kept]
+    threshold = ideal.threshold[kept]
+    of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
+    return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
+
+
+def _level(
+    ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool
+) -> Level:
+    """Return one share of damages found, from arrays (1 + draws,) that begin with the estimate."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        share = (ideal_index / needed) ** 2
+    of_index = percentiles(needed[1:]) if np.isfinite(needed[0]) else UNKNOWN
+    of_share = percentiles(share[1:]) if np.isfinite(needed[0]) else UNKNOWN
+    indices = float(ideal_index[0]), float(needed[0]), of_index
+    return Level(
+        float(ideal_mm[0]),
+        percentiles(ideal_mm[1:]),
+        all_found,
+        *indices,
+        float(share[0]),
+        of_share,
+    )
+
+
+def warnings_of(rows: list[Efficiency]) -> list[str]:
+    """Return sentences on reasons why the ideal observer's figures are unreliable."""
+    warnings = []
+    for row in rows:
+        name = row.limit.record.label
+        ideal = row.ideal
+        if ideal.kurtosis > HEAVY:
+            warnings.append(
+                f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis {ideal.kurtosis:.2g}): the ideal"
+                " observer for Gaussian noise is not the best detector there, and its rate of false calls differs"
+            )
+        if ideal.lost > MOST_LOST:
+            warnings.append(
+                f"{name}: up to {100 * ideal.lost:.2g} % of the pixels within a board's damage return nothing, which"
+                " the ideal observer does not use: with missing returns more can be found"
+            )
+        if row.why:
+            warnings.append(f"{name}: efficiency is not known: {row.why}")
+    return warnings

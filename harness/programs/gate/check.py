@@ -1,0 +1,170 @@
+"""``tofpod check experiments/regression.yaml``: a gate that fails if a detection limit has become
+worse.
+
+The study is run and compared with a committed baseline by `harness.programs.gate.verdict`. A
+set-up fails if its a90 or its rate of false calls has grown, or its signals relative to the
+threshold have fallen, by more than 10 % and the tests show that this is not by chance (at 0.1 %
+for the whole check). It also fails if its limit is lost, if more trials failed, or if it is
+missing. With the same seed and code nothing fails.
+
+Of 40 checks each, all fail with 1.4 times the camera's noise, 39 with 1.2 times the threshold, and
+13 if a90 grows by 20 % at the same a50; with only another draw of all noise, 2 of 746 fail (95 %:
+0.03 to 0.97 %), both by a90 (`tests/validation/gate_power.py`, boards as in regression.yaml). The
+limit of through-holes (a diameter) hardly depends on noise and threshold; that of blind holes (a
+depth) is proportional to them. If both thresholds were calibrated again, a90 must grow by two more
+standard errors (`verdict.limit_margin`)."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.runs.options import add_engine_options, engine_options
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import shipped, write_text
+from harness.vocabulary.program import program
+
+if TYPE_CHECKING:
+    from harness.evaluation.study.record import StudyRecord
+
+BASELINES = shipped(
+    "baselines"
+)  # folder of the committed baselines, one ``<name of the experiment>.json`` each
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "experiment",
+        type=Path,
+        help="a YAML file with a `study`, such as experiments/regression.yaml",
+    )
+    change = (
+        "change a value of the file, such as seed=7 for another draw of the noise; may be repeated"
+    )
+    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add(
+        "--baseline",
+        type=Path,
+        metavar="FILE",
+        help="default: results/baselines/<name of the experiment>.json",
+    )
+    add("--update", action="store_true", help="write a new baseline, and print what changes")
+    add(
+        "--out",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="folder of results (default: results)",
+    )
+    add_engine_options(parser)
+
+
+@program(
+    _options,
+    "Run a study of detection limits and compare it with its baseline. The check fails (exit code 1) if a "
+    "limit or the rate of false calls has grown by more than 10 % and a paired test shows that this is not by "
+    "chance, if a set-up no longer has a limit, or if more trials fail.",
+    epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Run the program. Returns 0, 1 if a set-up is worse or missing, 2 for a user's mistake, 130
+    after Ctrl-C."""
+    from harness.evaluation.study.record import read_record, record_text
+    from harness.experiment.load import load_experiment
+    from harness.programs.gate.compare import FILES, write_comparison
+    from harness.programs.gate.page import compare_parts
+    from harness.programs.gate.verdict import ALPHA, compare_studies, fewest_boards
+    from harness.runs.study import run_study
+    from harness.vocabulary.text import many, show
+
+    experiment = load_experiment(options.experiment, options.overrides)
+    study = experiment.config.study
+    set_ups = len(experiment.points)
+    if study is None:
+        raise UserError(
+            f"{options.experiment}: has no `study`", fix="name an experiment with a study of limits"
+        )
+    needed = fewest_boards(set_ups)
+    if (
+        study.boards < needed
+    ):  # no loss could ever be significant, so the gate would pass everything
+        what = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
+        fix = "raise study.boards: 24 are needed to detect a threshold that is 1.2 times as high"
+        raise UserError(
+            what, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix
+        )
+    engine = engine_options(options)
+    if not engine.shard.is_whole:
+        raise UserError(
+            "--shard: a check needs the whole study",
+            fix="run tofpod sweep in shards, merge, then check",
+        )
+    path = options.baseline or BASELINES / f"{experiment.config.name}.json"
+    baseline = _baseline(
+        path, update=options.update
+    )  # before anything runs, because a study takes minutes
+    code = run_study(experiment, options.out, engine, command)
+    if code not in (0, 1):
+        return code
+    folder = experiment.folder(options.out)
+    found = read_record(folder)
+    comparison = None if baseline is None else compare_studies(baseline, found)
+    if comparison is not None:
+        print()
+        show(compare_parts(comparison))
+        write_comparison(comparison, folder, command)
+        print(f"comparison with the baseline: {folder / FILES[1]}")
+    if options.update or comparison is None:
+        if code == 1:
+            raise UserError(
+                f"{path}: is unchanged, because trials failed",
+                fix="correct the cause of the failures",
+            )
+        write_text(path, record_text(found))
+        print(f"wrote {path}")
+        return 0
+    missing = [row.label for row in comparison.marked("only in first")]
+    if missing:
+        print(f"missing, although in the baseline: {'; '.join(missing)}", file=sys.stderr)
+    if missing or any(row.is_worse for row in comparison.rows):
+        print(
+            "the check fails; if this is intended, run it with --update and commit the baseline",
+            file=sys.stderr,
+        )
+        return 1
+    if apart := comparison.marked("not comparable"):
+        what = "; ".join(f"{row.label}: {row.why}" for row in apart)
+        fix = "run the check again with --update and commit the baseline"
+        raise UserError(f"{path}: cannot serve as a baseline: {what}", fix=fix)
+    return 0
+
+
+def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
+    """Read the baseline. Return None if there is none and this run is an ``update``."""
+    from harness.evaluation.study.record import read_record
+
+    if path.is_dir():
+        raise UserError(
+            f"{path}: is a folder",
+            fix="name the baseline's file with --baseline, such as regression.json",
+        )
+    if not path.exists() and not update:
+        raise UserError(
+            f"{path}: there is no such baseline", fix="write one with --update, and commit it"
+        )
+    try:
+        return read_record(path) if path.exists() else None
+    except UserError as mistake:
+        if not update:
+            raise UserError(
+                mistake.message, legal=mistake.legal, fix="write a new one with --update"
+            ) from mistake
+        print(f"no comparison with the old baseline, which will be overwritten. {mistake.message}")
+        return None
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

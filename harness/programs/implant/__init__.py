@@ -1,0 +1,1 @@
+"""`tofpod implant`: simulated damage in the user's own captures."""

@@ -1,0 +1,375 @@
+"""A study on recorded frames: virtual damage at random places of scans of an undamaged part,
+judged like boards.
+
+A placement corresponds to a simulated board: some damages at once, in one group of recorded
+frames. The placements in one recording share its surface and fixed pattern and, if it has few
+frames, its noise."""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import ndimage
+
+from detectors.averages.average import RECORDED, average
+from detectors.averages.noise import REACH_FRAMES, noise_reach_px
+from detectors.recordings import Recording
+from harness.evaluation.study.record import SetUpRecord
+from harness.records.trials import ResultTables
+from harness.runs.study import set_up_of
+from harness.runs.tables import columns_of
+from harness.trials.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
+from harness.trials.setup import INTACT_MARGIN_PX, KnownCloud, far_from, outlined, pixel_areas
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Cloud, Frame, invert, transform_points
+from harness.vocabulary.seeds import digest, random_stream
+from scenes.implants import BEYOND_PX, KINDS, Implant, implant_of, local_board, side_mm, unit_config
+from scenes.sensor.camera import camera_of
+from scenes.target.custom import TargetConfig
+from scenes.target.drawn import DrawnTargetConfig, Purpose
+from scenes.target.truth import truth_of
+
+# most undamaged averages that count false calls, and that set a threshold
+MOST_HOLE_FREE = 20
+MOST_SETTING = 5
+MOST_EMPTY = 200  # give up after this many placements in a row without a place for any damage
+NORMAL_PX = 4  # half the side of the square of surface that determines the tangent plane
+TELLING_DEG = (
+    5.0  # a warning follows if the judged rim is steeper than the places of damage by this angle
+)
+VARIANT = "main"
+
+
+@dataclass(frozen=True)
+class Judging:
+    """The rule by which clouds are judged. ``threshold`` None: ``threshold_of`` returns it, with
+    warnings."""
+
+    detector: str
+    settings_json: str
+    radius_m: float
+    threshold: float | None
+    threshold_of: Callable[[Cloud], tuple[float, tuple[str, ...]]]
+
+
+class Scan:
+    """A recording of an undamaged part, with its surface and judged area. Raises UserError if
+    either is missing."""
+
+    def __init__(self, recording: Recording, judging: Judging) -> None:
+        if recording.lens is None or recording.slopes is None or recording.projection != "central":
+            fix = "name the lens's file or the camera with --intrinsics"
+            raise UserError(
+                f"{recording.name}: the lens is not known, and damage cannot be placed", fix=fix
+            )
+        self.recording, self.lens, self.slopes = recording, recording.lens, recording.slopes
+        self.frames = list(recording.frames())
+        self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES], recording.z_step_m)
+        self.whole = self.averaged(self.frames)
+        evidence = detector_of(judging.detector, judging.settings_json).analyse(self.whole)
+        self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
+        self.surface_z_m = np.where(self.judged, evidence.surface_z_m, np.nan)
+        points_m = self.rays[self.judged] * self.surface_z_m[self.judged][:, None]
+        # the board's frame: the plane through the surface, z towards the camera, x along the
+        # picture's rows
+        centre = points_m.mean(axis=0)
+        _, axes = np.linalg.eigh(np.cov((points_m - centre).T))
+        normal = axes[:, 0] * -np.sign(axes[2, 0])
+        along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+        along /= np.linalg.norm(along)
+        self.T_camera_board = np.eye(4)
+        self.T_camera_board[:3] = np.column_stack([along, np.cross(normal, along), normal, centre])
+        places = transform_points(invert(self.T_camera_board), points_m)[:, :2]
+        middle = places.min(axis=0) / 2 + places.max(axis=0) / 2
+        self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
+        self.size_m: np.ndarray = np.ptp(places, axis=0)
+        # no damage is placed where the undamaged recording has findings, which would count as hits
+        detector = detector_of(judging.detector, judging.settings_json)
+        threshold = judging.threshold
+        found = detector.find(
+            self.whole, evidence, threshold or judging.threshold_of(self.whole)[0]
+        )
+        rays = np.array([each.centre_m for each in found]).reshape(-1, 3)
+        met = rays * ((self.T_camera_board[:3, 3] @ normal) / (rays @ normal))[:, None]
+        self.taken_m = transform_points(invert(self.T_camera_board), met)[:, :2]
+        self.free_m = judging.radius_m
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """Rays (h, w, 3) with z = 1."""
+        return np.concatenate([self.slopes, np.ones((*self.slopes.shape[:2], 1))], axis=-1)
+
+    @cached_property
+    def places_m(self) -> np.ndarray:
+        """Points (h, w, 2) where each pixel's ray meets the plane; NaN where nothing is judged."""
+        normal = self.T_camera_board[:3, 2]
+        centre = self.T_camera_board[:3, 3]
+        met = self.rays * ((centre @ normal) / (self.rays @ normal))[..., None]
+        return np.where(
+            self.judged[..., None],
+            transform_points(invert(self.T_camera_board), met)[..., :2],
+            np.nan,
+        )
+
+    @cached_property
+    def depth_px(self) -> np.ndarray:
+        """Distance (h, w) of each pixel to the nearest one that is not judged or is outside the
+        picture."""
+        return np.asarray(ndimage.distance_transform_edt(np.pad(self.judged, 1))[1:-1, 1:-1])
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Judged area of the surface in plan."""
+        return float(np.nansum(pixel_areas(self.places_m)[self.judged]))
+
+    @property
+    def pitch_m(self) -> float:
+        """Side of a square in plan with the mean area of a judged pixel."""
+        return math.sqrt(self.area_m2 / max(self.judged.sum(), 1))
+
+    @cached_property
+    def angle_deg(self) -> np.ndarray:
+        """Angle (h, w) between each judged pixel's ray and the fitted surface's normal; NaN
+        elsewhere."""
+        down, across = np.gradient(self.rays * self.surface_z_m[..., None], axis=(0, 1))
+        normal = np.cross(down, across)
+        along = (normal * self.rays).sum(-1) / (
+            np.linalg.norm(normal, axis=-1) * np.linalg.norm(self.rays, axis=-1)
+        )
+        return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
+
+    def rim_px(self, family: DrawnTargetConfig) -> float:
+        """Return the least distance of a damage's centre from the edge of the judged area, for any
+        size of damage."""
+        return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
+
+    def left_out(self, family: DrawnTargetConfig) -> str:
+        """Return a sentence on the rim where no damage is placed; empty if it is not steeper than
+        the rest."""
+        inner = self.depth_px >= self.rim_px(family)
+        known = np.isfinite(self.angle_deg)
+        if not (inner & known).any():
+            return ""
+        steep = [
+            float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)
+        ]
+        if steep[1] - steep[0] < TELLING_DEG:
+            return ""
+        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of the judged area"
+        rim = f"the limit says nothing about the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
+        return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
+
+    def averaged(self, frames: Sequence[Frame]) -> Cloud:
+        """Return the average of some frames, computed as in `tofpod detect`."""
+        cloud = average(
+            replace(self.recording, read=lambda: iter(frames), selection=None), RECORDED
+        )
+        return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
+
+    def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the surface's point (3,) above a place of the plane and the normal (3,) towards
+        the camera, in its frame; None with less than ``rim_px`` of judged surface around it, or
+        with a finding within the hit radius."""
+        if (np.linalg.norm(self.taken_m - [x_m, y_m], axis=1) < self.free_m).any():
+            return None
+        point = transform_points(self.T_camera_board, np.array([x_m, y_m, 0.0]))
+        u, v = self.lens.project(point)
+        row = round(float(v))
+        column = round(float(u))
+        h, w = self.judged.shape
+        if not (0 <= row < h and 0 <= column < w) or self.depth_px[row, column] < rim_px:
+            return None
+        rows = slice(max(row - NORMAL_PX, 0), row + NORMAL_PX + 1)
+        columns = slice(max(column - NORMAL_PX, 0), column + NORMAL_PX + 1)
+        around = rows, columns
+        points = (self.rays[around] * self.surface_z_m[around][..., None]).reshape(-1, 3)
+        points = points[np.isfinite(points[:, 2])]
+        middle = points.mean(axis=0)
+        normal = np.linalg.eigh(np.cov((points - middle).T))[1][:, 0]
+        normal = normal * -np.sign(normal[2])
+        ray = np.array([*(point[:2] / point[2]), 1.0])
+        return ray * (middle @ normal) / (ray @ normal), normal
+
+    def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
+        """Return a cloud of this scan with the truth of the implanted damage."""
+        truth = truth_of(target, self.T_camera_board)
+        intact = self.judged & far_from(truth, self.places_m, INTACT_MARGIN_PX * self.pitch_m)
+        of_truth = (target, truth, outlined(truth, self.places_m), self.places_m)
+        depths = {damage.id: damage.depth_m for damage in truth}
+        return KnownCloud(cloud, invert(self.T_camera_board), *of_truth, intact, depths)
+
+
+@dataclass(frozen=True, eq=False)
+class Implanted:
+    """Damages of ``target`` at suitable places in one scan, with the change that each makes."""
+
+    number: int
+    scan: Scan
+    target: TargetConfig
+    implants: tuple[Implant, ...]
+
+    def cloud(self, group: slice) -> Cloud:
+        """Return the average of a group of the scan's frames with the damage implanted."""
+        changed = []
+        for number, frame in list(enumerate(self.scan.frames))[group]:
+            z_m = frame.z_m.copy()
+            reason = frame.reason.copy()
+            for implant in self.implants:
+                implant.put_into(frame, number, z_m, reason)
+            changed.append(replace(frame, z_m=z_m, reason=reason))
+        return self.scan.averaged(changed)
+
+
+def placements(
+    scans: Sequence[Scan],
+    family: DrawnTargetConfig,
+    camera: str,
+    targets: int,
+    seed: int,
+    cache: Path,
+) -> Iterator[Implanted]:
+    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError if
+    none fits."""
+    units = [unit_config(camera, scan.lens) for scan in scans]
+    found = number = empty = 0
+    while found < targets:
+        scan, (config, same) = scans[number % len(scans)], units[number % len(scans)]
+        placed = damages_placed(scan, family, camera, "damaged", number)
+        empty = 0 if placed.damages else empty + 1
+        if empty > MOST_EMPTY:
+            fix = "smaller --diameters, a larger --crop, or a camera nearer to the part"
+            raise UserError(
+                f"{scan.recording.name}: the judged area has no room for the damage", fix=fix
+            )
+        implants = []
+        for damage in placed.damages:
+            spot = scan.place(*damage.centre_m, 0.0)
+            assert spot is not None  # `damages_placed` has checked it
+            board = local_board(placed, damage, *spot, side_mm(damage, float(spot[0][2]), config))
+            draw = int(random_stream(seed, "implant", number, damage.id).integers(2**31))
+            implants.append(
+                implant_of(config, same, scan.lens, board, len(scan.frames), draw, cache)
+            )
+        if implants:
+            found += len(implants)
+            yield Implanted(number, scan, placed, tuple(implants))
+        number += 1
+
+
+def damages_placed(
+    scan: Scan, family: DrawnTargetConfig, camera: str, purpose: Purpose, number: int
+) -> TargetConfig:
+    """Return a board of the family with only those damages that have enough judged surface around
+    them."""
+    drawn = family.drawn(purpose, number)
+    rim_px = scan.rim_px(family)
+    kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
+    left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
+    return drawn.model_copy(update=left)
+
+
+def judge_scans(
+    scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
+    frames: Sequence[int],
+) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
+    """Set a threshold for each number of frames, count false calls on undamaged frames, and judge
+    all placements. Return tables, a set-up for each number of frames, and warnings. If a recording
+    has two groups of that many frames or more, every second group sets the threshold; otherwise
+    the same frames do both, and a warning says so."""
+    rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
+    warnings, calibrated = [text for scan in scans if (text := scan.left_out(family))], {}
+    for count in frames:
+        groups = [
+            (scan, slice(k, k + count))
+            for scan in scans
+            for k in range(0, len(scan.frames) - count + 1, count)
+        ]
+        if not groups:
+            longest = max(len(scan.frames) for scan in scans)
+            raise UserError(
+                f"--frames {count}: no recording has that many frames", legal=f"1 to {longest}"
+            )
+        setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
+        if len(groups) == 1:
+            warnings.append(
+                f"{count} frames: one average sets the threshold, shows the false calls and is damaged too"
+            )
+        setting = setting[:MOST_SETTING] if judging.threshold is None else []
+        quiet = judged[:MOST_HOLE_FREE]
+        own = [judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting]
+        warnings += dict.fromkeys(f"{count} frames: {text}" for _, doubts in own for text in doubts)
+        calibrated[count] = len(own)
+        threshold = judging.threshold or float(np.median([value for value, _ in own]))
+
+        for number, (scan, group) in enumerate(quiet):
+            sites = damages_placed(scan, family, camera, "hole_free", number)
+            known = scan.known(scan.averaged(scan.frames[group]), sites)
+            _add(
+                rows,
+                judging,
+                known,
+                threshold,
+                {"frames": count, "board": number, "role": "hole_free"},
+            )
+        for at, placement in enumerate(made):
+            slices = [group for scan, group in judged if scan is placement.scan]
+            slices = slices or [group for scan, group in groups if scan is placement.scan]
+            known = placement.scan.known(
+                placement.cloud(slices[at % len(slices)]), placement.target
+            )
+            _add(
+                rows,
+                judging,
+                known,
+                threshold,
+                {"frames": count, "board": placement.number, "role": "damaged"},
+            )
+            print(f"frames averaged {count}: placement {at + 1} of {len(made)}", file=sys.stderr)
+    tables = ResultTables(
+        **{name: pd.DataFrame(columns_of(lines, {}) if lines else {}) for name, lines in rows.items()},
+        probes=pd.DataFrame(), variants=pd.DataFrame(), noise=pd.DataFrame(), axes=pd.DataFrame(),
+    )  # fmt: skip
+    detector = detector_of(judging.detector, judging.settings_json)
+    camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
+    set_ups = []
+    files = [str(path) for scan in scans for path in scan.recording.files]
+    for count in frames:
+        holes = tables.holes[tables.holes["frames"] == count]
+        runs = tables.runs[tables.runs["frames"] == count]
+        set_ups.append(
+            set_up_of(
+                holes,
+                runs,
+                variant=VARIANT,
+                frames=count,
+                detector=detector.name,
+                detector_version=detector.version,
+                calibration_runs=calibrated[count],
+                targets_digest=digest([placement.target.to_data() for placement in made]),
+                frames_digest=digest([camera_data, count, *files]),
+            )
+        )
+    return tables, tuple(set_ups), tuple(warnings)
+
+
+def _add(
+    rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]
+) -> None:
+    """Judge one cloud and add its rows. ``named``: its frames, board and role."""
+    began = time.perf_counter()
+    hole_free = named["role"] == "hole_free"
+    radius_m = judging.radius_m
+    judged = judge(
+        known, judging.detector, judging.settings_json, threshold, radius_m, hole_free=hole_free
+    )
+    found = study_rows(known, judged, radius_m, hole_free=hole_free)
+    for run in found["runs"]:
+        run["seconds_detect"] = time.perf_counter() - began
+    for name, added in found.items():
+        rows[name] += [{"variant": VARIANT, "repeat": 0, **named, **row} for row in added]

@@ -1,0 +1,1 @@
+"""`tofpod pod`, `design` and `gauge`: limits of real inspections, and how many targets they need."""

@@ -1,0 +1,239 @@
+"""``tofpod gauge``: designs boards with holes to check a detection limit: drilling template and
+truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program, span
+
+if TYPE_CHECKING:
+    from harness.evaluation.pod.curve import PodCurve
+    from harness.programs.inspections.gauge_board import Gauge
+
+DICTIONARY = "DICT_6X6_50"
+CODES = 50
+# Side of a mark, step of drill sizes, seed of the order of sizes
+MARK_MM = 32.0
+DRILLS_MM = 0.5
+SEED = 1
+# White margin of a mark; least distance from a hole's rim to the board's edge
+CLEAR_MM = 6.0
+EDGE_MM = 18.0
+LARGEST_MM = 5e3  # the largest size that the truth file allows
+HIT_SHARE = (
+    # Hit radius as a share of the distance between holes, so that no finding can hit two holes
+    0.4
+)
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--diameters",
+        required=True,
+        type=span,
+        metavar="FROM:TO",
+        help="range of drill diameters, mm",
+    )
+    add(
+        "--depths",
+        type=span,
+        metavar="FROM:TO",
+        help="depths of blind holes, mm (default: all are through-holes)",
+    )
+    add(
+        "--study",
+        type=Path,
+        metavar="DIR",
+        help="plan with the curve of this study, simulated or implanted",
+    )
+    add("--set-up", metavar="NAME", help='set-up of that study: "50 frames"')
+    add(
+        "--a50",
+        type=float,
+        metavar="MM",
+        help="plan with a guess: the size that is found half the time",
+    )
+    add("--a90", type=float, metavar="MM", help="and the size that is found nine times out of ten")
+    add("--targets", type=int, default=36, metavar="N", help="total number of holes (default: 36)")
+    add(
+        "--board",
+        default="270x175",
+        metavar="WxH",
+        help="size of a board, mm (default: 270x175, one sheet of A4)",
+    )
+    add(
+        "--apart",
+        type=float,
+        default=30.0,
+        metavar="MM",
+        help="distance between holes (default: 30)",
+    )
+    add("--paper", choices=("A4", "A3", "letter"), default="A4", help="default: A4")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for template.pdf, board-N.svg and gauge.json",
+    )
+
+
+@program(
+    _options,
+    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the limit that "
+    "tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG for each board, and "
+    "gauge.json, the truth that tofpod detect --gauge reads.",
+    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
+    "gauge, then drill, record, and tofpod detect captures/gauge --gauge gauge/gauge.json --out found",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
+    from harness.programs.inspections import design_statistics as plan
+    from harness.programs.inspections.gauge_board import GAUGE_VERSION
+    from harness.programs.inspections.gauge_page import template_pdf, template_svg, tiles_of
+    from harness.programs.inspections.mapod import PRIOR_SIZE
+    from harness.vocabulary.files import write_bytes, write_text
+
+    low, high = options.diameters
+    if not DRILLS_MM <= low < high < LARGEST_MM:
+        raise UserError(
+            f"--diameters {low:g}:{high:g}", legal=f"FROM < TO, and FROM at least {DRILLS_MM:g}"
+        )
+    if options.depths and not 0 < options.depths[0] <= options.depths[1] < LARGEST_MM:
+        raise UserError(
+            "--depths {:g}:{:g}".format(*options.depths), legal="FROM <= TO, both above 0, in mm"
+        )
+    if not 10 <= options.targets <= 600:
+        raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
+    curve = _curve(options)
+    # sizes are spread evenly: sizes only where the study's curve rises show nothing if the real
+    # curve rises elsewhere
+    (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
+    if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
+        were = f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is {wrong_mm:.3g} mm"
+        print(
+            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other --diameters"
+        )
+    gauge = _laid_out(options, chosen.sizes)
+    text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
+    write_text(options.out / "gauge.json", text + "\n")
+    write_bytes(options.out / "template.pdf", template_pdf(gauge.boards, DICTIONARY, options.paper))
+    for board in gauge.boards:
+        write_bytes(options.out / f"{board.name}.svg", template_svg(board, DICTIONARY))
+    first = gauge.boards[0]
+    sheets = len(tiles_of(first.width_mm, first.height_mm, options.paper)[1])
+    expected = (
+        "no a90/95" if chosen.bound == float("inf") else f"a90/95 of about {chosen.bound:.3g} mm"
+    )
+    print(
+        f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for each: {sheets}"
+    )
+    print(
+        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines them with a study"
+    )
+    print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
+    print(
+        f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json; print at 100 %"
+    )
+    return 0
+
+
+def _curve(options: argparse.Namespace) -> PodCurve:
+    """Return the curve for planning. Raises UserError if it is stated twice or not at all."""
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import read_record, set_up_named
+    from harness.programs.inspections.design_statistics import curve_through
+
+    guessed = options.a50 is not None and options.a90 is not None
+    if guessed == (options.study is not None):
+        raise UserError(
+            "planning needs exactly one curve", legal="--study DIR, or --a50 MM --a90 MM"
+        )
+    if guessed:
+        return curve_through(options.a50, options.a90)
+    limit = limit_of(set_up_named(read_record(options.study), options.set_up))
+    if limit.statement is None:
+        raise UserError(
+            f"{options.study}: has no curve: {limit.why}", fix="state a guess with --a50 and --a90"
+        )
+    return limit.statement.curve
+
+
+def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
+    """Return as few boards as can hold these holes, with sizes spread over all boards in random
+    order."""
+    from harness.programs.inspections.gauge_board import Gauge, GaugeBoard, GaugeHole, GaugeMark
+    from harness.vocabulary.seeds import random_stream
+
+    try:
+        width, height = map(float, options.board.lower().split("x"))
+        if not all(0 < each < LARGEST_MM for each in (width, height)):
+            raise ValueError("no size of a board")
+    except ValueError as error:
+        raise UserError(
+            f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
+        ) from error
+    side = MARK_MM
+    apart = options.apart
+    if not 0 < options.diameters[1] < apart - 4:
+        what = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm overlap"
+        raise UserError(what, legal="at least their diameter plus 5 mm")
+    inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
+    corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
+    rim = options.diameters[1] / 2 + EDGE_MM
+    room = [size - 2 * rim for size in (width, height)]
+    xs, ys = (
+        np.linspace(-size / 2, size / 2, max(int(size // apart) + 1, 2)).round(2).tolist()
+        for size in room
+    )
+    clear = side / 2 + options.diameters[1] / 2 + CLEAR_MM
+    places = [
+        (x, y) for y in ys for x in xs if (np.abs(corners - (x, y)).max(axis=1) >= clear).all()
+    ]
+    count = -(-len(sizes) // max(len(places), 1))
+    if not places or min(*inset, *room) <= side or 4 * count > CODES:
+        fix = "a larger --board, a smaller --apart, or fewer --targets"
+        raise UserError(
+            f"{len(sizes)} holes need {count} boards of {width:g} x {height:g} mm", fix=fix
+        )
+    drilled = np.round(sizes / DRILLS_MM) * DRILLS_MM
+    boards = []
+    for number in range(count):
+        stream = random_stream(SEED, "gauge board", number)
+        own = drilled[number::count]
+        chosen = stream.permutation(len(places))[: len(own)]
+        deep: list[float | None] = [None] * len(own)
+        if options.depths:
+            parts = (stream.permutation(len(own)) + 0.5) / len(own)
+            deep = np.round(
+                options.depths[0] + parts * (options.depths[1] - options.depths[0]), 1
+            ).tolist()
+        holes = tuple(
+            GaugeHole(
+                id=k + 1,
+                diameter_mm=float(own[k]),
+                depth_mm=deep[k],
+                x_mm=places[at][0],
+                y_mm=places[at][1],
+            )
+            for k, at in enumerate(chosen.tolist())
+        )
+        corner = enumerate(corners.tolist(), start=4 * number)
+        marks = tuple(GaugeMark(code=code, x_mm=x, y_mm=y, side_mm=side) for code, (x, y) in corner)
+        name = f"board-{number + 1}"
+        boards.append(
+            GaugeBoard(name=name, width_mm=width, height_mm=height, marks=marks, holes=holes)
+        )
+    return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * apart, boards=tuple(boards))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

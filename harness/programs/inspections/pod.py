@@ -1,0 +1,216 @@
+"""``tofpod pod``: fits the probability of detection to the user's own inspections
+(MIL-HDBK-1823A)."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import program
+
+if TYPE_CHECKING:
+    from harness.evaluation.pod.inspections import Inspections
+    from harness.evaluation.pod.statement import PodStatement
+    from harness.evaluation.study.record import SetUpRecord
+    from harness.programs.inspections.mapod import Mapod
+
+LINKS = ("logit", "probit", "cloglog", "loglog")
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    switch = argparse.BooleanOptionalAction
+    add(
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="CSV or Excel (.xlsx): a header row, then one row per inspection",
+    )
+    add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
+    hits = "column with 1 (found) and 0 (missed), yes and no, or hit and miss; give it once for each inspector"
+    add("--hit", metavar="COL", action="append", help=hits)
+    add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
+    add(
+        "--target",
+        metavar="COL",
+        help="column of the flaws' names, if some were inspected more than once",
+    )
+    add(
+        "--unit",
+        default="",
+        metavar="UNIT",
+        help="unit of the sizes, for the labels: mm, inch, ...",
+    )
+    add("--out", type=Path, default=Path("results/pod"), metavar="DIR", help="default: results/pod")
+    least = "(default: the choice with the lower deviance)"
+    add("--log", action=switch, help=f"use the logarithm of the sizes, or not {least}")
+    put = parser.add_argument_group("with --hit").add_argument
+    put(
+        "--link",
+        choices=LINKS,
+        help="shape of the curve (default: the shape with the least deviance)",
+    )
+    put = parser.add_argument_group("with --ahat").add_argument
+    put(
+        "--decision",
+        type=float,
+        metavar="Y",
+        help="a flaw is called if its signal is higher than this",
+    )
+    put(
+        "--left",
+        type=float,
+        metavar="Y",
+        help="signals at or below this value are censored (noise)",
+    )
+    put(
+        "--right",
+        type=float,
+        metavar="Y",
+        help="signals at or above this value are censored (saturation)",
+    )
+    put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
+    about = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
+    put = parser.add_argument_group(about).add_argument
+    prior = "folder of a study, simulated or by virtual damage (tofpod implant)"
+    put("--prior", type=Path, metavar="STUDY", help=prior)
+    put("--set-up", metavar="NAME", help='set-up of the study: "50 frames"')
+    put(
+        "--board",
+        metavar="COL",
+        help="column of the boards' names, in the order in which they were inspected",
+    )
+
+
+@program(
+    _options,
+    "Fit a probability of detection curve to inspections, one per row of a table, and state the size that is "
+    "found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png and pod.html.",
+    epilog="example: tofpod pod blades.csv --hit found --size length --target blade --unit mm",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130
+    after Ctrl-C."""
+    from harness.programs.inspections.mapod_page import mapod_html, mapod_parts, save_mapod_png
+    from harness.report.pod import pod_html, pod_parts, save_pod_png
+    from harness.vocabulary.files import write_json, write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION
+    from harness.vocabulary.text import show
+
+    found: Any = _stated(options) if options.prior is None else _corrected(options)
+    alone = (pod_parts, save_pod_png, pod_html)
+    combined = (mapod_parts, save_mapod_png, mapod_html)
+    parts, save_png, html = alone if options.prior is None else combined
+    show(parts(found))
+    stem = "pod" if options.prior is None else "mapod"
+    data = options.out / f"{stem}.{'json'}"
+    picture = options.out / f"{stem}.{'png'}"
+    page = options.out / f"{stem}.{'html'}"
+    write_json(data, {"results_version": RESULTS_VERSION, **found.to_data(), "command": command})
+    save_png(picture, found)
+    write_text(page, html(found, command))
+    print(f"wrote {data}, {picture.name}, {page.name}")
+    return 0
+
+
+def _corrected(options: argparse.Namespace) -> Mapod:
+    """Return a study's curve corrected by the inspections."""
+    from harness.evaluation.pod import inspections as table
+    from harness.evaluation.study.limit import limit_of
+    from harness.evaluation.study.record import read_record, set_up_named
+    from harness.programs.inspections.mapod import Mapod
+
+    for name in ("ahat", "decision", "left", "right", "log_signal", "link", "log"):
+        if getattr(options, name) is not None:
+            fix = "leave it out, since the study's curve determines it"
+            raise UserError(f"--{name.replace('_', '-')} cannot be combined with --prior", fix=fix)
+    if not options.hit or len(options.hit) != 1 or options.unit not in ("", "mm"):
+        legal = "--hit COL once, with sizes in mm like those of a study"
+        raise UserError("--prior corrects a curve by hits and misses", legal=legal)
+    study = read_record(options.prior)
+    limit = limit_of(set_up_named(study, options.set_up))
+    read = table.read_inspections(options.file, options.size, options.hit, options.target)
+    table.require_positive(read, response=False, why="--prior")
+    if read.targets < len(read.size):
+        raise UserError(
+            f"{options.file}: some targets appear more than once",
+            fix="keep one inspection of each target",
+        )
+    boards = table.texts_of(read, options.board) if options.board else None
+    doubt = _unlike(read, limit.record, study.hit_radius_mm)
+    return Mapod.of(limit.record.label, limit.statement, limit.why, read, boards, doubt)
+
+
+def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
+    """Return a remark if the real hits were counted differently from the study's, or if the table
+    does not show how."""
+    from harness.evaluation.pod.inspections import texts_of
+
+    counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"
+    own = counted.format(f"{study.detector} {study.detector_version}", study.threshold, radius_mm)
+    real = {f"in a way that {read.path.name} does not state"}
+    with suppress(UserError, ValueError):
+        columns = [texts_of(read, name) for name in ("detector", "threshold", "hit_radius_mm")]
+        real = {counted.format(by, float(k), float(mm)) for by, k, mm in zip(*columns, strict=True)}
+    return (
+        ""
+        if real == {own}
+        else f"real hits were counted {'; '.join(sorted(real))}; those of the study {own}"
+    )
+
+
+def _stated(options: argparse.Namespace) -> PodStatement:
+    from harness.evaluation.pod import inspections as table
+    from harness.evaluation.pod import statement as pod
+
+    for name in ("set_up", "board"):
+        if getattr(options, name) is not None:
+            raise UserError(
+                f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out"
+            )
+    of_hits = options.hit is not None
+    legal = "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
+    if of_hits == (options.ahat is not None):
+        what = "one of them, not both" if of_hits else "no column states what was found"
+        raise UserError(
+            f"--hit and --ahat: {what}",
+            legal=legal,
+            fix="name one column; the program does not guess",
+        )
+    owner = "--ahat" if of_hits else "--hit"
+    for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):
+        if getattr(options, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')} belongs to {owner}", fix="leave it out")
+    if not of_hits and options.decision is None:
+        legal = "a signal, in the column's unit"
+        fix = "add --decision Y; a value for a wanted rate of false calls comes from hole-free runs"
+        raise UserError(
+            "--ahat needs --decision, the signal above which a flaw is called", legal=legal, fix=fix
+        )
+    responses = options.hit if of_hits else [options.ahat]
+    read = table.read_inspections(
+        options.file, options.size, responses, options.target, hits=of_hits
+    )
+    if of_hits and read.response.min() == read.response.max():
+        kind = "hits" if read.response[0] else "misses"
+        what = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
+        raise UserError(
+            f"{what}, but a curve needs both hits and misses", fix="add targets of other sizes"
+        )
+    if options.log:
+        table.require_positive(read, response=False, why="--log")
+    if of_hits:
+        return pod.state_hits(read, link=options.link, log_size=options.log, unit=options.unit)
+    if options.log_signal and options.left is None:
+        table.require_positive(read, response=True, why="--log-signal")
+    names = ("decision", "left", "right", "log_signal", "unit")
+    return pod.state_signals(
+        read, log_size=options.log, **{name: getattr(options, name) for name in names}
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,174 @@
+"""``tofpod ls``: lists detectors and cameras with their settings, results folders, and stored
+renders."""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import size_text
+from harness.vocabulary.program import program
+
+DAY_S = 86_400.0
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "what",
+        nargs="?",
+        help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera",
+    )
+    add(
+        "name",
+        nargs="?",
+        help="a detector or camera, to show all its settings; with results, the experiment",
+    )
+    add(
+        "--out",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="folder of results (default: results)",
+    )
+    add("--json", action="store_true", help="print JSON, for programs")
+
+
+@program(
+    _options,
+    "List detectors and cameras: tofpod's own and those that installed packages offer through the entry point "
+    "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of renders, or all keys of an "
+    "experiment.",
+    epilog="examples: tofpod ls; tofpod ls thesis; tofpod ls cameras kinect_v2; "
+    "tofpod ls --json; tofpod ls results; tofpod ls results averaging; "
+    "tofpod ls cache",
+)
+def main(options: argparse.Namespace, command: str) -> int:
+    """Run the program. Returns 0 (also if something listed is broken), 2 for a user's mistake."""
+    if options.what == "keys":
+        from harness.programs.keeping.listing import reference
+
+        print(reference())
+        return 0
+    return {"results": _list_results, "cache": _list_cache}.get(options.what, _list_offers)(options)
+
+
+def _list_offers(options: argparse.Namespace) -> int:
+    """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown
+    name."""
+    from harness.programs.keeping.listing import SETTABLE, grid_of, offered, plug_ins, shown
+    from harness.vocabulary.declaration.diagnose import nearest
+    from harness.vocabulary.seeds import canonical_json
+    from harness.vocabulary.text import Grid, show
+
+    word = options.what
+    name = options.name
+    if word in (None, *SETTABLE) and name is None:
+        rows = {kind: offered(kind) for kind in ([word] if word else SETTABLE)}
+        if options.json:
+            return _print_json(rows)
+        for kind, found in rows.items():
+            show([f"{kind} (entry points: {plug_ins(kind).group})", grid_of(kind, found), ""])
+        return 0
+    named = (
+        [word]
+        if word in SETTABLE
+        else [kind for kind in SETTABLE if word in plug_ins(kind).names()]
+    )
+    if not named or (name is not None and word not in SETTABLE):
+        names = (
+            []
+            if name is not None
+            else [each for kind in SETTABLE for each in plug_ins(kind).names()]
+        )
+        legal = [*SETTABLE, "results", "cache", "keys", *names]
+        near = nearest(word, legal)
+        meant = f"; did you mean {near!r}?" if near else ""
+        fix = "run tofpod ls for a list"
+        raise UserError(
+            f"there is nothing called {word!r} to list{meant}", legal=", ".join(legal), fix=fix
+        )
+    details = {kind: shown(kind, name or word) for kind in named}
+    if options.json:
+        return _print_json(details if name is None else details[word])
+    for kind, row in details.items():
+        settable = [
+            (each["path"], canonical_json(each["value"]), each["about"])
+            for each in row[SETTABLE[kind]]
+        ]
+        what = (
+            ("setting", "default", "legal")
+            if kind == "detectors"
+            else ("number", "value", "tag and source")
+        )
+        show([grid_of(kind, [row]), "", Grid.of(what, settable, left=3)])
+    return 0
+
+
+def _list_results(options: argparse.Namespace) -> int:
+    """List every results folder with its state, limit and differences. Raises UserError for an
+    unknown experiment."""
+    from harness.programs.keeping.listing import differs_text, limit_text, result_folders
+    from harness.vocabulary.text import Grid
+
+    folders = result_folders(options.out, options.name)
+    if options.name is not None and not folders:
+        fix = "run tofpod ls results for a list"
+        raise UserError(f"{options.out}: has no results of {options.name!r}", fix=fix)
+    if options.json:
+        return _print_json(folders)
+    print(f"results in {options.out}" + ("" if folders else ": none"))
+    for name in sorted({run["experiment"] for run in folders}):
+        print(f"  {name}")
+        shown = [run for run in folders if run["experiment"] == name]
+        rows = []
+        for run in shown:
+            note = run["note"] + (", latest" if run["is_latest"] else "")
+            rows.append(
+                (run["digest"], (run["date"] or "")[:10], size_text(run["size_bytes"]), note)
+            )
+        for run, line in zip(
+            shown, Grid.of(("run", "date", "size", "state"), rows, left=4).lines()[1:], strict=True
+        ):
+            cells = (limit_text(run["limits"]), differs_text(run["differs"]))
+            print("\n".join([f"    {line}", *(f"      {text}" for text in cells if text)]))
+    return 0
+
+
+def _list_cache(options: argparse.Namespace) -> int:
+    from scenes.render.cache import leftovers, stored_renders
+
+    if options.name is not None:
+        raise UserError(f"the cache has no part called {options.name!r}", fix="tofpod ls cache")
+    folder = options.out / ".cache" / "renders"
+    renders = stored_renders(folder)
+    left = leftovers(folder)
+    size_bytes = sum(file.size_bytes for file in renders)
+    unused_days = max(
+        (max(time.time() - file.used_s, 0.0) / DAY_S for file in renders), default=0.0
+    )
+    if options.json:
+        facts = {
+            "folder": str(folder),
+            "renders": len(renders),
+            "size_bytes": size_bytes,
+            "leftovers": len(left),
+        }
+        return _print_json(facts | {"longest_unused_days": unused_days})
+    print(f"cache {folder}\n  renders: {len(renders)}, {size_text(size_bytes)}")
+    if renders:
+        print(f"  longest time without use: {unused_days:.1f} days")
+    if left:
+        print(f"  left by killed processes: {len(left)} files")
+    return 0
+
+
+def _print_json(value: Any) -> int:
+    print(json.dumps(value, indent=2, ensure_ascii=False))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,2 @@
+"""The scorecard: measurements of simulated cameras compared with published measurements of real
+cameras."""

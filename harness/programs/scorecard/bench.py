@@ -1,0 +1,86 @@
+"""Places a simulated camera in front of a scene of known geometry and takes frames of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.vocabulary.geometry import Region
+from scenes.optics import NoiseFreeView
+from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, EffectsConfig, load_camera
+from scenes.sensor.source import SimulatedUnit
+
+SEED = 1
+NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
+"""Effects of each pixel's noise, to which the calibration point refers, without effects of a unit
+or of a frame."""
+STEADY = EffectsConfig().model_copy(update={"frame_jumps": False})
+PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Numbers of frames for each kind of measurement, and of units for measurements of a unit's
+    error."""
+
+    noise_frames: int
+    few_frames: int
+    whole_frames: int
+    units: int
+
+
+FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A camera and the effort of its measurements."""
+
+    camera_name: str
+    effort: Effort
+
+    @property
+    def camera(self) -> AnyCamera:
+        """The camera of the camera file."""
+        return load_camera(self.camera_name)
+
+    def patch(self, height: int, width: int) -> Region:
+        """Return pixels about the optical axis with the margin for the camera's own filter,
+        clipped to the sensor."""
+        lens = self.camera.nominal_lens
+        row = round(lens.cy) - height // 2
+        column = round(lens.cx) - width // 2
+        tight = Region(row, row + height, column, column + width)
+        return tight.grown(self.camera.optics.margin_px, lens.height, lens.width)
+
+    def taken(
+        self,
+        view: NoiseFreeView,
+        effects: EffectsConfig,
+        frames: int,
+        *labels: str | int,
+        **settings: Any,
+    ) -> FrameStack:
+        """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels``
+        select the noise."""
+        unit = SimulatedUnit(
+            self.camera, CameraConfig(name=self.camera_name, effects=effects, **settings), view
+        )
+        cut = unit.cut
+        taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)
+        true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
+        z_m = np.stack([frame.z_m for frame in taken.frames()]).astype(float)
+        return FrameStack(z_m, true_z_m, view.slopes[cut], unit.region)
+
+
+@dataclass(frozen=True)
+class FrameStack:
+    """A static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w,
+    2); ``region``."""
+
+    z_m: np.ndarray
+    true_z_m: np.ndarray
+    slopes: np.ndarray
+    region: Region

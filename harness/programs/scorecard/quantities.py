@@ -1,0 +1,402 @@
+"""All quantities that the scorecard measures, each with its conditions and the function that
+measures it.
+
+A published figure names a quantity and those conditions that differ from the defaults. A curve is
+a quantity over a range of conditions and is measured by the same function. All scenes lie about
+the optical axis.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from harness.programs.scorecard.bench import NOISE, PATTERNED, STEADY, Bench, FrameStack
+from harness.stills.statistics import (
+    FLAT_PX,
+    Reading,
+    correlation_at,
+    edge_widths,
+    fixed_pattern,
+    jackknifed,
+    mean_of,
+    on_surface_tolerance_m,
+    share_of,
+    temporal_sigma_m,
+)
+from harness.vocabulary.config import Config
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM
+from harness.vocabulary.seeds import digest
+from scenes.closed_form import Plane, layered_view, plane_view
+from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.camera import CameraConfig, EffectsConfig
+
+PATCH = (40, 24)
+"""Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by
+6 % to either side on the coarsest camera, and the mean deviation by less than 1 %."""
+PATTERN_PATCH = (140, 180)
+LEAST_TILT = (0.05, 0.02)
+"""Slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step
+occur."""
+EDGE_PATCH = (40, 96)
+REACH_PX = 44.0
+"""Distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m,
+under 44 pixels."""
+# pixels across per pixel along the edge: all positions of an edge in a pixel occur, as in ISO
+# 12233
+SLANT = 0.1
+ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
+
+Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
+Albedo = Annotated[
+    float, Field(gt=0.0, le=1.0, description="diffuse reflectance, above 0 and up to 1")
+]
+Lag = Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")]
+
+
+class PlaneConditions(Config):
+    """An infinite matte plane; ambient light is as in `CameraConfig`. For a continuous-wave
+    camera, the sum of the amplitudes may be given instead of the albedo."""
+
+    distance_m: Distance = 1.5
+    albedo: Albedo = 0.8
+    angle_deg: Annotated[
+        float, Field(ge=0.0, le=80.0, description="angle of incidence, 0 to 80 degrees")
+    ] = 0.0
+    ambient_uw_cm2_nm: Annotated[
+        float, Field(ge=0.0, le=200.0, description="0 to 200 uW/(cm2 nm)")
+    ] = ROOM_LIGHT
+    amplitude_units: (
+        Annotated[float, Field(gt=0.0, description="sum over frequencies, in ADC units")] | None
+    ) = None
+
+
+class LagConditions(PlaneConditions):
+    """Two pixels of a plane at a distance in pixels."""
+
+    lag_x_px: Lag = 1
+    lag_y_px: Lag = 0
+
+
+class PatchConditions(PlaneConditions):
+    """Square patches of a plane, each minus its own fitted plane, and a distance between pixels
+    within them."""
+
+    patch_px: Annotated[
+        int, Field(ge=3, le=70, description="side of a patch in pixels, 3 to 70")
+    ] = 38
+    apart_px: Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")] = 0
+    rounded_mm: Annotated[
+        float, Field(ge=0.0, le=10.0, description="step of the stored depth, 0 to 10 mm")
+    ] = 0.0
+
+
+class StepConditions(Config):
+    """A straight edge of a matte plane in front of another, both frontal, 6 degrees off the pixel
+    grid. z steps along the image axis ``across``; with ``shadow``, the front is on the emitter's
+    side and casts its shadow on the back."""
+
+    distance_m: Distance = 0.75
+    step_mm: Annotated[
+        float, Field(ge=0.5, le=5e3, description="from front to back, 0.5 to 5000 mm")
+    ] = 50.0
+    albedo: Albedo = 0.6
+    across: Literal["x", "y"] = "x"
+    shadow: bool = False
+
+
+_WORDS: dict[str, Callable[[Any], str]] = {
+    "distance_m": "{:g} m".format,
+    "albedo": "albedo {:g}".format,
+    "angle_deg": lambda v: f"{v:g}°" if v else "",
+    "ambient_uw_cm2_nm": lambda v: "" if v == ROOM_LIGHT else f"ambient {v:g} µW/(cm² nm)",
+    "amplitude_units": lambda v: "" if v is None else f"amplitudes {v:g}",
+    "step_mm": "step {:g} mm".format,
+    "across": "across {}".format,
+    "shadow": lambda v: "shadowed" if v else "",
+    "patch_px": "patches of {:g} px".format,
+    "apart_px": lambda v: f"{v:g} px apart" if v else "",
+    "rounded_mm": lambda v: f"stored in steps of {v:g} mm" if v else "",
+    "lag_px": "lag {} px".format,
+}
+
+
+def in_words(conditions: Config) -> str:
+    """Return conditions as a short text with units: ``1.5 m, albedo 0.8``."""
+    data = conditions.to_data()
+    if data.get("amplitude_units") is not None:
+        del data["albedo"]
+    if "lag_x_px" in data:
+        data["lag_px"] = (data.pop("lag_x_px"), data.pop("lag_y_px"))
+    return ", ".join(filter(None, (_WORDS[key](value) for key, value in data.items())))
+
+
+def scene_of(conditions: Config) -> tuple[str, dict[str, Any]]:
+    """Return the scene for conditions; conditions that share a scene, such as lags on a plane,
+    give equal results."""
+    shared = _plane(conditions) if isinstance(conditions, PlaneConditions) else conditions
+    return type(shared).__name__, shared.to_data()
+
+
+def _plane(c: PlaneConditions) -> PlaneConditions:
+    return PlaneConditions(**{key: getattr(c, key) for key in PlaneConditions.model_fields})
+
+
+Measure = Callable[[Bench, Any], Reading]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured quantity. ``unit`` is empty for ratios; ``says`` is a sentence for the page."""
+
+    name: str
+    title: str
+    unit: str
+    conditions: type[Config]
+    measure: Measure
+    says: str
+
+
+QUANTITIES: dict[str, Quantity] = {}
+
+
+def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
+    """Register a measuring function. The ending of its name is the unit; the page quotes its
+    docstring's start."""
+
+    def listed(measure: Measure) -> Measure:
+        name = measure.__name__
+        says = " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
+        ending = name.rpartition("_")[2]
+        unit = ending if ending in ("mm", "px") else ""
+        QUANTITIES[name] = Quantity(name, title, unit, conditions, measure, says)
+        return measure
+
+    return listed
+
+
+@lru_cache(maxsize=8)
+def plane_stack(
+    bench: Bench,
+    c: PlaneConditions,
+    effects: EffectsConfig = NOISE,
+    frames: int | None = None,
+    unit: int = 1,
+    patch: tuple[int, int] = PATCH,
+) -> FrameStack:
+    """Return frames of a plane about the axis; all measurements of a plane with the same effects
+    share them."""
+    slope_x = max(float(np.tan(np.radians(c.angle_deg))), LEAST_TILT[0])
+    albedo = c.albedo
+    if c.amplitude_units is not None:
+        camera = bench.camera
+        if not isinstance(camera, AmcwCamera):
+            raise UserError(
+                f"{camera.name}: does not support amplitude_units", fix="give the plane's albedo"
+            )
+        electrons = c.amplitude_units * camera.photons.electrons_per_unit.value * c.distance_m**2
+        albedo = electrons / (
+            camera.photons.signal_electrons.value * sum(camera.modulation.contrast.value)
+        )
+    view = plane_view(
+        bench.camera, bench.patch(*patch), c.distance_m, albedo, slope_x, LEAST_TILT[1]
+    )
+    labels = ("plane", digest([c.to_data(), effects.to_data()]), unit)
+    count = frames or bench.effort.noise_frames
+    return bench.taken(
+        view, effects, count, *labels, unit_seed=unit, ambient_uw_cm2_nm=c.ambient_uw_cm2_nm
+    )
+
+
+def _deviation(stack: FrameStack) -> Reading:
+    return jackknifed(stack.z_m, lambda z: temporal_sigma_m(z) / MM)
+
+
+@_quantity("temporal deviation", PlaneConditions)
+def temporal_sigma_mm(bench: Bench, c: PlaneConditions) -> Reading:
+    """Standard deviation of a pixel's z over frames, rms over pixels, noise alone."""
+    return _deviation(plane_stack(bench, c))
+
+
+@_quantity("random error", PlaneConditions)
+def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
+    """Standard deviation of a pixel's z over frames, with whole-frame jitter and jumps, rms over
+    pixels."""
+    return _deviation(plane_stack(bench, c, EffectsConfig(), bench.effort.whole_frames))
+
+
+@_quantity("noise correlation", LagConditions)
+def noise_correlation(bench: Bench, c: LagConditions) -> Reading:
+    """Correlation of the temporal noise of two pixels, noise alone."""
+    return jackknifed(
+        plane_stack(bench, _plane(c)).z_m, lambda z: correlation_at(z, True, c.lag_x_px, c.lag_y_px)
+    )
+
+
+@_quantity("valid fraction", PlaneConditions)
+def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
+    """Share of pixels about the axis that have a range."""
+    # all neighbours that the camera's own filter mixes count as a single pixel
+    stack = plane_stack(bench, c, NOISE, bench.effort.few_frames)
+    return share_of(np.isfinite(stack.z_m), (2 * bench.camera.optics.margin_px + 1) ** 2)
+
+
+def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
+    """Return z (h, w) as square patches (patches, n, n) minus each patch's own plane, mm."""
+    v, u = np.mgrid[:n, :n].reshape(2, -1) - n / 2
+    plane = np.column_stack([np.ones(n * n), u, v])
+    corners = [
+        (i, j) for i in range(0, len(z_m) - n + 1, n) for j in range(0, z_m.shape[1] - n + 1, n)
+    ]
+    patches = np.stack([z_m[i : i + n, j : j + n].ravel() for i, j in corners], axis=1) / MM
+    return np.asarray((patches - plane @ np.linalg.lstsq(plane, patches)[0]).T.reshape(-1, n, n))
+
+
+@lru_cache(maxsize=4)
+def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
+    """Return one frame's z (h, w) for each of several units, cached for all patches of this plane."""
+    units = range(1, bench.effort.few_frames + 1)
+    return tuple(plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] for unit in units)
+
+
+def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
+    """Return (units, patches) in mm^2: the variance about each patch's plane in a frame, and the
+    product at the lag."""
+    n = c.patch_px
+    k = c.apart_px
+    found = []
+    for z_m in _single_frames(bench, _plane(c)):
+        stored_m = (
+            np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
+        )
+        left = _left_of_patches(stored_m, n)
+        beside = left[:, :, k:] * left[:, :, : n - k]
+        below = left[:, k:] * left[:, : n - k]
+        found.append(
+            (left.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2)
+        )
+    variance, product = np.transpose(found, (1, 0, 2))
+    return variance, product
+
+
+@_quantity("deviation within patches", PatchConditions)
+def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
+    """Standard deviation of a single frame about the patch's own plane, with noise and fixed
+    pattern: median over patches, mean over units."""
+    return mean_of(np.sqrt(np.median(_patch_products(bench, c)[0], axis=1)))
+
+
+@_quantity("pattern within patches", PatchConditions)
+def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
+    """Standard deviation about the patch's own plane that two averages of different frames share:
+    rms over patches, mean over units."""
+    found = []
+    for unit in range(1, min(bench.effort.units, 5) + 1):
+        z_m = plane_stack(
+            bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
+        ).z_m
+        even = _left_of_patches(z_m[::2].mean(axis=0), c.patch_px)
+        odd = _left_of_patches(z_m[1::2].mean(axis=0), c.patch_px)
+        found.append(float(np.sqrt(max((even * odd).mean(), 0.0))))
+    return mean_of(found)
+
+
+@_quantity("correlation within patches", PatchConditions)
+def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
+    """Correlation between pixels of a single frame about the patch's own plane, mean over rows and
+    columns."""
+    variance, product = _patch_products(bench, c)
+    return mean_of(product.mean(axis=1) / variance.mean(axis=1))
+
+
+@_quantity("systematic error", PlaneConditions)
+def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
+    """Largest absolute mean error of z among ten units, one hour after power-on, direct light
+    only."""
+    errors = []
+    for unit in range(1, bench.effort.units + 1):
+        stack = plane_stack(bench, c, STEADY, bench.effort.few_frames, unit)
+        error_m = (stack.z_m - stack.true_z_m)[np.isfinite(stack.z_m)]
+        errors.append(abs(error_m.mean()) / MM if error_m.size else np.nan)
+    return Reading(float(np.fmax.reduce(errors)))
+
+
+@_quantity("fixed pattern", PlaneConditions)
+def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
+    """Standard deviation over pixels of the average minus a smooth surface and the remaining
+    noise, mean of 5 units."""
+    found = []
+    for unit in range(1, min(bench.effort.units, 5) + 1):
+        stack = plane_stack(
+            bench, c, PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
+        )
+        where = np.isfinite(stack.z_m).all(axis=0)
+        if where.mean() > 0.5:
+            found.append(
+                fixed_pattern(np.nan_to_num(stack.z_m), where, stack.slopes, lags=12).std_m / MM
+            )
+    return mean_of(found)
+
+
+@lru_cache(maxsize=4)
+def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
+    """Return widths at a straight edge near the axis; in front, sign (across - slant along) < 0 in
+    ideal pixels."""
+    camera = bench.camera
+    axis = ("x", "y").index(c.across)
+    lens = camera.nominal_lens
+    region = bench.patch(*(EDGE_PATCH if axis == 0 else EDGE_PATCH[::-1]))
+    toward_emitter = -1.0 if camera.optics.emitter_m[axis] < 0 else 1.0
+    # in front, sign * (position across) < edge; for a shadow, the front is on the emitter's side
+    sign = -toward_emitter if c.shadow else toward_emitter
+
+    def signed_px(slopes: np.ndarray) -> np.ndarray:
+        px = slopes * np.array([lens.fx, lens.fy])
+        return np.asarray(sign * (px[..., axis] - SLANT * px[..., 1 - axis]))
+
+    front = Plane(c.distance_m)
+    back = Plane(c.distance_m + c.step_mm * MM)
+    view = layered_view(camera, region, front, back, lambda slopes: signed_px(slopes) < 0, c.albedo)
+    stack = bench.taken(view, NOISE, bench.effort.few_frames, "step", digest(c.to_data()))
+    from_edge = signed_px(lens.region_slopes(stack.region))
+    tolerance_m = on_surface_tolerance_m(
+        temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX), c.step_mm * MM
+    )
+    front_z = front.z_along_m(stack.slopes)
+    back_z = back.z_along_m(stack.slopes)
+    widths = edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, 2 - axis)
+    # pixels so far from the edge that the camera's filter mixes in no other surface
+    on_front = from_edge < -FLAT_PX
+    on_back = (from_edge > FLAT_PX) & np.isfinite(stack.z_m).all(axis=0)
+    return widths | {
+        "height": stack.z_m[:, on_back].mean(axis=1) - np.nanmean(stack.z_m[:, on_front], axis=1)
+    }
+
+
+@_quantity("gap at an edge", StepConditions)
+def edge_gap_px(bench: Bench, c: StepConditions) -> Reading:
+    """Width across an edge of the pixels without a range, including the shadow."""
+    return mean_of(_widths(bench, c)["gap"])
+
+
+@_quantity("flying pixels", StepConditions)
+def flying_pixels_px(bench: Bench, c: StepConditions) -> Reading:
+    """Width across an edge of the pixels whose range differs from both surfaces by more than four
+    standard deviations plus a tenth of the step."""
+    return mean_of(_widths(bench, c)["flying"])
+
+
+@_quantity("edges with flying pixels", StepConditions)
+def flying_share(bench: Bench, c: StepConditions) -> Reading:
+    """Share of the lines of pixels across an edge that contain a flying pixel."""
+    return mean_of(_widths(bench, c)["with_flying"])
+
+
+@_quantity("height of a step", StepConditions)
+def step_height_mm(bench: Bench, c: StepConditions) -> Reading:
+    """Mean z of the back minus that of the front, more than 8 pixels from the edge, noise alone."""
+    return mean_of(_widths(bench, c)["height"] / MM)

@@ -1,0 +1,1 @@
+"""Rows of trials as typed records, the tables that hold them, and the files that programs write."""

@@ -1,0 +1,63 @@
+"""Declares the files that programs write into a results folder, for `tofpod clean` and
+`results/README.md`."""
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+FolderKind = Literal["results", "capture"]
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file, or several if ``name`` holds * or ?. ``note`` describes its content. ``place`` is a
+    results folder or a real capture's folder in it. ``of`` is the kind of experiment or program
+    that writes it; empty for every sweep."""
+
+    name: str
+    note: str
+    place: FolderKind = "results"
+    of: str = ""
+
+
+REPORT = Output("report.html", "the report: a single file that can be read offline")
+EXPERIMENT = Output("experiment.yaml", "the experiment with every default written out")
+PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine, failures")
+STUDY = Output(
+    "study.json", "every inspection of every set-up: what `tofpod compare` reads", of="study"
+)
+LEARNED = Output(
+    "learning-*.npz", "what a detector has learned from separate hole-free boards: arrays by name"
+)
+MAPS = Output("map-*.html", "a map that can be turned in the browser", of="views")
+CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings", of="capture")
+COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
+COMPARISON_PAGE = Output("compare.html", "the comparison as a page", of="check")
+EFFICIENCY_PAGE = Output(
+    "efficiency.html", "detectors compared with the ideal observer", of="efficiency"
+)
+COVERAGE_PAGE = Output(
+    "coverage.html", "the part in 3-D, coloured by the size of damage that is found", of="coverage"
+)
+ATLAS_PAGE = Output(
+    "atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas"
+)
+ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
+FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
+FINDINGS_DATA = Output(
+    "findings.json", "findings by both measures, target, settings, origin", "capture", "capture"
+)
+ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
+TARGETS = Output(
+    "targets.png", "the targets that were found, with the chosen target", "capture", "capture"
+)
+BLIND = Output("blind.png", "the pixels without a return", "capture", "capture")
+GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
+CLOUD = Output("cloud.ply", "the cloud, with findings in magenta", "capture", "capture")
+FILES = (
+    REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
+    COVERAGE_PAGE, ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
+)  # fmt: skip
+JOURNAL = "journal"
+LATEST = "latest"
+LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")

@@ -1,0 +1,94 @@
+"""The options of all programs that run experiments: how many processes, where, and within which
+limits."""
+
+import argparse
+from dataclasses import dataclass
+
+from harness.runs.jobs import Limits
+from harness.runs.shards import WHOLE, Shard
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.program import whole_number
+
+DEFAULT_LIMITS = Limits(
+    seconds=900.0, memory_mb=4000
+)  # a trial needs seconds and 300 MB; maps of many views need 2 GB
+LEAST_MEMORY_GB = 0.5  # a process that has loaded the code of trials needs 0.2 GB
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """``jobs``: processes, or a cluster's workers. ``scheduler`` None: this machine. ``serial``:
+    in this process."""
+
+    jobs: int = 2
+    limits: Limits = DEFAULT_LIMITS
+    scheduler: str | None = None
+    serial: bool = False
+    shard: Shard = WHOLE
+    retry_failed: bool = False
+    cache_limit_gb: float | None = None
+
+
+def add_engine_options(parser: argparse.ArgumentParser) -> None:
+    """Add these options to a parser, in their own group."""
+    add = parser.add_argument_group("execution").add_argument
+    processes = "processes, or workers of a cluster (default: 2)"
+    add("--jobs", type=whole_number(4096), default=2, metavar="N", help=processes)
+    add(
+        "--serial",
+        action="store_true",
+        help="run everything in this process, for a debugger; without limits",
+    )
+    help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
+    add("--scheduler", metavar="ADDRESS", help=help)
+    add(
+        "--shard", metavar="K/N", help="run part K of N only, such as 3/10; tofpod merge joins them"
+    )
+    add(
+        "--retry-failed",
+        action="store_true",
+        help="run again the trials that failed, crashed or timed out before",
+    )
+    for name, unit, default, meaning in (
+        ("--time-limit", "SECONDS", 900.0, "time that one trial or render may take"),
+        ("--memory-limit", "GB", 4.0, "memory that a trial's process may use, also on a cluster"),
+        (
+            "--cache-limit",
+            "GB",
+            20.0,
+            "size of all stored renders; the least recently used are removed first",
+        ),
+    ):
+        add(
+            name,
+            type=_positive,
+            default=default,
+            metavar=unit,
+            help=f"{meaning} (default: {default:g})",
+        )
+
+
+def engine_options(options: argparse.Namespace) -> EngineOptions:
+    """Return the options that were given. Raises UserError if they contradict each other."""
+    if options.serial and options.scheduler is not None:
+        raise UserError(
+            "--serial and --scheduler: ask for different engines", fix="leave one of them out"
+        )
+    if options.memory_limit < LEAST_MEMORY_GB:
+        legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
+        what = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
+        raise UserError(what, legal=legal)
+    limits = Limits(options.time_limit, round(1000 * options.memory_limit))
+    shard = WHOLE if options.shard is None else Shard.of(options.shard)
+    where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)
+    return EngineOptions(options.jobs, limits, *where)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value

@@ -1,1 +1,0 @@
-"""The scorecard: measurements of simulated cameras compared with published measurements of real cameras."""

@@ -1,0 +1,1 @@
+"""Static captures, real or simulated: statistics of their frames."""

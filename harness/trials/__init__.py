@@ -1,0 +1,1 @@
+"""One trial: a board becomes frames, a cloud, evidence, findings and rows."""

@@ -1,0 +1,454 @@
+"""The flat field of a unit: the pattern found again, the surface parted from it, doubts told,
+files refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from detectors.averages.flat_captures import Separated, flattened, separated
+from detectors.averages.flat_field import (
+    FlatField,
+    corrected,
+    doubts,
+    load_flat_field,
+    save_flat_field,
+)
+from harness import detect
+from harness.experiment.load import load_experiment
+from harness.programs.camera import flatfield
+from harness.runs.plan import plan_of
+from harness.trials.trial import flat_field_of
+from harness.vocabulary.declaration.yaml_source import DeclarationError
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Cloud, Lens, Region
+from tests.support.serial_run import records_of, run_serially
+from tests.support.tiny_sweep import STUDY
+
+LENS = Lens(160, 128, 250.0, 250.0, 80.0, 64.0)
+FRAMES = 50
+NOISE_M = 0.5 * MM
+SHIFTS = (
+    (0.55, 0.0, 0.0),
+    (0.55, 0.04, 0.01),
+    (0.55, -0.03, 0.035),
+    (1.0, 0.0, 0.0),
+    (1.0, 0.05, -0.02),
+)
+"""Distance, and where the camera stands along the wall, metres."""
+SIDE_M = 1 * MM
+Places = tuple[tuple[float, float, float], ...]
+
+
+def smooth(
+    rng: np.random.Generator, shape: tuple[int, int], length: float, rms_m: float
+) -> np.ndarray:
+    field = ndimage.gaussian_filter(rng.standard_normal(shape, np.float32), length, mode="wrap")
+    return rms_m * field / field.std()
+
+
+@cache
+def pattern() -> np.ndarray:
+    """(h, w): as an imager's, filtered over pixels and smooth, 0.5 mm."""
+    rng = np.random.default_rng(1)
+    return smooth(rng, (LENS.height, LENS.width), 3.0, 0.4 * MM) + smooth(
+        rng, (128, 160), 1.0, 0.3 * MM
+    )
+
+
+@cache
+def relief() -> np.ndarray:
+    return smooth(np.random.default_rng(2), (1200, 1200), 6.0, 1.0)
+
+
+def wall(rms_m: float) -> np.ndarray:
+    return rms_m * relief()
+
+
+def capture(
+    number: int,
+    shape_m: np.ndarray,
+    place: tuple[float, float, float] = (0.8, 0.0, 0.0),
+    fixed_m: np.ndarray | None = None,
+    noise_m: float = NOISE_M,
+) -> Cloud:
+    """An average of a wall with a shape, seen from a place, each frame's z with white noise."""
+    distance_m, x_m, y_m = place
+    slopes = LENS.region_slopes(LENS.whole)
+    rng = np.random.default_rng([3, number])
+    at = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
+    length = np.sqrt(1 + (slopes**2).sum(axis=-1))
+    z_m = distance_m + ndimage.map_coordinates(shape_m, np.moveaxis(at, -1, 0), order=1)
+    z_m = z_m + (pattern() if fixed_m is None else fixed_m) / length
+    z_m = z_m + rng.standard_normal(z_m.shape) * noise_m / np.sqrt(FRAMES)
+    scatter_m2 = noise_m**2 * rng.chisquare(FRAMES - 1, z_m.shape) / (FRAMES - 1)
+    points = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
+    count = np.full(z_m.shape, FRAMES)
+    return Cloud(
+        points, np.zeros(z_m.shape, np.uint8), count, scatter_m2, LENS.whole, 0.0, FRAMES, lens=LENS
+    )
+
+
+def found(
+    shape_m: np.ndarray,
+    *,
+    poses: bool,
+    patterns: list[np.ndarray] | None = None,
+    shifts: Places = SHIFTS,
+) -> Separated:
+    captures = []
+    for number, (distance_m, x_m, y_m) in enumerate(shifts):
+        cloud = capture(number, shape_m, (distance_m, x_m, y_m), patterns and patterns[number])
+        pose = np.eye(4)
+        pose[:3, 3] = x_m, y_m, shifts[0][0] - distance_m
+        captures.append(flattened(cloud, cloud.valid, f"capture {number}", pose if poses else None))
+    return separated(captures, LENS)
+
+
+@pytest.fixture(scope="module")
+def truth_m() -> np.ndarray:
+    """The pattern, less what a smooth fit takes of it."""
+    cloud = capture(0, wall(0.0), noise_m=1e-9)
+    return flattened(cloud, cloud.valid, "truth").residual_m
+
+
+def errors(result: Separated, truth_m: np.ndarray) -> tuple[float, float]:
+    """The rms error of a map in mm, and the rms of the error over its stated deviation."""
+    off_m = result.field.error_m - truth_m
+    ratio = off_m**2 / result.field.variance_m2
+    return float(np.sqrt(np.nanmean(off_m**2))) / MM, float(np.sqrt(np.nanmean(ratio)))
+
+
+# ---- the pattern and the surface
+# -------------------------------------------------------------------------------------
+
+
+def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
+    """20,480 pixels: the ratio is known to 0.5 %; the frames' scatter tells the noise to a per
+    cent."""
+    result = found(wall(0.0), poses=False)
+    error_mm, ratio = errors(result, truth_m)
+    assert error_mm == pytest.approx(NOISE_M / MM / np.sqrt(FRAMES * len(SHIFTS)), rel=0.1)
+    assert ratio == pytest.approx(1.0, abs=0.04)
+    assert result.field.rms_m == pytest.approx(float(np.nanstd(truth_m)), rel=0.01)
+    assert result.field.warnings == ()
+    assert result.field.distances_m == pytest.approx((0.55, 1.0), rel=0.01)
+
+
+@pytest.mark.parametrize(("rough_mm", "gain", "most_ratio"), [(0.1, 0.85, 1.15), (0.25, 0.6, 1.35)])
+def test_the_surface_is_parted_from_the_pattern(truth_m, rough_mm, gain, most_ratio):
+    """Walls rough by a fifth and by half of the pattern: with poses the map is better than
+    without, and says nothing; the stated deviation is too small by no more than
+    `detectors.averages.flat_captures` states."""
+    rough = wall(rough_mm * MM)
+    solved = found(rough, poses=True)
+    averaged = found(rough, poses=False)
+    error_mm, ratio = errors(solved, truth_m)
+    assert error_mm < gain * errors(averaged, truth_m)[0]
+    assert 0.85 < ratio < most_ratio
+    assert solved.separated and solved.field.warnings == ()
+    assert solved.surface_m / MM == pytest.approx(rough_mm, rel=0.1)
+
+
+def test_without_poses_a_rough_surface_counts_as_noise_and_is_told(truth_m):
+    result = found(wall(0.4 * MM), poses=False)
+    (warning,) = result.field.warnings
+    assert "is not stable" in warning and "or the surface is not flat (state --poses" in warning
+    assert errors(result, truth_m)[1] < 1.0
+    assert found(wall(0.4 * MM), poses=True).field.warnings == ()
+
+
+def test_a_pattern_that_drifts_or_depends_on_distance_is_told_with_its_size(truth_m):
+    new_m = pattern()[::-1]
+    drifting = [pattern(), pattern(), pattern() + 0.8 * new_m, pattern(), pattern() + 0.8 * new_m]
+    result = found(wall(0.0), poses=False, patterns=drifting)
+    assert result.in_time is not None
+    # two beside three captures, of which two have the new pattern
+    assert result.in_time.excess_m == pytest.approx(
+        2 / 3 * 0.8 * float(np.nanstd(truth_m)), rel=0.1
+    )
+    for poses in (True, False):
+        result = found(wall(0.0), poses=poses, patterns=drifting)
+        (warning,) = result.field.warnings
+        assert "is not stable: it changes from the first captures to the last by" in warning
+        assert errors(result, truth_m + 0.4 * new_m)[1] < 1.0
+    by_range = [pattern()] * 3 + [pattern() + 0.8 * new_m] * 2
+    result = found(wall(0.0), poses=False, patterns=by_range)
+    assert result.in_range is not None
+    assert result.in_range.excess_m == pytest.approx(0.8 * float(np.nanstd(truth_m)), rel=0.1)
+    assert (
+        "with distance by" in result.field.warnings[0]
+        and "from the first" not in result.field.warnings[0]
+    )
+
+
+@pytest.mark.parametrize(
+    "shifts", [((0.8, 0.0, 0.0),), ((0.8, 0.0, 0.0),) * 2, ((0.8, 0.0, 0.0), (0.8, 0.01, 0.0))]
+)
+@pytest.mark.parametrize("poses", [True, False])
+def test_one_place_cannot_part_surface_and_pattern(shifts, poses):
+    warnings = found(wall(0.0), poses=poses, shifts=shifts).field.warnings
+    assert "is assumed to be flat" in warnings[0]
+
+
+def test_few_frames_cannot_tell_their_noise():
+    cloud = replace(capture(0, wall(0.0)), n_frames=2)
+    with pytest.raises(UserError, match="2 frames: too few to estimate the noise"):
+        flattened(cloud, cloud.valid, "short")
+
+
+# ---- the correction
+# --------------------------------------------------------------------------------------------------
+
+
+def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
+    field = found(wall(0.0), poses=False).field
+    cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
+    made = corrected(cloud, field)
+    residual_m = flattened(made, made.valid, "corrected").residual_m
+    assert made.mean_variance_m2 is not None
+    axial_m = residual_m * cloud.points_m[..., 2] / np.linalg.norm(cloud.points_m, axis=-1)
+    assert np.nanstd(axial_m) == pytest.approx(
+        float(np.sqrt(made.mean_variance_m2.mean())), rel=0.03
+    )
+    np.testing.assert_allclose(
+        np.cross(made.points_m, cloud.points_m), 0.0, atol=1e-15
+    )  # along the rays
+    part = Region(10, 90, 30, 120)
+    rows, columns = part.within(LENS.whole)
+    cut = {
+        name: getattr(cloud, name)[rows, columns]
+        for name in ("points_m", "reason", "count", "variance_m2")
+    }
+    np.testing.assert_array_equal(
+        corrected(replace(cloud, region=part, **cut), field).points_m, made.points_m[rows, columns]
+    )
+    single = corrected(replace(cloud, n_frames=1), field)
+    assert single.mean_variance_m2 is None
+
+
+def test_pixels_without_a_pattern_stay_and_are_told():
+    field = found(wall(0.0), poses=False).field
+    cloud = capture(9, wall(0.0))
+    error_m = field.error_m.copy()
+    error_m[:, :40] = np.nan
+    holed = replace(field, error_m=error_m, warnings=("it drifts",))
+    made = corrected(cloud, holed)
+    np.testing.assert_array_equal(made.points_m[:, :40], cloud.points_m[:, :40])
+    assert made.mean_variance_m2 is not None
+    assert made.mean_variance_m2[:, :40].mean() > 10 * made.mean_variance_m2[:, 40:].mean()
+    assert doubts(cloud, holed, "unit.npz") == (
+        "the flat field unit.npz: it drifts",
+        "the flat field unit.npz covers 75 % of the valid pixels; others are not corrected",
+    )
+    far = doubts(capture(9, wall(0.0), (1.5, 0.0, 0.0)), field, "unit.npz")
+    assert far == (
+        "the flat field unit.npz was measured at 0.55 to 1.00 m, this capture is at 1.50 m",
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lens": replace(LENS, fx=300.0)}, "is not that of the flat field"),
+        (
+            {"lens": replace(LENS, width=320, height=256)},
+            "has 160 x 128 pixels, the capture has 320 x 256",
+        ),
+        ({"organised": False}, "no pixel grid"),
+        ({"projection": "parallel"}, "no pixel grid"),
+    ],
+)
+def test_another_camera_s_cloud_is_refused(changes, message):
+    flat = FlatField(np.zeros((128, 160)), np.ones((128, 160)), LENS, (1.0, 1.0))
+    with pytest.raises(UserError, match=message):
+        corrected(replace(capture(0, wall(0.0)), **changes), flat)
+
+
+# ---- files and programs
+# ----------------------------------------------------------------------------------------------
+
+
+def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
+    flat = FlatField(
+        np.full((128, 160), 2e-4), np.full((128, 160), 1e-8), LENS, (0.5, 1.0), ("it drifts",)
+    )
+    flat.error_m[0, 0] = np.nan
+    path = tmp_path / "unit.npz"
+    save_flat_field(path, flat)
+    held = load_flat_field(path)
+    np.testing.assert_array_equal(held.error_m, flat.error_m.astype(np.float32))
+    assert (held.lens, held.distances_m, held.warnings) == (LENS, (0.5, 1.0), ("it drifts",))
+    arrays = dict(np.load(path))
+    for changes, message in (
+        ({"version": np.array(2)}, "was written by a newer tofpod"),
+        ({"version": np.array(1.5)}, "states the invalid version"),
+        ({"error_m": np.zeros((3, 3))}, "do not belong together"),
+        ({"variance_m2": -np.ones((128, 160))}, "do not belong together"),
+        ({"lens": np.array([160.0, 128.0])}, "not a flat field"),
+        ({"lens": np.full(14, np.nan)}, "not a flat field"),
+        ({"warnings": np.array("[1]")}, "do not belong together"),
+        ({"error_m": np.array([{}])}, "cannot be read as arrays"),
+    ):
+        np.savez(path, **{**arrays, **changes})
+        with pytest.raises(UserError, match=message):
+            load_flat_field(path)
+    path.write_bytes(b"PK nonsense")
+    with pytest.raises(UserError, match="cannot be read as arrays"):
+        load_flat_field(path)
+    np.savez(path, depth=np.zeros((4, 4)))
+    with pytest.raises(UserError, match="states no version"):
+        load_flat_field(path)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three captures of 8 frames each as .npy in metres, with a lens."""
+    folder = tmp_path_factory.mktemp("walls")
+    for number, place in enumerate(SHIFTS[:3]):
+        z_m = capture(number, wall(0.0), place, noise_m=0.0).points_m[..., 2]
+        noise = np.random.default_rng([4, number]).standard_normal((8, *z_m.shape)) * NOISE_M
+        np.save(folder / f"wall{number}.npy", (z_m + noise).astype(np.float32))
+    stated = {name: getattr(LENS, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    (folder / "lens.json").write_text(json.dumps(stated))
+    return folder
+
+
+@pytest.mark.usefixtures("unpictured")
+def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_path, capsys, truth_m):
+    walls = [str(path) for path in sorted(recorded.glob("*.npy"))]
+    given = ["--unit", "m"]
+    given += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
+    unit = tmp_path / "unit.npz"
+    assert flatfield.main([*walls, *given, "--out", str(unit)]) == 0
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first.startswith("warning: nothing shows that the camera moved")
+    assert rest[0].startswith("fixed pattern 0.4")
+    told = json.loads(unit.with_suffix(".json").read_text())
+    assert told["warnings"] == list(load_flat_field(unit).warnings)
+    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    assert figures["noise of the map"] == pytest.approx(NOISE_M / MM / np.sqrt(24), rel=0.05)
+    assert figures["pattern"] == pytest.approx(float(np.nanstd(truth_m)) / MM, rel=0.03)
+    assert figures["change, near and far captures"] is None
+    assert len(told["captures"]) == 3
+    assert unit.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+
+    judged = [walls[0], *given, "--threshold", "5"]
+    assert detect.main([*judged, "--flat-field", str(unit), "--out", str(tmp_path / "with")]) == 0
+    assert capsys.readouterr().out.startswith(f"warning: the flat field {unit}: nothing shows that")
+    assert detect.main(judged) == 0
+    unit_of_score = float(
+        re.search(r"one unit of score is .* ([0-9.]+) mm for", capsys.readouterr().out)[1]
+    )
+    with_field = json.loads((tmp_path / "with" / "findings.json").read_text())
+    assert with_field["surface"]["one_unit_of_score_mm"] < 0.6 * unit_of_score
+    assert str(unit) in [file["path"] for file in with_field["provenance"]["files"]]
+
+
+def test_the_program_refuses_what_makes_no_flat_field(recorded, tmp_path, capsys):
+    one = str(recorded / "wall0.npy")
+    lens = ["--unit", "m", "--intrinsics", str(recorded / "lens.json")]
+    single = tmp_path.parent / "single.npy"
+    np.save(single, np.load(one)[:1])
+    for arguments, message in (
+        ([one, "--unit", "m", "--out", "unit.npz"], "the lens of these depth images is unknown"),
+        ([one, *lens, "--out", "unit.png"], "a name that ends in .npz"),
+        ([one, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
+        ([one, one, *lens, "--out", "unit.npz"], "is named twice"),
+        ([str(single), *lens, "--out", "unit.npz"], "record 50 frames"),
+    ):
+        assert flatfield.main(arguments) == 2
+        assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lone_capture_is_judged_by_its_halves(recorded, tmp_path, capsys):
+    lens = ["--unit", "m", "--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
+    assert (
+        flatfield.main([str(recorded / "wall0.npy"), *lens, "--out", str(tmp_path / "unit.npz")])
+        == 0
+    )
+    told = json.loads((tmp_path / "unit.json").read_text())
+    assert [row["capture"] for row in told["captures"]] == [
+        "wall0.npy, first half",
+        "wall0.npy, second half",
+    ]
+    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    # 4 frames in each half
+    signal = figures["pattern"] ** 2
+    noise = (NOISE_M / MM) ** 2 / 4
+    expected = signal / (signal + noise)
+    assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path, capsys):
+    """22 frames of a real Azure Kinect from one place: the pattern of the first half is that of
+    the second, within the noise, so that their correlation is what pattern and noise make it."""
+    walls = tmp_path / "walls"
+    walls.mkdir()
+    for path in sorted((shared_data / "azure_nfov_walls").glob("[0-9]*.png")):
+        (walls / path.name).symlink_to(path)
+    unit = tmp_path / "unit.npz"
+    assert (
+        flatfield.main([str(walls), "--intrinsics", "azure_kinect_nfov", "--out", str(unit)]) == 0
+    )
+    assert "is assumed to be flat" in capsys.readouterr().out.splitlines()[0]
+    told = json.loads(unit.with_suffix(".json").read_text())
+    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    assert figures["pattern"] > 2 * figures["noise of the map"]
+    assert figures["change, first and last captures"] < 0.1
+    noise_mm = told["captures"][0]["noise_mm"]
+    expected = figures["pattern"] ** 2 / (figures["pattern"] ** 2 + noise_mm**2)
+    assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.05)
+
+
+# ---- experiments
+# -----------------------------------------------------------------------------------------------------
+
+BINNED = "source.camera.name=azure_kinect_nfov_binned"  # a quarter of the pixels
+FLAT = "capture.flat_field={frames: 20, distance_m: 1.0}"
+
+
+def test_an_experiment_with_a_flat_field_is_repeatable_and_quieter(study_out, tmp_path):
+    records = {}
+    for name, changes in (("first", [FLAT]), ("again", [FLAT]), ("without", [])):
+        changes = [*changes, "sweep={}", "capture.frames=8", "threshold={k: 5.0}", BINNED]
+        changes.append("study={boards: 1, hole_free_boards: 1}")
+        experiment = load_experiment(study_out.parent / "tiny.yaml", changes)
+        plan = plan_of(experiment, tmp_path / "renders")
+        flat_field_of.cache_clear()
+        outcome = run_serially(plan, tmp_path / name)
+        assert outcome.failures == []
+        records[name] = [
+            row for record in records_of(tmp_path / name, outcome) for row in record["runs"]
+        ]
+        for row in records[name]:
+            del row["seconds_frames"], row["seconds_detect"]
+    assert records["first"] == records["again"]
+    quieter = [
+        a["scale_mm"] / b["scale_mm"]
+        for a, b in zip(records["first"], records["without"], strict=True)
+    ]
+    # 8 frames of 0.5 mm noise leave 0.18 mm, and the map's own 0.2 mm, of a pattern of 0.55 mm
+    assert max(quieter) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("capture.flat_field={frames: 50, distance_m: 20.0}", "gives no range at 20 m"),
+        ("capture.flat_field={frames: 1, distance_m: 1.0}", "4"),
+    ],
+)
+def test_an_impossible_flat_field_is_refused(tmp_path, change, message):
+    (tmp_path / "tiny.yaml").write_text(STUDY)
+    with pytest.raises(DeclarationError, match=message):
+        load_experiment(tmp_path / "tiny.yaml", [change])

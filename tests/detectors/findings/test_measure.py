@@ -1,0 +1,408 @@
+"""Measurements: extents by hand, the blurred disc against brute force, standard errors against
+simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from detectors.findings.hole_model import HolePatch, pictures, sight
+from detectors.findings.measure import HoleModelConfig, extents, measure_detection
+from detectors.interface import Detection, Evidence, Measurement
+from harness.vocabulary.geometry import Cloud, Region
+
+FOCAL_PX = 504.0
+HEIGHT = 60
+WIDTH = 70
+REGION = Region(100, 100 + HEIGHT, 200, 200 + WIDTH)
+MIDDLE = (250.0, 120.0)
+"""Principal point (u, v) on the sensor."""
+
+
+def test_extents_of_a_hand_made_cluster() -> None:
+    points = np.array(
+        [[0.0, 0.1, 1.0], [0.3, 0.1, 1.4], [0.1, 0.0, 1.0], [0.1, 0.2, 1.0], [0.15, 0.1, 1.0]]
+    )
+    diameter, centre = extents(points)
+    # in x: 0.3 across and 0.4 deep make 0.5; in y: 0.2
+    assert diameter == pytest.approx(0.35, abs=1e-15)
+    np.testing.assert_allclose(centre, [0.125, 0.1, 1.1], atol=1e-15)
+
+
+def test_of_equal_extremes_the_first_counts() -> None:
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 2.0], [1.0, 0.5, 1.0], [1.0, 0.0, 3.0]])
+    diameter, _ = extents(points)
+    west_east = np.hypot(1.0, 0.5)
+    north_south = np.hypot(0.5, 1.0)
+    assert diameter == pytest.approx((west_east + north_south) / 2, abs=1e-15)
+
+
+def brute_disc(
+    u: float, v: float, radius: float, metric: np.ndarray, blur: int, over: int = 24
+) -> np.ndarray:
+    fine_v, fine_u = np.mgrid[: 30 * over, : 34 * over]
+    offset = np.stack([(fine_u + 0.5) / over - 0.5 - u, (fine_v + 0.5) / over - 0.5 - v], axis=-1)
+    inside = np.einsum("...i,ij,...j", offset, metric, offset) < radius**2
+    pixels = inside.reshape(30, over, 34, over).mean(axis=(1, 3))
+    return cv2.blur(pixels, (blur, blur))
+
+
+@pytest.mark.parametrize("blur", [1, 3, 5])
+@pytest.mark.parametrize("radius_px", [1.3, 4.2, 7.6])
+def test_blurred_disc_equals_brute_force(blur: int, radius_px: float) -> None:
+    pitch = 1.5e-3
+    metric = pitch**2 * np.array([[1.0, 0.15], [0.15, 1.3]])
+    blank = np.zeros((30, 34))
+    patch = HolePatch(blank, blank == 0, metric, (float(blur), float(blur)), 1e-4, np.ones((1, 8)))
+    image = -pictures(patch, np.array([[16.3, 14.8, radius_px * pitch, -1.0, 0.0]]))[0]
+    np.testing.assert_allclose(
+        image, brute_disc(16.3, 14.8, radius_px * pitch, metric, blur), atol=0.012
+    )
+    area_px = np.pi * radius_px**2 * pitch**2 / np.sqrt(np.linalg.det(metric))
+    assert image.sum() == pytest.approx(area_px, rel=1e-9)
+
+
+class Board:
+    """A tilted plane with one drilled hole, seen through the filter: truth by rays in space, not
+    by the model.
+
+    ``depth_mm`` along the optical axis, negative for a disc before the surface; ``wall``: the
+    tube's length over it. A ray counts as deep as it is in the tube (or behind its end) and lit
+    from the emitter.
+    """
+
+    def __init__(
+        self,
+        diameter_mm: float,
+        depth_mm: float,
+        *,
+        wall: float = 1.0,
+        blur: int = 5,
+        at: tuple[float, float] = (0.4e-3, -0.7e-3),
+        emitter_mm: tuple[float, float, float] = HoleModelConfig().emitter_mm,
+        middle: tuple[float, float] = MIDDLE,
+    ):
+        self.depth_m = depth_mm * 1e-3
+        self.blur = blur
+        self.middle = middle
+        self.emitter = np.array(emitter_mm) * 1e-3
+        # the plane z = 0.75 + 0.1 x - 0.15 y, and the hole's centre on it
+        self.tilt = np.array([0.1, -0.15])
+        self.normal = np.array([*-self.tilt, 1.0]) / np.sqrt(1.0 + self.tilt @ self.tilt)
+        self.centre = np.array([*at, 0.75 + self.tilt @ np.array(at)])
+        self.radius = diameter_mm * 5e-4
+        over = 8
+        v, u = np.mgrid[: HEIGHT * over, : WIDTH * over]
+        fine = self.surface((u + 0.5) / over - 0.5, (v + 0.5) / over - 0.5)
+        image = self.hole(fine, wall).reshape(HEIGHT, over, WIDTH, over).mean(axis=(1, 3))
+        self.image = cv2.blur(image, (blur, blur))
+        v, u = np.mgrid[:HEIGHT, :WIDTH]
+        self.plane = self.surface(u, v)
+
+    def hole(self, seen: np.ndarray, wall: float, steps: int = 24) -> np.ndarray:
+        """Residual along z of rays that meet the plane at points (h, w, 3)."""
+        mouth = ((seen - self.centre) ** 2).sum(axis=-1) < self.radius**2
+        residual = np.zeros(mouth.shape)
+        if self.depth_m <= 0:
+            residual[mouth] = self.depth_m
+            return residual
+        points = seen[mouth]
+        to_plane = self.normal @ self.centre
+        deep = self.depth_m * to_plane / self.centre[2]
+        tube = wall * deep
+        total = np.zeros(len(points))
+        for depth in (np.arange(steps) + 0.5) / steps * tube:
+            at = points * (1.0 + depth / to_plane)
+            total += tube / steps * (self.passes(at, 0.0, depth) & self.within(at, depth))
+        end = points * (1.0 + tube / to_plane)
+        floor = points * (1.0 + deep / to_plane)
+        lit = self.passes(floor, 0.0, deep) & self.passes(floor, tube, deep)
+        total += (deep - tube) * (self.within(end, tube) & lit)
+        residual[mouth] = total * points[:, 2] / to_plane
+        return residual
+
+    def within(self, points: np.ndarray, depth: float) -> np.ndarray:
+        apart = points - self.centre - depth * self.normal
+        return (apart**2).sum(axis=-1) < self.radius**2
+
+    def passes(self, points: np.ndarray, rim: float, depth: float) -> np.ndarray:
+        """Whether light from the emitter to points at a depth passes the circle at the depth
+        ``rim``."""
+        height = self.normal @ (self.centre - self.emitter)
+        part = (depth - rim) / (depth + height)
+        return self.within(points + part * (self.emitter - points), rim)
+
+    def surface(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        place = np.stack([u + REGION.col0, v + REGION.row0], axis=-1)
+        slopes = (place - np.array(self.middle)) / FOCAL_PX
+        z = 0.75 / (1 - slopes @ self.tilt)
+        return np.concatenate([slopes * z[..., None], z[..., None]], axis=-1)
+
+    def seen(self, sigma_mm: float, seed: int) -> tuple[Cloud, Evidence]:
+        white = np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH))
+        noise = cv2.blur(white, (self.blur, self.blur), borderType=cv2.BORDER_REFLECT)
+        residual = self.image + sigma_mm * 1e-3 * self.blur * noise
+        points = self.plane * (1 + residual / self.plane[..., 2])[..., None]
+        flat = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+        cloud = Cloud(
+            points, flat, flat.astype(int) + 1, np.full(flat.shape, np.nan), REGION, 0.0, 1
+        )
+        return cloud, Evidence(
+            np.abs(residual) / (sigma_mm * 1e-3), residual, self.plane[..., 2], sigma_mm * 1e-3
+        )
+
+
+def strongest(cloud: Cloud, evidence: Evidence, threshold: float) -> Detection:
+    above = (np.nan_to_num(evidence.score) > threshold).astype(np.uint8)
+    _, labels = cv2.connectedComponents(above)
+    peak = np.nanargmax(evidence.score)
+    return detection_of(
+        cloud,
+        float(np.nanmax(evidence.score)),
+        np.flatnonzero(labels.ravel() == labels.ravel()[peak]),
+    )
+
+
+def detection_of(cloud: Cloud, score: float, pixels: np.ndarray) -> Detection:
+    return Detection(score, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1])
+
+
+def measured(board: Board, sigma_mm: float, seed: int, threshold: float = 5.0) -> Measurement:
+    cloud, evidence = board.seen(sigma_mm, seed)
+    return measure_detection(
+        cloud, evidence, strongest(cloud, evidence, threshold), HoleModelConfig()
+    )
+
+
+def patch_of(board: Board) -> tuple[HolePatch, np.ndarray]:
+    """The whole picture as a patch, and the true hole (u, v, radius, depth, wall 0.6) in it."""
+    u, v = (
+        board.centre[:2] / board.centre[2] * FOCAL_PX
+        + board.middle
+        - np.array([REGION.col0, REGION.row0])
+    )
+    per_px = np.stack(
+        [
+            (board.surface(u + du, v + dv) - board.surface(u - du, v - dv)) / 2
+            for du, dv in ((0.5, 0), (0, 0.5))
+        ]
+    )
+    per_px *= 2
+    used = np.ones((HEIGHT, WIDTH), dtype=bool)
+    sights = sight(board.centre, per_px, board.emitter)[None]
+    patch = HolePatch(
+        board.image, used, per_px @ per_px.T, (float(board.blur), float(board.blur)), 1e-4, sights
+    )
+    return patch, np.array([u, v, board.radius, board.depth_m, 0.6])
+
+
+OBLIQUE = (60.0, 200.0)
+"""A principal point that puts the hole 20 degrees off the axis, as the thesis' outermost hole at
+0.7 m."""
+
+
+@pytest.mark.parametrize("middle", [MIDDLE, OBLIQUE])
+@pytest.mark.parametrize(("diameter_mm", "depth_mm"), [(6.35, 33.0), (19.05, 12.7), (25.4, 33.0)])
+def test_the_image_of_a_hole_is_that_of_rays_in_space(
+    diameter_mm: float, depth_mm: float, middle: tuple[float, float]
+) -> None:
+    at = tuple((np.array([235.2, 130.4]) - middle) / FOCAL_PX * 0.75)
+    board = Board(diameter_mm, depth_mm, wall=0.6, middle=middle, at=at)
+    patch, hole = patch_of(board)
+    # perspective over a wide disc, three points for the wall's integral
+    image = pictures(patch, hole[None])[0]
+    np.testing.assert_allclose(image, board.image, atol=0.03 * board.depth_m)
+    assert image.sum() == pytest.approx(board.image.sum(), rel=0.025)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("diameter_mm", [6.35, 12.7, 25.4])
+def test_a_nearly_noise_free_hole_or_bump_is_measured_exactly(
+    diameter_mm: float, sign: int
+) -> None:
+    board = Board(diameter_mm, sign * 12.7)
+    m = measured(board, 0.005, 1, threshold=100.0)
+    assert m.model_note == ""
+    assert m.model_diameter_m == pytest.approx(diameter_mm * 1e-3, abs=0.1e-3)
+    assert m.model_depth_m == pytest.approx(sign * 12.7e-3, abs=0.25e-3)
+    np.testing.assert_allclose(m.model_centre_m, board.centre, atol=0.05e-3)
+    u, v = board.centre[:2] / board.centre[2] * FOCAL_PX + MIDDLE
+    assert (m.u_px, m.v_px) == pytest.approx((u, v), abs=0.04)
+    assert m.extent_diameter_m > m.model_diameter_m + 2e-3
+    # the area that faces the camera is the disc's times the cosine of the tilt; of a hole less is
+    # seen
+    volume = sign * np.pi * board.radius**2 * board.normal[2] * 12.7e-3
+    assert (
+        m.volume_m3 == pytest.approx(volume, rel=0.02)
+        if sign < 0
+        else 0.5 * volume < m.volume_m3 < volume
+    )
+
+
+@pytest.mark.parametrize("wall", [0.4, 1.0])
+@pytest.mark.parametrize("diameter_mm", [12.7, 25.4])
+def test_an_oblique_hole_has_the_diameter_and_the_place_of_its_mouth(
+    diameter_mm: float, wall: float
+) -> None:
+    at = tuple((np.array([235.2, 130.4]) - OBLIQUE) / FOCAL_PX * 0.75)
+    board = Board(diameter_mm, 30.0, wall=wall, middle=OBLIQUE, at=at)
+    m = measured(board, 0.02, 1, threshold=100.0)
+    floor = board.image > 0.5 * board.image.max()
+    seen_m = 2 * np.sqrt(floor.sum() / np.pi * np.linalg.det(patch_of(board)[0].metric_m2) ** 0.5)
+    assert seen_m < 0.93 * diameter_mm * 1e-3
+    assert m.model_note == ""
+    assert m.model_diameter_m == pytest.approx(diameter_mm * 1e-3, abs=0.15e-3)
+    np.testing.assert_allclose(m.model_centre_m, board.centre, atol=0.15e-3)
+
+
+@pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
+def test_standard_errors_cover_the_truth(count: int) -> None:
+    """Draws of correlated noise, over walls of every length as the prior has it. The deviation of
+    200 standard scores with some 20 degrees of freedom each has a standard error of 0.055, so 1 -+
+    0.2 holds with a risk below 0.1 % for each of the three; means within 0.25 (3.5 standard
+    errors). Of fewer draws the bounds are wider."""
+    boards = [Board(12.7, 5.0, wall=wall) for wall in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    draws = [(boards[seed % 5], measured(boards[seed % 5], 0.25, seed)) for seed in range(count)]
+    assert all(m.model_note == "" for _, m in draws)
+    scores = np.array(
+        [
+            [
+                (m.model_diameter_m - 12.7e-3) / m.model_diameter_se_m,
+                (m.model_depth_m - 5.0e-3) / m.model_depth_se_m,
+                (m.model_centre_m - board.centre)[0] / m.model_centre_se_m,
+            ]
+            for board, m in draws
+        ]
+    )
+    wider = np.sqrt(200 / count)
+    assert np.all(np.abs(scores.mean(axis=0)) < 0.25 * wider)
+    assert np.all(np.abs(scores.std(axis=0) - 1.02) < 0.2 * wider)
+
+
+@pytest.mark.parametrize(("reach_px", "low_mm", "high_mm"), [(5.0, 8.0, 10.5), (0.0, 0.0, 7.5)])
+def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise(
+    reach_px, low_mm, high_mm
+) -> None:
+    board = Board(9.0, 9.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
+    cloud, evidence = board.seen(0.5, 3)
+    cloud = replace(
+        cloud, noise_reach_px=reach_px
+    )  # 0: no recording, so that the model's own blur of 5 pixels is taken
+    white = np.pad([[1.0]], 10)
+    m = measure_detection(
+        cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig(), white
+    )
+    assert low_mm * 1e-3 < m.model_diameter_m < high_mm * 1e-3
+
+
+def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
+    board = Board(9.0, 9.0, wall=0.0)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    # a cap 48 mm wide; half of its depth lies within 34 mm
+    board.image = 7e-3 * np.clip(
+        1 - ((u - WIDTH / 2) ** 2 + (v - HEIGHT / 2) ** 2) / 16.0**2, 0, None
+    )
+    cloud, evidence = board.seen(0.05, 3)
+    lag = np.abs(np.arange(-28, 29))
+    short, long = (
+        np.outer(row, row)
+        for row in (np.clip(1 - lag / 4, 0, None), np.exp(-(lag**2) / (2 * 6.3**2)))
+    )
+    core = detection_of(cloud, 9.0, np.flatnonzero(board.image > 6.3e-3))
+    m = measure_detection(cloud, evidence, core, HoleModelConfig(), 0.3 * short + 0.7 * long)
+    assert m.model_depth_m == pytest.approx(7e-3, abs=1.5e-3)
+    assert m.model_diameter_m == pytest.approx(34e-3, abs=5e-3)
+
+
+def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
+    m = measured(Board(2.0, 12.7, wall=0.3), 0.15, 3, threshold=4.0)
+    assert (
+        m.model_note.startswith("the blur hides the difference")
+        and "half-depth contour" in m.model_note
+    )
+    assert m.model_diameter_m > 2.0e-3 and np.isnan(m.model_diameter_se_m)
+
+
+def test_a_deep_hole_falls_back_to_its_contour() -> None:
+    board = Board(19.0, 200.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
+    m = measured(board, 0.2, 3)
+    assert "deeper than 75 mm" in m.model_note
+    assert m.model_diameter_m == pytest.approx(19.0e-3, abs=0.4e-3)
+    assert m.model_depth_m == pytest.approx(0.2, abs=1e-3)
+
+
+def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_through() -> None:
+    # 26 degrees off the axis and 20 off the normal, the tube of 20 mm hides most of what lies 0.5
+    # m behind
+    board = Board(
+        19.0,
+        500.0,
+        wall=0.04,
+        blur=1,
+        emitter_mm=(0.0, 0.0, 0.0),
+        at=(0.32, 0.0),
+        middle=(50.0, 120.0),
+    )
+    through_m = np.sqrt((board.image > 0.25).sum() / (board.image > 0).sum()) * 19.0e-3
+    m = measured(board, 0.2, 3)
+    assert through_m < 11.0e-3 and "deeper than 75 mm" in m.model_note
+    assert 14.0e-3 < m.model_diameter_m < 20.0e-3
+
+
+def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
+    board = Board(19.0, 30.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
+    cloud, evidence = board.seen(0.2, 3)
+    detection = strongest(cloud, evidence, 5.0)
+    inside = board.image > 0.99 * board.depth_m
+    cloud.points_m[inside] = np.nan
+    evidence.residual_m[inside] = np.nan
+    rim = np.setdiff1d(detection.pixels, np.flatnonzero(inside))
+    m = measure_detection(cloud, evidence, detection_of(cloud, 9.0, rim), HoleModelConfig())
+    assert "no range" in m.model_note
+    assert m.model_diameter_m == pytest.approx(19.0e-3, abs=1.0e-3)
+    assert np.isnan(m.model_depth_m) and np.isnan(m.model_diameter_se_m)
+
+
+def test_a_neighbour_is_masked() -> None:
+    board = Board(12.7, 12.7)
+    other = Board(12.7, 12.7, at=(24e-3, 2e-3))
+    cloud, evidence = board.seen(0.1, 3)
+    alone = measure_detection(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig())
+    pixels = strongest(cloud, evidence, 5.0)
+    evidence.residual_m[:] += other.image
+    m = measure_detection(cloud, evidence, pixels, HoleModelConfig())
+    assert m.model_note == ""
+    assert m.model_diameter_m == pytest.approx(alone.model_diameter_m, abs=0.15e-3)
+    assert m.model_depth_m == pytest.approx(alone.model_depth_m, abs=0.15e-3)
+
+
+def test_without_a_grid_only_extents_are_given() -> None:
+    cloud, evidence = Board(12.7, 12.7).seen(0.1, 3)
+    detection = strongest(cloud, evidence, 5.0)
+    n = HEIGHT * WIDTH
+    row = {
+        "points_m": cloud.points_m.reshape(1, n, 3),
+        "organised": False,
+        "region": Region(0, 1, 0, n),
+    }
+    flat = Cloud(**{**cloud.__dict__, **row})
+    m = measure_detection(flat, evidence, detection, HoleModelConfig())
+    assert m.model_note == "no pixel grid: extents only" and m.points == len(detection.pixels)
+    assert m.extent_diameter_m > 12.7e-3 and np.isnan(m.model_diameter_m) and np.isnan(m.u_px)
+
+
+def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
+    cloud, evidence = Board(12.7, 0.0).seen(0.2, 7)
+    m = measure_detection(
+        cloud, evidence, detection_of(cloud, 4.0, np.array([17])), HoleModelConfig()
+    )
+    assert m.points == 1 and m.extent_diameter_m == 0.0 and m.model_note != ""
+
+
+def test_an_even_blur_is_refused() -> None:
+    with pytest.raises(ValidationError, match="odd"):
+        HoleModelConfig(blur_px=4)

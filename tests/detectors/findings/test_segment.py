@@ -1,0 +1,80 @@
+"""Clusters against a brute-force distance matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
+
+from detectors.findings.clusters import euclidean_clusters
+from harness.vocabulary.errors import UserError
+
+
+def brute_force(points: np.ndarray, distance: float) -> np.ndarray:
+    """Component of each point, in the order of first appearance."""
+    component = connected_components(cdist(points, points) <= distance, directed=False)[1]
+    _, first, inverse = np.unique(component, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    n=st.integers(1, 200),
+    spread=st.sampled_from([0.02, 0.1, 0.4]),
+    flat=st.booleans(),
+)
+def test_equals_brute_force(seed: int, n: int, spread: float, flat: bool) -> None:
+    points = np.random.default_rng(seed).uniform(-spread, spread, (n, 3))
+    if flat:
+        points[:, 2] = 0.7
+    np.testing.assert_array_equal(euclidean_clusters(points, 0.01), brute_force(points, 0.01))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_order_and_place_of_points_do_not_matter(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    points = random.uniform(0, 0.1, (150, 3))
+    order = random.permutation(150)
+    labels = euclidean_clusters(points, 0.012)
+    moved = euclidean_clusters(points[order] + [0.3, -0.2, 1.0], 0.012)
+    same = labels[order][:, None] == labels[order][None, :]
+    np.testing.assert_array_equal(same, moved[:, None] == moved[None, :])
+
+
+def test_single_linkage_joins_a_chain_and_stops_beyond_the_distance() -> None:
+    x = np.array([0.0, 0.0099, 0.0198, 0.0299, 0.0398])
+    points = np.stack([x, 0 * x, 0 * x], axis=1)
+    np.testing.assert_array_equal(euclidean_clusters(points, 0.01), [0, 0, 0, 1, 1])
+
+
+def test_a_distance_exactly_reached_joins() -> None:
+    points = np.array([[0.0, 0, 0], [0.25, 0, 0], [0.51, 0, 0]])
+    np.testing.assert_array_equal(euclidean_clusters(points, 0.25), [0, 0, 1])
+
+
+def test_small_clusters_and_missing_points_get_no_label() -> None:
+    points = np.array(
+        [[0.0, 0, 0], [1, 0, 0], [1.001, 0, 0], [np.nan, 0, 0], [2, 0, 0], [2, 0.001, 0]]
+    )
+    np.testing.assert_array_equal(
+        euclidean_clusters(points, 0.01, min_points=2), [-1, 0, 0, -1, 1, 1]
+    )
+    assert len(euclidean_clusters(np.empty((0, 3)), 0.01)) == 0
+
+
+def test_a_dense_sheet_of_100_000_points_is_one_cluster() -> None:
+    v, u = np.mgrid[:320, :320] * 1e-3
+    points = np.stack([u.ravel(), v.ravel(), np.full(u.size, 0.7)], axis=1)
+    points[points[:, 0] > 0.2, 0] += 0.0101
+    labels = euclidean_clusters(points, 0.01)
+    assert labels.max() == 1 and (labels == 0).sum() == 320 * 201
+
+
+def test_a_wrong_unit_is_a_clear_mistake() -> None:
+    with pytest.raises(UserError, match="cannot be clustered"):
+        euclidean_clusters(np.array([[0.0, 0, 0], [1e5, 0, 0]]), 0.01)

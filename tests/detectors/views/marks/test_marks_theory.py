@@ -1,0 +1,161 @@
+"""The parts that marks rest on: the lattice's error, the plane under a mark, the target's own
+colour."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from detectors.views.marks.blobs import (
+    FALSE_RATE,
+    above_half,
+    centroid_covariance_px2,
+    chromaticity,
+    region_covariance_px2,
+    stand_out,
+)
+from detectors.views.marks.find import fit_patch
+from harness.vocabulary.seeds import random_stream
+
+
+def rectangle(length: float, breadth: float, turn_deg: float = 0.0) -> np.ndarray:
+    turn = np.deg2rad(turn_deg)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * [length, breadth] @ axes
+
+
+def lattice_within(polygon: np.ndarray) -> np.ndarray:
+    reach = np.arange(-25, 26)
+    points = (
+        np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2).astype(float)
+    )
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    arms = points[:, None] - polygon[None]
+    return points[np.all(edges[:, 0] * arms[..., 1] - edges[:, 1] * arms[..., 0] >= 0, axis=1)]
+
+
+def test_a_whole_number_of_pixels_shifts_by_up_to_half_a_pixel_and_a_half_one_by_a_quarter():
+    # both ends of a whole length are rounded alike: uniform in +-1/2; of a half one they
+    # alternate: uniform in +-1/4
+    covariance = centroid_covariance_px2(rectangle(30.0, 9.5))
+    assert covariance[0, 0] == pytest.approx(1 / 12, rel=0.01)
+    assert covariance[1, 1] == pytest.approx(1 / 48, rel=0.1)
+    assert covariance[0, 1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_order_of_the_vertices_does_not_matter():
+    polygon = rectangle(20.3, 7.7, 12.0)
+    np.testing.assert_allclose(
+        centroid_covariance_px2(polygon), centroid_covariance_px2(polygon[::-1]), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("length", "breadth", "turn"), [(28.3, 9.1, 1.0), (28.3, 9.1, 3.0), (14.2, 14.6, 45.0)]
+)
+def test_the_lattice_error_is_that_of_random_shifts(length, breadth, turn):
+    rng = random_stream(1, "shifts", turn)
+    polygon = rectangle(length, breadth, turn)
+    shifts = rng.uniform(-0.5, 0.5, (1000, 2))
+    errors = np.array([lattice_within(polygon + shift).mean(axis=0) - shift for shift in shifts])
+    # a variance of 1000 bounded values is known to 4 %; the frequencies left out and the first
+    # order cost 12 % more
+    np.testing.assert_allclose(
+        np.diag(centroid_covariance_px2(polygon)), errors.var(axis=0), rtol=0.15
+    )
+
+
+@pytest.mark.parametrize(
+    "turn",
+    [pytest.param(0.0, marks=pytest.mark.slow), 3.0, pytest.param(10.0, marks=pytest.mark.slow)],
+)
+def test_a_region_known_by_its_pixels_alone_states_its_error_within_a_factor(turn):
+    rng = random_stream(2, "regions", turn)
+    errors = []
+    stated = []
+    for _ in range(200):
+        size = np.array([28.0, 9.0]) + rng.uniform(0.0, 1.0, 2)
+        shift = rng.uniform(-0.5, 0.5, 2)
+        pixels = lattice_within(rectangle(*size, turn) + shift)
+        errors.append(pixels.mean(axis=0) - shift)
+        stated.append(np.diag(region_covariance_px2(pixels)))
+    ratio = np.sqrt(np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0))
+    # a slope of one or two steps cannot be told from none, so the error may be stated twice too
+    # large
+    assert np.all((ratio > 1 / 1.5) & (ratio < 2.0)), ratio
+
+
+def test_the_plane_under_a_mark_survives_a_hole_beside_it():
+    rng = random_stream(3, "patch")
+    x, y = rng.uniform(-0.03, 0.03, (2, 600))
+    z = 0.7 + 0.3 * x - 0.2 * y + 2e-4 * rng.standard_normal(600)
+    z[:150] += 0.03
+    patch = fit_patch(np.stack([x, y, z], axis=1))
+    assert patch is not None
+    # slopes of 450 points over 17 mm rms are known to 0.2 / 17 / 21, here to four such deviations
+    assert (patch.slope_x, patch.slope_y) == pytest.approx((0.3, -0.2), abs=2.5e-3)
+    assert patch.sigma_m == pytest.approx(2e-4, rel=0.1)
+
+
+def test_rays_meet_the_plane_along_themselves():
+    grid = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2) * 0.01
+    patch = fit_patch(np.column_stack([grid, 0.5 + 0.1 * grid[:, 0]]))
+    assert patch is not None
+    point = np.array([[0.02, -0.01, 0.6]])
+    central = patch.cut(point, "central")
+    parallel = patch.cut(point, "parallel")
+    np.testing.assert_allclose(central / central[0, 2], point / 0.6)
+    np.testing.assert_allclose(patch.above_m(central), 0.0, atol=1e-9)
+    np.testing.assert_allclose(parallel, [[0.02, -0.01, 0.502]], atol=1e-9)
+    np.testing.assert_allclose(patch.normal, np.array([0.1, 0.0, -1.0]) / np.sqrt(1.01), atol=1e-9)
+
+
+def test_points_on_a_line_or_too_few_give_no_plane():
+    line = np.column_stack([np.linspace(0, 1, 50), np.linspace(0, 2, 50), np.ones(50)])
+    assert fit_patch(line) is None
+    assert fit_patch(line[:5]) is None
+
+
+def wood(rng: np.random.Generator, noise: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    places = rng.uniform(-1, 1, (pixels, 2))
+    light = np.exp(0.5 * np.log(3.0) * places[:, :1]) * np.array([1.0, 0.9, 0.7])
+    # no channel is clipped: 98 * 1.73 * 1.5 = 254
+    colours = (
+        np.array([98.0, 75.0, 50.0]) * light * (1.0 + 0.15 * rng.standard_normal((pixels, 1)))
+        + noise
+    )
+    return np.clip(np.rint(colours), 0, 255).astype(np.uint8), places
+
+
+@pytest.mark.parametrize(("tail", "factor"), [("gaussian", 30), ("laplace", 150)])
+def test_as_many_of_the_targets_own_pixels_pass_as_stated(tail, factor):
+    rng = random_stream(4, "false rate", tail)
+    pixels = 100_000
+    noise = 2.0 * (
+        rng.standard_normal((pixels, 3))
+        if tail == "gaussian"
+        else rng.laplace(size=(pixels, 3)) / np.sqrt(2)
+    )
+    rgb, places = wood(rng, noise, pixels)
+    passed = (stand_out(*chromaticity(rgb), places)[1] > 1.0).mean()
+    assert passed < factor * FALSE_RATE
+
+
+def test_a_quarter_of_the_target_may_be_marked():
+    rng = random_stream(5, "many marks")
+    rgb, places = wood(rng, 3.0 * rng.standard_normal((20_000, 3)), 20_000)
+    marked = places[:, 1] > 0.5
+    rgb[marked] = (200, 30, 30)
+    chosen = stand_out(*chromaticity(rgb), places)[1] > 1.0
+    assert chosen[marked].all()
+    assert chosen[~marked].mean() < 30 * FALSE_RATE
+
+
+def test_what_is_smeared_around_a_mark_is_not_of_it():
+    contrast = np.zeros((40, 40))
+    contrast[15:25, 15:25] = 20.0
+    contrast[15:25, 25:30] = 8.0
+    kept = above_half(contrast > 4.0, contrast)
+    expected = np.zeros((40, 40), bool)
+    expected[15:25, 15:25] = True
+    np.testing.assert_array_equal(kept, expected)

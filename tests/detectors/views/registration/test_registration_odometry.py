@@ -1,0 +1,74 @@
+"""Odometry: it follows a textured board, drifts, says when it is lost, and sees through the lens's
+distortion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from detectors.views.registration.by_points import register_by_odometry
+from detectors.views.registration.register import register
+from detectors.views.registration.settings import PlainRegistration
+from harness.vocabulary.geometry import Lens
+from tests.support.board_views import LENS, pose, target_error_m, views
+
+PITCH_M = 0.5 / 300
+WALK = [
+    pose(2 * np.sin(t), 3 * t, 1.5 * t, (0.004 * t, 0.003 * np.sin(2 * t), 0.004 * t))
+    for t in np.arange(5.0)
+]
+
+
+def test_it_follows_a_walk_and_drifts():
+    made = views(WALK, noise_m=2e-4, textured=True)
+    found = register([each.prepared for each in made], PlainRegistration(method="odometry"))
+    errors = [
+        np.hypot(*target_error_m(each, made[0], view))
+        for each, view in zip(found, made, strict=True)
+    ]
+    assert not any(each.failure for each in found) and errors[0] == 0.0
+    # steps of 3 degrees and 5 mm; without following them the last view would be 24 mm off
+    assert max(errors[1:]) < 1.5 * PITCH_M and errors[-1] > errors[1] > 1e-5
+    assert all(
+        np.isnan(each.covariance).all() and "no covariance" in each.notes[0] for each in found[1:]
+    )
+
+
+def test_the_same_walk_gives_the_same_bits():
+    made = [each.prepared for each in views(WALK[:3], noise_m=2e-4, textured=True)]
+    first = register_by_odometry(made)
+    second = register_by_odometry(made)
+    assert [a.T_reference_view.tobytes() for a in first] == [
+        b.T_reference_view.tobytes() for b in second
+    ]
+
+
+def test_after_a_view_that_shows_nothing_it_is_lost_for_good():
+    made = [each.prepared for each in views(WALK[:4], noise_m=2e-4, textured=True)]
+    nothing = np.zeros_like(made[2].inside)
+    # only a corner of three pixels is left of the target
+    nothing[tuple(np.argwhere(made[2].inside)[:3].T)] = True
+    made[2] = replace(made[2], inside=nothing)
+    found = register_by_odometry(made)
+    assert [bool(each.failure) for each in found] == [False, True, True]
+    assert all("failed at view 2" in each.failure for each in found[1:])
+
+
+def test_distortion_is_taken_out():
+    bent = Lens(
+        LENS.width,
+        LENS.height,
+        LENS.fx,
+        LENS.fy,
+        LENS.cx,
+        LENS.cy,
+        (0.25, -0.1, 1e-3, -1e-3, 0, 0, 0, 0),
+    )
+    errors = []
+    for lens in (LENS, bent):
+        made = views(WALK[:2], noise_m=2e-4, textured=True, lens=lens)
+        (found,) = register_by_odometry([each.prepared for each in made])
+        errors.append(np.hypot(*target_error_m(found, made[0], made[1])))
+    # left in, the distortion shifts the board's corners by 3 pixels
+    assert errors[1] < 2 * errors[0] + 0.2 * PITCH_M

@@ -1,0 +1,156 @@
+"""A study's file: written and read again it is the same, and whatever is wrong with it is told
+with its place."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.evaluation.study.record import (
+    Calibrated,
+    Inspected,
+    SetUpRecord,
+    StudyRecord,
+    Unflawed,
+    read_record,
+    record_text,
+)
+from harness.vocabulary.errors import UserError
+from tests.support.synthetic_study import SetUp, Study, study_record
+
+STUDY = study_record(
+    Study((SetUp(), SetUp(frames=5, axes={"x": [1, 2]})), boards=3, hole_free_boards=2, holes=4)
+)
+DATA = json.loads(record_text(STUDY))
+MISSING = object()
+SECOND = ("set_ups", 1)
+TABLE = (*SECOND, "inspected")
+EMPTY: dict[str, list[Any]] = {name: [] for name in DATA["set_ups"][0]["inspected"]}
+
+
+def changed(path: tuple[str | int, ...], value: Any) -> Any:
+    data = copy.deepcopy(DATA)
+    at = data
+    for step in path[:-1]:
+        at = at[step]
+    if value is MISSING:
+        del at[path[-1]]
+    else:
+        at[path[-1]] = value
+    return data
+
+
+def refusal(file: Path) -> UserError:
+    with pytest.raises(UserError) as caught:
+        read_record(file)
+    assert str(file) in caught.value.message and (caught.value.fix or caught.value.legal)
+    return caught.value
+
+
+def test_written_and_read_it_is_the_same(tmp_path):
+    by_depth = STUDY.set_ups[0].inspected.hit
+    seen = replace(
+        STUDY.set_ups[0].inspected,
+        signal=np.where(np.arange(12) == 3, np.nan, 2.5),
+        by_depth=by_depth,
+        by_no_return=~by_depth,
+    )
+    study = replace(
+        STUDY,
+        set_ups=(replace(STUDY.set_ups[0], inspected=seen, threshold_mm=np.nan), STUDY.set_ups[1]),
+    )
+    text = record_text(study)
+    assert "NaN" not in text, "JSON has no such word"
+    (tmp_path / "study.json").write_text(text)
+    again = read_record(tmp_path)
+    assert record_text(again) == text
+    for field in fields(StudyRecord):
+        if field.name != "set_ups":
+            assert getattr(again, field.name) == getattr(study, field.name)
+    for one, other in zip(study.set_ups, again.set_ups, strict=True):
+        for field in fields(SetUpRecord):
+            a = getattr(one, field.name)
+            b = getattr(other, field.name)
+            if isinstance(a, Inspected | Unflawed | Calibrated):
+                for column in fields(a):
+                    before = getattr(a, column.name)
+                    now = getattr(b, column.name)
+                    if not isinstance(before, np.ndarray):
+                        assert now == before
+                        continue
+                    assert before.dtype.kind == now.dtype.kind
+                    np.testing.assert_array_equal(before, now)
+            else:
+                assert a == b or (a != a and b != b)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "told"),
+    [
+        (
+            (*TABLE, "hit", 2),
+            1,
+            "set_ups.1.inspected.hit.2 (set-up main, frames 5): Input should be a valid boolean",
+        ),
+        (
+            (*TABLE, "diameter_mm", 0),
+            0,
+            "inspected.diameter_mm.0 (set-up main, frames 5): Input should be greater than 0",
+        ),
+        ((*TABLE, "diameter_mm", 0), float("nan"), "Input should be a finite number, not .nan"),
+        ((*TABLE, "depth_mm", 0), float("inf"), "inspected.depth_mm.0"),
+        ((*TABLE, "x_mm"), "a", 'Input should be a valid list, not "a"'),
+        ((*TABLE, "signal"), [1.0], "columns of different lengths: hit 12, signal 1"),
+        (
+            (*TABLE, "signal", 1),
+            "high",
+            'inspected.signal.1 (set-up main, frames 5): Input should be a valid number, not "',
+        ),
+        ((*TABLE, "hole"), MISSING, "set_ups.1.inspected.hole (set-up main, frames 5): "),
+        ((*TABLE, "hole", 1), "1", "the same inspection occurs twice"),
+        ((*TABLE, "board", 0), 10**30, "inspected.board.0"),
+        (TABLE, EMPTY, "inspected.hole"),
+        ((*SECOND, "unflawed", "area_m2", 0), 0.0, "unflawed.area_m2.0"),
+        ((*SECOND, "unflawed", "calls", 0), -1, "greater than or equal to 0, not -1"),
+        ((*SECOND, "frames"), 0, "set_ups.1.frames"),
+        ((*SECOND, "frames"), 1, "set-up 'main' with frames 1 occurs twice"),
+        ((*SECOND, "threshold"), None, "Input should be a valid number, not null"),
+        ((*SECOND, "axes"), [1], "set_ups.1.axes"),
+        (SECOND, 7, "set_ups.1: "),
+        (("set_ups",), [], "set_ups: "),
+        (("set_ups",), {"a": 1}, "set_ups: "),
+        (("hit_radius_mm",), -1, "hit_radius_mm: Input should be greater than 0, not -1"),
+        (
+            ("false_calls_per_m2",),
+            "one",
+            'false_calls_per_m2: Input should be a valid number, not "one"',
+        ),
+        (("provenance",), MISSING, "provenance: "),
+        (("further",), 1, "further: "),
+    ],
+)
+def test_a_damaged_one_is_told_with_its_place(tmp_path, path, value, told):
+    file = tmp_path / "study.json"
+    file.write_text(json.dumps(changed(path, value)))
+    mistake = refusal(file)
+    assert f"{file}: is damaged: " in mistake.message and told in mistake.message
+    assert "run the study again" in (mistake.fix or "")
+
+
+def test_several_mistakes_are_counted(tmp_path):
+    data = changed((*TABLE, "hit"), [0] * 12)
+    (tmp_path / "study.json").write_text(json.dumps(data))
+    assert refusal(tmp_path / "study.json").message.endswith("not 0; and 11 more")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b"a,b\n1,2\n"])
+def test_what_is_no_json_is_told_what_to_do(tmp_path, content):
+    (tmp_path / "no.json").write_bytes(content)
+    mistake = refusal(tmp_path / "no.json")
+    assert "is not JSON" in mistake.message and mistake.fix and mistake.legal

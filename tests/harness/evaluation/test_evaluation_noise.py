@@ -1,0 +1,83 @@
+"""The parts of the error recovered from tables that were made of known parts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness.evaluation.summary import fit_floor, noise_against_frames, noise_law
+from tests.support.synthetic_tables import FRAMES, World, tables
+
+
+def test_parts_are_recovered() -> None:
+    """800 pixels, 50 repeats: each part within 5 of its standard errors (alpha below 1e-5)."""
+    noise = noise_against_frames(tables().probes)
+    frames = np.array(FRAMES)
+    assert list(noise["frames"]) == list(FRAMES)
+    temporal = 0.9 / np.sqrt(frames)
+    np.testing.assert_allclose(noise["temporal_rms_mm"], temporal, rtol=5 / np.sqrt(2 * 800 * 49))
+    np.testing.assert_allclose(
+        noise["guide_mm"], noise["temporal_rms_mm"].iloc[0] / np.sqrt(frames)
+    )
+    assert (np.abs(noise["offset_mm"] - 0.2) < 5 * temporal / np.sqrt(50 * 800)).all()
+    left = temporal**2 / 50
+    spread = np.sqrt((4 * 0.09 * left + 2 * left**2) / 800)
+    assert (np.abs(noise["pattern_mm"] ** 2 - 0.09) < 5 * spread).all()
+    np.testing.assert_allclose(
+        noise["total_rms_mm"] ** 2, noise["temporal_rms_mm"] ** 2 + noise["systematic_mm"] ** 2
+    )
+
+
+def test_pattern_of_pure_noise_is_corrected_away() -> None:
+    world = World(pattern_mm=lambda frames: 0.0, temporal_mm=lambda frames: 2.0)
+    noise = noise_against_frames(tables(world, frames=(1,)).probes)
+    uncorrected = 2.0 / np.sqrt(50)
+    assert noise["pattern_mm"].iloc[0] < 0.5 * uncorrected
+
+
+def test_three_pixels_by_hand() -> None:
+    probes = pd.DataFrame(
+        {
+            "variant": "main",
+            "frames": 4,
+            "pixel": [0, 1, 2, 3],
+            "mean_error_mm": [1.0, 2.0, 3.0, np.nan],
+            "temporal_std_mm": [0.5, 0.5, 0.5, 0.5],
+            "displacement_std_mm": [0.1, 0.1, 0.1, 0.1],
+            "repeats": 5,
+        }
+    )
+    row = noise_against_frames(probes).iloc[0]
+    assert (row["pixels"], row["offset_mm"], row["temporal_rms_mm"]) == (3, 2.0, 0.5)
+    assert row["pattern_mm"] == pytest.approx(np.sqrt(1 - 0.25 / 5))
+    assert row["systematic_mm"] == pytest.approx(np.sqrt(4 + 0.95))
+
+
+def test_floor_fit_is_exact_on_its_own_law_and_never_negative() -> None:
+    frames = np.array(FRAMES)
+    assert fit_floor(frames, np.sqrt(0.81 / frames + 0.04)) == pytest.approx(0.2)
+    assert fit_floor(frames, 1.0 / frames) == 0.0
+    assert np.isnan(fit_floor([1, 1], [0.5, 0.5]))
+
+
+def test_law_of_white_noise_and_of_drift() -> None:
+    law = noise_law(tables().probes, "main")
+    assert law is not None
+    assert law.slope_interval.low < -0.5 < law.slope_interval.high
+    assert law.slope == pytest.approx(-0.5, abs=0.005)
+    assert law.systematic_ratio == pytest.approx(1, abs=0.05)
+    drift = noise_law(tables(World(temporal_mm=lambda frames: 0.9 * frames**-0.3)).probes, "main")
+    assert drift is not None
+    assert drift.slope == pytest.approx(-0.3, abs=0.005)
+
+
+def test_law_uses_only_pixels_seen_at_every_count_and_needs_two_counts() -> None:
+    probes = tables(frames=(1, 50)).probes
+    probes.loc[(probes["frames"] == 50) & (probes["pixel"] < 100), "mean_error_mm"] = np.nan
+    law = noise_law(probes.sample(frac=1, random_state=0), "main")
+    assert law is not None
+    assert law.pixels == 700
+    assert (law.few_frames, law.many_frames) == (1, 50)
+    assert noise_law(probes[probes["frames"] == 1], "main") is None
+    assert noise_law(probes, "elsewhere") is None

@@ -1,0 +1,120 @@
+"""The experiments that come with tofpod: valid, complete, crop and radius fit for the board in
+every variation."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from detectors.crop import BoxCrop
+from detectors.methods.thesis import ThesisConfig
+from harness.experiment.load import load_experiment, resolved_yaml
+from harness.experiment.schema import MAIN, Experiment, Point, SimulatedSource
+from harness.vocabulary.geometry import MM, transform_points
+
+FOLDER = Path(__file__).resolve().parents[3] / "experiments"
+MANY = 200  # set-ups
+RIM_MM = 5.9
+"""The crop leaves a rim of 6 mm of the untilted board (and 3 pixels more); the tilt shortens it by
+0.1 mm."""
+
+
+@cache
+def experiment(name: str) -> Experiment:
+    return load_experiment(FOLDER / f"{name}.yaml")
+
+
+def points_of(name: str) -> tuple[Point, ...]:
+    return experiment(name).points
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_experiment_is_valid_and_named_like_its_file(path: Path, tmp_path: Path) -> None:
+    first = experiment(path.stem)
+    assert first.config.name == path.stem
+    if len(first.points) > MANY:  # resolved in the same way, but for seconds
+        return
+    resolved = tmp_path / path.name
+    resolved.write_text(resolved_yaml(first))
+    again = load_experiment(resolved)
+    assert (again.points, again.digest) == (first.points, first.digest)
+
+
+def test_averaging_is_the_experiment_of_the_thesis() -> None:
+    main = [point for point in points_of("averaging") if point.variant == MAIN]
+    assert [point.config.capture.frames for point in main] == [1, 2, 5, 10, 20, 50]
+    assert {point.config.repeats for point in main} == {50}
+    assert (
+        len({point.frames_key for point in main}) == 1
+    )  # shorter averages are prefixes of the longer
+    assert len({point.digest for point in main}) == len(main)
+
+
+def test_a_quick_run_has_few_repeats_or_boards_and_says_that_it_is_a_first_look() -> None:
+    first = load_experiment(
+        FOLDER / "averaging.yaml", ["threshold.calibrate.repeats=7"], quick=True
+    )
+    assert first.config.repeats == 5 and first.config.threshold.calibrate.repeats == 7  # type: ignore[union-attr]
+    assert first.config.sensitivity is None and {point.variant for point in first.points} == {MAIN}
+    assert first.config.title == f"{experiment('averaging').config.title} (a first look)"
+    whole = load_experiment(FOLDER / "detection_limit.yaml", quick=False).config
+    study = load_experiment(FOLDER / "detection_limit.yaml", quick=True).config
+    boards = [
+        [c.study.boards, c.study.hole_free_boards, c.threshold.calibrate.boards]
+        for c in (whole, study)
+    ]  # type: ignore[union-attr]
+    assert boards == [[36, 36, 60], [12, 12, 20]] and study.repeats == whole.repeats == 1
+
+
+def test_every_variation_of_averaging_changes_something() -> None:
+    points = points_of("averaging")
+    main = {point.digest for point in points if point.variant == MAIN}
+    varied = [point.digest for point in points if point.variant != MAIN]
+    assert main.isdisjoint(varied)
+    assert len(set(varied)) == len(varied)
+
+
+@pytest.mark.parametrize("name", ["averaging", "smoke"])
+def test_the_crop_keeps_all_holes_and_leaves_a_rim(name: str) -> None:
+    for point in points_of(name):
+        source = point.config.source
+        crop = ThesisConfig.from_data(point.config.detector.settings).crop
+        assert isinstance(source, SimulatedSource)
+        assert isinstance(crop, BoxCrop)
+        target = source.target.declare()
+        to_camera = target.pose.T_camera_board
+        half = np.array([target.board.width_mm, target.board.height_mm]) / 2
+        corners = [[x * half[0], y * half[1], 0.0] for x, y in product((-1, 1), repeat=2)]
+        board_mm = transform_points(to_camera, np.array(corners) * MM) / MM
+        for axis, (low, high) in enumerate((crop.x_mm, crop.y_mm)):
+            # the board's edges are within a degree of the camera's axes, so the inner corner on
+            # each side is its limit
+            assert low - np.sort(board_mm[:, axis])[1] >= RIM_MM, point.label
+            assert np.sort(board_mm[:, axis])[2] - high >= RIM_MM, point.label
+        assert crop.z_mm[0] < board_mm[:, 2].min(), point.label
+        assert board_mm[:, 2].max() + target.board.thickness_mm < crop.z_mm[1], point.label
+        assert crop.range_max_m is None
+        for hole in target.holes:
+            angle = np.linspace(0, 2 * np.pi, 64)
+            rim = (
+                np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) * hole.diameter_mm / 2
+            )
+            rim_mm = transform_points(to_camera, (rim + np.array([*hole.centre_mm, 0.0])) * MM) / MM
+            for axis, (low, high) in enumerate((crop.x_mm, crop.y_mm)):
+                assert low < rim_mm[:, axis].min() and rim_mm[:, axis].max() < high, point.label
+
+
+def test_the_matching_radius_tells_neighbours_apart_and_covers_the_largest_hole() -> None:
+    for point in points_of("averaging"):
+        assert isinstance(point.config.source, SimulatedSource)
+        holes = point.config.source.target.declare().holes
+        pitch_mm = min(abs(a.centre_mm[0] - b.centre_mm[0]) for a, b in pairwise(holes))
+        assert (
+            max(hole.diameter_mm for hole in holes) / 2
+            < point.config.matching.radius_mm
+            < pitch_mm / 2
+        )

@@ -1,0 +1,368 @@
+"""A gauge board: its template is true to scale, and a capture of the drilled board gives hits and
+misses."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from harness import detect, sweep
+from harness.evaluation.study.limit import limit_of
+from harness.evaluation.study.record import read_record
+from harness.programs.inspections import design_statistics as plan
+from harness.programs.inspections import gauge, pod
+from harness.programs.inspections.gauge_board import Gauge, read_gauge
+from harness.programs.inspections.gauge_page import (
+    MARGIN_MM,
+    PAPER_MM,
+    draw_board,
+    template_pdf,
+    tiles_of,
+)
+from harness.vocabulary.geometry import MM, Lens, invert, rotation_xyz_deg, transform_points
+from scenes.optics import RenderConfig
+from scenes.render.cache import cached_view
+from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.source import SimulatedUnit
+from scenes.target import custom
+
+CAMERA = "azure_kinect_nfov"
+LENS = Lens(width=640, height=480, fx=700.0, fy=700.0, cx=320.3, cy=239.2)
+GIVEN = ["--diameters", "2:12", "--a50", "5", "--a90", "7", "--targets", "24"]
+DEPTH_M = 0.02
+NEVER_FOUND_MM = 3.5
+NOISE_MM = 0.4
+THRESHOLD = 8
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("gauge") / "out"
+    assert gauge.main([*GIVEN, "--out", str(out)]) == 0
+    return out
+
+
+def test_the_truth_holds_what_was_designed(made: Path):
+    (board,) = read_gauge(made / "gauge.json").boards
+    sizes = np.array([hole.diameter_mm for hole in board.holes])
+    assert len(sizes) == 24
+    assert set((sizes * 2 % 1).tolist()) == {0.0} and sizes.min() >= 2 and sizes.max() <= 12
+    assert ((sizes > 4) & (sizes < 8)).sum() >= 8  # where the guessed curve rises
+    places = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes])
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + 1e3 * np.eye(24)
+    assert apart.min() > 2 * read_gauge(made / "gauge.json").hit_radius_mm
+    for mark in board.marks:
+        beside = np.abs(places - [mark.x_mm, mark.y_mm]).max(axis=1) - sizes / 2
+        assert beside.min() > mark.side_mm / 2 + 3
+
+
+def test_the_template_is_true_to_scale(made: Path):
+    """The SVG states its size; the drawing, in pixels of 0.2 mm, shows the codes where the truth
+    has them."""
+    from matplotlib.figure import Figure
+
+    found = read_gauge(made / "gauge.json")
+    (board,) = found.boards
+    size = re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', (made / "board-1.svg").read_text())
+    assert size is not None
+    np.testing.assert_allclose(
+        [float(size[k]) / 72 * 25.4 for k in (1, 2)], [board.width_mm + 2, board.height_mm + 2]
+    )
+    pdf = template_pdf(found.boards, found.dictionary, "letter")
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
+    assert box is not None
+    assert sorted(float(box[k]) / 72 * 25.4 for k in (1, 2)) == pytest.approx(
+        sorted(PAPER_MM["letter"]), abs=0.01
+    )
+
+    figure = Figure(figsize=(board.width_mm / 25.4, board.height_mm / 25.4))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(
+        xlim=(-board.width_mm / 2, board.width_mm / 2),
+        ylim=(-board.height_mm / 2, board.height_mm / 2),
+    )
+    axes.set_axis_off()
+    draw_board(axes, board, found.dictionary)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=127)
+    picture = cv2.imdecode(np.frombuffer(buffer.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    codes = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50))
+    corners, seen, _ = codes.detectMarkers(picture)
+    assert sorted(seen.ravel().tolist()) == [mark.code for mark in board.marks]
+    for code, corner in zip(seen.ravel(), corners, strict=True):
+        mark = board.marks[int(code)]
+        centre = corner.reshape(4, 2).mean(axis=0) + 0.5
+        at = (centre / 5 - [board.width_mm / 2, board.height_mm / 2]) * [1, -1]
+        np.testing.assert_allclose(at, [mark.x_mm, mark.y_mm], atol=0.3)
+
+
+@pytest.mark.parametrize("paper", list(PAPER_MM))
+def test_tiles_cover_the_board_and_overlap(paper: str):
+    for size in ((100.0, 80.0), (400.0, 300.0), (900.0, 200.0)):
+        sheet, places = tiles_of(*size, paper)
+        room = np.array(sheet) - [2 * MARGIN_MM, 2 * MARGIN_MM + 12]
+        for x, y in np.random.default_rng(1).uniform(0, 1, (200, 2)) * size:
+            assert any(
+                left <= x <= left + room[0] and low <= y <= low + room[1] for left, low in places
+            )
+
+
+def picture(truth: Gauge, place_mm: np.ndarray, hidden: tuple[int, ...] = ()) -> np.ndarray:
+    """The board's picture (h, w, 3) with its marks, whose pixels lie at places (h, w, 2) on it."""
+    (board,) = truth.boards
+    rgb = np.full((*place_mm.shape[:2], 3), 90, np.uint8)
+    rgb[(np.abs(place_mm) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)] = 215
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, truth.dictionary))
+    for mark in board.marks:
+        if mark.code not in hidden:
+            tag = cv2.aruco.generateImageMarker(known, mark.code, 8)
+            at = np.floor(
+                ((place_mm - [mark.x_mm, mark.y_mm]) * [1, -1] / mark.side_mm + 0.5) * 8
+            ).astype(int)
+            inside = ((at >= 0) & (at < 8)).all(axis=-1)
+            rgb[inside] = tag[at[inside][:, 1], at[inside][:, 0]][:, None] // 2 + 60
+    return rgb
+
+
+def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
+    """The drilled board as a camera without a model would see it: holes above a size are steps,
+    with noise."""
+    (board,) = truth.boards
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_xyz_deg(6.0, -9.0, 3.0)
+    T[:3, 3] = 0.01, -0.005, 0.42
+    slopes = LENS.region_slopes(LENS.whole)
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    normal = T[:3, 2]
+    centre = T[:3, 3]
+    z_m = (centre @ normal) / (rays @ normal)
+    place = transform_points(invert(T), rays * z_m[..., None])[..., :2] / MM
+    on_board = (np.abs(place) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)
+    z_m = np.where(on_board, z_m, z_m + 0.3)
+    for hole in board.holes:
+        if hole.diameter_mm > NEVER_FOUND_MM:
+            z_m += DEPTH_M * (
+                np.linalg.norm(place - [hole.x_mm, hole.y_mm], axis=-1) < hole.diameter_mm / 2
+            )
+    rgb = picture(truth, place, hidden)
+    for name in ("depth", "color"):
+        (folder / name).mkdir(parents=True)
+    for number in range(3):
+        noise = np.random.default_rng([2, number]).normal(size=z_m.shape) * NOISE_MM
+        cv2.imwrite(
+            str(folder / "depth" / f"{number}.png"), np.rint(z_m / MM + noise).astype(np.uint16)
+        )
+        cv2.imwrite(str(folder / "color" / f"{number}.png"), cv2.GaussianBlur(rgb, (3, 3), 0))
+    sizes = {
+        "width": LENS.width,
+        "height": LENS.height,
+        "intrinsic_matrix": LENS.matrix.T.ravel().tolist(),
+    }
+    (folder / "intrinsic.json").write_text(json.dumps(sizes))
+    return folder
+
+
+@pytest.mark.usefixtures("unsaved")
+@pytest.mark.usefixtures("unpictured")
+def test_a_capture_of_the_board_gives_hits_and_misses(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    truth = read_gauge(made / "gauge.json")
+    given = [str(captured(tmp_path / "seen", truth)), "--gauge", str(made / "gauge.json")]
+    assert detect.main([*given, "--out", str(tmp_path / "found")]) == 0
+    said = capsys.readouterr().out
+    assert "4 marks" in said and "0 false calls" in said
+    lines = (tmp_path / "found" / "gauge.csv").read_text().splitlines()
+    rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
+    assert [row["target"] for row in rows] == [f"board-1:{n}" for n in range(1, 25)]
+    for row, hole in zip(rows, truth.boards[0].holes, strict=True):
+        assert row["found"] == ("hit" if hole.diameter_mm > NEVER_FOUND_MM else "miss"), row
+        if row["found"] == "hit":
+            assert float(row["offset_mm"]) < 1.0
+        assert (
+            row["detector"].startswith("matched ")
+            and float(row["threshold"]) > 3
+            and row["hit_radius_mm"] == "12"
+        )
+    table = str(tmp_path / "found" / "gauge.csv")
+    asked = ["--size", "diameter_mm", "--hit", "found", "--target", "target", "--unit", "mm"]
+    assert pod.main([table, *asked, "--out", str(tmp_path / "pod")]) == 0
+
+    hidden = captured(tmp_path / "hidden", truth, hidden=(0, 2))
+    assert detect.main([str(hidden), "--gauge", str(made / "gauge.json")]) == 2
+    assert "no board is recognised" in capsys.readouterr().err
+    (tmp_path / "no.json").write_text('{"gauge_version": 1, "boards": []}')
+    assert detect.main([str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
+    assert "boards" in capsys.readouterr().err
+
+
+def seen_by(
+    config: CameraConfig, truth: Gauge, tilt_deg: tuple[float, float], seed: int, folder: Path
+) -> Path:
+    """Write a frame of the board, rendered 0.5 m before this camera, as a capture of depth with a
+    picture; its path."""
+    (board,) = truth.boards
+    holes = tuple(
+        custom.HoleConfig(
+            id=each.id, diameter_mm=each.diameter_mm, centre_mm=(each.x_mm, each.y_mm)
+        )
+        for each in board.holes
+    )
+    target = custom.TargetConfig(
+        board=custom.BoardConfig(
+            width_mm=board.width_mm,
+            height_mm=board.height_mm,
+            thickness_mm=12.7,
+            shape=custom.FlatConfig(),
+        ),
+        holes=holes,
+        backing=custom.BackingConfig(distance_mm=20.0),
+        material=custom.MaterialConfig(albedo_850=0.6, grain_contrast=0.0),
+        pose=custom.PoseConfig(distance_m=0.5, tilt_x_deg=tilt_deg[0], tilt_y_deg=tilt_deg[1]),
+    )
+    camera = camera_of(config)
+    view, _ = cached_view(
+        target,
+        camera.optics,
+        RenderConfig(hole_noise_mm=0.3, face_samples=2048),
+        folder / "renders",
+    )
+    unit = SimulatedUnit(camera, config, view)
+    (frame,) = unit.capture(1, seed, "gauge").frames()
+    T = target.pose.T_camera_board
+    slopes = unit.view.slopes[unit.cut]
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    on_board = rays * ((T[:3, 3] @ T[:3, 2]) / (rays @ T[:3, 2]))[..., None]
+    place_mm = transform_points(invert(T), on_board)[..., :2] / MM
+    whole = camera.nominal_lens.whole
+    cut = unit.region.within(camera.nominal_lens.whole)
+    depth = np.zeros(whole.shape, np.uint16)
+    colour = np.full((*whole.shape, 3), 90, np.uint8)
+    depth[cut], colour[cut] = np.rint(np.nan_to_num(frame.z_m) / MM), picture(truth, place_mm)
+    for name, image in (("depth", depth), ("color", colour)):
+        (folder / "seen" / name).mkdir(parents=True)
+        cv2.imwrite(str(folder / "seen" / name / "0.png"), image)
+    return folder / "seen"
+
+
+@pytest.mark.slow
+def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wrong(tmp_path: Path):
+    """The real camera has five times the fixed pattern of the study's, whose limit is too small.
+    Holes of a rendered gauge board before the real camera correct it, in three campaigns of 24
+    holes. The truth is the same study with the real camera: of the same detector, threshold, hit
+    radius, material and distance. Its holes keep as clear of the edge as the gauge's, as the crop
+    takes those near it; so no false call (all of them lie on the rim) counts as a hit."""
+    numbers = {"fixed_pattern.smooth_mm": 3.0, "fixed_pattern.pixel_mm": 4.0}
+    experiment = Path(__file__).resolve().parents[4] / "experiments" / "detection_limit.yaml"
+    judged = {"crop": {"kind": "auto"}, "surface": {"shape": "auto"}}  # as tofpod detect has them
+    changes = [
+        "source.target.distance_m=0.5",
+        "detector.name=local",
+        f"detector.settings={json.dumps(judged)}",
+    ]
+    changes += [
+        f"threshold={{k: {THRESHOLD}}}",
+        "matching.radius_mm=12.0",
+        "source.target.material.grain_contrast=0.0",
+    ]
+    changes += [
+        "study.boards=16",
+        "study.hole_free_boards=4",
+        "capture.frames=1",
+        "source.target.room=null",
+    ]
+    changes.append(f"source.target.edge_mm={2 * gauge.EDGE_MM}")
+    changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
+    changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
+    given = [text for each in changes for text in ("--set", each)]
+    assert sweep.main([str(experiment), *given, "--out", str(tmp_path / "study")]) == 0
+    study = tmp_path / "study" / "detection_limit" / "latest"
+    simulated, real = (limit_of(one) for one in read_record(study).set_ups)
+    truth_mm = real.statement.a90
+    assert simulated.statement.bound.value < truth_mm
+
+    sizes = [
+        "--diameters",
+        "2:12",
+        "--study",
+        str(study),
+        "--set-up",
+        simulated.record.label,
+        "--targets",
+        "24",
+    ]
+    assert gauge.main([*sizes, "--out", str(tmp_path / "gauge")]) == 0
+    truth = read_gauge(tmp_path / "gauge" / "gauge.json")
+    for seed, tilt_deg in enumerate([(5.0, -4.0), (-3.0, 6.0), (2.0, 1.0)]):
+        out = tmp_path / str(seed)
+        given = [
+            str(seen_by(CameraConfig(name=CAMERA, numbers=numbers), truth, tilt_deg, seed, out))
+        ]
+        given += ["--intrinsics", CAMERA, "--detector", "local", "--threshold", str(THRESHOLD)]
+        given += ["--gauge", str(tmp_path / "gauge" / "gauge.json"), "--out", str(out / "found")]
+        assert detect.main(given) == 0
+        given = [
+            str(out / "found" / "gauge.csv"),
+            "--size",
+            "diameter_mm",
+            "--hit",
+            "found",
+            "--board",
+            "board",
+        ]
+        given += [
+            "--prior",
+            str(study),
+            "--set-up",
+            simulated.record.label,
+            "--out",
+            str(out / "pod"),
+        ]
+        assert pod.main(given) == 0
+        said = json.loads((out / "pod" / "mapod.json").read_text())
+        last = said["after_each_board"][-1]
+        print(
+            f"simulated {simulated.statement.a90:.2f}, truth {truth_mm:.2f}, {last}, quoted {said['a90_95']}"
+        )
+        assert said["counted_otherwise"] == ""
+        assert truth_mm <= last["a90_95"] < 2 * truth_mm
+        assert truth_mm <= said["a90_95"] < 2 * truth_mm
+        assert (
+            simulated.statement.a90 < last["a90"]
+            and simulated.statement.bound.value < said["a90_95"]
+        )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        (["--a50", "5"], "exactly one curve"),
+        (["--diameters", "12:2", "--a50", "5", "--a90", "7"], "--diameters"),
+        (["--a50", "5", "--a90", "7", "--board", "60x60"], "a larger --board"),
+        (["--a50", "5", "--a90", "7", "--board", "big"], "280x190|270x175"),
+        (["--a50", "5", "--a90", "7", "--apart", "10"], "--apart"),
+        (["--a50", "5", "--a90", "7", "--board", "175xnan"], "280x190|270x175"),
+        (["--a50", "5", "--a90", "7", "--depths", "5:2"], "--depths 5:2"),
+    ],
+)
+def test_mistakes_are_explained(
+    wrong: list[str],
+    word: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    planned = plan.design  # whose simulated studies are most of the time
+    monkeypatch.setattr(
+        plan, "design", lambda *given, **how: planned(*given, **how | {"studies": 10})
+    )
+    base = [] if "--diameters" in wrong else ["--diameters", "2:12"]
+    assert gauge.main([*base, *wrong, "--targets", "24", "--out", str(tmp_path / "none")]) == 2
+    assert re.search(word, capsys.readouterr().err)
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,98 @@
+"""False calls against exact laws and by simulation; planning a study."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness.evaluation.intervals import (
+    false_call_rate,
+    threshold_for_rate,
+)
+from harness.evaluation.pod.curve import PodCurve
+from harness.programs.inspections.design_statistics import design, even_sizes
+from harness.vocabulary.errors import UserError
+
+GUESS = PodCurve("logit", False, 10.0, 2.0, np.zeros((2, 2)))
+
+
+def test_rate_per_area_by_poisson() -> None:
+    three = false_call_rate(3, 1.5)
+    assert three.rate_per_m2 == 2.0
+    assert stats.poisson.cdf(3, three.interval_per_m2.high * 1.5) == pytest.approx(0.025, rel=1e-9)
+    assert stats.poisson.sf(2, three.interval_per_m2.low * 1.5) == pytest.approx(0.025, rel=1e-9)
+
+
+def test_threshold_of_a_hundred_runs_by_hand() -> None:
+    """99 runs, wanted P(call) = 1 - exp(-0.07) = 0.0676: six of a hundred may lie above, so five
+    of the 99 do."""
+    found = threshold_for_rate(
+        np.random.default_rng(3).permutation(99.0 * np.arange(99)), 0.07, 1.0
+    )
+    assert (found.value, found.calling_runs, found.runs) == (99.0 * 93, 5, 99)
+    assert found.rate_per_m2 == pytest.approx(-np.log(0.94) / 0.07)
+    assert found.upper_per_m2 == pytest.approx(-np.log1p(-stats.beta.ppf(0.95, 6, 94)) / 0.07)
+
+
+def test_threshold_keeps_the_rate_on_new_runs() -> None:
+    """Calls on boards are Poisson with rate 6 per m2 at score > 0 and exponential scores: rate(t)
+    = 6 exp(-t). Over 300 calibrations the mean probability of a call on a new run is (k + 1) / (n
+    + 1); normal limits, alpha = 0.001."""
+    rng = np.random.default_rng(4)
+    area = 0.07
+    runs = 40
+    probability = []
+    wanted = []
+    for _ in range(300):
+        highest = [
+            rng.exponential(size=count).max(initial=-np.inf)
+            for count in rng.poisson(6 * area, runs)
+        ]
+        found = threshold_for_rate(highest, area, 1.0)
+        probability.append(-np.expm1(-6 * np.exp(-max(found.value, 0.0)) * area))
+        wanted.append(-np.expm1(-found.rate_per_m2 * area))
+    assert np.allclose(wanted, 2 / 41)
+    error = np.std(probability) / np.sqrt(300)
+    assert abs(np.mean(probability) - 2 / 41) < 3.3 * error
+
+
+def test_runs_without_findings_and_ties() -> None:
+    silent = threshold_for_rate([-np.inf] * 95 + [1.0] * 5, 0.07, 1.0)
+    assert (silent.value, silent.calling_runs) == (-np.inf, 5)
+    tied = threshold_for_rate([2.0] * 100, 0.07, 1.0)
+    assert (tied.value, tied.calling_runs) == (2.0, 0)
+
+
+def test_too_few_runs_says_how_many() -> None:
+    with pytest.raises(UserError, match="at least 14 runs"):
+        threshold_for_rate(np.arange(13.0), 0.07, 1.0)
+    assert threshold_for_rate(np.arange(14.0), 0.07, 1.0).calling_runs == 0
+
+
+def test_places_of_sizes() -> None:
+    assert even_sizes(4, (0, 40)).tolist() == [5.0, 15.0, 25.0, 35.0]
+
+
+def test_more_targets_demonstrate_smaller_sizes() -> None:
+    few, many = design(GUESS, (30, 120), (1, 80), studies=40)
+    assert few.true_size == many.true_size == pytest.approx(10 + 2 * np.log(9))
+    assert many.low <= many.bound <= many.high and many.bound < few.bound
+
+
+def test_a_plan_is_repeatable_and_independent_of_its_company() -> None:
+    alone = design(GUESS, (20,), (1, 40), studies=10, seed=3)[0]
+    among = design(GUESS, (16, 20), (1, 40), studies=10, seed=3)[1]
+    assert (alone.bound, alone.low, alone.high) == (among.bound, among.low, among.high)
+
+
+def test_studies_far_from_the_rise_demonstrate_nothing() -> None:
+    plan = design(GUESS, (20,), (30, 60), studies=20)[0]
+    assert plan.bound == np.inf and plan.demonstrated < 0.5
+
+
+def test_mistakes_of_the_user() -> None:
+    with pytest.raises(UserError, match="area above 0"):
+        false_call_rate(1, 0.0)
+    with pytest.raises(UserError, match="highest score is a number"):
+        threshold_for_rate([np.nan, 1.0], 1.0, 1.0)

@@ -1,0 +1,229 @@
+"""Every claim reaches every verdict, on tables whose answer is known."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from itertools import permutations
+from unittest.mock import patch
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import spearmanr
+
+from harness.evaluation.profile import HoleInView, hole_shape, hole_shapes
+from harness.evaluation.summary import hole_list
+from harness.programs.thesis.claims import (
+    RULES,
+    Verdict,
+    decide,
+    falling_rank,
+    scatter_ratio,
+    score_claims,
+)
+from harness.records.trials import CLAIMS
+from harness.report.clouds import ExampleCloud
+from tests.support.synthetic_tables import World, example, joined, tables
+
+
+def verdict(
+    claim: str, world: World | None = None, frames: tuple[int, ...] = (1, 10, 50)
+) -> Verdict:
+    with patch.dict(
+        RULES, {claim: RULES[claim]}, clear=True
+    ):  # the others would take most of the time
+        (found,) = score_claims(tables(world, frames=frames))
+    return found
+
+
+def rate(many: float, few: float, of: int) -> World:
+    """The thesis' answer but for one hole, detected at these rates."""
+    usual = World().rate
+    return World(rate=lambda hole, n: (many if n == 50 else few) if hole == of else usual(hole, n))
+
+
+CASES = {
+    "C1": (
+        (World(), "borne out"),
+        (rate(1.0, 0.0, of=3), "borne out"),
+        (rate(0.0, 0.0, of=4), "not borne out"),
+        (rate(0.5, 0.0, of=4), "undecided"),
+    ),
+    "C1b": (
+        (World(), "borne out"),
+        (rate(1.0, 0.0, of=3), "not borne out"),
+        (rate(0.0, 0.0, of=4), "borne out"),
+        (rate(0.5, 0.0, of=3), "undecided"),
+    ),
+    "C2": (
+        (World(), "borne out"),
+        (rate(1.0, 1.0, of=4), "not borne out"),
+        (rate(1.0, 0.5, of=5), "undecided"),
+        (World(threshold={1: 1.0, 10: 3.0, 50: 5.0}), "not borne out"),
+    ),
+    "C3": (
+        (World(), "borne out"),
+        (World(size_bias_mm=lambda diameter: 2.4 if diameter < 7 else 0.0), "not borne out"),
+        (World(size_bias_mm=lambda diameter: 1.2), "undecided"),
+        (World(size_bias_mm=lambda diameter: -2.4), "not borne out"),
+    ),
+    "C4": (
+        (World(), "borne out"),
+        (World(size_bias_mm=lambda diameter: 0.1 * diameter), "not borne out"),
+        (
+            World(size_bias_mm=lambda diameter: 1.0 + 0.3 * np.cos(2 * diameter) - 0.01 * diameter),
+            "undecided",
+        ),
+    ),
+    "C5": (
+        (World(), "borne out"),
+        (World(place_bias_mm=3.0), "not borne out"),
+        (World(place_std_mm=0.6), "not borne out"),
+        (World(place_std_mm=1.2), "undecided"),
+    ),
+    "C9": (
+        (World(), "borne out"),
+        (World(temporal_mm=lambda n: 0.9 * n**-0.2), "not borne out"),
+        (World(pattern_mm=lambda n: 0.6 / n**0.5, offset_mm=0.0), "not borne out"),
+        (World(pattern_mm=lambda n: 0.27 if n == 50 else 0.3, offset_mm=0.0, seed=2), "undecided"),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("claim", "world", "answer"),
+    [(claim, world, answer) for claim, rows in CASES.items() for world, answer in rows],
+)
+def test_each_verdict_is_reachable(claim: str, world: World, answer: str) -> None:
+    assert verdict(claim, world).verdict == answer
+
+
+@pytest.mark.parametrize("shape", ["bowl", "cylinder"])
+def test_shapes_are_told_apart(shape: str) -> None:
+    scored = score_claims(tables(frames=(50,)), examples=[example(50, shape)])
+    c6 = next(v for v in scored if v.claim == "C6")
+    assert c6.verdict == ("borne out" if shape == "bowl" else "not borne out")
+
+
+def test_c6_is_undecided_without_a_cloud_or_with_mixed_holes() -> None:
+    assert verdict("C6").verdict == "undecided"
+    one_frame = score_claims(tables(), examples=[example(1)])
+    assert next(v for v in one_frame if v.claim == "C6").verdict == "undecided"
+    round_ = example(50, "bowl")
+    flat = example(50, "cylinder")
+    mixed = round_.residual_mm.copy()
+    mixed[:, 250:] = flat.residual_mm[:, 250:]
+    scored = score_claims(tables(), examples=[dataclasses.replace(round_, residual_mm=mixed)])
+    assert next(v for v in scored if v.claim == "C6").verdict == "undecided"
+
+
+@pytest.mark.parametrize("claim", ["C1", "C3", "C4", "C5"])
+def test_missing_counts_are_undecided_and_say_why(claim: str) -> None:
+    answer = verdict(claim, frames=(1, 10))
+    assert answer.verdict == "undecided"
+    assert "50 frames" in answer.evidence
+
+
+def test_nothing_found_is_no_evidence() -> None:
+    scored = score_claims(tables(World(rate=lambda hole, frames: 0.0), frames=(1, 50)))
+    assert [v.verdict for v in scored] == ["not borne out", "borne out", "not borne out"] + [
+        "undecided"
+    ] * 4 + ["borne out"]
+
+
+def test_another_target_is_not_the_thesis() -> None:
+    other = tables(frames=(1, 50))
+    other = dataclasses.replace(other, holes=other.holes[other.holes["hole"] != "3"])
+    scored = {v.claim: v for v in score_claims(other)}
+    assert scored["C1"].verdict == "undecided"
+    assert "eleven" in scored["C1"].evidence
+
+
+def test_evidence_carries_the_numbers() -> None:
+    more = verdict("C1b", rate(42 / 50, 0.0, of=3))
+    assert "More than the thesis: 3" in more.evidence
+    assert "42 of 50 (3)" in more.evidence
+    assert (
+        "hole 4 +2.0 (1.5 to 2.5)"
+        in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
+    )
+    assert "that it falls with the diameter" in verdict("C4").evidence
+    assert "ratio of the variances of position and size 4.00" in verdict("C5").evidence
+
+
+def test_sizes_are_held_against_the_scatter_between_units_too() -> None:
+    biases = {"main": 0.4, "unit 2": 1.4, "unit 3": 1.2}
+    parts = [
+        tables(World(size_bias_mm=lambda _, bias=bias: bias), frames=(50,), variant=variant)
+        for variant, bias in biases.items()
+    ]
+    for number, part in enumerate(parts[1:], 2):
+        part.variants["settings"] = json.dumps({"source.camera.unit_seed": number})
+    other = tables(
+        World(size_bias_mm=lambda _: 30.0), frames=(50,), variant="nearer"
+    )  # no unit: left out
+    evidence = next(v.evidence for v in score_claims(joined(*parts, other)) if v.claim == "C3")
+    assert "Between 3 units: hole 4 +1.9," in evidence  # 1.0 mm in the mean, by 0.53 mm
+    assert "Between units: not judged" in verdict("C3").evidence
+
+
+def test_the_table_of_claims_has_a_row_for_each_verdict() -> None:
+    table = CLAIMS.frame(map(vars, score_claims(tables(frames=(1, 50)))))
+    assert list(table["claim"]) == list(RULES)
+    assert list(table.columns) == ["claim", "text", "verdict", "evidence", "rule"]
+    assert list(CLAIMS.frame([]).columns) == list(table.columns)
+
+
+def test_rank_test_is_the_exact_permutation_test() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=6)
+    y = rng.normal(size=6)
+    rho, p = falling_rank(x, y)
+    assert rho == pytest.approx(spearmanr(x, y).statistic)
+    every = [spearmanr(x, np.array(order)).statistic for order in permutations(y)]
+    assert p == pytest.approx(np.mean(np.array(every) <= rho + 1e-12))
+    assert falling_rank(np.arange(4.0), -np.arange(4.0)) == (
+        pytest.approx(-1),
+        pytest.approx(1 / 24),
+    )
+    assert falling_rank(np.arange(4.0), np.ones(4)) == (0.0, 1.0)
+
+
+def test_scatter_ratio_by_hand() -> None:
+    place = [1.0, 3.0, 5.0, np.nan]
+    size = [1.0, 2.0, 3.0, 9.0]
+    rows = pd.DataFrame(
+        {"repeat": range(4), "hole": "5", "extent_offset_mm": place, "extent_diameter_mm": size}
+    )
+    assert scatter_ratio(rows, "extent_offset_mm", "extent_diameter_mm")[0] == pytest.approx(4.0)
+    rows["extent_diameter_mm"] = 2.0
+    assert scatter_ratio(rows, "extent_offset_mm", "extent_diameter_mm")[0] == np.inf
+
+
+def test_hole_lists_and_decisions() -> None:
+    assert hole_list(["4", "5", "6", "9", "11", "10", "dent"]) == "4–6, 9–11, dent"
+    assert hole_list([]) == "none"
+    assert decide([True, True]) == "borne out"
+    assert decide([None, False]) == "not borne out"
+    assert decide([None, True]) == "undecided"
+    assert decide([]) == "undecided"
+
+
+def test_bowl_fit_by_its_own_shape() -> None:
+    cloud = example(50, "bowl", noise_mm=0.0)
+    shape = hole_shape(cloud, cloud.truth[-1])
+    assert shape is not None
+    assert shape.bowl_rms_mm == pytest.approx(0, abs=1e-9)
+    assert shape.true_cylinder_rms_mm == pytest.approx(0, abs=1e-9)
+
+
+def test_holes_too_small_or_too_invalid_are_not_judged() -> None:
+    cloud = example(50)
+    assert {shape.hole for shape in hole_shapes(cloud)}.isdisjoint({"1", "2", "3"})
+    blind: ExampleCloud = dataclasses.replace(
+        cloud, residual_mm=np.where(cloud.residual_mm > 6, np.nan, cloud.residual_mm)
+    )
+    assert hole_shape(blind, cloud.truth[-1]) is None
+    lonely = HoleInView("1", 0.0, 0.0, 0.4, 1.0, 5.0)
+    assert hole_shape(cloud, lonely) is None

@@ -1,0 +1,220 @@
+"""The local engine: each job comes back with how it ended, and takes no other with it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+from harness.runs.jobs import STATES, Ended, Job, JobEngine, Limits, attempt
+from harness.runs.processes import LocalEngine, SerialEngine
+from harness.vocabulary.errors import UserError
+from tests.support import faulty_jobs
+from tests.support.tiny_sweep import ROOT
+
+
+def run(engine: JobEngine, jobs: list[Job]) -> dict[str, Ended]:
+    """All jobs, by name."""
+    waiting = list(jobs)
+    found = {}
+    with engine:
+        while len(found) < len(jobs):
+            while waiting and engine.room(waiting[0].stage) > 0:
+                engine.submit(waiting.pop(0))
+            found.update({job.name: ended for job, ended in engine.ended()})
+    return found
+
+
+def doubles(count: int) -> list[Job]:
+    return [Job(f"double {n}", "trials", faulty_jobs.double, (n,)) for n in range(count)]
+
+
+def job(function: object) -> Job:
+    return Job(function.__name__, "trials", function, ())  # type: ignore[attr-defined, arg-type]
+
+
+def test_every_fault_costs_its_own_job_only():
+    faults = [
+        job(faulty_jobs.raises),
+        job(faulty_jobs.refuses),
+        job(faulty_jobs.kills_its_process),
+        job(faulty_jobs.aborts),
+        job(faulty_jobs.hangs),
+        job(faulty_jobs.eats_memory),
+    ]
+    innocent = doubles(30)
+    jobs = [
+        one for pair in zip(faults, innocent[: len(faults)], strict=True) for one in pair
+    ] + innocent[len(faults) :]
+    found = run(LocalEngine(2, Limits(seconds=10.0, memory_mb=1000)), jobs)
+    assert {name: ended.state for name, ended in found.items() if ended.state != "done"} == {
+        "raises": "failed",
+        "refuses": "failed",
+        "kills_its_process": "crashed",
+        "aborts": "crashed",
+        "hangs": "timed out",
+        "eats_memory": "failed",
+    }
+    assert [found[one.name].value for one in innocent] == [2 * n for n in range(30)]
+    assert found["raises"].is_bug and found["raises"].why.rstrip().endswith("ValueError: a bug")
+    assert "Traceback" in found["raises"].why
+    assert not found["refuses"].is_bug and "to do: mend it" in found["refuses"].why
+    assert "SIGKILL" in found["kills_its_process"].why
+    assert "SIGABRT" in found["aborts"].why and "faulty_jobs.py" in found["aborts"].why
+    assert "not done after 10" in found["hangs"].why and "in hangs" in found["hangs"].why
+    assert "out of memory" in found["eats_memory"].why
+    assert found["hangs"].seconds >= 10.0
+    assert all(ended.state in STATES and ended.worker for ended in found.values())
+
+
+def test_quick_jobs_are_ready_before_the_last_has_ended():
+    """And those that wait for a process that dies, or hangs, are run by another."""
+    rest = doubles(40)
+    jobs = [
+        *rest[:20],
+        job(faulty_jobs.kills_its_process),
+        *rest[20:30],
+        job(faulty_jobs.hangs),
+        *rest[30:],
+    ]
+    with LocalEngine(1, Limits()) as engine:
+        assert engine.room("trials") == 2
+        engine.submit(jobs[0])
+        assert engine.room("trials") == 1
+    found = run(LocalEngine(1, Limits(seconds=8.0)), jobs)
+    states = {name: ended.state for name, ended in found.items() if ended.state != "done"}
+    assert states == {"kills_its_process": "crashed", "hangs": "timed out"}
+    assert [found[one.name].value for one in rest] == [2 * n for n in range(40)]
+
+
+def test_time_and_memory_are_told():
+    ended = attempt(Job("a", "trials", faulty_jobs.double, (3,)), "somebody")
+    assert (ended.state, ended.value, ended.worker) == ("done", 6, "somebody")
+    assert 0 <= ended.seconds < 600
+    assert 20 < ended.peak_mb < 20_000
+
+
+def test_the_peak_of_memory_is_the_jobs_own():
+    before = attempt(job(faulty_jobs.imported), "x").peak_mb
+    import numpy as np
+
+    large = attempt(Job("a", "trials", np.ones, (40_000_000,)), "x")
+    assert large.peak_mb > before + 300
+    del large
+    assert attempt(job(faulty_jobs.imported), "x").peak_mb < before + 100
+
+
+def test_trial_processes_load_neither_mitsuba_nor_open3d():
+    assert run(LocalEngine(1, Limits()), [job(faulty_jobs.imported)])["imported"].value == []
+
+
+OTHER_FOLDER = """
+from harness.runs.processes import LocalEngine
+from harness.runs.jobs import Job, Limits
+import os, sys
+
+os.chdir(sys.argv[1])
+with LocalEngine(1, Limits()) as engine:
+    engine.submit(Job("where", "trials", eval, ("__import__('sys').modules['harness.trials.trial'].__file__",)))
+    print(engine.ended()[0][1])
+"""
+
+
+def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_in(tmp_path):
+    """A second `harness`, as another checkout has it, would be found first in the folder where a
+    sweep is started."""
+    other = tmp_path / "harness" / "trials"
+    other.mkdir(parents=True)
+    for path in (other.parent / "__init__.py", other / "__init__.py", other / "trial.py"):
+        path.touch()
+    given = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900}
+    done = subprocess.run([sys.executable, "-c", OTHER_FOLDER, str(tmp_path)], **given)
+    assert str(ROOT / "harness" / "trials" / "trial.py") in done.stdout, done.stdout + done.stderr
+
+
+def test_serial_runs_here_and_in_order():
+    jobs = [Job("pid", "trials", os.getpid, ()), *doubles(3), job(faulty_jobs.raises)]
+    found = run(SerialEngine(), jobs)
+    assert found["pid"].value == os.getpid()
+    assert list(found) == [one.name for one in jobs]
+    assert found["raises"].state == "failed"
+
+
+def test_leaving_early_ends_processes_at_once():
+    """The job that hangs would never end by itself."""
+    engine = LocalEngine(2, Limits())
+    with pytest.raises(KeyboardInterrupt), engine:
+        engine.submit(Job("pid", "trials", os.getpid, ()))
+        ((_, ended),) = engine.ended()
+        engine.submit(job(faulty_jobs.hangs))
+        raise KeyboardInterrupt
+    with pytest.raises(ProcessLookupError):
+        os.kill(ended.value, 0)
+
+
+def test_processes_that_cannot_start_are_a_message(monkeypatch):
+    monkeypatch.setattr("harness.runs.processes.serve", faulty_jobs.dies_at_once)
+    with pytest.raises(UserError, match="3 worker processes in a row died as they started"):
+        run(LocalEngine(1, Limits()), doubles(1))
+
+
+def test_a_process_killed_between_jobs_costs_nothing():
+    with LocalEngine(1, Limits()) as engine:
+        engine.submit(Job("pid", "trials", os.getpid, ()))
+        ((_, first),) = engine.ended()
+        os.kill(first.value, signal.SIGKILL)
+        with contextlib.suppress(FileNotFoundError):
+            while "Z (zombie)" not in Path(f"/proc/{first.value}/status").read_text():
+                time.sleep(0.01)
+        states = []
+        for one in doubles(2):
+            engine.submit(one)
+            states += [ended.state for _, ended in engine.ended()]
+    assert states == ["done", "done"]
+
+
+def test_a_process_that_has_loaded_edited_code_is_refused(tmp_path, monkeypatch):
+    source = tmp_path / "edited_plug_in.py"
+    source.write_text("ANSWER = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    code = {"trials": (("edited_plug_in",), ("numpy",))}
+    found = run(LocalEngine(1, Limits(), code), doubles(2))
+    assert [ended.value for ended in found.values()] == [0, 2]
+    engine = LocalEngine(1, Limits(), code)
+    source.write_text("ANSWER = 2\n")
+    with pytest.raises(UserError, match="the code of trials was edited while this sweep ran"):
+        run(engine, doubles(1))
+
+
+def test_time_in_which_everything_stood_still_is_not_counted(monkeypatch):
+    """As after Ctrl-Z: the wait took an hour where a second was asked for."""
+    from harness.runs import processes
+
+    clock = {"ahead_s": 0.0}
+    real = time.monotonic
+    real_poll = Connection.poll
+    monkeypatch.setattr(processes.time, "monotonic", lambda: real() + clock["ahead_s"])
+
+    def stopped(pipe: Connection, timeout: float = 0.0) -> bool:
+        heard = real_poll(pipe, timeout)
+        if not heard and clock["ahead_s"] == 0.0:
+            clock["ahead_s"] = 3600.0
+        return heard
+
+    monkeypatch.setattr(Connection, "poll", stopped)
+    engine = LocalEngine(1, Limits(seconds=60.0))
+    found = run(engine, [Job("sleeps", "trials", time.sleep, (3.0,))])
+    assert clock["ahead_s"] == 3600.0 and found["sleeps"].state == "done"
+
+
+def test_a_full_disk_ends_everything(tmp_path, monkeypatch):
+    assert attempt(Job("full", "trials", faulty_jobs.finds_the_disk_full, ()), "x").ends_all
+    assert not attempt(job(faulty_jobs.refuses), "x").ends_all

@@ -1,0 +1,332 @@
+"""The run loop with an engine that runs nothing and ends jobs in any order: no trial is lost,
+whatever happens when."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from harness.experiment.load import load_experiment
+from harness.programs.cluster.merge import merge_into
+from harness.runs import run as engine_run
+from harness.runs.jobs import Ended, Job, Outcome, Stage, State
+from harness.runs.journal import Journal, record_text
+from harness.runs.plan import Group, SweepPlan, parts_of, plan_of
+from harness.runs.run import run_plan
+from harness.runs.shards import Shard
+from harness.trials.judge import FINDING_OCTAVES, grid
+from harness.trials.trial import TrialTask
+from tests.support.serial_run import trial_count
+from tests.support.tiny_sweep import STUDY, TINY
+
+STATES: tuple[State, ...] = ("failed", "crashed", "timed out")
+
+
+class Pretended:
+    """An engine: records are made up from the task, jobs end in the order that ``seed`` draws, or
+    badly by ``ends``."""
+
+    def __init__(
+        self,
+        seed: int = 0,
+        ends: Callable[[Job], State | None] = lambda job: None,
+        factor: float = 1.0,
+    ) -> None:
+        self._rng = random.Random(seed)
+        self._ends = ends
+        self._factor = factor
+        self._jobs: list[Job] = []
+        self.begun: Counter[str] = Counter()
+
+    def __enter__(self) -> Pretended:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def room(self, stage: Stage) -> int:
+        return 4 - len(self._jobs)
+
+    def submit(self, job: Job) -> None:
+        self._jobs.append(job)
+        self.begun[job.name] += 1
+
+    def ended(self) -> list[tuple[Job, Ended]]:
+        job = self._jobs.pop(self._rng.randrange(len(self._jobs)))
+        state = self._ends(job)
+        if state is not None:
+            return [(job, Ended(state, why="a fault"))]
+        if job.stage == "renders":
+            return [(job, Ended("done", (False, 0.1)))]
+        if job.name.startswith("pictures"):
+            return [(job, Ended("done", [job.name]))]
+        return [(job, Ended("done", made_up(job.arguments[0], self._factor)))]
+
+
+def made_up(task: TrialTask, factor: float = 1.0) -> str:
+    """A record. ``factor``: by which this machine's scores differ from another's."""
+    word = hashlib.sha256(f"{task.board} {task.repeat} {task.role}".encode()).digest()
+    quiet = factor * (3 + word[0] / 256)
+    runs = [
+        {
+            "point": one.digest,
+            "variant": one.variant,
+            "frames": one.frames,
+            "quiet_threshold": quiet if one.threshold is None else None,
+            "inspected_m2": 0.06,
+            "threshold": one.threshold,
+        }
+        for one in task.points
+    ]
+    operating = [
+        {
+            "variant": one.variant,
+            "frames": one.frames,
+            "threshold": grid(one.threshold, FINDING_OCTAVES).tolist(),
+        }
+        for one in task.points
+        if one.threshold is not None
+    ]
+    return record_text({"runs": runs, "operating": operating})
+
+
+PLANS = {
+    "units that share renders": (
+        TINY,
+        ["sweep={source.camera.unit_seed: [1, 2], capture.frames: [1, 3]}"],
+    ),
+    "distances": (TINY, ["sweep={source.target.distance_m: [0.6, 0.7]}", "repeats=3"]),
+    "a given threshold": (TINY, ["threshold={k: 5.0}", "sweep={source.camera.unit_seed: [1, 2]}"]),
+    "many repeats": (TINY, ["repeats=259", "threshold={calibrate: {repeats: 257}}"]),
+    "a study": (STUDY, []),
+    "a study of two distances": (STUDY, ["sweep={source.target.distance_m: [0.6, 0.7]}"]),
+    "a study of two ranges of damage": (
+        STUDY,
+        ["sweep={source.target.damage.diameter_mm: [[2.0, 8.0], [4.0, 9.0]]}"],
+    ),
+}
+
+
+@pytest.fixture(params=PLANS)
+def plan(request: pytest.FixtureRequest, tmp_path: Path) -> SweepPlan:
+    text, changes = PLANS[request.param]
+    (tmp_path / "tiny.yaml").write_text(text)
+    return plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path / "renders")
+
+
+def go(plan: SweepPlan, folder: Path, engine: Pretended, **asked: object) -> Outcome:
+    return run_plan(plan, Journal(folder), engine, lambda _: None, **asked)  # type: ignore[arg-type]
+
+
+def records(folder: Path) -> dict[str, str | None]:
+    return {key: entry.value for key, entry in Journal(folder).entries()}
+
+
+def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
+    expected = None
+    for seed in range(2):
+        engine = Pretended(seed)
+        outcome = go(plan, tmp_path / str(seed), engine)
+        assert set(engine.begun.values()) == {1}
+        assert (
+            outcome.failures == []
+            and len(outcome.finished) == trial_count(plan) == outcome.trials.done
+        )
+        assert outcome.renders.done == len(plan.renders)
+        pictures = [
+            f"pictures of set-up {n}"
+            for n, group in enumerate(plan.groups)
+            if group.damaged.board is None
+        ]
+        assert outcome.examples == pictures
+        found = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
+        assert expected is None or found == expected
+        expected = found
+
+
+def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
+    """Any trials are missing from the journal, others are left as failed or skipped."""
+    whole = go(plan, tmp_path / "whole", Pretended())
+    rng = random.Random(1)
+    for number in range(3):
+        folder = tmp_path / str(number)
+        kept = 0
+        journal = Journal(folder)
+        source = Journal(tmp_path / "whole")
+        for key in whole.finished:
+            entry = source.read(key)
+            assert entry is not None
+            chance = rng.random()
+            if number == 0 or chance < 0.5:
+                journal.write(key, entry)
+                kept += 1
+            elif chance < 0.7:
+                journal.write(key, Ended(rng.choice((*STATES, "skipped")), why="before"))
+        engine = Pretended(number)
+        outcome = go(plan, folder, engine, retry_failed=True)
+        assert (outcome.trials.found, outcome.trials.over) == (kept, trial_count(plan))
+        assert outcome.failures == [] and outcome.finished == whole.finished
+        assert outcome.examples == whole.examples, (
+            "pictures are made again, though every trial may be there"
+        )
+        assert records(folder) == records(tmp_path / "whole")
+        if number == 0:
+            simple = [group for group in plan.groups if group.damaged.board is None]
+            shown = {job.path.name for group in simple for job in group.damaged.renders}
+            assert {name for name in engine.begun if name.endswith(".npz")} == shown
+
+
+def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
+    """Renders, calibrations and judged trials end badly at random; mended by running on."""
+    for seed in range(3):
+        rng = random.Random(seed)
+
+        def ends(job: Job, rng: random.Random = rng) -> State | None:
+            return rng.choice(STATES) if rng.random() < 0.2 else None
+
+        folder = tmp_path / str(seed)
+        outcome = go(plan, folder, Pretended(seed, ends))
+        assert outcome.trials.over == outcome.trials.total
+        assert outcome.trials.failed <= len(outcome.failures)
+        assert {one.why for one in outcome.failures} <= {
+            "a fault",
+            *(f.why for f in outcome.failures),
+        }
+        mended = go(plan, folder, Pretended(seed), retry_failed=True)
+        assert mended.failures == [] and len(mended.finished) == trial_count(plan)
+
+
+def test_a_render_whose_process_dies_is_tried_once_more(plan, tmp_path):
+    died: Counter[str] = Counter()
+
+    def ends(job: Job) -> State | None:
+        died[job.name] += job.stage == "renders"
+        return "crashed" if died[job.name] == 1 else None
+
+    outcome = go(plan, tmp_path / "journal", Pretended(0, ends))
+    assert outcome.failures == [] and set(died.values()) <= {0, 2}
+
+
+def test_a_calibration_whose_process_dies_is_tried_once_more(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    plan = plan_of(load_experiment(tmp_path / "tiny.yaml"), tmp_path)
+    died: Counter[str] = Counter()
+
+    def ends(job: Job) -> State | None:
+        died[job.name] += job.name.startswith("hole_free")
+        return "crashed" if died[job.name] == 1 else None
+
+    outcome = go(plan, tmp_path / "journal", Pretended(0, ends))
+    assert outcome.failures == [] and sorted(died.values())[-2:] == [2, 2]
+
+
+def test_shards_that_finish_each_others_calibration(plan, tmp_path):
+    """While one shard works, another in the same folder does; in any order of events no judged
+    trial is lost."""
+    whole = go(plan, tmp_path / "whole", Pretended())
+    for seed in range(3):
+        folder = tmp_path / str(seed)
+
+        def other_is_faster(job: Job, folder: Path = folder) -> None:
+            source = Journal(tmp_path / "whole")
+            journal = Journal(folder)
+            for key in whole.finished:
+                entry = source.read(key)
+                if entry is not None and key.startswith(("calibration", "hole_free")):
+                    journal.write(key, entry)
+
+        rng = random.Random(seed)
+        at = rng.randrange(1, 6)
+
+        def ends(job: Job, at: int = at, seen: list[str] = [], faster=other_is_faster) -> None:  # noqa: B006
+            seen.append(job.name)
+            if len(seen) == at:
+                faster(job)
+
+        total = 0
+        for number in (1, 2):
+            outcome = go(plan, folder, Pretended(seed, ends), shard=Shard(number, 2))
+            assert outcome.failures == [] and outcome.trials.over == outcome.trials.total
+            total += outcome.trials.over
+        joined = go(plan, folder, Pretended())
+        assert (joined.trials.done, joined.trials.found) == (0, trial_count(plan))
+        assert total >= trial_count(plan)
+
+
+def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Path:
+    """Two shards, each with a folder of its own, the second on a machine whose scores differ by a
+    factor; merged into a third folder."""
+    into = Journal(home / "into")
+    for number, own in ((1, 1.0), (2, factor)):
+        go(plan, home / str(number), Pretended(factor=own), shard=Shard(number, 2))
+        assert not merge_into(into, Journal(home / str(number)), Counter()) or factor == 1.01
+    return home / "into"
+
+
+def test_shards_of_unlike_machines_lose_no_work(plan, tmp_path):
+    """Their thresholds differ in the last digits: nothing is judged again, and all rows state the
+    threshold in use."""
+    whole = go(plan, tmp_path / "whole", Pretended())
+    into = shards_of_unlike_machines(plan, tmp_path, 1 + 1e-9)
+    joined = go(plan, into, Pretended())
+    assert (joined.trials.done, joined.trials.found, joined.failures) == (0, trial_count(plan), [])
+    assert joined.thresholds == pytest.approx(whole.thresholds, rel=1e-8)
+    journal = Journal(into)
+    for key in joined.finished:
+        entry = journal.read(key)
+        assert entry is not None and entry.record is not None
+        of = {
+            (run["variant"], run["frames"]): joined.thresholds[run["point"]]
+            for run in entry.record["runs"]
+        }
+        assert all(
+            run["threshold"] in (None, of[run["variant"], run["frames"]])
+            for run in entry.record["runs"]
+        )
+        for row in entry.record["operating"]:
+            assert (
+                row["threshold"]
+                == grid(of[row["variant"], row["frames"]], FINDING_OCTAVES).tolist()
+            )
+
+
+def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
+    into = shards_of_unlike_machines(plan, tmp_path, 1.01)
+    joined = go(plan, into, Pretended())
+    judged = [parts_of(plan, Shard(number, 2))[1] for number in (1, 2)]
+    # groups that share their trials before thresholds also share them between shards
+    leaders = [group.leader or group for group in plan.groups]
+    shards = [
+        [id(leader) for leader, parts in zip(leaders, each, strict=True) if parts]
+        for each in judged
+    ]
+    both = [group for group in leaders if all(id(group) in each for each in shards) and group.first]
+    calibrates = any(
+        point.config.threshold.calibrate is not None for group in both for point in group.points
+    )
+    assert (joined.trials.done > 0) == calibrates
+    assert joined.failures == [] and joined.trials.over == trial_count(plan)
+
+
+def test_work_ahead_is_bounded(tmp_path, monkeypatch):
+    """However many repeats: a few thousand tasks are in memory, and the engine gets its first at
+    once."""
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    changes = ["repeats=100000", "threshold={k: 5.0}"]
+    plan = plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path)
+    made = []
+    real = Group._key
+
+    class Stopped(Pretended):
+        def ended(self) -> list[tuple[Job, Ended]]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Group, "_key", lambda *one: made.append(1) or real(*one))
+    with pytest.raises(KeyboardInterrupt):
+        go(plan, tmp_path / "journal", Stopped())
+    assert 0 < len(made) <= engine_run.AHEAD + 256

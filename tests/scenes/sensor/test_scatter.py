@@ -1,0 +1,67 @@
+"""Lens blur and stray light, on views known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.vocabulary.geometry import Region
+from scenes.closed_form import Plane, layered_view, plane_view
+from scenes.sensor.amcw.imager import scattered
+from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
+from scenes.sensor.source import SimulatedUnit
+
+REGION = Region(250, 330, 260, 380)
+
+
+def z_of(view_of, **scatter: float) -> np.ndarray:
+    numbers = {f"scatter.{key}": value for key, value in scatter.items()}
+    config = CameraConfig(effects=NO_EFFECTS, edge_gate=False, numbers=numbers)
+    camera = camera_of(config)
+    (frame,) = SimulatedUnit(camera, config, view_of(camera)).capture(1, 1, "scatter").frames()
+    return frame.z_m
+
+
+def test_a_point_keeps_its_light_and_gets_the_declared_width():
+    facts = camera_of(
+        CameraConfig(
+            numbers={"scatter.blur_px": 1.5, "scatter.stray_share": 0.2, "scatter.stray_px": 8.0}
+        )
+    ).scatter
+    point = np.zeros((2, 101, 121), np.complex64)
+    point[0, 50, 60], point[1, 40, 70] = 1.0, 2.0j
+    spread = scattered(point, facts)
+    v, u = np.mgrid[:101, :121]
+    assert spread.sum(axis=(1, 2)) == pytest.approx([1.0, 2.0j], abs=1e-5)
+    for along, at in ((u, 60), (v, 50)):
+        variance = (spread[0].real * (along - at) ** 2).sum()
+        assert variance == pytest.approx(0.8 * 1.5**2 + 0.2 * 8.0**2, rel=0.01)
+
+
+def test_stray_light_draws_a_near_patch_towards_its_surroundings():
+    """A tenth of the light from far and wide: the phasor of what is 1.5 times as near and small
+    keeps nine tenths."""
+
+    def patch(camera):
+        near = layered_view(
+            camera,
+            REGION,
+            Plane(0.6),
+            Plane(0.7),
+            lambda s: np.abs(s + 0.03).max(axis=-1) < 0.012,
+            0.6,
+        )
+        return near
+
+    def far(camera):
+        return plane_view(camera, REGION, 0.7, 0.6)
+
+    clean = z_of(patch, stray_share=0.0, stray_px=30.0)
+    stray = z_of(patch, stray_share=0.1, stray_px=30.0)
+    middle = clean < 0.605
+    assert middle.sum() > 20
+    drawn = np.nanmedian(stray[middle]) - np.nanmedian(clean[middle])
+    # a tenth of light that is (0.6 / 0.7)^2 as strong and 0.1 m farther, by the smallest and
+    # largest frequency's rule
+    assert 0.002 < drawn < 0.012
+    assert np.abs(z_of(far, stray_share=0.1, stray_px=30.0) - z_of(far)).max() < 0.0011
