@@ -10,11 +10,11 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from mutants.draw import Equivalents, all_mutants, drawn, named
-from mutants.kinds import Mutant
-from mutants.page import Trial, page
-from mutants.rooms import room_tests
-from mutants.trying import BrokenTests, Tree, tried
+from tests.mutants.draw import Equivalents, all_mutants, drawn, named
+from tests.mutants.kinds import Mutant
+from tests.mutants.page import Trial, page
+from tests.mutants.rooms import room_tests
+from tests.mutants.trying import BrokenTests, Tree, tried
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]

@@ -9,47 +9,61 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from mutants.kinds import Mutant, mutants_of, named_mutant, on_one_line
+from tests.mutants.kinds import Mutant, mutants_of, named_mutant, on_one_line
 
 PRODUCT = ("scenes", "detectors", "harness")
 NUMERIC = (
     "scenes/*.py",
     "detectors/*.py",
     "harness/evaluation/*.py",
-    "harness/thesis/*.py",
-    "harness/engine/*.py",
-    "harness/runs/*.py",
-    "harness/trials/*.py",
-    "harness/own_camera/*.py",
-    "harness/scorecard/*.py",
     "harness/inspection/*.py",
     "harness/programs/*.py",
+    "harness/runs/*.py",
+    "harness/stills/*.py",
+    "harness/trials/*.py",
     "harness/vocabulary/geometry.py",
 )
 """Modules whose mutants are drawn; ``*`` also stands for folders."""
 NOT_NUMERIC = (
     "*/__init__.py",
-    *("*/page.py", "*/pages.py", "*/command.py", "*/program.py", "*/arguments.py", "*/output.py"),
-    *("*/settings.py", "*/tables.py", "*/pictures.py", "*/plug_ins.py", "*/listing.py"),
-    *(
-        "*/journal.py",
-        "*/processes.py",
-        "*/cluster.py",
-        "*/cluster/*",
-        "*/keeping/*",
-        "*/plug_ins/*",
-    ),
-    *("detectors/recordings/bags.py", "detectors/recordings/messages.py"),
-    *("detectors/recordings/devices.py", "detectors/recordings/opening.py"),
+    "*page.py",
+    "*tables.py",
+    "*/settings.py",
+    # open, read, write or show files
+    "detectors/recordings/bags.py",
+    "detectors/recordings/devices.py",
+    "detectors/recordings/messages.py",
+    "detectors/recordings/opening.py",
+    "harness/inspection/arguments.py",
+    "harness/inspection/output.py",
+    "harness/programs/dataset/exchange.py",
+    "harness/programs/keeping/*",
+    # start and end processes
+    "harness/programs/cluster/*",
+    "harness/runs/engines.py",
+    "harness/runs/journal.py",
+    "harness/runs/options.py",
+    "harness/runs/pictures.py",
+    "harness/runs/processes.py",
+    "harness/runs/results_folder.py",
 )
-"""Modules among these that read, write, show or start something."""
+"""Modules among these that compute nothing."""
+COMMAND = b"@program("  # in a module that is the command of a program
 
 
 def numeric_modules(root: Path) -> list[str]:
     """Return the paths of the numeric modules in a checkout."""
-    paths = [path.relative_to(root).as_posix() for path in product_modules(root)]
-    numeric = [path for path in paths if any(fnmatch(path, pattern) for pattern in NUMERIC)]
-    return [path for path in numeric if not any(fnmatch(path, pattern) for pattern in NOT_NUMERIC)]
+    modules: list[str] = []
+    for path in product_modules(root):
+        file = path.relative_to(root).as_posix()
+        is_numeric = _matches(file, NUMERIC) and not _matches(file, NOT_NUMERIC)
+        if is_numeric and COMMAND not in path.read_bytes():
+            modules.append(file)
+    return modules
+
+
+def _matches(file: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch(file, pattern) for pattern in patterns)
 
 
 def product_modules(root: Path) -> list[Path]:

@@ -339,13 +339,15 @@ def named_mutant(
     file: str, data: bytes, function: str, original: str, replaced: str
 ) -> Mutant | None:
     """Return the fault that replaces ``original``, a text that occurs once in a function; else
-    None. White space in the text stands for any white space."""
+    None. Line breaks and the commas before closing brackets may differ."""
     source = Source(data)
     ranges = [(0, len(data))] if function == OUTSIDE else []
     for node, name in _nodes(source.tree, OUTSIDE):
         if name == function and isinstance(node, ast.FunctionDef | ast.ClassDef):
             ranges.append((source.start(node), source.end(node)))
-    pattern = re.compile(rb"\s+".join(re.escape(word.encode()) for word in original.split()))
+    tokens = [re.escape(token) for token in re.findall(r"\w+|\S", original)]
+    broken = [rf",?\s*{token}" if token in (r"\)", r"\]") else token for token in tokens]
+    pattern = re.compile(r"\s*".join(broken).encode())
     hits = [hit for start, end in ranges for hit in pattern.finditer(data, start, end)]
     if len(hits) != 1:
         return None

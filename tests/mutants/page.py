@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scipy.stats import binomtest
 
-from mutants.kinds import RULES, Mutant
+from tests.mutants.kinds import RULES, Mutant
 
 HEAD = """# Mutants: small faults that the tests must notice
 

@@ -24,25 +24,23 @@ def module_name(file: str) -> str:
 
 
 def room_tests(tree: Path, file: str) -> tuple[list[str], list[str]]:
-    """Return the test files of a module's room: those that import the module, and the others. The
-    room's tests stand in the folder of ``tests`` with the module's path, or else in the nearest
-    folder around it that has tests. If that is ``tests`` itself, only files that import the module
-    count or, without any, those that import something of its package."""
-    folder = tree / "tests" / Path(file).parent
+    """Return the test files of a module's room: those that import the module, and the others.
+
+    The room's tests stand in the folder of ``tests`` with the module's path, or else in the nearest
+    folder around it that has tests. Files in folders around these count if they import the
+    module."""
+    tests = tree / "tests"
+    folder = tests / Path(file).parent
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
-    paths = sorted(folder.glob("test_*.py"))
-    direct = [path for path in paths if module_name(file) in imported(path)]
-    further = [path for path in paths if path not in direct]
-    if folder == tree / "tests":
-        further = [] if direct else [path for path in paths if _imports_package(path, file)]
+    in_room = sorted(folder.glob("test_*.py"))
+    candidates = list(in_room)
+    while folder != tests:
+        folder = folder.parent
+        candidates += sorted(folder.glob("test_*.py"))
+    direct = [path for path in candidates if module_name(file) in imported(path)]
+    further = [path for path in in_room if path not in direct]
     return _relative(direct, tree), _relative(further, tree)
-
-
-def _imports_package(path: Path, file: str) -> bool:
-    """Return whether a test file imports something of the package of a module."""
-    package = module_name(str(Path(file).parent))
-    return any(f"{name}.".startswith(f"{package}.") for name in imported(path))
 
 
 def _relative(paths: list[Path], tree: Path) -> list[str]:

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from mutants.__main__ import HERE, ROOT, stored, try_all
-from mutants.draw import Equivalents, all_mutants, drawn, named, numeric_modules
-from mutants.kinds import RULES, mutants_of, named_mutant
-from mutants.page import Trial, page
-from mutants.rooms import room_tests
-from mutants.trying import BrokenTests, Tree, run_tests, users_of_kernels
+from tests.mutants.__main__ import HERE, ROOT, stored, try_all
+from tests.mutants.draw import Equivalents, all_mutants, drawn, named, numeric_modules
+from tests.mutants.kinds import RULES, mutants_of, named_mutant
+from tests.mutants.page import Trial, page
+from tests.mutants.rooms import room_tests
+from tests.mutants.trying import BrokenTests, Tree, run_tests, users_of_kernels
 
 KINDS = {
     "constant": [
@@ -177,7 +177,8 @@ def test_of_an_expression_one_mutant_at_most_is_drawn():
 
 
 def test_a_named_fault_is_found_by_its_function_and_text():
-    code = b"def f():\n    return max(a,\n        b)\ndef g():\n    return max(a, b)\n"
+    function = b"def f():\n    return max(\n        a,\n        b,\n    )\n"
+    code = function + b"def g():\n    return max(a, b)\n"
     mutant = named_mutant("a.py", code, "f", "max(a, b)", "min(a, b)")
     assert mutant is not None
     assert (
@@ -199,7 +200,7 @@ def test_all_equivalent_mutants_are_in_the_code():
 
 def test_the_numeric_modules_are_those_that_compute():
     modules = numeric_modules(ROOT)
-    assert {"scenes/optics.py", "detectors/hole_model.py"} <= set(modules)
+    assert {"scenes/optics.py", "detectors/findings/hole_model.py"} <= set(modules)
     assert not {"harness/__init__.py", "harness/sweep.py", "harness/report/page.py"} & set(modules)
 
 
@@ -244,7 +245,7 @@ def test_tests_that_fail_without_a_fault_are_refused(tiny: Path, tmp_path: Path)
         Tree(tiny, tmp_path).seconds(["tests/scenes/test_broken.py"])
 
 
-def test_room_tests_a_module_are_those_of_the_nearest_folder(tmp_path: Path):
+def test_tests_of_a_module_are_those_of_the_nearest_folder(tmp_path: Path):
     tests = tmp_path / "tests"
     (tests / "harness" / "room").mkdir(parents=True)
     (tests / "test_all.py").touch()

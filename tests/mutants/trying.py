@@ -18,9 +18,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mutants.draw import PRODUCT, product_modules
-from mutants.kinds import Mutant
-from mutants.rooms import imported, module_name, room_tests
+from tests.mutants.draw import PRODUCT, product_modules
+from tests.mutants.kinds import Mutant
+from tests.mutants.rooms import imported, module_name, room_tests
 
 EXTRA_S = 60.0
 FACTOR = 3.0
