@@ -92,8 +92,8 @@ def main() -> int:
     missing = [mutant for mutant in mutants if mutant.key not in records]
     try:
         for mutant in missing:
-            direct, further = room_tests(tree.folder, mutant.file)
-            tree.seconds([*direct, *further])
+            direct, indirect = room_tests(tree.folder, mutant.file)
+            tree.seconds([*direct, *indirect])
     except BrokenTests as error:
         print(error, file=sys.stderr)
         return 1
@@ -124,11 +124,11 @@ def _chosen(root: Path, arguments: argparse.Namespace) -> tuple[list[Mutant], li
 
 def _print_list(mutants: Sequence[Mutant]) -> None:
     for mutant in mutants:
-        direct, further = room_tests(ROOT, mutant.file)
+        direct, indirect = room_tests(ROOT, mutant.file)
         print(f"{mutant.file} {mutant.function} ({mutant.kind})")
         print(f"    - {mutant.original}\n    + {mutant.mutant}")
         names = " ".join(Path(file).stem for file in direct)
-        print(f"    {names}; then {len(further)} further files of the room")
+        print(f"    {names}; then {len(indirect)} files of the room")
 
 
 def _report_named(trials: Sequence[Trial], lost: Sequence[str]) -> int:

@@ -28,6 +28,7 @@ NOT_NUMERIC = (
     "*/__init__.py",
     "*page.py",
     "*tables.py",
+    "*/program.py",
     "*/settings.py",
     # open, read, write or show files
     "detectors/recordings/bags.py",
@@ -38,6 +39,7 @@ NOT_NUMERIC = (
     "harness/inspection/output.py",
     "harness/programs/dataset/exchange.py",
     "harness/programs/keeping/*",
+    "scenes/render/cache.py",
     # start and end processes
     "harness/programs/cluster/*",
     "harness/runs/engines.py",

@@ -14,7 +14,8 @@ GUARD = 1e-6
 """A constant up to this size only prevents a division by zero: doubled or 0, it is no fault that a
 test could see."""
 OUTSIDE = "<module>"  # the function of a statement outside of all functions
-SKIPPED_FUNCTIONS = {"_options"}  # the options of a program
+SKIPPED_FUNCTIONS = {"_options", "_draw", "_figure", "_plot"}  # options of a program, and figures
+DRAWN_ON = re.compile(r"(axis|axes|ax|figure|plt)\.")  # objects whose methods lay out a figure
 SKIPPED_CALLS = {"UserError", "add_argument", "print", "warn", "subplots", "figure", "savefig"}
 SYMMETRIC_CALLS = {
     "min",
@@ -179,11 +180,11 @@ def _constants(source: Source, node: ast.AST) -> Iterator[Edit]:
 def _comparisons(source: Source, node: ast.AST) -> Iterator[Edit]:
     if not isinstance(node, ast.Compare):
         return
-    lefts = [node.left, *node.comparators]
-    for left, operator, right in zip(lefts, node.ops, node.comparators, strict=False):
+    operands = [node.left, *node.comparators]
+    for first, operator, second in zip(operands, node.ops, node.comparators, strict=False):
         old, replacements = COMPARISONS.get(type(operator), ("", ()))
         for new in replacements:
-            yield from _between(source, left, right, old, new)
+            yield from _between(source, first, second, old, new)
 
 
 def _signs(source: Source, node: ast.AST) -> Iterator[Edit]:
@@ -247,8 +248,8 @@ def _and_and_or(source: Source, node: ast.AST) -> Iterator[Edit]:
     if isinstance(node, ast.BinOp) and type(node.op) in MASKS:
         yield from _between(source, node.left, node.right, *MASKS[type(node.op)])
     elif isinstance(node, ast.BoolOp):
-        for left, right in zip(node.values, node.values[1:], strict=False):
-            yield from _between(source, left, right, *WORDS[type(node.op)])
+        for first, second in zip(node.values, node.values[1:], strict=False):
+            yield from _between(source, first, second, *WORDS[type(node.op)])
 
 
 def _dropped_functions(source: Source, node: ast.AST) -> Iterator[Edit]:
@@ -273,7 +274,8 @@ RULES = {
 def _is_skipped(node: ast.AST) -> bool:
     """Return whether no fault is sought in a node: a message, an import, a version, an option."""
     if isinstance(node, ast.Call):
-        return _name_of(node) in SKIPPED_CALLS
+        is_layout = DRAWN_ON.match(ast.unparse(node.func)) is not None
+        return is_layout or _name_of(node) in SKIPPED_CALLS
     if isinstance(node, ast.FunctionDef):
         return node.name in SKIPPED_FUNCTIONS
     if isinstance(node, ast.Assign):

@@ -39,8 +39,8 @@ def room_tests(tree: Path, file: str) -> tuple[list[str], list[str]]:
         folder = folder.parent
         candidates += sorted(folder.glob("test_*.py"))
     direct = [path for path in candidates if module_name(file) in imported(path)]
-    further = [path for path in in_room if path not in direct]
-    return _relative(direct, tree), _relative(further, tree)
+    indirect = [path for path in in_room if path not in direct]
+    return _relative(direct, tree), _relative(indirect, tree)
 
 
 def _relative(paths: list[Path], tree: Path) -> list[str]:

@@ -31,7 +31,7 @@ PATIENCE = 10.0
 PYTEST = ("-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0")
 FAILURE = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 NO_TESTS = 5  # pytest's exit code if all tests are deselected
-OWN = "tests/mutants/"  # not copied: a further equivalent mutant changes no test
+OWN = "tests/mutants/"  # not copied: another equivalent mutant changes no test
 COPIED = (*PRODUCT, "tests")  # folders with compiled files
 COMPILED = ("*.nbi", "*.nbc")  # files in which numba keeps kernels
 
@@ -175,8 +175,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 def tried(mutant: Mutant, tree: Tree) -> TestRun:
     """Return the outcome of the room's tests on a mutant: first of the files that import the
     module, and in both groups the fastest file first."""
-    direct, further = room_tests(tree.folder, mutant.file)
-    seconds = tree.seconds([*direct, *further])
+    direct, indirect = room_tests(tree.folder, mutant.file)
+    seconds = tree.seconds([*direct, *indirect])
     limit_s = EXTRA_S + FACTOR * seconds["all"]
     compiled_in = users_of_kernels(tree.folder, mutant.file)
     total_s = 0.0
@@ -184,7 +184,7 @@ def tried(mutant: Mutant, tree: Tree) -> TestRun:
         copy = Path(scratch) / "tree"
         shutil.copytree(tree.folder, copy)
         put_in(mutant, copy, compiled_in)
-        for group in (direct, further):
+        for group in (direct, indirect):
             if not group:
                 continue
             files = sorted(group, key=lambda file: seconds[file])
