@@ -90,28 +90,38 @@ def main() -> int:
     if arguments.rerun_survivors:
         records = {key: record for key, record in records.items() if record[0] != "survived"}
     missing = [mutant for mutant in mutants if mutant.key not in records]
-    try:
-        for mutant in missing:
-            direct, indirect = room_tests(tree.folder, mutant.file)
-            tree.seconds([*direct, *indirect])
-    except BrokenTests as error:
-        print(error, file=sys.stderr)
-        return 1
-    records.update(try_all(missing, tree, results, arguments.jobs))
+    broken = _broken_files(missing, tree)
+    for file, why in broken.items():
+        print(f"{file}: not tried: {why}", file=sys.stderr)
+    ready = [mutant for mutant in missing if mutant.file not in broken]
+    records.update(try_all(ready, tree, results, arguments.jobs))
     equivalents = Equivalents(HERE / "equivalent.yaml")
     trials: list[Trial] = []
     for mutant in mutants:
-        state, test = records[mutant.key]
-        trials.append(Trial(mutant, state, test, equivalents.reason(mutant)))
+        if mutant.key in records:
+            state, test = records[mutant.key]
+            trials.append(Trial(mutant, state, test, equivalents.reason(mutant)))
     if arguments.named:
-        return _report_named(trials, lost)
+        return max(_report_named(trials, lost), int(bool(broken)))
     text = page(trials, arguments.seed)
     print(text)
     if arguments.page is not None:
         arguments.page.write_text(text)
     for line in equivalents.stale(tree.folder):
         print(f"equivalent.yaml: no longer in the code: {line}", file=sys.stderr)
-    return 0
+    return int(bool(broken))
+
+
+def _broken_files(mutants: Sequence[Mutant], tree: Tree) -> dict[str, str]:
+    """Return why mutants cannot be tried, by file: the tests of its room fail anyway."""
+    broken: dict[str, str] = {}
+    for file in dict.fromkeys(mutant.file for mutant in mutants):
+        direct, indirect = room_tests(tree.folder, file)
+        try:
+            tree.seconds([*direct, *indirect])
+        except BrokenTests as error:
+            broken[file] = str(error)
+    return broken
 
 
 def _chosen(root: Path, arguments: argparse.Namespace) -> tuple[list[Mutant], list[str]]:

@@ -24,8 +24,8 @@ from tests.mutants.rooms import imported, module_name, room_tests
 
 EXTRA_S = 60.0
 FACTOR = 3.0
-"""The tests of a mutant may take so many processor seconds more than this multiple of those of the
-unchanged tests, as kernels are compiled anew."""
+"""The tests of a mutant may take so many processor seconds more than this multiple of the seconds
+of the unchanged tests, as kernels are compiled anew."""
 PATIENCE = 10.0
 """Real seconds per processor second of this limit after which a process waits in vain."""
 PYTEST = ("-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0")
@@ -67,9 +67,10 @@ class Tree:
             digest.update(name.encode() + b"\0" + (root / name).read_bytes())
         self._digest = digest.hexdigest()
         self._seconds: dict[str, dict[str, float]] = {}
+        self._failures: dict[str, str] = {}
         stored = json.loads(self._record.read_text()) if self._record.exists() else {}
         if stored.get("digest") == self._digest:
-            self._seconds = stored["rooms"]
+            self._seconds = stored["seconds"]
             return
         shutil.rmtree(self.folder, ignore_errors=True)
         for name in files:
@@ -83,21 +84,29 @@ class Tree:
                 shutil.copytree(cache, self.folder / relative)
 
     def seconds(self, files: list[str]) -> dict[str, float]:
-        """Return the seconds of each of the test files of a room on the unchanged product, and the
-        processor seconds of all together by the name "all". Raises BrokenTests if one fails."""
-        room = " ".join(sorted(files))
-        if room not in self._seconds:
-            report = self.folder.parent / "report.xml"
-            before = _processor_seconds()
-            run = run_tests(self.folder, files, 3600.0, f"--junitxml={report}")
-            spent = _processor_seconds() - before
-            if run.state != "passed":
-                what = run.test or run.state
-                raise BrokenTests(f"{what}: the tests fail on the unchanged product")
-            self._seconds[room] = {"all": spent, **_seconds_of_files(report, files)}
-            record = {"digest": self._digest, "rooms": self._seconds}
-            self._record.write_text(json.dumps(record, indent=1))
-        return self._seconds[room]
+        """Return the seconds of test files on the unchanged product, which are measured once for
+        all files of a folder. Raises BrokenTests if one of them fails."""
+        seconds: dict[str, float] = {}
+        for folder in sorted({Path(file).parent.as_posix() for file in files}):
+            if folder in self._failures:
+                raise BrokenTests(self._failures[folder])
+            if folder not in self._seconds:
+                self._seconds[folder] = self._measured(folder)
+                record = {"digest": self._digest, "seconds": self._seconds}
+                self._record.write_text(json.dumps(record, indent=1))
+            seconds.update(self._seconds[folder])
+        return {file: seconds[file] for file in files}
+
+    def _measured(self, folder: str) -> dict[str, float]:
+        paths = sorted((self.folder / folder).glob("test_*.py"))
+        files = [path.relative_to(self.folder).as_posix() for path in paths]
+        report = self.folder.parent / "report.xml"
+        run = run_tests(self.folder, files, 3600.0, f"--junitxml={report}")
+        if run.state != "passed":
+            what = run.test or run.state
+            self._failures[folder] = f"{what}: the tests fail on the unchanged product"
+            raise BrokenTests(self._failures[folder])
+        return _seconds_of_files(report, files)
 
 
 def _files(root: Path) -> list[str]:
@@ -118,12 +127,6 @@ def _seconds_of_files(report: Path, files: list[str]) -> dict[str, float]:
             if classname == module or classname.startswith(f"{module}."):
                 seconds[file] += float(case.get("time", "0"))
     return seconds
-
-
-def _processor_seconds() -> float:
-    """Return the processor time of all processes that have been started and have ended."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 def run_tests(tree: Path, files: list[str], limit_s: float, *options: str) -> TestRun:
@@ -177,7 +180,7 @@ def tried(mutant: Mutant, tree: Tree) -> TestRun:
     module, and in both groups the fastest file first."""
     direct, indirect = room_tests(tree.folder, mutant.file)
     seconds = tree.seconds([*direct, *indirect])
-    limit_s = EXTRA_S + FACTOR * seconds["all"]
+    limit_s = EXTRA_S + FACTOR * sum(seconds.values())
     compiled_in = users_of_kernels(tree.folder, mutant.file)
     total_s = 0.0
     with tempfile.TemporaryDirectory(prefix="mutant-", ignore_cleanup_errors=True) as scratch:
