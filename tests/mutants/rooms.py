@@ -27,15 +27,15 @@ def room_tests(tree: Path, file: str) -> tuple[list[str], list[str]]:
     """Return the test files of a module's room: those that import the module, and the others.
 
     The room's tests stand in the folder of ``tests`` with the module's path, or else in the nearest
-    folder around it that has tests. Files in folders around these count if they import the
-    module."""
-    tests = tree / "tests"
-    folder = tests / Path(file).parent
+    folder around it that has tests. Files in the folders around count if they import the module,
+    but for those of ``tests`` itself, which look at the whole."""
+    whole = (tree / "tests", tree)
+    folder = tree / "tests" / Path(file).parent
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
     in_room = sorted(folder.glob("test_*.py"))
     candidates = list(in_room)
-    while folder != tests:
+    while folder.parent not in whole:
         folder = folder.parent
         candidates += sorted(folder.glob("test_*.py"))
     direct = [path for path in candidates if module_name(file) in imported(path)]

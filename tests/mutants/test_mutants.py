@@ -249,16 +249,19 @@ def test_tests_that_fail_without_a_fault_are_refused(tiny: Path, tmp_path: Path)
 def test_tests_of_a_module_are_those_of_the_nearest_folder(tmp_path: Path):
     tests = tmp_path / "tests"
     (tests / "harness" / "room").mkdir(parents=True)
-    (tests / "test_all.py").touch()
+    (tests / "test_all.py").write_text("import harness.room.deep\n")
     (tests / "harness" / "test_harness.py").touch()
+    (tests / "harness" / "test_user.py").write_text("import harness.room.deep\n")
     (tests / "harness" / "room" / "test_a.py").touch()
     (tests / "harness" / "room" / "test_b.py").write_text("from harness.room import deep\n")
     (tests / "harness" / "room" / "test_c.py").write_text("import harness.room.deep\n")
     folder = "tests/harness/room"
-    expected = ([f"{folder}/test_b.py", f"{folder}/test_c.py"], [f"{folder}/test_a.py"])
-    assert room_tests(tmp_path, "harness/room/deep.py") == expected
-    assert room_tests(tmp_path, "harness/room/deeper/flat.py") == ([], [*expected[1], *expected[0]])
-    assert room_tests(tmp_path, "harness/other/flat.py") == ([], ["tests/harness/test_harness.py"])
+    around = ["tests/harness/test_harness.py", "tests/harness/test_user.py"]
+    in_room = [f"{folder}/test_a.py", f"{folder}/test_b.py", f"{folder}/test_c.py"]
+    direct = [*in_room[1:], around[1]]
+    assert room_tests(tmp_path, "harness/room/deep.py") == (direct, in_room[:1])
+    assert room_tests(tmp_path, "harness/room/deeper/flat.py") == ([], in_room)
+    assert room_tests(tmp_path, "harness/other/flat.py") == ([], around)
 
 
 def test_kernels_that_contain_a_changed_module_are_compiled_anew(tmp_path: Path):
