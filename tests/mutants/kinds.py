@@ -340,18 +340,19 @@ def mutants_of(file: str, data: bytes) -> list[Mutant]:
 def named_mutant(
     file: str, data: bytes, function: str, original: str, replaced: str
 ) -> Mutant | None:
-    """Return the fault that replaces ``original``, a text that occurs once in a function; else
-    None. Line breaks and the commas before closing brackets may differ."""
+    """Return the fault that replaces ``original``, a text that occurs once in a function or, if not
+    there, in the file; else None. Line breaks and commas before closing brackets may differ."""
     source = Source(data)
-    ranges = [(0, len(data))] if function == OUTSIDE else []
+    ranges = [(0, len(data))]
     for node, name in _nodes(source.tree, OUTSIDE):
         if name == function and isinstance(node, ast.FunctionDef | ast.ClassDef):
-            ranges.append((source.start(node), source.end(node)))
+            ranges.insert(0, (source.start(node), source.end(node)))
     tokens = [re.escape(token) for token in re.findall(r"\w+|\S", original)]
     broken = [rf",?\s*{token}" if token in (r"\)", r"\]") else token for token in tokens]
     pattern = re.compile(r"\s*".join(broken).encode())
-    hits = [hit for start, end in ranges for hit in pattern.finditer(data, start, end)]
-    if len(hits) != 1:
-        return None
-    edit = Edit(hits[0].start(), hits[0].end(), replaced)
-    return mutant_of(source, file, function, "named", edit)
+    for start, end in ranges:
+        hits = list(pattern.finditer(data, start, end))
+        if len(hits) == 1:
+            edit = Edit(hits[0].start(), hits[0].end(), replaced)
+            return mutant_of(source, file, function, "named", edit)
+    return None

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from tests.mutants.__main__ import HERE, ROOT, stored, try_all
-from tests.mutants.draw import Equivalents, all_mutants, drawn, named, numeric_modules
+from tests.mutants.draw import (
+    Equivalents,
+    all_mutants,
+    drawn,
+    entries,
+    named,
+    numeric_modules,
+)
 from tests.mutants.kinds import RULES, mutants_of, named_mutant
 from tests.mutants.page import Trial, page
 from tests.mutants.rooms import room_tests
@@ -185,18 +192,41 @@ def test_a_named_fault_is_found_by_its_function_and_text():
     assert (
         mutant.applied(code) == b"def f():\n    return min(a, b)\ndef g():\n    return max(a, b)\n"
     )
-    assert named_mutant("a.py", code, "h", "max(a, b)", "min(a, b)") is None
-    assert named_mutant("a.py", code, "<module>", "max(a, b)", "min(a, b)") is None
+    assert named_mutant("a.py", code, "h", "max(a, b)", "min(a, b)") is None, (
+        "it stands there twice"
+    )
+    moved = named_mutant("a.py", function, "h", "max(a, b)", "min(a, b)")
+    assert moved is not None, "a function may be renamed"
+    assert named_mutant("a.py", code, "f", "max(a, c)", "min(a, b)") is None
 
 
-def test_all_listed_faults_are_in_the_code():
-    mutants, lost = named(ROOT, HERE / "named.yaml")
-    assert lost == []
-    assert len(mutants) >= 17
+def test_the_lists_can_be_read(tmp_path: Path):
+    fields = ["file", "function", "original", "replaced", "says", "test"]
+    listed = entries(HERE / "named.yaml")
+    assert len(listed) >= 17
+    assert all(list(entry) == fields for entry in listed)
+    fields = ["file", "function", "original", "mutant", "reason"]
+    assert all(list(entry) == fields for entry in entries(HERE / "equivalent.yaml"))
 
 
-def test_all_equivalent_mutants_are_in_the_code():
-    assert Equivalents(HERE / "equivalent.yaml").stale(ROOT) == []
+def test_a_listed_fault_is_sought_in_all_modules_if_its_file_has_moved(tiny: Path, tmp_path: Path):
+    listed = tmp_path / "named.yaml"
+    entry = "- {file: old.py, function: area, original: width < 0, replaced: width > 0}\n"
+    listed.write_text(entry + entry.replace("width < 0", "width < 1"))
+    mutants, lost = named(tiny, listed)
+    assert [mutant.mutant for mutant in mutants] == ["if width > 0:"]
+    assert lost == ["old.py: area does not have once: width < 1"]
+
+
+def test_an_equivalent_mutant_keeps_its_reason_until_its_text_changes(tiny: Path, tmp_path: Path):
+    listed = tmp_path / "equivalent.yaml"
+    entry = "- {file: harness/tiny.py, function: area, original: if width < 0:, reason: None is 0,"
+    listed.write_text(f"{entry} mutant: if width <= 0:}}\n{entry} mutant: if width <= 1:}}\n")
+    equivalents = Equivalents(listed)
+    mutants = [mutant for mutant in all_mutants(tiny, "*") if mutant.kind == "comparison"]
+    reasons = {mutant.mutant: equivalents.reason(mutant) for mutant in mutants}
+    assert reasons == {"if width <= 0:": "None is 0", "if width > 0:": None}
+    assert equivalents.stale(tiny) == ["tiny.py | area | if width < 0: | if width <= 1:"]
 
 
 def test_the_numeric_modules_are_those_that_compute():
