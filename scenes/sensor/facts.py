@@ -35,13 +35,14 @@ class Fact(Config, Generic[T]):
 
     @model_validator(mode="after")
     def _guess_has_a_range(self) -> Fact[T]:
-        low, high = self.range or (np.nan, np.nan)
-        if (self.tag == "G") != (self.range is not None) or (
-            self.range and not low <= self.value <= high
-        ):  # type: ignore[operator]
-            raise ValueError(
-                "a number with the tag G, and no other, states the `range` that it may lie in"
-            )
+        message = "a number with the tag G, and no other, states the `range` that it may lie in"
+        if (self.tag == "G") != (self.range is not None):
+            raise ValueError(message)
+        if self.range is not None:
+            low, high = self.range
+            value: Any = self.value
+            if not low <= value <= high:
+                raise ValueError(message)
         return self
 
 
