@@ -26,11 +26,11 @@ from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import at_once as sums_of_frames
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.at_once import BEND, SCALE
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
-from scenes.sensor.amcw.linear import light_of_samples
+from scenes.sensor.amcw.light import light_of_samples
+from scenes.sensor.amcw.linear_frames import BEND, SCALE
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 
@@ -209,7 +209,7 @@ def test_so_have_those_of_a_dim_and_distant_face(name: str):
     assert unit.at_once is not None
     knee = float(camera.converter.knee_units.value)
     light = light_of_samples(unit.exposure, knee, np.ones(len(camera.frequencies_hz)))
-    assert 0.055 < np.median(light.turn.max(axis=0)) < 0.13
+    assert 0.055 < np.median(light.phase_noise.max(axis=0)) < 0.13
     assert_alike(unit, *clouds_before(unit))
 
 
