@@ -13,10 +13,8 @@ FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil"
 """Compiler options of all camera kernels: operations are neither reordered nor fused, so that
 every processor gives the same bits. Values may be infinite: an unlit pixel may divide by zero and
 is gated out later."""
-EXACT_SUMS: Any = {
-    **FAST,
-    "fastmath": {"nsz", "reassoc"},
-}  # of whole numbers that float32 holds: exact in any order
+# of whole numbers that float32 holds: exact in any order
+EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 """The same for float64 sums that are rounded to float32 afterwards; their order changes a range by
 1e-13 m."""
@@ -87,14 +85,15 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
     return a, b
 
 
-def _bits(of: Any, into: Any) -> Any:
+def _bits(source: Any, target: Any) -> Any:
     """Return a compiled function that reinterprets the bits of a number of one type as another
     type."""
 
+    def generate(context, builder, _, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], context.get_value_type(target))
+
     def cast(context, value):  # type: ignore[no-untyped-def]
-        return into(of), lambda inner, builder, _, args: builder.bitcast(
-            args[0], inner.get_value_type(into)
-        )
+        return target(source), generate
 
     return intrinsic(cast)
 
@@ -103,8 +102,13 @@ float_bits = _bits(types.float32, types.uint32)
 bits_float = _bits(types.uint32, types.float32)
 
 
+def _generate_fused(context: Any, builder: Any, _: Any, args: Any) -> Any:
+    a, b, c = args
+    return builder.fma(a, b, c)
+
+
 def _fused(context: Any, a: Any, b: Any, c: Any) -> Any:
-    return types.float32(*3 * (types.float32,)), lambda _, builder, __, args: builder.fma(*args)
+    return types.float32(types.float32, types.float32, types.float32), _generate_fused
 
 
 fma: Any = intrinsic(_fused)
