@@ -49,7 +49,14 @@ def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> Si
     row = int(lens.cy)
     col = int(lens.cx)
     region = Region(row - half_h, row + half_h, col - half_w, col + half_w)
-    view = plane_view(camera, region, distance_m, albedo, 0.05, 0.02)
+    view = plane_view(
+        camera,
+        region,
+        distance_m,
+        albedo,
+        0.05,
+        0.02,
+    )
     return SimulatedUnit(camera, ONLY_NOISE.model_copy(update={"name": camera.name}), view)
 
 

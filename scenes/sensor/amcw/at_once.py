@@ -111,11 +111,26 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     edge = edge.reshape(len(edge), n)
     filtered = unknown_filtered(len(light.phase_noise), n)
     is_even = even_pixels(edge, light, window, shape, lost)
-    even_moves = fill_even(is_even, alone, edge, light, window, shape, filtered)
+    even_moves = fill_even(
+        is_even,
+        alone,
+        edge,
+        light,
+        window,
+        shape,
+        filtered,
+    )
     # in the finished image, the engine looks one pixel beyond the requested ones
     is_uneven = ~(is_even | lost) & pixels_within(pixels, 3).ravel()
     uneven = np.flatnonzero(is_uneven)
-    uneven_moves = linearised(uneven, light, window, shape, lost, filtered)
+    uneven_moves = linearised(
+        uneven,
+        light,
+        window,
+        shape,
+        lost,
+        filtered,
+    )
 
     # which pixels must be simulated one by one
     unit = imager.camera.unit
@@ -137,7 +152,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     )
     flying = imager.engine.flying is not None
     listing = listed_of(undecided.reshape(shape), window.space.shape[0], flying)
-    halo = Light(*(np.ascontiguousarray(part[:, listing.halo]) for part in light))
+    halo = Light._make(np.ascontiguousarray(part[:, listing.halo]) for part in light)
     halo_noise = (metres_by_phase[:, listing.halo] * halo.phase_noise).T
     shares = halo_noise / np.sqrt((halo_noise**2).sum(axis=1, keepdims=True))
     return AtOnce(
@@ -188,28 +203,28 @@ def _linear(
     kind = np.full(n, NONE, np.uint8)
 
     # even pixels: one number for all neighbours, and one for the centre
-    at = even.pixels
-    kind[at] = np.where(certain.always[at], EVEN, NONE)
-    carried = light.amplitude[:, at] if settings.by_amplitude else 1.0
-    moves_m = metres * even.moves.by_neighbour * carried * light.phase_noise[:, at]
-    by_neighbours = np.sqrt((moves_m**2).sum(axis=0)) * by_path[at] / step_m
+    pixels = even.pixels
+    kind[pixels] = np.where(certain.always[pixels], EVEN, NONE)
+    carried = light.amplitude[:, pixels] if settings.by_amplitude else 1.0
+    moves_m = metres * even.moves.by_neighbour * carried * light.phase_noise[:, pixels]
+    by_neighbours = np.sqrt((moves_m**2).sum(axis=0)) * by_path[pixels] / step_m
     centre_m = metres * even.moves.by_centre
-    by_own = np.sqrt((centre_m**2).sum(axis=0)) * by_path[at] / step_m
+    by_own = np.sqrt((centre_m**2).sum(axis=0)) * by_path[pixels] / step_m
     by_neighbour = np.zeros(n, f4)
-    by_neighbour[at] = by_neighbours / noise[at]
+    by_neighbour[pixels] = by_neighbours / noise[pixels]
     by_centre = np.zeros(n, f4)
-    by_centre[at] = (by_own - space[middle, middle] * by_neighbours) / noise[at]
+    by_centre[pixels] = (by_own - space[middle, middle] * by_neighbours) / noise[pixels]
 
     # uneven pixels: a number for each neighbour, with the sign of the sum over the frequencies
     always = certain.always[uneven.pixels]
-    at = uneven.pixels[always]
-    kind[at] = UNEVEN
+    pixels = uneven.pixels[always]
+    kind[pixels] = UNEVEN
     row = np.zeros(n, np.int32)
-    row[at] = np.arange(len(at))
+    row[pixels] = np.arange(len(pixels))
     pulls_m = metres[:, :, None] * uneven.moves[:, always]
     size_m = np.copysign(np.sqrt((pulls_m**2).sum(axis=0)), pulls_m.sum(axis=0))
-    moves = size_m * by_path[at, None] / f4(step_m)
-    moves /= windows_of(noise.reshape(imager.region.shape), side, 1.0, at)
+    moves = size_m * by_path[pixels, None] / f4(step_m)
+    moves /= windows_of(noise.reshape(imager.region.shape), side, 1.0, pixels)
 
     # windows with zeros around them, up to an odd multiple of `TOGETHER`
     padded_side = 2 * TOGETHER * ((side + 4) // (2 * TOGETHER)) + TOGETHER
@@ -407,7 +422,13 @@ class AtOnce:
         flying = np.zeros((len(listing.wanted), LANES), bool)
         if flying_gate is not None:
             ranging.find_flying(
-                z_m, total, reason, listing.wanted, listing.neighbours, flying_gate, flying
+                z_m,
+                total,
+                reason,
+                listing.wanted,
+                listing.neighbours,
+                flying_gate,
+                flying,
             )
         add_listed_frames(
             z_m,
@@ -449,12 +470,12 @@ class AtOnce:
         never = np.flatnonzero(certain.never)
         reasons[certain.reason[never], never] = frames
         reasons[Reason.VALID, certain.always] = frames
-        at = self.listed
-        count[at] = listed_sums.valid[part]
-        total[at] = listed_sums.total[part]
-        squares[at] = listed_sums.squares[part]
-        amplitude[at] = listed_sums.amplitude[part]
-        reasons[:, at] = listed_sums.reasons[part]
+        listed = self.listed
+        count[listed] = listed_sums.valid[part]
+        total[listed] = listed_sums.total[part]
+        squares[listed] = listed_sums.squares[part]
+        amplitude[listed] = listed_sums.amplitude[part]
+        reasons[:, listed] = listed_sums.reasons[part]
         return FrameTotals(
             frames=frames,
             step_m=self.imager.camera.z_step_m,

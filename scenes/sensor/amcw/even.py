@@ -94,8 +94,8 @@ def fill_even(
         by_centre=np.empty((len(edge), len(pixels)), f4),
     )
     for f in range(len(edge)):
-        light_of_frequency = Light(*(part[f] for part in light))
-        filtered_of_frequency = Filtered(*(part[f] for part in filtered))
+        light_of_frequency = Light._make(part[f] for part in light)
+        filtered_of_frequency = Filtered._make(part[f] for part in filtered)
         amplitude = light_of_frequency.amplitude
         carried = amplitude if window.by_amplitude else np.ones_like(amplitude)
         _fill_even(
@@ -154,7 +154,14 @@ def _noise_table(window: FilterSettings) -> NoiseTable:
     lost = np.zeros(count * k, bool)
     middles = np.arange(count) * k + k // 2
     noisy = middles[1:]  # the first window has no noise
-    moves = linearised(noisy, light, window, (count * side, side), lost, filtered)[0]
+    moves = linearised(
+        noisy,
+        light,
+        window,
+        (count * side, side),
+        lost,
+        filtered,
+    )[0]
     corner_weight = window.space.ravel()[0] / window.space.sum()
     neighbour_share = np.ones(count)
     neighbour_share[1:] = moves[:, 0] / NOISES[1:] / corner_weight
@@ -182,7 +189,7 @@ def _fill_even(  # type: ignore[no-untyped-def]
     """Do the work of `fill_even` for one frequency."""
     middle = space[len(space) // 2, len(space) // 2]
     neighbours = space.size - 1
-    whole = space.sum()
+    space_sum = space.sum()
     step = LARGEST_NOISE / (len(table.neighbour_share) - 1)
     for m in range(pixels.size):
         i = pixels[m]
@@ -211,7 +218,7 @@ def _fill_even(  # type: ignore[no-untyped-def]
         # noise perpendicular to a mean phasor lengthens it
         filtered.amplitude[i] = alone[2, i] * (1 + 0.5 * variance if by_amplitude else 1.0)
         filtered.phase_noise[i] = np.sqrt(variance)
-        filtered.amplitude_noise[i] = np.sqrt(sums.amplitude_variance[i]) / whole
+        filtered.amplitude_noise[i] = np.sqrt(sums.amplitude_variance[i]) / space_sum
         filtered.higher_share[i] = higher / variance
         # each neighbour's difference has the noise of two pixels; the centre's is in all
         filtered.edge[i] = edge[i] + 0.5 * neighbours * (1 - np.exp(-noise2))

@@ -91,8 +91,8 @@ def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, floa
         if np.abs(multiples - np.round(multiples)).max() < 1e-6 * divisor:
             return np.round(multiples).astype(np.int64), float(lowest / divisor)
     legal = "frequencies that are integer multiples (the lowest at most 64 times) of a common one"
-    what = f"modulation frequencies {[f / 1e6 for f in frequencies_hz]} MHz share no base frequency"
-    raise UserError(what, legal=legal)
+    in_mhz = [f / 1e6 for f in frequencies_hz]
+    raise UserError(f"modulation frequencies {in_mhz} MHz share no base frequency", legal=legal)
 
 
 def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:

@@ -54,7 +54,17 @@ class FilterSettings(NamedTuple):
 
 @numba.njit(**FAST)
 def expose(  # type: ignore[no-untyped-def]
-    means, sigma, limit, normals, knee, gains, cosines, sines, unit, amplitude, saturated
+    means,
+    sigma,
+    limit,
+    normals,
+    knee,
+    gains,
+    cosines,
+    sines,
+    unit,
+    amplitude,
+    saturated,
 ):
     """Convert samples to unit phasors and amplitudes.
 
@@ -78,7 +88,7 @@ def expose(  # type: ignore[no-untyped-def]
         re = unit[0, f]
         im = unit[1, f]
         length = amplitude[f]
-        scale = gains[f] * np.float32(2.0) / np.float32(n_phases)
+        scale = gains[f] * f4(2.0) / f4(n_phases)
         re[:] = ZERO
         im[:] = ZERO
         for k in range(n_phases):
@@ -123,7 +133,14 @@ def _start_of(j, f, n_frequencies):  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def noisy_phasors(  # type: ignore[no-untyped-def]
-    phasor, amplitude, phase_noise, relative_noise, shares, words, planes, noise
+    phasor,
+    amplitude,
+    phase_noise,
+    relative_noise,
+    shares,
+    words,
+    planes,
+    noise,
 ):
     """Draw `LANES` frames of g listed pixels.
 
@@ -142,12 +159,12 @@ def noisy_phasors(  # type: ignore[no-untyped-def]
     length_plane = np.uint64(2 * STRIDE)
     for j in range(g):
         for f in range(n_frequencies):
-            c = np.float32(phasor[f, j].real)
-            s = np.float32(phasor[f, j].imag)
+            c = f4(phasor[f, j].real)
+            s = f4(phasor[f, j].imag)
             share = shares[j, f]
-            size = np.float32(amplitude[f, j])
-            across_noise = np.float32(amplitude[f, j] * phase_noise[f, j])
-            along_noise = np.float32(amplitude[f, j] * relative_noise[f, j])
+            size = f4(amplitude[f, j])
+            across_noise = f4(amplitude[f, j] * phase_noise[f, j])
+            along_noise = f4(amplitude[f, j] * relative_noise[f, j])
             start = np.uint64(_start_of(j, f, n_frequencies))
             for t in range(np.uint64(LANES)):
                 first, second = normal_pair(words[j, f, t])
@@ -165,7 +182,14 @@ def noisy_phasors(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always", **FAST)
-def _with_neighbour(planes, index, weight, centre, by_amplitude, sums):  # type: ignore[no-untyped-def]
+def _with_neighbour(  # type: ignore[no-untyped-def]
+    planes,
+    index,
+    weight,
+    centre,
+    by_amplitude,
+    sums,
+):
     """Return the sums over a window with one neighbour more.
 
     Args:
@@ -204,7 +228,17 @@ def _with_neighbour(planes, index, weight, centre, by_amplitude, sums):  # type:
 
 
 @numba.njit(**FAST)
-def _filter_window(planes, centre, starts, space, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
+def _filter_window(  # type: ignore[no-untyped-def]
+    planes,
+    centre,
+    starts,
+    space,
+    length,
+    settings,
+    total,
+    filtered,
+    edge,
+):
     """Filter values side by side: pixels of a row, or frames of a pixel. Indices are unsigned: the
     compiler gathers by signed ones.
 
@@ -260,11 +294,46 @@ def _filter_window(planes, centre, starts, space, length, settings, total, filte
                 total[weight_plane + x],
                 total[gap_plane + x],
             )
-            sums = _with_neighbour(planes, s1 + x, w1, pixel, by_amplitude, sums)
-            sums = _with_neighbour(planes, s2 + x, w2, pixel, by_amplitude, sums)
-            sums = _with_neighbour(planes, s3 + x, w3, pixel, by_amplitude, sums)
-            sums = _with_neighbour(planes, s4 + x, w4, pixel, by_amplitude, sums)
-            sums = _with_neighbour(planes, s5 + x, w5, pixel, by_amplitude, sums)
+            sums = _with_neighbour(
+                planes,
+                s1 + x,
+                w1,
+                pixel,
+                by_amplitude,
+                sums,
+            )
+            sums = _with_neighbour(
+                planes,
+                s2 + x,
+                w2,
+                pixel,
+                by_amplitude,
+                sums,
+            )
+            sums = _with_neighbour(
+                planes,
+                s3 + x,
+                w3,
+                pixel,
+                by_amplitude,
+                sums,
+            )
+            sums = _with_neighbour(
+                planes,
+                s4 + x,
+                w4,
+                pixel,
+                by_amplitude,
+                sums,
+            )
+            sums = _with_neighbour(
+                planes,
+                s5 + x,
+                w5,
+                pixel,
+                by_amplitude,
+                sums,
+            )
             total[x] = sums[0]
             total[im_plane + x] = sums[1]
             total[amplitude_plane + x] = sums[2]
@@ -331,7 +400,17 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
         for q in range(side * side):
             starts[q] = 3 * ((below + 1 + q // side) % side) * STRIDE + q % side
         centre = 3 * (y % side) * STRIDE + half
-        _filter_window(rows, centre, starts, space, w, settings, total, filtered[:, y], edge[y])
+        _filter_window(
+            rows,
+            centre,
+            starts,
+            space,
+            w,
+            settings,
+            total,
+            filtered[:, y],
+            edge[y],
+        )
 
 
 @numba.njit(**FAST)

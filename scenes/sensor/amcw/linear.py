@@ -46,7 +46,11 @@ UNIFORM_VARIANCE = 0.125
 f4 = np.float32
 REACH = f4(DEVIATIONS)
 SQRT_3 = f4(np.sqrt(3.0))
+SIXTEENTH = f4(1 / 16)
 SIXTH = f4(1 / 6)
+FACTORIAL_4 = f4(1 / 24)
+FACTORIAL_5 = f4(1 / 120)
+FACTORIAL_6 = f4(1 / 720)
 QUARTER = f4(0.25)
 HALF = f4(0.5)
 ZERO = f4(0)
@@ -128,8 +132,8 @@ def linearised(
     """
     moves = np.zeros((len(light.phase_noise), len(pixels), window.space.size), f4)
     for f, moves_of_frequency in enumerate(moves):
-        light_of_frequency = Light(*(part[f] for part in light))
-        filtered_of_frequency = Filtered(*(part[f] for part in filtered))
+        light_of_frequency = Light._make(part[f] for part in light)
+        filtered_of_frequency = Filtered._make(part[f] for part in filtered)
         _linearise(
             pixels,
             light_of_frequency,
@@ -149,34 +153,42 @@ ROW = np.uint64(ABREAST)  # indices are unsigned: the compiler gathers by signed
 
 # Values of a neighbour, each a row for `ABREAST` pixels. A neighbour's values begin at its slot; a
 # complex value has its imaginary part one row behind its real part.
-DIRECTION = ROW * np.uint64(0)  # complex: exp(i t) of the phase minus the centre's
-AMPLITUDE = ROW * np.uint64(2)  # as in `Light`
-MEAN_AMPLITUDE = ROW * np.uint64(3)  # as in `Light`
-PHASE_NOISE = ROW * np.uint64(4)  # as in `Light`
-AMPLITUDE_NOISE = ROW * np.uint64(5)  # deviation of the amplitude
-SPACE = ROW * np.uint64(6)  # s_j: weight by distance, 0 if the neighbour does not count
-WEIGHT = ROW * np.uint64(7)  # weight in the filter: s_j exp(-c (1 - cos t))
-FIRST = ROW * np.uint64(8)  # complex: s_j E[F'], then over S
-SECOND = ROW * np.uint64(10)  # complex: s_j E[F'']
-MOVE = ROW * np.uint64(12)  # change of arg S by the neighbour's phase
-VALUES = ROW * np.uint64(13)  # from one slot to the next
+DIRECTION = ROW * 0  # complex: exp(i t) of the phase minus the centre's
+AMPLITUDE = ROW * 2  # as in `Light`
+MEAN_AMPLITUDE = ROW * 3  # as in `Light`
+PHASE_NOISE = ROW * 4  # as in `Light`
+AMPLITUDE_NOISE = ROW * 5  # deviation of the amplitude
+SPACE = ROW * 6  # s_j: weight by distance, 0 if the neighbour does not count
+WEIGHT = ROW * 7  # weight in the filter: s_j exp(-c (1 - cos t))
+FIRST = ROW * 8  # complex: s_j E[F'], then over S
+SECOND = ROW * 10  # complex: s_j E[F'']
+MOVE = ROW * 12  # change of arg S by the neighbour's phase
+VALUES = ROW * 13  # from one slot to the next
 
 # Values of a pixel, each a row.
-CONCENTRATION = ROW * np.uint64(0)  # c, or 0 if the centre is dim
-LIT = ROW * np.uint64(1)  # 1 if the centre is certainly bright
-CERTAIN = ROW * np.uint64(2)  # 1 if it is certain which neighbours count
-LARGEST_NOISE = ROW * np.uint64(3)  # largest phase noise of the neighbours that count
-FITS = ROW * np.uint64(4)  # above 0 if the linear model holds
-SUMS = tuple(ROW * np.uint64(row) for row in range(5, 16))
+CONCENTRATION = ROW * 0  # c, or 0 if the centre is dim
+LIT = ROW * 1  # 1 if the centre is certainly bright
+CERTAIN = ROW * 2  # 1 if it is certain which neighbours count
+LARGEST_NOISE = ROW * 3  # largest phase noise of the neighbours that count
+FITS = ROW * 4  # above 0 if the linear model holds
+SUMS = tuple(ROW * row for row in range(5, 16))
 """Rows for sums over the window, which each function names for itself."""
-END = ROW * np.uint64(16)
+END = ROW * 16
 
 
 # ---------------------------------------------------------------- one frequency, all pixels
 
 
 @numba.njit(**FAST)
-def _linearise(pixels, light, window, shape, lost, filtered, moves):  # type: ignore[no-untyped-def]
+def _linearise(  # type: ignore[no-untyped-def]
+    pixels,
+    light,
+    window,
+    shape,
+    lost,
+    filtered,
+    moves,
+):
     """Do the work of `linearised` for one frequency; arrays have no first axis."""
     k = window.space.size
     middle = k // 2
@@ -191,24 +203,67 @@ def _linearise(pixels, light, window, shape, lost, filtered, moves):  # type: ig
         for x in range(ABREAST):
             batch[x] = pixels[min(start + x, pixels.size - 1)]
         written = batch[: min(ABREAST, pixels.size - start)]
-        _gather(batch, light, window.space, shape, lost, values)
+        _gather(
+            batch,
+            light,
+            window.space,
+            shape,
+            lost,
+            values,
+        )
         _choose_neighbours(window, centre, neighbours, values, sums)
-        _write_edges(written, window, centre, neighbours, values, sums, filtered)
+        _write_edges(
+            written,
+            window,
+            centre,
+            neighbours,
+            values,
+            sums,
+            filtered,
+        )
         _write_amplitudes(
-            written, light.phasor, by_amplitude, centre, neighbours, values, sums, filtered
+            written,
+            light.phasor,
+            by_amplitude,
+            centre,
+            neighbours,
+            values,
+            sums,
+            filtered,
         )
         if sums[FITS : FITS + ROW].max() > ZERO:
             _write_mean_phasors(
-                written, light.phasor, by_amplitude, centre, neighbours, values, sums, filtered
+                written,
+                light.phasor,
+                by_amplitude,
+                centre,
+                neighbours,
+                values,
+                sums,
+                filtered,
             )
             moves_of_batch = moves[start : start + ABREAST]
             _write_phase_noise(
-                written, by_amplitude, centre, neighbours, values, sums, filtered, moves_of_batch
+                written,
+                by_amplitude,
+                centre,
+                neighbours,
+                values,
+                sums,
+                filtered,
+                moves_of_batch,
             )
 
 
 @numba.njit(**FAST)
-def _gather(batch, light, space, shape, lost, values):  # type: ignore[no-untyped-def]
+def _gather(  # type: ignore[no-untyped-def]
+    batch,
+    light,
+    space,
+    shape,
+    lost,
+    values,
+):
     """Fill ``values`` with the windows of the pixels in ``batch`` (`ABREAST`,)."""
     h, w = shape
     side = space.shape[0]
@@ -216,17 +271,16 @@ def _gather(batch, light, space, shape, lost, values):  # type: ignore[no-untype
     for x in range(batch.size):
         i = batch[x]
         slot = np.uint64(x)
-        top = i // w - half
-        left = i % w - half
+        first_row = i // w - half
+        first_column = i % w - half
         for dy in range(side):
             for dx in range(side):
-                row = top + dy
-                column = left + dx
+                row = first_row + dy
+                column = first_column + dx
                 inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
                 j = row * w + column if inside else i
                 direction = light.phasor[j] * light.phasor[i].conjugate()
-                values[slot + DIRECTION] = direction.real
-                values[slot + DIRECTION + ROW] = direction.imag
+                _put(values, slot + DIRECTION, direction.real, direction.imag)
                 values[slot + AMPLITUDE] = light.amplitude[j]
                 values[slot + MEAN_AMPLITUDE] = light.mean_amplitude[j]
                 values[slot + PHASE_NOISE] = min(light.phase_noise[j], LARGEST_PHASE_NOISE)
@@ -282,10 +336,13 @@ def _choose_neighbours(window, centre, neighbours, values, sums):  # type: ignor
 def _exp(x):  # type: ignore[no-untyped-def]
     """Return the exponential of -8 <= x <= 0, to 2e-5 of its value: the sixteenth power of a
     series."""
-    t = x * f4(1 / 16)
-    e = ONE + t * (
-        ONE + t * (HALF + t * (f4(1 / 6) + t * (f4(1 / 24) + t * (f4(1 / 120) + t * f4(1 / 720)))))
-    )
+    t = x * SIXTEENTH
+    e = FACTORIAL_5 + t * FACTORIAL_6
+    e = FACTORIAL_4 + t * e
+    e = SIXTH + t * e
+    e = HALF + t * e
+    e = ONE + t * e
+    e = ONE + t * e
     e = e * e
     e = e * e
     e = e * e
@@ -296,7 +353,15 @@ def _exp(x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def _write_edges(written, window, centre, neighbours, values, sums, filtered):  # type: ignore[no-untyped-def]
+def _write_edges(  # type: ignore[no-untyped-def]
+    written,
+    window,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
+):
     """Write the edge sum's mean, deviation and bounds."""
     dim = window.dim
     dim_edges = window.dim_edges
@@ -336,8 +401,7 @@ def _write_edges(written, window, centre, neighbours, values, sums, filtered):  
             sums[doubtful_count + x] += counted - certainly
             sums[certain_count + x] += certainly
             length = certainly * min(ONE, f4(RESULTANT_SLOPE) / max(noise, f4(1e-9)))
-            sums[resultant + x] += re * length
-            sums[resultant + ROW + x] += im * length
+            _add(sums, resultant + x, re * length, im * length)
             # a phase that is known scatters by half its noise
             scatter = QUARTER * noise2 if noise < f4(LARGEST_NORMAL) else f4(UNIFORM_VARIANCE)
             sums[bound_variance + x] += certainly * scatter
@@ -379,7 +443,14 @@ def _write_edges(written, window, centre, neighbours, values, sums, filtered):  
 
 @numba.njit(**FAST)
 def _write_amplitudes(  # type: ignore[no-untyped-def]
-    written, phasor, by_amplitude, centre, neighbours, values, sums, filtered
+    written,
+    phasor,
+    by_amplitude,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
 ):
     """Write the filtered amplitude and its deviation, and the filtered phasor if noise leaves the
     phases unchanged."""
@@ -395,7 +466,7 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
         sums[amplitudes + x] = weight * values[centre + MEAN_AMPLITUDE + x]
         sums[variance + x] = (weight * values[centre + AMPLITUDE_NOISE + x]) ** 2
         sums[by_centre + x] = ZERO
-        _put(sums, total + x, complex(weight * values[centre + AMPLITUDE + x], ZERO))
+        _put(sums, total + x, weight * values[centre + AMPLITUDE + x], ZERO)
     for slot in neighbours:
         for x in range(ROW):
             c = sums[CONCENTRATION + x]
@@ -409,15 +480,15 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
             sums[weights + x] += weight
             sums[amplitudes + x] += weight * values[slot + MEAN_AMPLITUDE + x]
             # noise across lengthens a phasor by what it takes from its mean
-            sums[total + x] += weight * values[slot + AMPLITUDE + x] * re
-            sums[total + ROW + x] += weight * values[slot + AMPLITUDE + x] * im
+            size = weight * values[slot + AMPLITUDE + x]
+            _add(sums, total + x, size * re, size * im)
             sums[variance + x] += (weight * values[slot + AMPLITUDE_NOISE + x]) ** 2
     for x in range(ROW):
         size = np.sqrt(_squared(_complex_at(sums, total + x)))
-        whole = max(sums[weights + x], NEVER_ZERO)
+        weight_sum = max(sums[weights + x], NEVER_ZERO)
         sums[length + x] = max(size, NEVER_ZERO)
-        sums[weights + x] = whole
-        sums[amplitudes + x] = (size if by_amplitude else sums[amplitudes + x]) / whole
+        sums[weights + x] = weight_sum
+        sums[amplitudes + x] = (size if by_amplitude else sums[amplitudes + x]) / weight_sum
     # noise of phases changes weights and how phasors add up: its variance, times the squared sum
     # of weights
     for slot in neighbours:
@@ -457,9 +528,15 @@ def _complex_at(values, index):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always", **FAST)
-def _put(values, index, z):  # type: ignore[no-untyped-def]
-    values[index] = z.real
-    values[index + ROW] = z.imag
+def _put(values, index, re, im):  # type: ignore[no-untyped-def]
+    values[index] = re
+    values[index + ROW] = im
+
+
+@numba.njit(inline="always", **FAST)
+def _add(values, index, re, im):  # type: ignore[no-untyped-def]
+    values[index] += re
+    values[index + ROW] += im
 
 
 @numba.njit(inline="always", **FAST)
@@ -468,10 +545,12 @@ def _squared(z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always", **FAST)
-def _inverse(z):  # type: ignore[no-untyped-def]
-    """Return 1 / z, 0 where z is 0."""
-    size = ONE / max(_squared(z), NEVER_ZERO * NEVER_ZERO)
-    return complex(z.real * size, -z.imag * size)
+def _invert(values, source, target):  # type: ignore[no-untyped-def]
+    """Write 1 / z of the number at ``source`` to ``target``, 0 where z is 0."""
+    re = values[source]
+    im = values[source + ROW]
+    size = ONE / max(re * re + im * im, NEVER_ZERO * NEVER_ZERO)
+    _put(values, target, re * size, -im * size)
 
 
 # ---------------------------------------------------------------- the phase
@@ -505,7 +584,14 @@ def _mean_derivatives(c, direction, v):  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def _write_mean_phasors(  # type: ignore[no-untyped-def]
-    written, phasor, by_amplitude, centre, neighbours, values, sums, filtered
+    written,
+    phasor,
+    by_amplitude,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
 ):
     """Write the mean phasor, and into ``values`` the `MOVE` of its phase by each neighbour's
     phase."""
@@ -534,35 +620,33 @@ def _write_mean_phasors(  # type: ignore[no-untyped-def]
                 turn = complex(np.cos(angle), np.sin(angle))
             else:
                 turn = _complex_at(sums, node + x).conjugate()
-            _put(sums, node + x, turn)
-            _put(sums, total + x, complex(values[centre + SPACE + x], ZERO))
+            _put(sums, node + x, turn.real, turn.imag)
+            _put(sums, total + x, values[centre + SPACE + x], ZERO)
         sums[squares : squares + ROW + ROW] = ZERO
         # S, and each neighbour's derivatives
         for slot in neighbours:
             for x in range(ROW):
                 noise = values[slot + PHASE_NOISE + x]
                 space = values[slot + SPACE + x]
-                turn_back = complex(sums[node + x], -sums[node + ROW + x])
+                turn_back = _complex_at(sums, node + x).conjugate()
                 direction = _complex_at(values, slot + DIRECTION + x) * turn_back
                 value, first, second = _mean_derivatives(
                     sums[CONCENTRATION + x], direction, noise * noise
                 )
-                sums[total + x] += space * value.real
-                sums[total + ROW + x] += space * value.imag
-                values[slot + FIRST + x] = space * first.real
-                values[slot + FIRST + ROW + x] = space * first.imag
-                values[slot + SECOND + x] = space * second.real
-                values[slot + SECOND + ROW + x] = space * second.imag
+                _add(sums, total + x, space * value.real, space * value.imag)
+                _put(values, slot + FIRST + x, space * first.real, space * first.imag)
+                _put(values, slot + SECOND + x, space * second.real, space * second.imag)
         for x in range(ROW):
-            _put(sums, inverse + x, _inverse(_complex_at(sums, total + x)))
+            _invert(sums, total + x, inverse + x)
         # E[dS^2] / S^2
         for slot in neighbours:
             for x in range(ROW):
                 first = _complex_at(values, slot + FIRST + x) * _complex_at(sums, inverse + x)
                 noise2 = values[slot + PHASE_NOISE + x] ** 2
-                _put(values, slot + FIRST + x, first)
-                sums[squares + x] += noise2 * (first.real * first.real - first.imag * first.imag)
-                sums[squares + ROW + x] += noise2 * TWO * first.real * first.imag
+                re = first.real
+                im = first.imag
+                _put(values, slot + FIRST + x, re, im)
+                _add(sums, squares + x, noise2 * (re * re - im * im), noise2 * TWO * re * im)
         # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and
         # -3 S' S'' / S^2
         for slot in neighbours:
@@ -577,22 +661,30 @@ def _write_mean_phasors(  # type: ignore[no-untyped-def]
                 values[slot + MOVE + x] += share * (first * together).imag
         # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
         for x in range(ROW):
-            whole = _complex_at(sums, total + x)
+            phasor_sum = _complex_at(sums, total + x)
             correction = complex(ONE, -HALF * sums[squares + ROW + x])
-            size = share / max(np.sqrt(_squared(whole)), NEVER_ZERO)
-            turned = whole * correction * _complex_at(sums, node + x)
-            sums[mean + x] += size * turned.real
-            sums[mean + ROW + x] += size * turned.imag
+            size = share / max(np.sqrt(_squared(phasor_sum)), NEVER_ZERO)
+            turned = phasor_sum * correction * _complex_at(sums, node + x)
+            _add(sums, mean + x, size * turned.real, size * turned.imag)
     for x in range(written.size):
         if sums[FITS + x] > ZERO:
             i = written[x]
-            whole = _complex_at(sums, mean + x)
-            filtered.phasor[i] = whole * phasor[i] / max(np.sqrt(_squared(whole)), NEVER_ZERO)
+            mean_phasor = _complex_at(sums, mean + x)
+            filtered.phasor[i] = (
+                mean_phasor * phasor[i] / max(np.sqrt(_squared(mean_phasor)), NEVER_ZERO)
+            )
 
 
 @numba.njit(**FAST)
 def _write_phase_noise(  # type: ignore[no-untyped-def]
-    written, by_amplitude, centre, neighbours, values, sums, filtered, moves
+    written,
+    by_amplitude,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
+    moves,
 ):
     """Write the phase's deviation, the share of its variance that is not of first order in phases,
     and its ``moves`` (`ABREAST` or fewer, k) by each neighbour's noise."""
@@ -604,15 +696,15 @@ def _write_phase_noise(  # type: ignore[no-untyped-def]
     variance = SUMS[7]
     for x in range(ROW):
         amplitude = values[centre + AMPLITUDE + x] if by_amplitude else ONE
-        _put(sums, total + x, complex(values[centre + WEIGHT + x] * amplitude, ZERO))
+        _put(sums, total + x, values[centre + WEIGHT + x] * amplitude, ZERO)
     for slot in neighbours:
         for x in range(ROW):
             amplitude = values[slot + AMPLITUDE + x] if by_amplitude else ONE
             size = values[slot + WEIGHT + x] * amplitude
-            sums[total + x] += size * values[slot + DIRECTION + x]
-            sums[total + ROW + x] += size * values[slot + DIRECTION + ROW + x]
+            direction = _complex_at(values, slot + DIRECTION + x)
+            _add(sums, total + x, size * direction.real, size * direction.imag)
     for x in range(ROW):
-        _put(sums, inverse + x, _inverse(_complex_at(sums, total + x)))
+        _invert(sums, total + x, inverse + x)
     sums[by_neighbours : variance + ROW] = ZERO
     for slot in neighbours:
         for x in range(ROW):

@@ -68,7 +68,14 @@ class SharedNoise(NamedTuple):
 
 @numba.njit(**FAST)
 def add_linear_frames(  # type: ignore[no-untyped-def]
-    shape, linear, words, shared, errors, counted, total, squares
+    shape,
+    linear,
+    words,
+    shared,
+    errors,
+    counted,
+    total,
+    squares,
 ):
     """Add `LANES` frames of the even and uneven pixels to sums of z and of its square.
 
@@ -99,7 +106,15 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
     for y in range(-half, h):
         below = y + half
         if below < h:
-            _draw_row(below, words, shared, linear.noise, w, half, rows[below % side])
+            _draw_row(
+                below,
+                words,
+                shared,
+                linear.noise,
+                w,
+                half,
+                rows[below % side],
+            )
         if y < 0:
             continue
         for q in range(side):
@@ -116,12 +131,34 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
                 centre = row_starts[half] + (x + half) * LANES
                 a = linear.by_neighbour[i]
                 b = linear.by_centre[i]
-                _round(z, by_path, errors, a, across, x * LANES, b, noise, centre, rounded)
+                _round(
+                    z,
+                    by_path,
+                    errors,
+                    a,
+                    across,
+                    x * LANES,
+                    b,
+                    noise,
+                    centre,
+                    rounded,
+                )
             elif linear.kind[i] == UNEVEN:
                 for q in range(side * side):
                     window_starts[q] = row_starts[q // side] + (x + q % side) * LANES
                 _sum_over(noise, window_starts, linear.moves[linear.row[i]], moved)
-                _round(z, by_path, errors, f4(1), moved, 0, f4(0), moved, 0, rounded)
+                _round(
+                    z,
+                    by_path,
+                    errors,
+                    f4(1),
+                    moved,
+                    0,
+                    f4(0),
+                    moved,
+                    0,
+                    rounded,
+                )
             else:
                 continue
             for part in range(len(counted)):
@@ -131,7 +168,15 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def _draw_row(y, words, shared, noise, w, half, row):  # type: ignore[no-untyped-def]
+def _draw_row(  # type: ignore[no-untyped-def]
+    y,
+    words,
+    shared,
+    noise,
+    w,
+    half,
+    row,
+):
     """Write the noise of picture row y into ``row`` ((w + 2 half) lanes,), with zeros beside the
     picture."""
     bend = f4(BEND)
@@ -174,7 +219,16 @@ def _sum_over(values, starts, taps, total):  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def _round(  # type: ignore[no-untyped-def]
-    z, by_path, errors, by_sum, sums, sums_start, by_centre, noise, noise_start, rounded
+    z,
+    by_path,
+    errors,
+    by_sum,
+    sums,
+    sums_start,
+    by_centre,
+    noise,
+    noise_start,
+    rounded,
 ):
     """Write z (lanes,) of one pixel, in whole steps."""
     half = f4(0.5)

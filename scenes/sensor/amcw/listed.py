@@ -81,7 +81,16 @@ def empty_sums(parts: int, pixels: int) -> ListedSums:
 
 @numba.njit(**FAST)
 def add_listed_frames(  # type: ignore[no-untyped-def]
-    z_m, reason, strength, flying, wanted, part_of, share, step_m, base, sums
+    z_m,
+    reason,
+    strength,
+    flying,
+    wanted,
+    part_of,
+    share,
+    step_m,
+    base,
+    sums,
 ):
     """Add frames of listed pixels to their sums.
 

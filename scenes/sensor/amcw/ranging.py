@@ -12,6 +12,7 @@ from scenes.sensor.amcw.facts import UnwrapTable
 from scenes.sensor.normals import FAST
 
 f4 = np.float32
+ZERO = f4(0)
 HALF = f4(0.5)
 ONE = f4(1)
 TWO = f4(2)
@@ -139,15 +140,15 @@ def turns(re: np.float32, im: np.float32) -> np.float32:
     ax = abs(re)
     ay = abs(im)
     big = max(ax, ay)
-    q = min(ax, ay) / big if big > f4(0) else f4(0)
+    q = min(ax, ay) / big if big > ZERO else ZERO
     s = q * q
     p = ((ATAN[0] * s + ATAN[1]) * s + ATAN[2]) * s + ATAN[3]
     p = (((p * s + ATAN[4]) * s + ATAN[5]) * s + ATAN[6]) * s + ATAN[7]
     a = p * q
     a = HALF_PI - a if ay > ax else a
-    a = PI - a if re < f4(0) else a
+    a = PI - a if re < ZERO else a
     t = a / TWO_PI
-    t = ONE - t if im < f4(0) else t
+    t = ONE - t if im < ZERO else t
     return t - ONE if t >= ONE else t
 
 
@@ -181,13 +182,13 @@ def half_path(
     _find_keys(turn, lattice, key)
     first_wraps = lattice.wraps[0]
     for i in range(n):
-        unknown = key[i] < 0 or first_wraps[key[i]] < f4(0)
-        residual2[i] = INFINITE if unknown else f4(0)
+        unknown = key[i] < 0 or first_wraps[key[i]] < ZERO
+        residual2[i] = INFINITE if unknown else ZERO
         key[i] = np.int32(0) if unknown else key[i]
     # half path, and the common turns that the phases of all frequencies should have
     n_frequencies = turn.shape[0]
     norm = (lattice.lattice * lattice.lattice).sum()
-    half[:] = f4(0)
+    half[:] = ZERO
     common = np.zeros(n, np.float32)
     for f in range(n_frequencies):
         wraps = lattice.wraps[f]
@@ -211,7 +212,7 @@ def _find_keys(turn, lattice, key):  # type: ignore[no-untyped-def]
     sums = np.empty(n, np.float32)
     n_frequencies = turn.shape[0]
     for row in range(n_frequencies - 1):
-        sums[:] = f4(0)
+        sums[:] = ZERO
         for f in range(n_frequencies):
             _add_scaled(lattice.combination[row, f], turn[f, :n], sums)
         # the combination of whole turns is a whole number, which is the key's next digit
@@ -230,44 +231,44 @@ def _find_keys(turn, lattice, key):  # type: ignore[no-untyped-def]
 def residual_limit(gates, brightest):  # type: ignore[no-untyped-def]
     """Return the largest lattice residual in turns of a pixel with a greatest amplitude
     ``brightest``."""
-    if gates.residual_slope == f4(0):
+    if gates.residual_slope == ZERO:
         return gates.residual
     by_amplitude = gates.residual_scale * np.exp(gates.residual_slope * np.log(brightest))
     return min(gates.residual_most, max(gates.residual, np.float32(by_amplitude)))
 
 
 @numba.njit(inline="always", **FAST)
-def first_failed(gates, limit, at):  # type: ignore[no-untyped-def]
+def first_failed(gates, limit, pixel):  # type: ignore[no-untyped-def]
     """Return the code of the first gate that a pixel with a `residual_limit` fails, or VALID: the
     table of gates."""
     # the first gate that fails gives the reason, so gates are tried from the last to the first
-    reflectivity = at.total * at.range_m * at.range_m
+    reflectivity = pixel.total * pixel.range_m * pixel.range_m
     code = LOW_REFLECTIVITY if reflectivity < gates.reflectivity else VALID
-    in_range = (at.low_m >= gates.nearest_m) & (at.high_m <= gates.farthest_m)
+    in_range = (pixel.low_m >= gates.nearest_m) & (pixel.high_m <= gates.farthest_m)
     code = code if in_range else OUT_OF_RANGE
     # an infinite residual means that no wrap counts fit: no gate may pass it
-    unwrapped = (at.residual2 < INFINITE) & (at.residual2 <= limit * limit)
+    unwrapped = (pixel.residual2 < INFINITE) & (pixel.residual2 <= limit * limit)
     code = code if unwrapped else UNWRAP
-    code = AMPLITUDE_RATIO if at.greatest - at.least > gates.ratio * at.greatest else code
-    code = EDGE if at.edge >= gates.edge else code
-    return LOW_AMPLITUDE if (at.least < gates.least) | (at.total < gates.total) else code
+    code = AMPLITUDE_RATIO if pixel.greatest - pixel.least > gates.ratio * pixel.greatest else code
+    code = EDGE if pixel.edge >= gates.edge else code
+    return LOW_AMPLITUDE if (pixel.least < gates.least) | (pixel.total < gates.total) else code
 
 
 @numba.njit(**FAST)
-def first_failed_each(gates, at):  # type: ignore[no-untyped-def]
-    """Return `first_failed` of n pixels (n,); each field of ``at`` is an array (n,)."""
-    codes = np.empty(at.edge.size, np.uint8)
+def first_failed_each(gates, inputs):  # type: ignore[no-untyped-def]
+    """Return `first_failed` of n pixels (n,); each field of ``inputs`` is an array (n,)."""
+    codes = np.empty(inputs.edge.size, np.uint8)
     for i in range(codes.size):
         pixel = GateInputs(
-            edge=at.edge[i],
-            least=at.least[i],
-            greatest=at.greatest[i],
-            total=at.total[i],
-            residual2=at.residual2[i],
-            brightest=at.brightest[i],
-            range_m=at.range_m[i],
-            low_m=at.low_m[i],
-            high_m=at.high_m[i],
+            edge=inputs.edge[i],
+            least=inputs.least[i],
+            greatest=inputs.greatest[i],
+            total=inputs.total[i],
+            residual2=inputs.residual2[i],
+            brightest=inputs.brightest[i],
+            range_m=inputs.range_m[i],
+            low_m=inputs.low_m[i],
+            high_m=inputs.high_m[i],
         )
         codes[i] = first_failed(gates, residual_limit(gates, pixel.brightest), pixel)
     return codes
@@ -341,7 +342,17 @@ def ranges_of(
 
 @numba.njit(**FAST)
 def _range_and_gates(  # type: ignore[no-untyped-def]
-    filtered, edge, saturated, geometry, outside_mask, lattice, gates, errors_m, z_m, reason, total
+    filtered,
+    edge,
+    saturated,
+    geometry,
+    outside_mask,
+    lattice,
+    gates,
+    errors_m,
+    z_m,
+    reason,
+    total,
 ):
     """Run `ranges_of`: r = (4 s^2 - e.e) / (4 s - 2 u.e) of half the path s by the emitter at e,
     along u."""
@@ -363,7 +374,7 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
         block[ERROR, :length] = errors_m[these]
         block[ALONG : COSINE + 1, :length] = geometry[:, these]
         block[LIMIT] = least_limit
-        if gates.residual_slope != f4(0):
+        if gates.residual_slope != ZERO:
             for i in range(length):
                 # no limit is lower than the least
                 if block[RESIDUAL, i] > least_limit * least_limit:
@@ -396,12 +407,12 @@ def _judge(block, gates, n_frequencies):  # type: ignore[no-untyped-def]
     """Fill the rows of z and of the code of the first gate that fails."""
     for i in range(np.uint64(BLOCK)):
         mean = block[STEPS * BLOCK + i] / n_frequencies
-        edge = mean if gates.edge_mean > f4(0) else block[STEEPEST * BLOCK + i]
+        edge = mean if gates.edge_mean > ZERO else block[STEEPEST * BLOCK + i]
         path = block[HALF_PATH * BLOCK + i] + block[ERROR * BLOCK + i]
         ratio = FOUR * path - TWO * block[ALONG * BLOCK + i]
         range_m = (FOUR * path * path - block[EMITTER * BLOCK + i]) / ratio
         z = range_m * block[COSINE * BLOCK + i]
-        limited = z if gates.axial > f4(0) else range_m
+        limited = z if gates.axial > ZERO else range_m
         least = block[LEAST * BLOCK + i]
         greatest = block[GREATEST * BLOCK + i]
         total = block[TOTAL * BLOCK + i]
@@ -432,7 +443,15 @@ def _reasons(code, saturated, outside_mask, reason):  # type: ignore[no-untyped-
 
 
 @numba.njit(**FAST)
-def find_flying(z_m, total, reason, pixels, neighbours, gate, flying):  # type: ignore[no-untyped-def]
+def find_flying(  # type: ignore[no-untyped-def]
+    z_m,
+    total,
+    reason,
+    pixels,
+    neighbours,
+    gate,
+    flying,
+):
     """Find pixels between a nearer and a farther surface in the finished image. Neighbours whose
     phases fit a distance count, even out of range.
 

@@ -9,10 +9,12 @@ def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) 
     outside the border."""
     padded = np.pad(image, side // 2, constant_values=beyond)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
-    return windows[np.divmod(pixels, image.shape[1])].reshape(-1, side * side)
+    rows, columns = np.divmod(pixels, image.shape[1])
+    return windows[rows, columns].reshape(-1, side * side)
 
 
 def pixels_within(pixels: np.ndarray, side: int) -> np.ndarray:
     """Return the pixels (h, w) bool whose window of ``side`` contains one of ``pixels`` (h, w)
     bool."""
-    return cv2.dilate(pixels.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
+    square = np.ones((side, side), np.uint8)
+    return cv2.dilate(pixels.view(np.uint8), square).view(bool)

@@ -116,7 +116,8 @@ def _peaks(
             y = row[j]
             if y > 0.0 and y > row[j - 1] and y >= row[j + 1 if j + 1 < m else 0]:
                 if first < 0 or y > row[first]:
-                    first, second = j, first
+                    second = first
+                    first = j
                 elif second < 0 or y > row[second]:
                     second = j
         for rank, sample in enumerate((first, second)):
@@ -140,6 +141,11 @@ EDGE = np.int32(Reason.EDGE)
 OUT_OF_RANGE = np.int32(Reason.OUT_OF_RANGE)
 CHUNK = 256  # columns whose sums stand side by side: a loop that writes to one array is vectorised
 NOWHERE_M = np.float32(1e9)  # half path beyond the picture's border: it agrees with nothing
+ZERO = np.float32(0)
+HALF = np.float32(0.5)
+TWO = np.float32(2)
+FOUR = np.float32(4)
+NAN = np.float32(np.nan)
 
 
 @numba.njit(**FAST)
@@ -162,7 +168,15 @@ def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
 
 @numba.njit(**FAST)
 def stronger_peak(  # type: ignore[no-untyped-def]
-    height, half_m, deviation_m, noise, normals, sweep_m, won_m, won_height, won_deviation_m
+    height,
+    half_m,
+    deviation_m,
+    noise,
+    normals,
+    sweep_m,
+    won_m,
+    won_height,
+    won_deviation_m,
 ):
     """Choose the higher of two peaks after noise is added, with the noise of its range.
 
@@ -230,7 +244,15 @@ def noise_peaks(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def smooth(  # type: ignore[no-untyped-def]
-    half_m, share, height, gate_m, taps, along_rows, out_m, out_share, out_height
+    half_m,
+    share,
+    height,
+    gate_m,
+    taps,
+    along_rows,
+    out_m,
+    out_share,
+    out_height,
 ):
     """Average the neighbours of a column, or of a row, that agree.
 
@@ -252,11 +274,20 @@ def smooth(  # type: ignore[no-untyped-def]
     for v in range(h):
         for start in range(0, w, CHUNK):
             n = min(CHUNK, w - start)
-            sums[:] = np.float32(0)
+            sums[:] = ZERO
             pixels = (v + p, q + start)
             for k in range(-r, r + 1):
                 neighbours = (v + p, q + start + k) if along_rows else (v + p + k, q + start)
-                _add_agreeing(image, gate_m, neighbours, pixels, (v, start), n, taps[k + r], sums)
+                _add_agreeing(
+                    image,
+                    gate_m,
+                    neighbours,
+                    pixels,
+                    (v, start),
+                    n,
+                    taps[k + r],
+                    sums,
+                )
             for u in range(n):
                 out_m[v, start + u] = half_m[v + p, q + start + u] + sums[u] / sums[CHUNK + u]
                 out_share[v, start + u] = sums[CHUNK + u]
@@ -264,7 +295,16 @@ def smooth(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def _add_agreeing(image, gate_m, neighbours, pixels, gates, n, tap, sums):  # type: ignore[no-untyped-def]
+def _add_agreeing(  # type: ignore[no-untyped-def]
+    image,
+    gate_m,
+    neighbours,
+    pixels,
+    gates,
+    n,
+    tap,
+    sums,
+):
     """Add n neighbours of n pixels. ``neighbours``, ``pixels`` and ``gates``: (row, column) of the
     first of each. Images are passed whole, as a slice costs as much as tens of sums."""
     half_m, share, height = image
@@ -276,7 +316,7 @@ def _add_agreeing(image, gate_m, neighbours, pixels, gates, n, tap, sums):  # ty
     start = np.uint64(gates[1])
     for u in range(np.uint64(n)):
         off = half_m[row, column + u] - half_m[pixel_row, pixel_column + u]
-        counted = tap if abs(off) <= gate_m[v, start + u] else np.float32(0)
+        counted = tap if abs(off) <= gate_m[v, start + u] else ZERO
         weight = counted * share[row, column + u]
         sums[u] += weight * off
         sums[np.uint64(CHUNK) + u] += weight
@@ -334,15 +374,14 @@ def gated(  # type: ignore[no-untyped-def]
         for u in range(w):
             support = height[v, u] / whole_share[v, u]
             half = half_m[v, u] + error_m
-            range_m = (np.float32(4) * half * half - limits.receiver2_m2) / (
-                np.float32(4) * half - np.float32(2) * along_m[v, u]
-            )
+            path2_m2 = FOUR * half * half
+            range_m = (path2_m2 - limits.receiver2_m2) / (FOUR * half - TWO * along_m[v, u])
             in_range = (range_m >= limits.nearest_m) & (range_m <= limits.farthest_m)
             code = VALID if in_range else OUT_OF_RANGE
             code = code if share[v, u] >= limits.least_agreeing * whole_share[v, u] else EDGE
             code = code if support >= limits.least_strength else LOW_AMPLITUDE
             code = SATURATED if saturated[v, u] else code
-            rounded = np.floor(range_m * cosine[v, u] / step_m + np.float32(0.5)) * step_m
-            z_m[v, u] = rounded if code == VALID else np.float32(np.nan)
+            steps = np.floor(range_m * cosine[v, u] / step_m + HALF)
+            z_m[v, u] = steps * step_m if code == VALID else NAN
             reason[v, u] = np.uint8(code)
-            strength[v, u] = max(support, np.float32(0))
+            strength[v, u] = max(support, ZERO)
