@@ -166,9 +166,9 @@ def lens_names() -> dict[str, str]:
     camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
-        for mode in (camera, *load_camera(camera).modes):
-            # a mode with its own file stays with the camera whose mode it is
-            names.setdefault(mode, camera)
+        modes = dict.fromkeys((camera, *load_camera(camera).modes), camera)
+        # a mode with its own file stays with the camera whose mode it is
+        names = {**modes, **names}
     return names
 
 

@@ -68,7 +68,8 @@ def test_frames_that_neither_jump_nor_drift_stay():
 
 def test_rays_by_hand():
     """A ray of slopes (3/4, 0) has the direction (3, 0, 4) / 5."""
-    along_m, cosine = rays_of(np.array([[[0.75, 0.0]]]), np.array([10.0, 7.0, 5.0]))
+    slopes = np.array([0.75, 0.0]).reshape(1, 1, 2)
+    along_m, cosine = rays_of(slopes, np.array([10.0, 7.0, 5.0]))
     assert along_m[0, 0] == pytest.approx(0.6 * 10 + 0.8 * 5)
     assert cosine[0, 0] == pytest.approx(0.8)
 
@@ -101,7 +102,8 @@ def test_light_without_multipath_is_the_direct_light():
     object.__setattr__(view, "intensity", dim)
     assert light_of(view, NO_EFFECTS)[1] == pytest.approx(dim)
     all_phasor, all_intensity = light_of(view, EffectsConfig())
-    assert all_phasor is view.phasor and all_intensity is view.intensity
+    assert all_phasor is view.phasor
+    assert all_intensity is view.intensity
 
 
 def test_a_part_of_sums_is_theirs_on_those_pixels():

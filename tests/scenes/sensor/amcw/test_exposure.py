@@ -14,6 +14,7 @@ from scenes.sensor.amcw.windows import pixels_within, windows_of
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
 
 f4 = np.float32
+STEPS = 2 * np.pi * np.arange(3) / 3
 REGION = Region(290, 300, 310, 322)
 ELECTRONS = 10_000.0
 ALBEDO = 0.5
@@ -21,12 +22,18 @@ ALBEDO = 0.5
 
 def exposure_of(numbers: dict, distance_m: float = 1.0, **effects: bool):
     """The exposure of a facing plane, and its view's intensity times the gathered light."""
-    declared = {"photons.signal_electrons": ELECTRONS, "photons.electrons_per_unit": 2.0, **numbers}
-    config = CameraConfig(effects=NO_EFFECTS.model_copy(update=effects), numbers=declared)
+    declared = {
+        "photons.signal_electrons": ELECTRONS,
+        "photons.electrons_per_unit": 2.0,
+        **numbers,
+    }
+    only = NO_EFFECTS.model_copy(update=effects)
+    config = CameraConfig(effects=only, numbers=declared)
     camera = camera_of(config)
     view = plane_view(camera, REGION, distance_m, ALBEDO)
     imager = AmcwImager(camera, config, REGION, view.slopes)
-    return imager.expose(view), (imager.gathered * view.intensity).ravel(), view
+    light = imager.gathered * view.intensity
+    return imager.expose(view), light.ravel(), view
 
 
 @pytest.mark.parametrize("read_noise", [0.0, 40.0, 300.0])
@@ -44,18 +51,19 @@ def test_samples_are_those_of_the_correlation():
     assert exposure.shape == REGION.shape
     phase = np.angle(view.phasor.reshape(3, -1))
     for f, contrast in enumerate((0.9, 0.8, 0.7)):
-        for k in range(3):
-            cosine = np.cos(phase[f] - 2 * np.pi * k / 3)
-            expected = contrast * ELECTRONS * light * cosine / 2.0
+        amplitude = contrast * ELECTRONS * light / 2.0
+        for k, step in enumerate(STEPS):
+            expected = amplitude * np.cos(phase[f] - step)
             assert exposure.means[f, k] == pytest.approx(expected, rel=1e-4, abs=0.05)
 
 
 def test_errors_that_all_frames_share_delay_the_light():
-    exposure, _, _ = exposure_of({"unit.drift_mm": 40.0, "unit.drift_ramp": 0.0})
-    shifted, _, _ = exposure_of({"unit.drift_mm": 40.0, "unit.drift_ramp": 0.0}, warm_up_drift=True)
-    steps = np.exp(2j * np.pi * np.arange(3) / 3)
-    turned = np.angle((shifted.means * steps[:, None]).sum(axis=1))
-    turned -= np.angle((exposure.means * steps[:, None]).sum(axis=1))
+    numbers = {"unit.drift_mm": 40.0, "unit.drift_ramp": 0.0}
+    exposure, _, _ = exposure_of(numbers)
+    shifted, _, _ = exposure_of(numbers, warm_up_drift=True)
+    waves = np.exp(1j * STEPS)[:, None]
+    turned = np.angle((shifted.means * waves).sum(axis=1))
+    turned -= np.angle((exposure.means * waves).sum(axis=1))
     error_m = 0.040 * np.exp(-60 / 20)
     for f, frequency_hz in enumerate(camera_of(CameraConfig()).frequencies_hz):
         expected = 4 * np.pi * frequency_hz * error_m / SPEED_OF_LIGHT_AIR
@@ -65,9 +73,13 @@ def test_errors_that_all_frames_share_delay_the_light():
 def test_the_fuller_well_or_the_converter_limits_a_sample():
     """Half of both wells' electrons and half the sample fit into one well."""
     assert np.isinf(exposure_of({})[0].limit).all()
-    wide = {"photons.full_well_electrons": 16_000.0, "converter.full_scale_units": 10**6}
+    wide = {
+        "photons.full_well_electrons": 16_000.0,
+        "converter.full_scale_units": 10**6,
+    }
     exposure, light, _ = exposure_of(wide, saturation=True)
-    assert exposure.limit == pytest.approx((2 * 16_000 - ELECTRONS * light) / 2.0, rel=1e-5)
+    room = 2 * 16_000 - ELECTRONS * light
+    assert exposure.limit == pytest.approx(room / 2.0, rel=1e-5)
     narrow = {**wide, "converter.full_scale_units": 300}
     assert (exposure_of(narrow, saturation=True)[0].limit == 300).all()
     full = {**wide, "photons.full_well_electrons": 1.0}
@@ -75,15 +87,8 @@ def test_the_fuller_well_or_the_converter_limits_a_sample():
 
 
 def test_pixels_span_the_slopes_between_their_neighbours():
-    """The area per pixel of the lens's map from pixels to slopes, by differences."""
-    lens = camera_of(CameraConfig()).nominal_lens
-    v, u = np.meshgrid([30.0, 200.0, 500.0], [20.0, 300.0, 600.0], indexing="ij")
-    right = lens.slopes(u + 0.5, v) - lens.slopes(u - 0.5, v)
-    down = lens.slopes(u, v + 0.5) - lens.slopes(u, v - 0.5)
-    area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
-    expected = area * lens.fx * lens.fy
-    assert pixel_spans(lens, lens.slopes(u, v)) == pytest.approx(expected, rel=2e-4)
-    skewed = Lens(
+    """The inverse of the area that a lens's map from slopes to pixels makes of a small square."""
+    lens = Lens(
         width=400,
         height=300,
         fx=300.0,
@@ -93,14 +98,19 @@ def test_pixels_span_the_slopes_between_their_neighbours():
         distortion=(0.05, 0.02, 0.01, -0.02, 0.01, 0.03, 0.01, 0.02),
     )
     slopes = np.array([[0.3, -0.2], [-0.1, 0.4]])
-    step = 1e-5
-    moved = []
-    for shift in ([step, 0.0], [0.0, step]):
-        ahead = skewed.project(np.append(slopes + shift, np.ones((2, 1)), axis=1))
-        behind = skewed.project(np.append(slopes - shift, np.ones((2, 1)), axis=1))
-        moved.append((ahead - behind) / (2 * step) / [300.0, 310.0])
-    determinant = moved[0][:, 0] * moved[1][:, 1] - moved[0][:, 1] * moved[1][:, 0]
-    assert pixel_spans(skewed, slopes) == pytest.approx(1 / determinant, rel=1e-5)
+    moved_x = moved_by(lens, slopes, [1e-5, 0.0])
+    moved_y = moved_by(lens, slopes, [0.0, 1e-5])
+    areas = [np.linalg.det([x, y]) for x, y in zip(moved_x, moved_y, strict=True)]
+    assert pixel_spans(lens, slopes) == pytest.approx(1 / np.array(areas), rel=1e-5)
+
+
+def moved_by(lens: Lens, slopes: np.ndarray, step: list[float]) -> np.ndarray:
+    """(n, 2): derivative of pixels over the focal lengths by slopes (n, 2), along a step."""
+    ones = np.ones((len(slopes), 1))
+    ahead = lens.project(np.append(slopes + step, ones, axis=1))
+    behind = lens.project(np.append(slopes - step, ones, axis=1))
+    per_slope = (ahead - behind) / (2 * sum(step))
+    return per_slope / [lens.fx, lens.fy]
 
 
 def test_light_of_samples_is_what_noisy_samples_show():
@@ -109,40 +119,53 @@ def test_light_of_samples_is_what_noisy_samples_show():
     rng = np.random.default_rng(4)
     amplitude = np.array([200.0, 6.0])
     phase = np.array([0.7, 2.0])
-    steps = 2 * np.pi * np.arange(3) / 3
-    means = (amplitude * np.cos(phase - steps[:, None]))[None].astype(f4)
+    means = amplitude * np.cos(phase - STEPS[:, None])
     sigma = np.array([4.0, 4.0], f4)
-    exposure = AmcwExposure(means, sigma, np.full(2, np.inf, f4), (1, 2))
+    exposure = exposure_without_limit(means, sigma)
     light = light_of_samples(exposure, 1e6, np.array([1.5]))
-    samples = means[0] + sigma * rng.standard_normal((100_000, 3, 2))
+    samples = means + sigma * rng.standard_normal((100_000, 3, 2))
     # the converter's rounding to whole units
-    phasor = np.einsum("dkn,k->dn", np.round(samples), np.exp(1j * steps)) * 2 / 3 * 1.5
+    weights = np.exp(1j * STEPS) * 2 / 3 * 1.5
+    phasor = np.einsum("dkn,k->dn", np.round(samples), weights)
     assert light.phasor[0] == pytest.approx(np.exp(1j * phase), abs=1e-5)
     assert light.amplitude[0] == pytest.approx(1.5 * amplitude, rel=1e-5)
-    assert light.mean_amplitude[0] == pytest.approx(np.abs(phasor).mean(axis=0), rel=0.005)
-    turned = (phasor * np.conj(light.phasor[0])) / light.amplitude[0]
-    assert light.phase_noise[0] == pytest.approx(turned.imag.std(axis=0), rel=0.01)
-    assert light.relative_noise[0] == pytest.approx(turned.real.std(axis=0), rel=0.01)
+    mean_amplitude = np.abs(phasor).mean(axis=0)
+    assert light.mean_amplitude[0] == pytest.approx(mean_amplitude, rel=0.005)
+    relative = phasor * np.conj(light.phasor[0]) / light.amplitude[0]
+    phase_noise = relative.imag.std(axis=0)
+    assert light.phase_noise[0] == pytest.approx(phase_noise, rel=0.01)
+    relative_noise = relative.real.std(axis=0)
+    assert light.relative_noise[0] == pytest.approx(relative_noise, rel=0.01)
+
+
+def exposure_without_limit(means: np.ndarray, sigma: np.ndarray) -> AmcwExposure:
+    """One frequency of n pixels in a row, with samples (k, n)."""
+    n = sigma.size
+    return AmcwExposure(
+        means=means[None].astype(f4),
+        sigma=sigma,
+        limit=np.full(n, np.inf, f4),
+        shape=(1, n),
+    )
 
 
 def test_coarse_steps_of_the_converter_are_noise():
     """At samples from 4 to 8 knees the step is 4: a variance of 16/12, and none of shot noise."""
-    means = np.full((1, 3, 1), 50.0, f4)
-    exposure = AmcwExposure(means, np.zeros(1, f4), np.full(1, np.inf, f4), (1, 1))
-    means[0, 1:] = 0.0
+    means = np.array([[50.0], [0.0], [0.0]])
+    exposure = exposure_without_limit(means, np.zeros(1, f4))
     light = light_of_samples(exposure, 10.0, np.ones(1))
-    steps = 2 * np.pi * np.arange(3) / 3
     variance = np.array([16.0, 1.0, 1.0]) / 12
-    across = np.sqrt((variance * np.sin(steps) ** 2).sum()) / 50.0
-    along = np.sqrt((variance * np.cos(steps) ** 2).sum()) / 50.0
-    assert light.phase_noise[0, 0] == pytest.approx(across, rel=1e-5)
-    assert light.relative_noise[0, 0] == pytest.approx(along, rel=1e-5)
+    across = np.sqrt((variance * np.sin(STEPS) ** 2).sum())
+    along = np.sqrt((variance * np.cos(STEPS) ** 2).sum())
+    assert light.phase_noise[0, 0] == pytest.approx(across / 50.0, rel=1e-5)
+    assert light.relative_noise[0, 0] == pytest.approx(along / 50.0, rel=1e-5)
 
 
 def test_rices_mean_by_hand():
     """sqrt(pi / 2) of a vector of noise alone; L + 1 / (2 L) of a long one."""
     assert RICE[0] == pytest.approx(np.sqrt(np.pi / 2))
-    assert RICE[-1] == pytest.approx(LENGTHS[-1] + 0.5 / LENGTHS[-1], abs=1e-4)
+    longest = LENGTHS[-1]
+    assert RICE[-1] == pytest.approx(longest + 0.5 / longest, abs=1e-4)
 
 
 def test_windows_and_pixels_that_they_touch():

@@ -65,7 +65,14 @@ def filtered_by_kernel(
     filtered = unknown_filtered(1, n)
     pixels = np.flatnonzero(~is_lost)
     moves = np.full((n, SIDE**2), np.nan)
-    moves[pixels] = linearised(pixels, light, settings, SHAPE, is_lost, filtered)[0]
+    moves[pixels] = linearised(
+        pixels,
+        light,
+        settings,
+        SHAPE,
+        is_lost,
+        filtered,
+    )[0]
     return filtered, moves
 
 
@@ -82,8 +89,9 @@ def window_at(light: Light, settings: FilterSettings, i: int, lost: np.ndarray) 
             indices[q] = row * w + column
             space[q] = settings.space.ravel()[q]
     amplitude = light.amplitude[0, indices].astype(float)
+    direction = light.phasor[0, indices] * np.conj(light.phasor[0, i])
     return Window(
-        phase=np.angle(light.phasor[0, indices] * np.conj(light.phasor[0, i])).astype(float),
+        phase=np.angle(direction).astype(float),
         amplitude=amplitude,
         mean_amplitude=light.mean_amplitude[0, indices].astype(float),
         phase_noise=light.phase_noise[0, indices].astype(float),
@@ -94,10 +102,12 @@ def window_at(light: Light, settings: FilterSettings, i: int, lost: np.ndarray) 
     )
 
 
+@pytest.mark.parametrize("noise", [0.12, 0.34])
 @pytest.mark.parametrize("by_amplitude", [False, True])
-def test_the_linear_model_is_that_of_its_reference(by_amplitude: bool):
-    """On every pixel, those at the border included, beside two that are always saturated."""
-    light = random_light(1, 0.12)
+def test_the_linear_model_is_that_of_its_reference(by_amplitude: bool, noise: float):
+    """On every pixel, those at the border included, beside two that are always saturated; with
+    noise at which terms of second order count, and with all that the model allows."""
+    light = random_light(1, noise)
     settings = settings_of(by_amplitude)
     lost = np.zeros(SHAPE[0] * SHAPE[1], bool)
     lost[[3, 50]] = True
@@ -109,7 +119,7 @@ def test_the_linear_model_is_that_of_its_reference(by_amplitude: bool):
         for name in Filtered._fields[1:]:
             value = getattr(filtered, name)[0, i]
             assert value == pytest.approx(getattr(expected, name), rel=3e-4, abs=1e-5), name
-        np.testing.assert_allclose(moves[i], expected_moves, rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(moves[i], expected_moves, rtol=3e-4, atol=2e-6)
 
 
 @pytest.mark.parametrize("by_amplitude", [False, True])
@@ -149,7 +159,7 @@ def neighbour_of(amplitude: float, phase_noise: float, settings: FilterSettings)
     light.phase_noise[0, middle + 1] = phase_noise
     light.relative_noise[0, middle + 1] = 0.1
     filtered, _ = filtered_by_kernel(light, settings)
-    return Filtered(*(part[:, middle] for part in filtered))
+    return Filtered._make(part[:, middle] for part in filtered)
 
 
 @pytest.mark.parametrize(
@@ -175,8 +185,10 @@ def test_a_neighbour_that_is_too_noisy_leaves_bounds_only():
     noisy phase, and its greatest deviation."""
     calm = neighbour_of(BRIGHT, 0.34, settings_of(False))
     wild = neighbour_of(BRIGHT, 0.36, settings_of(False))
-    assert np.isfinite(calm.phase_noise[0]) and np.isfinite(calm.edge[0])
-    assert np.isinf(wild.phase_noise[0]) and np.isinf(wild.edge[0])
+    assert np.isfinite(calm.phase_noise[0])
+    assert np.isfinite(calm.edge[0])
+    assert np.isinf(wild.phase_noise[0])
+    assert np.isinf(wild.edge[0])
     assert 0 <= wild.edge_least[0] < calm.edge[0]
     assert calm.edge_noise[0] < wild.edge_least_noise[0]
 
@@ -219,8 +231,23 @@ def test_sums_of_linear_frames_are_those_of_their_reference():
     counted[1, 29:50] = 1
     total = np.full((2, n), 5.0)
     squares = np.full((2, n), 7.0)
-    add_linear_frames(SHAPE, linear, words, shared, errors, counted, total, squares)
-    z = linear_frames(SHAPE, linear, words, shared, errors)
+    add_linear_frames(
+        SHAPE,
+        linear,
+        words,
+        shared,
+        errors,
+        counted,
+        total,
+        squares,
+    )
+    z = linear_frames(
+        SHAPE,
+        linear,
+        words,
+        shared,
+        errors,
+    )
     is_linear = linear.kind != NONE
     assert np.array_equal(np.isfinite(z).all(axis=1), is_linear)
     z = np.where(is_linear[:, None], z, 0.0)
