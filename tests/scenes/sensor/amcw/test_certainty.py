@@ -95,7 +95,7 @@ def test_even_pixels_are_filled_as_the_linear_model_would(by_amplitude: bool, no
     by_neighbour = moves.by_neighbour[0] * carried * noise
     corner = by_neighbour * settings.space[0, 0]
     assert corner == pytest.approx(expected_moves[:, 0], rel=0.05)
-    assert moves.by_centre[0] == pytest.approx(expected_moves[:, 12], rel=0.003)
+    assert moves.by_centre[0] == pytest.approx(expected_moves[:, 12], rel=0.015)
 
 
 def test_pixels_that_are_not_even():
