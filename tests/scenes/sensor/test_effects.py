@@ -58,7 +58,8 @@ def unit_of(
 
 def detour(view) -> np.ndarray:
     """The view's light with a tenth more that came 0.3 m further."""
-    phase = 2 * np.pi * np.array(view.frequencies_hz)[:, None, None] * 0.3 / SPEED_OF_LIGHT_AIR
+    frequencies_hz = np.array(view.frequencies_hz)[:, None, None]
+    phase = 2 * np.pi * frequencies_hz * 0.3 / SPEED_OF_LIGHT_AIR
     return view.phasor * (1 + 0.1 * np.exp(1j * phase))
 
 
@@ -111,7 +112,8 @@ def test_ambient_and_multipath_that_are_off_are_exactly_absent():
     assert np.array_equal(z_of(unit_of(dark)), z_of(unit_of(bright)))
     settings = config(**(all_on | {"multipath": False}))
     plain = unit_of(settings)
-    assert np.array_equal(z_of(plain), z_of(unit_of(settings, phasor=detour(plain.view))))
+    with_detour = unit_of(settings, phasor=detour(plain.view))
+    assert np.array_equal(z_of(plain), z_of(with_detour))
 
 
 def test_noise_keeps_its_draws_when_another_effect_is_switched():
@@ -158,7 +160,8 @@ def test_wiggling_is_the_weighted_sum_of_its_frequencies(camera):
     error of phase."""
     for distance_m in (0.62, 0.85, 1.31):
         unit = unit_of(config(camera, wiggling=True), distance_m)
-        imager = AmcwImager(unit.camera, unit.config, unit.region, unit.view.slopes[unit.cut])
+        slopes = unit.view.slopes[unit.cut]
+        imager = AmcwImager(unit.camera, unit.config, unit.region, slopes)
         shares = np.array(unit.camera.modulation.wiggling_residual.value)
         light = unit.view.phasor
         wiggled_light = with_harmonics(light, 3, shares)
@@ -179,7 +182,8 @@ def test_wiggling_of_a_kinect_v2_has_the_published_size_and_period():
     wiggled = with_harmonics(light[None, None], 3, np.ones(1))[0, 0]
     error_mm = np.angle(wiggled * light.conj()) / (2 * np.pi) * 694.0
     assert np.abs(error_mm).max() == pytest.approx(2.15, abs=0.05)
-    crossings = distance_m[1:][(error_mm[1:] >= 0) & (error_mm[:-1] < 0)]
+    rises = (error_mm[1:] >= 0) & (error_mm[:-1] < 0)
+    crossings = distance_m[1:][rises]
     assert np.diff(crossings) == pytest.approx(1.561, abs=0.002)
 
 
@@ -207,10 +211,13 @@ def test_drift_decays_and_tilts(minutes):
     facts = load_camera(AZURE).unit
     settings = config(warm_up_drift=True).model_copy(update={"minutes_since_power_on": minutes})
     unit = unit_of(settings)
-    shift_mm = (z_of(unit)[0] - z_of(unit_of(config()))[0]) * 1e3
+    still = unit_of(config())
+    shift_mm = (z_of(unit)[0] - z_of(still)[0]) * 1e3
     ramp = 1 + 0.5 * unit.view.slopes[unit.cut][..., 0]
     expected = 2.0 * np.exp(-minutes / 20.0) * ramp / stretch_of(unit)
-    assert (facts.drift_mm.value, facts.drift_min.value, facts.drift_ramp.value) == (2.0, 20.0, 0.5)
+    assert facts.drift_mm.value == 2.0
+    assert facts.drift_min.value == 20.0
+    assert facts.drift_ramp.value == 0.5
     assert np.abs(shift_mm - expected).max() < 0.02
 
 
@@ -272,11 +279,10 @@ def test_sunlight_fills_the_wells():
     sun = {"ambient_uw_cm2_nm": 150.0}
     for saturation, expected in ((True, Reason.SATURATED), (False, Reason.VALID)):
         settings = config(AZURE, ambient=True, saturation=saturation).model_copy(update=sun)
-        frame = next(iter(unit_of(settings, 0.42, albedo=0.9).capture(1, 1).frames()))
+        frame = first_frame(unit_of(settings, 0.42, albedo=0.9))
         assert (frame.reason == expected).all()
-    assert np.isfinite(
-        z_of(unit_of(config(AZURE, ambient=True, saturation=True), 0.42, albedo=0.9))
-    ).all()
+    in_a_room = config(AZURE, ambient=True, saturation=True)
+    assert np.isfinite(z_of(unit_of(in_a_room, 0.42, albedo=0.9))).all()
 
 
 def test_near_bright_surfaces_saturate():
@@ -335,12 +341,11 @@ def test_the_scanner_is_rid_of_all_indirect_light_too():
     direct part alone."""
     settings = config("realsense_l515", fine=False, noise=True)
     plain = unit_of(settings)
-    lit = unit_of(settings, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity)
+    twice = {"phasor": 2 * plain.view.phasor, "intensity": 2 * plain.view.intensity}
+    lit = unit_of(settings, **twice)
     assert np.allclose(lit.exposure.noise, plain.exposure.noise, rtol=1e-6)
     with_multipath = config("realsense_l515", fine=False, noise=True, multipath=True)
-    noisy = unit_of(
-        with_multipath, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity
-    )
+    noisy = unit_of(with_multipath, **twice)
     assert (noisy.exposure.noise > 1.1 * plain.exposure.noise).all()
 
 
@@ -349,7 +354,8 @@ def test_saturated_neighbours_do_not_count():
     amplitude."""
     settings = config(saturation=True, multipath=True)
     plain = unit_of(settings)
-    bright = np.where(np.arange(plain.view.intensity.shape[1]) < 30, 1.0, 2000.0)
+    columns = np.arange(plain.view.intensity.shape[1])
+    bright = np.where(columns < 30, 1.0, 2000.0)
     unit = unit_of(
         settings, phasor=plain.view.phasor * bright, intensity=plain.view.intensity * bright
     )

@@ -153,8 +153,11 @@ def test_noise_follows_the_closed_form_for_any_number_of_phases(tmp_path):
         )
         z = z_of(unit, 60)
         electrons = 50_000.0 * 0.6
-        phase = np.sqrt(2 / phases) * np.sqrt(electrons + 2 * 3.2**2) / (0.5 * electrons)
-        expected = np.hypot(299_702_547 / (4 * np.pi * 20e6) * phase / 3, 1e-3 / np.sqrt(12))
+        noise = np.sqrt(electrons + 2 * 3.2**2)
+        phase = np.sqrt(2 / phases) * noise / (0.5 * electrons)
+        metres_per_radian = 299_702_547 / (4 * np.pi * 20e6)
+        rounding_m = 1e-3 / np.sqrt(12)
+        expected = np.hypot(metres_per_radian * phase / 3, rounding_m)
         # the lens gathers up to 3 % less beside the axis
         assert z.std(axis=0, ddof=1).mean() == pytest.approx(expected, rel=0.03)
 

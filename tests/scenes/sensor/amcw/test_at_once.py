@@ -33,6 +33,7 @@ from scenes.sensor.amcw.light import light_of_samples
 from scenes.sensor.amcw.linear_frames import BEND, SCALE
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
+from tests.support.sensor_frames import z_of as stacked_z
 
 REGIONS = {
     "azure_kinect_nfov": Region(306, 338, 296, 352),
@@ -273,7 +274,9 @@ def assert_alike(unit: SimulatedUnit, exact: list[Cloud], at_once: list[Cloud]) 
                 amplitudes = np.stack([cloud.amplitude for cloud in clouds])
                 values["amplitude"] = amplitudes[:, repeated].mean(axis=1)
             statistics.append(values)
-        off = {key: compared(value, statistics[1][key]) for key, value in statistics[0].items()}
+        off = {}
+        for key, value in statistics[0].items():
+            off[key] = compared(value, statistics[1][key])
         limit = SURE_OF_FLOOR if group == "floor" else SURE
         assert max(map(abs, off.values())) < limit, (group, off)
     never = (count_of(exact + at_once) == 0).all(axis=0)
@@ -312,7 +315,7 @@ def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
     """Every pixel that some frame loses and another does not is on the list; few others, and no
     even face."""
     unit = unit_before_hole("azure_kinect_nfov", 200.0)
-    z_m = np.stack([frame.z_m for frame in unit.capture(100, 7).frames()])
+    z_m = stacked_z(unit, 100, 7)
     valid = np.isfinite(z_m).mean(axis=0)
     summer = unit.at_once
     assert summer is not None
@@ -419,7 +422,8 @@ def test_a_detector_finds_as_often_and_calls_as_often_falsely():
             0.6,
         ),
     )
-    hole = ndimage.binary_dilation((unit.view.surface == 1)[unit.cut], np.ones((7, 7)))
+    floor = (unit.view.surface == 1)[unit.cut]
+    hole = ndimage.binary_dilation(floor, np.ones((7, 7)))
     detector = ThesisDetector(ThesisConfig(crop=NoCrop()))
     trials = range(200)
     exact = np.array(
@@ -464,8 +468,10 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     light = summer.light
     halo = summer.list.halo
     ranges = summer.list.range
-    words = random_stream(1).integers(2**32, size=(len(halo), 3, LANES), dtype=np.uint32)
-    planes = np.empty((len(halo) // kernels.BESIDE + 2, 3, 3, kernels.STRIDE), np.float32)
+    shape = (len(halo), 3, LANES)
+    words = random_stream(1).integers(2**32, size=shape, dtype=np.uint32)
+    n_rows = len(halo) // kernels.BESIDE + 2
+    planes = np.empty((n_rows, 3, 3, kernels.STRIDE), np.float32)
     noise = np.empty((len(halo), LANES), np.float32)
     kernels.noisy_phasors(
         light.phasor,

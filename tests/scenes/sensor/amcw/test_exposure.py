@@ -67,7 +67,8 @@ def test_errors_that_all_frames_share_delay_the_light():
     error_m = 0.040 * np.exp(-60 / 20)
     for f, frequency_hz in enumerate(camera_of(CameraConfig()).frequencies_hz):
         expected = 4 * np.pi * frequency_hz * error_m / SPEED_OF_LIGHT_AIR
-        assert np.exp(1j * turned[f]) == pytest.approx(np.exp(1j * expected), abs=1e-4)
+        off = np.exp(1j * (turned[f] - expected))
+        assert off == pytest.approx(1, abs=1e-4)
 
 
 def test_the_fuller_well_or_the_converter_limits_a_sample():
@@ -100,8 +101,8 @@ def test_pixels_span_the_slopes_between_their_neighbours():
     slopes = np.array([[0.3, -0.2], [-0.1, 0.4]])
     moved_x = moved_by(lens, slopes, [1e-5, 0.0])
     moved_y = moved_by(lens, slopes, [0.0, 1e-5])
-    areas = [np.linalg.det([x, y]) for x, y in zip(moved_x, moved_y, strict=True)]
-    assert pixel_spans(lens, slopes) == pytest.approx(1 / np.array(areas), rel=1e-5)
+    areas = np.linalg.det(np.stack([moved_x, moved_y], axis=1))
+    assert pixel_spans(lens, slopes) == pytest.approx(1 / areas, rel=1e-5)
 
 
 def moved_by(lens: Lens, slopes: np.ndarray, step: list[float]) -> np.ndarray:
@@ -114,10 +115,10 @@ def moved_by(lens: Lens, slopes: np.ndarray, step: list[float]) -> np.ndarray:
 
 
 def test_light_of_samples_is_what_noisy_samples_show():
-    """Mean amplitude and deviations against 100,000 draws of three samples: bright, and so dim
+    """Mean amplitude and deviations against 100,000 draws of three samples: noisy, and so dim
     that the mean length is by Rice."""
     rng = np.random.default_rng(4)
-    amplitude = np.array([200.0, 6.0])
+    amplitude = np.array([40.0, 6.0])
     phase = np.array([0.7, 2.0])
     means = amplitude * np.cos(phase - STEPS[:, None])
     sigma = np.array([4.0, 4.0], f4)
@@ -130,7 +131,7 @@ def test_light_of_samples_is_what_noisy_samples_show():
     assert light.phasor[0] == pytest.approx(np.exp(1j * phase), abs=1e-5)
     assert light.amplitude[0] == pytest.approx(1.5 * amplitude, rel=1e-5)
     mean_amplitude = np.abs(phasor).mean(axis=0)
-    assert light.mean_amplitude[0] == pytest.approx(mean_amplitude, rel=0.005)
+    assert light.mean_amplitude[0] == pytest.approx(mean_amplitude, rel=0.0015)
     relative = phasor * np.conj(light.phasor[0]) / light.amplitude[0]
     phase_noise = relative.imag.std(axis=0)
     assert light.phase_noise[0] == pytest.approx(phase_noise, rel=0.01)
@@ -171,8 +172,11 @@ def test_rices_mean_by_hand():
 def test_windows_and_pixels_that_they_touch():
     image = np.arange(12).reshape(3, 4)
     windows = windows_of(image, 3, -1, np.array([0, 6]))
-    assert windows[0].tolist() == [-1, -1, -1, -1, 0, 1, -1, 4, 5]
-    assert windows[1].tolist() == [1, 2, 3, 5, 6, 7, 9, 10, 11]
+    corner, inner = windows.reshape(2, 3, 3)
+    assert corner[1:, 1:].tolist() == image[:2, :2].tolist()
+    assert (corner[0] == -1).all()
+    assert (corner[:, 0] == -1).all()
+    assert inner.tolist() == image[:, 1:].tolist()
     wanted = np.zeros((4, 5), bool)
     wanted[0, 3] = True
     touched = pixels_within(wanted, 3)

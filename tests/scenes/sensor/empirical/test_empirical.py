@@ -12,7 +12,7 @@ from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
 from scenes.sensor.empirical.facts import EmpiricalCamera
-from scenes.sensor.empirical.imager import EmpiricalImager
+from scenes.sensor.empirical.imager import EmpiricalImager, IdealRange
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.tabled import DepthNoise, filtered
 from tests.support.sensor_frames import correlation
@@ -74,6 +74,10 @@ def imager_before(distance_m: float, albedo: float, config: CameraConfig = NOISY
     return EmpiricalImager(camera, config, REGION, view.slopes), view
 
 
+def first_frame_of(imager: EmpiricalImager, ideal: IdealRange, error_m: float = 0.0):
+    return imager.frame(ideal, np.random.default_rng(1), error_m)
+
+
 @pytest.mark.parametrize(
     ("distance_m", "albedo", "sigma_mm"),
     [
@@ -107,7 +111,7 @@ def test_dropouts_by_the_logarithm_of_amplitude(albedo, share):
     imager, view = imager_before(1.0, albedo)
     ideal = imager.expose(view)
     assert ideal.chance[30, 40] == pytest.approx(share, abs=2e-3)
-    frame = imager.frame(ideal, np.random.default_rng(1))
+    frame = first_frame_of(imager, ideal)
     lost = frame.reason == Reason.NO_RETURN
     assert lost.mean() == pytest.approx(ideal.chance.mean(), abs=0.03)
     assert np.array_equal(lost, np.isnan(frame.z_m))
@@ -120,25 +124,22 @@ def test_frames_scatter_by_the_noise_and_their_displacement():
     ideal = imager.expose(view)
     stretch = np.sqrt(1 + (view.slopes**2).sum(axis=-1))
     true_m = view.range_m
-    moved_mm = 1e3 * (imager.frame(ideal, np.random.default_rng(1), 0.02).z_m * stretch - true_m)
-    noise_mm = 1e3 * (imager.frame(ideal, np.random.default_rng(1)).z_m * stretch - true_m)
+    noise_m = first_frame_of(imager, ideal).z_m * stretch - true_m
+    moved_m = first_frame_of(imager, ideal, 0.02).z_m * stretch - true_m
     # the same noise, 20 mm farther; 4,800 pixels tell a deviation to 1 %
-    assert moved_mm - noise_mm == pytest.approx(20.0, abs=0.01)
-    assert abs(noise_mm.mean()) < 0.06
-    assert (noise_mm / (1e3 * ideal.sigma_m)).std() == pytest.approx(1.0, rel=0.04)
+    assert moved_m - noise_m == pytest.approx(0.02, abs=1e-5)
+    assert abs(noise_m.mean()) < 0.06e-3
+    normal = noise_m / ideal.sigma_m
+    assert normal.std() == pytest.approx(1.0, rel=0.04)
 
 
 def test_limits_and_the_step_of_the_output():
-    imager, view = imager_before(0.29, 0.5, QUIET)
-    assert imager.frame(imager.expose(view), np.random.default_rng(1)).reason[30, 40] == (
-        Reason.OUT_OF_RANGE
-    )
-    imager, view = imager_before(5.1, 0.5, QUIET)
-    assert (
-        imager.frame(imager.expose(view), np.random.default_rng(1)).reason == Reason.OUT_OF_RANGE
-    ).all()
+    for distance_m in (0.29, 5.1):
+        imager, view = imager_before(distance_m, 0.5, QUIET)
+        frame = first_frame_of(imager, imager.expose(view))
+        assert frame.reason[30, 40] == Reason.OUT_OF_RANGE
     coarse, view = imager_before(1.0037, 0.5, QUIET, engine__output_step_mm=5.0)
-    z_m = coarse.frame(coarse.expose(view), np.random.default_rng(1)).z_m
+    z_m = first_frame_of(coarse, coarse.expose(view)).z_m
     assert z_m == pytest.approx(1.005, abs=1e-6)
 
 
@@ -230,7 +231,8 @@ def test_pixels_without_light_have_no_return():
     dark = dataclasses.replace(view, phasor_direct=0 * view.phasor_direct)
     ideal = imager.expose(dark)
     assert (ideal.chance == 1).all()
-    assert (imager.frame(ideal, np.random.default_rng(1)).reason == Reason.NO_RETURN).all()
+    frame = first_frame_of(imager, ideal)
+    assert (frame.reason == Reason.NO_RETURN).all()
 
 
 def test_the_margin_holds_the_gap_and_the_kernel():
@@ -294,8 +296,9 @@ def test_the_table_s_noise_by_light(intensity, sigma_mm, share):
 def test_the_table_s_limits_step_pattern_and_rays():
     bright = np.ones((40, 50))
     rng = np.random.default_rng(1)
-    assert np.isnan(DepthNoise(table_of())(0.49 * bright, bright, rng)).all()
-    assert np.isnan(DepthNoise(table_of())(5.1 * bright, 100 * bright, rng)).all()
+    plain = DepthNoise(table_of())
+    assert np.isnan(plain(0.49 * bright, bright, rng)).all()
+    assert np.isnan(plain(5.1 * bright, 100 * bright, rng)).all()
     coarse = DepthNoise(table_of(step_m=f4(0.01)))(bright, bright, rng)
     assert np.abs(coarse * 100 - np.round(coarse * 100)).max() < 1e-4
     patterned = DepthNoise(table_of(pattern_m=f4(0.05)), seed=3)
@@ -312,7 +315,9 @@ def test_the_table_s_limits_step_pattern_and_rays():
 def test_filters_are_causal_and_periodic():
     image = np.zeros((4, 5))
     image[3, 1] = 1.0
-    result = filtered(image, np.array([0.5, 0.25]), np.array([2.0, 1.0]))
+    down = np.array([0.5, 0.25])
+    across = np.array([2.0, 1.0])
+    result = filtered(image, down, across)
     expected = np.zeros((4, 5))
     expected[3, 1:3] = [1.0, 0.5]
     expected[0, 1:3] = [0.5, 0.25]

@@ -53,7 +53,8 @@ def test_range_on_planes_is_exact_without_noise(distance_m, region):
             0.05,
         ),
     )
-    assert np.abs(z_of(unit)[0] - true_z_m(unit)).max() < 0.01e-3 + 0.025e-3 * distance_m
+    off_m = z_of(unit)[0] - true_z_m(unit)
+    assert np.abs(off_m).max() < 0.01e-3 + 0.025e-3 * distance_m
 
 
 def test_the_receiver_beside_the_transmitter_is_corrected_for():
@@ -102,7 +103,8 @@ def test_two_separate_returns_are_two_peaks_in_order_of_their_light(
     which is filtered)."""
     half_m = np.array([first_m, first_m + gap_m])
     light = np.array([ratio, 1.0]) if far_wins else np.array([1.0, ratio])
-    peaks = strongest_peaks(comb_phasors(CAMERA, half_m[:, None], light[:, None]), CAMERA.weights)
+    phasors = comb_phasors(CAMERA, half_m[:, None], light[:, None])
+    peaks = strongest_peaks(phasors, CAMERA.weights)
     order = [1, 0] if far_wins else [0, 1]
     assert peaks.delay[:, 0] * CAMERA.unambiguous_m == pytest.approx(half_m[order], abs=0.02)
     assert peaks.height[:, 0] == pytest.approx([1.0, ratio], abs=0.04)
@@ -123,7 +125,8 @@ def test_a_lone_return_has_the_pulse_of_the_file():
     """Height 1 at the return, half of it half a width away; curvature of the bandwidth that the
     bound uses."""
     half_m = np.array([[1.234]])
-    peaks = strongest_peaks(comb_phasors(CAMERA, half_m, np.ones((1, 1))), CAMERA.weights)
+    phasors = comb_phasors(CAMERA, half_m, np.ones((1, 1)))
+    peaks = strongest_peaks(phasors, CAMERA.weights)
     assert peaks.delay[0, 0] * CAMERA.unambiguous_m == pytest.approx(1.234, abs=1e-6)
     assert peaks.height[0, 0] == pytest.approx(1, abs=1e-6)
     per_radian = CAMERA.period_s / (2 * np.pi)
@@ -159,7 +162,8 @@ def test_noise_of_a_peak_meets_the_bound_in_brute_force():
     bound_m = CAMERA.unambiguous_m / (CAMERA.period_s * CAMERA.bandwidth_rad_s)
     assert places_m.std() == pytest.approx(bound_m / ratio, rel=0.045)
     assert peaks.height[0].std() == pytest.approx(1 / ratio, rel=0.045)
-    assert abs(np.corrcoef(places_m, peaks.height[0])[0, 1]) < 4 / np.sqrt(n)
+    correlations_of_both = np.corrcoef(places_m, peaks.height[0])
+    assert abs(correlations_of_both[0, 1]) < 4 / np.sqrt(n)
 
 
 def test_highest_maximum_of_noise_follows_rices_count():
@@ -256,7 +260,8 @@ def test_smoothing_correlates_as_its_weights_say():
     column_taps, row_taps = CAMERA.smoothing_taps
     column = np.correlate(column_taps, column_taps, "full")
     row = np.correlate(row_taps, row_taps, "full")
-    along_column = np.convolve(column, [share, 1, share])[len(column) // 2 + 1 :][:7]
+    overlapped = np.convolve(column, [share, 1, share])
+    along_column = overlapped[len(column) // 2 + 1 :][:7]
     along_row = row[len(row) // 2 :][:7]
     expected = np.outer(along_column / along_column[0], along_row / row.max())
     assert correlations(changed({**UNIFORM, **FINE})) == pytest.approx(expected, abs=0.04)
@@ -271,9 +276,10 @@ def test_smoothing_of_more_columns_than_a_chunk_meets_brute_force(along_rows: bo
     r = 2
     h = 6
     w = CHUNK + 37
-    half_m = np.full((h + 2 * r, w + 2 * r), NOWHERE_M, np.float32)
-    share = np.full((h + 2 * r, w + 2 * r), 0, np.float32)
-    height = np.full((h + 2 * r, w + 2 * r), 0, np.float32)
+    bordered = (h + 2 * r, w + 2 * r)
+    half_m = np.full(bordered, NOWHERE_M, np.float32)
+    share = np.zeros(bordered, np.float32)
+    height = np.zeros(bordered, np.float32)
     inner = slice(r, -r), slice(r, -r)
     steps_m = 0.02 * random.integers(0, 2, (h, w))
     half_m[inner] = 1 + steps_m + 0.005 * random.standard_normal((h, w))
@@ -287,7 +293,9 @@ def test_smoothing_of_more_columns_than_a_chunk_meets_brute_force(along_rows: bo
     heights = np.zeros((h, w))
     for k, tap in enumerate(taps, -r):
         down, right = (0, k) if along_rows else (k, 0)
-        neighbours = slice(r + down, r + down + h), slice(r + right, r + right + w)
+        rows = slice(r + down, r + down + h)
+        columns = slice(r + right, r + right + w)
+        neighbours = (rows, columns)
         off = half_m[neighbours] - half_m[inner]
         weight = tap * (np.abs(off) <= gate_m)
         moved += weight * share[neighbours] * off
@@ -358,7 +366,8 @@ def test_the_file_holds_the_calibrated_numbers():
 
 
 def valid_share(distance_m: float, albedo: float) -> float:
-    return float(np.isfinite(z_of(unit_before_plane(CAMERA, distance_m, albedo), 40, 7)).mean())
+    unit = unit_before_plane(CAMERA, distance_m, albedo)
+    return float(np.isfinite(z_of(unit, 40, 7)).mean())
 
 
 def test_both_calibration_points_are_met():

@@ -99,7 +99,8 @@ def stepped(step_m: float) -> NoiseFreeView:
     """The left half at 1 m, the right half farther, no beam across the edge."""
     front = plane_view(CAMERA, PATCH, 1.0, 0.6)
     back = plane_view(CAMERA, PATCH, 1.0 + step_m, 0.6)
-    return mixed(front, back, (np.arange(PATCH.shape[1]) >= 30).astype(float))
+    right_half = np.arange(PATCH.shape[1]) >= 30
+    return mixed(front, back, right_half.astype(float))
 
 
 def test_smoothing_keeps_a_step_of_30_mm_and_blurs_one_of_4_mm():
@@ -119,7 +120,8 @@ def test_integration_smears_along_the_sweep_only():
     beside nothing."""
     view = plane_view(CAMERA, PATCH, 1.0, 0.6)
     row = (np.arange(PATCH.shape[0]) == 25).astype(float)[:, None]
-    lit = mixed(replace(view, phasor=0 * view.phasor, intensity=0 * view.intensity), view, row)
+    dark = replace(view, phasor=0 * view.phasor, intensity=0 * view.intensity)
+    lit = mixed(dark, view, row)
     heights = SimulatedUnit(CAMERA, QUIET, lit).exposure.height[0]
     weights = smear_weights(CAMERA.integration_points)
     bright = SimulatedUnit(CAMERA, QUIET, view).exposure.height[0]
@@ -182,7 +184,8 @@ def test_five_pixels_in_a_row_are_invalid_and_three_by_three_are_not():
     frame = first_frame(unit)
     m = camera.optics.margin_px
     assert (frame.reason[20 - m, 20 - m : 25 - m] == Reason.EDGE).all()
-    assert frame.z_m[30 - m : 33 - m, 20 - m : 23 - m] == pytest.approx(1.8, abs=0.13e-3)
+    square = frame.z_m[30 - m : 33 - m, 20 - m : 23 - m]
+    assert square == pytest.approx(1.8, abs=0.13e-3)
     assert (frame.reason != Reason.VALID).sum() == 5
 
 
@@ -209,7 +212,8 @@ def test_effects_that_are_off_are_absent():
         0.05,
         0.02,
     )
-    z = z_of(SimulatedUnit(CAMERA, CameraConfig(name=CAMERA.name, effects=NO_EFFECTS), view), 3)
+    quiet = CameraConfig(name=CAMERA.name, effects=NO_EFFECTS)
+    z = z_of(SimulatedUnit(CAMERA, quiet, view), 3)
     assert np.array_equal(z[0], z[1])
     assert np.array_equal(z[0], z[2])
     for name in EffectsConfig.model_fields:
@@ -260,9 +264,9 @@ def test_single_precision_views_change_nothing_that_counts():
         0.05,
         0.02,
     )
-    single = replace(
-        view, phasor=view.phasor.astype(np.complex64), intensity=view.intensity.astype(np.float32)
-    )
+    phasor = view.phasor.astype(np.complex64)
+    intensity = view.intensity.astype(np.float32)
+    single = replace(view, phasor=phasor, intensity=intensity)
     a = SimulatedUnit(CAMERA, QUIET, view).exposure.half_m[0]
     b = SimulatedUnit(CAMERA, QUIET, single).exposure.half_m[0]
     assert np.abs(a - b).max() < 2e-6
