@@ -26,15 +26,15 @@ class Fact(Config, Generic[T]):
     """One number of a camera with its origin."""
 
     value: T
-    """In the unit that the key's name ends with."""
+    """The number, in the unit that the key's name ends with."""
     tag: Literal["R", "D", "S", "W", "O", "C", "M", "G", "U"]
     """R: read in the named public source; D: derived from such; S: a single secondary source; W:
     measured on public captures; O: measured on the owner's by `tofpod characterise`; C: calibrated;
     M: a guess; G: a guess of the precision; U: set by the user of an experiment."""
     source: str
-    """What says so."""
+    """The document or measurement that says so."""
     range: tuple[float, float] | None = None
-    """Of a guess of the precision: least and greatest value."""
+    """Least and greatest value of a guess of the precision."""
 
     @model_validator(mode="after")
     def _guess_has_a_range(self) -> Fact[T]:
@@ -257,13 +257,13 @@ class CameraFacts(Config):
     title: str
     """Name for readers."""
     wavelength_nm: Wavelength
-    """Of the emitter."""
+    """Wavelength of the emitter."""
     lens: LensFacts
     """The nominal lens."""
     unit: UnitFacts
     """Differences between units, and between frames."""
     engine: OutputFacts
-    """What the camera makes of its measurements."""
+    """Processing of the measurements."""
     modes: Annotated[tuple[str, ...], BeforeValidator(tuple)] = Field((), exclude=True)
     """Cameras that are other modes of this one, or a mapping of them by name; no simulation uses
     them."""

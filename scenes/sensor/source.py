@@ -31,7 +31,7 @@ class SimulatedUnit:
     config: CameraConfig
     """The unit, and the effects that are on."""
     view: NoiseFreeView
-    """What it looks at, with a margin around its own region."""
+    """The light before it, with a margin around its own region."""
 
     @cached_property
     def model(self) -> AmcwImager | LidarScanner | EmpiricalImager:

@@ -59,7 +59,7 @@ class _EvenPixels(NamedTuple):
     pixels: np.ndarray
     """(m,): flat indices."""
     moves: EvenMoves
-    """How noise turns them."""
+    """Changes of their phases by noise."""
 
 
 class _UnevenPixels(NamedTuple):
@@ -263,7 +263,7 @@ class AtOnce:
     linear: Linear
     """The pixels that are linear in the noise."""
     certain: Certainty
-    """Which pixels always or never have a range."""
+    """The pixels that always, and those that never, have a range."""
     list: Listed
     """The pixels that are simulated one by one."""
     farthest_error_m: float

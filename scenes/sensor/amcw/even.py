@@ -23,7 +23,7 @@ NOISES = np.linspace(0.0, LARGEST_NOISE, 33)
 
 
 class NoiseTable(NamedTuple):
-    """What noise does to an even window, at each of `NOISES`."""
+    """Effects of noise on an even window, at each of `NOISES`."""
 
     neighbour_share: np.ndarray
     """(33,): a neighbour's part in the phase, over its weight."""
@@ -32,7 +32,7 @@ class NoiseTable(NamedTuple):
 
 
 class EvenMoves(NamedTuple):
-    """How noise turns m even pixels, at f frequencies."""
+    """Changes of the phases of m even pixels by noise, at f frequencies."""
 
     by_neighbour: np.ndarray
     """(f, m) float32: change of the phase by a neighbour's noise at weight and amplitude 1, over
@@ -45,11 +45,11 @@ class _WindowSums(NamedTuple):
     """Sums over the window of each pixel, (n,) float32."""
 
     weights: np.ndarray
-    """of the weights by distance, times amplitudes if those count."""
+    """Sum of the weights by distance, times amplitudes if those count."""
     phase_variance: np.ndarray
-    """of squared weights times phase variances."""
+    """Sum of squared weights times phase variances."""
     amplitude_variance: np.ndarray
-    """of squared weights by distance times amplitude variances."""
+    """Sum of squared weights by distance times amplitude variances."""
 
 
 def even_pixels(

@@ -149,7 +149,7 @@ class EmitterFacts(ConeFacts):
     """The light source: a point beside the lens with uniform intensity in its cone."""
 
     irradiance_w_m2: Positive
-    """On a facing surface on the axis at 1 m; only a reference for ambient light."""
+    """Irradiance of a facing surface on the axis at 1 m; only a reference for ambient light."""
     mask_slopes: Fact[tuple[tuple[float, float], ...]] | None = None
     """Corners (x/z, y/z), counter-clockwise in the image's axes, of a convex polygon outside which
     the camera gives no range."""
@@ -187,7 +187,7 @@ class ColourFacts(Config):
     shift_mm: Fact[tuple[float, float, float]]
     """Origin of the depth camera's frame in its frame."""
     distortion: Fact[tuple[float, ...]]
-    """As for every lens."""
+    """The coefficients, as for every lens."""
 
     @property
     def T_colour_depth(self) -> np.ndarray:
@@ -236,7 +236,7 @@ class PhotonFacts(Config):
     """The photon budget: one gain, calibrated at one point."""
 
     signal_electrons: Positive
-    """In both wells in one exposure, from albedo 1, facing, on the axis at 1 m."""
+    """Electrons in both wells in one exposure, from albedo 1, facing, on the axis at 1 m."""
     calibration_sigma_mm: Positive
     """Published temporal deviation of single pixels at the calibration point."""
     calibration_distance_m: Positive
@@ -250,7 +250,8 @@ class PhotonFacts(Config):
     full_well_electrons: Positive | None = None
     """Capacity of one well; None: only the converter saturates."""
     exposure_ends_electrons: Positive | None = None
-    """In both wells when a pixel's exposure ends; its sample is scaled to the full length."""
+    """Electrons in both wells when a pixel's exposure ends; its sample is scaled to the full
+    length."""
     band_nm: Positive
     """Width of the filter's band, for ambient light."""
 
@@ -305,7 +306,7 @@ class EngineFacts(LimitFacts):
     window_px: Window
     """Side of the filter's window."""
     filter_on: Fact[Literal["unit_phasors", "phasors"]]
-    """Whether each phasor counts by its weight alone, or by its amplitude too."""
+    """A phasor counts by its weight alone, or by its amplitude too."""
     spatial_sigma_px: Positive | None = None
     """Deviation of the window's Gaussian; None: a box."""
     concentration: NonNegative
@@ -313,17 +314,17 @@ class EngineFacts(LimitFacts):
     dim_amplitude_units: NonNegative
     """A centre not brighter than that gets weights by distance alone."""
     drop_dim_neighbours: Fact[bool]
-    """Whether a brighter centre ignores dimmer neighbours."""
+    """True if a brighter centre ignores dimmer neighbours."""
     edges_to_dim: Fact[bool]
-    """Whether dim neighbours that are not ignored count in the edge sum."""
+    """True if dim neighbours that are not ignored count in the edge sum."""
     fusion: Fact[Literal["least_squares", "mean"]]
-    """How the frequencies' unwrapped phases become one path."""
+    """The rule by which the frequencies' unwrapped phases become one path."""
     amplitude_gains: PositiveEach
     """Multiply each frequency's amplitude before all gates."""
     edge_threshold: Positive | None = None
     """Limit of the sum over the window of (1 - cos dphi)/2."""
     edges_in: Fact[Literal["any", "mean"]]
-    """Whether the limit holds for any of the frequencies or for their mean."""
+    """The limit holds for any of the frequencies, or for their mean."""
     lattice_residual_turns: Positive | None = None
     """Limit of the deviation of phases from those of one path."""
     residual_by_amplitude: ResidualByAmplitudeFacts | None = None

@@ -42,11 +42,11 @@ class FilterSettings(NamedTuple):
     dim: Any
     """Amplitude in units up to which a pixel is dim."""
     drop_dim: bool
-    """Whether a brighter centre drops neighbours below ``dim``."""
+    """True if a brighter centre drops neighbours below ``dim``."""
     dim_edges: bool
-    """Whether neighbours below ``dim`` that are kept count in the edge sum."""
+    """True if neighbours below ``dim`` that are kept count in the edge sum."""
     by_amplitude: bool
-    """Whether phasors also count by amplitude."""
+    """True if phasors also count by amplitude."""
 
 
 # ---------------------------------------------------------------- exposure

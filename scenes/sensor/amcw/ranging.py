@@ -57,7 +57,7 @@ class Gates(NamedTuple):
     residual_most: np.float32
     """Greatest limit of the lattice residual, in turns."""
     residual_scale: np.float32
-    """Between them, the limit is this times A^``residual_slope``, A the greatest amplitude."""
+    """The limit between them is this times A^``residual_slope``, A the greatest amplitude."""
     residual_slope: np.float32
     """0: the limit is ``residual``."""
     ratio: np.float32
@@ -84,11 +84,11 @@ class FlyingGate(NamedTuple):
     least_mean: np.float32
     """Smallest mean that the deviation is compared with, in units."""
     near_m: np.float32
-    """How much nearer a neighbour must reach."""
+    """A neighbour must reach more than that nearer."""
     far_m: np.float32
-    """How much farther another must reach."""
+    """Another must reach more than that farther."""
     most_m: np.float32
-    """What either must exceed."""
+    """Either must exceed that."""
 
 
 class DepthEngine(NamedTuple):

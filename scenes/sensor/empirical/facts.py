@@ -34,7 +34,8 @@ class SurfaceLightFacts(Config):
     """The recorded surface as a standard of brightness."""
 
     amplitude_at_1m: Positive
-    """In the recording's units, facing the camera; it falls with the square of the distance."""
+    """Amplitude in the recording's units, facing the camera; it falls with the square of the
+    distance."""
     albedo: Annotated[Fact[float], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
     """Assumed for that surface."""
 

@@ -33,7 +33,7 @@ class IdealRange(NamedTuple):
     sigma_m: np.ndarray
     """Deviation of a frame's range."""
     amplitude: np.ndarray
-    """In the recording's units."""
+    """Amplitude in the recording's units."""
     chance: np.ndarray
     """Probability of no return."""
 

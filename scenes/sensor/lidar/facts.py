@@ -68,9 +68,9 @@ class LidarPhotonFacts(Config):
     """The photon budget in primary electrons, before the avalanche, of one point's integration."""
 
     signal_electrons: Positive
-    """From albedo 1 facing the camera at 1 m on the axis."""
+    """Electrons from albedo 1 facing the camera at 1 m on the axis."""
     excess_noise_factor: Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
-    """By which the avalanche multiplies the variance of shot noise."""
+    """Factor by which the avalanche multiplies the variance of shot noise."""
     amplifier_electrons: NonNegative
     """Standard deviation of the amplifier's noise."""
     band_nm: Positive
@@ -121,7 +121,7 @@ class ScannedLidar(CameraFacts):
     scan: ScanFacts
     """The raster of its directions."""
     code: CodeFacts
-    """What modulates it."""
+    """The modulation."""
     photons: LidarPhotonFacts
     """The photon budget."""
     fixed_pattern: SmoothPatternFacts

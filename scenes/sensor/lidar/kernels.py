@@ -323,8 +323,8 @@ def _add_agreeing(  # type: ignore[no-untyped-def]
         sums[np.uint64(2 * CHUNK) + u] += counted * height[row, column + u]
 
 
-class Limits(NamedTuple):
-    """What the device asks of a smoothed half path."""
+class DeviceLimits(NamedTuple):
+    """Limits that the device sets to a smoothed half path."""
 
     receiver2_m2: np.float32
     """Squared distance from the transmitter to the receiver."""
@@ -364,7 +364,7 @@ def gated(  # type: ignore[no-untyped-def]
         along_m: (h, w) u.e.
         cosine: (h, w) u_z.
         saturated: (h, w) bool.
-        limits: the `Limits`.
+        limits: the `DeviceLimits`.
         error_m: displacement of the frame.
         z_m, reason, strength: (h, w); written.
     """

@@ -96,11 +96,11 @@ class LidarScanner(UnitModel[ScannedLidar]):
         return np.stack(rays_of(self.slopes, self.camera.optics.emitter_m)).astype(f4)
 
     @cached_property
-    def _limits(self) -> kernels.Limits:
+    def _limits(self) -> kernels.DeviceLimits:
         camera = self.camera
         engine = camera.engine
         receiver_m = camera.optics.emitter_m
-        return kernels.Limits(
+        return kernels.DeviceLimits(
             receiver2_m2=f4(receiver_m @ receiver_m),
             least_strength=f4(engine.confidence_electrons.value),
             least_agreeing=f4(engine.least_agreeing.value),
