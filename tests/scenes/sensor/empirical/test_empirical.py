@@ -271,6 +271,8 @@ def table_of(**changes: Any) -> dict[str, Any]:
     ("intensity", "sigma_mm", "share"),
     [
         (0.25, 4.0, 0.5),
+        (0.33, 4.0, 0.5),  # the nearest octave counts
+        (0.38, 2.0, 0.9),
         (0.5, 2.0, 0.9),
         (1.0, 1.0, 1.0),
         (8.0, 1.0, 1.0),
