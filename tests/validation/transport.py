@@ -29,14 +29,10 @@ if __name__ == "__main__":
 from harness.vocabulary.geometry import MM, Lens
 from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig, wave_numbers
 from scenes.render.direct import OffFace, cast
+from scenes.render.indirect import PathWork, gather_in_pixels
+from scenes.render.range_noise import range_change_m, range_noise_m
 from scenes.render.scene import LitScene, lit_scene, load_mitsuba
-from scenes.render.view import (
-    PathWork,
-    gather_in_pixels,
-    range_change_m,
-    range_noise_m,
-    render_view,
-)
+from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import Target, build_target
 from scenes.target.thesis import ThesisTargetConfig

@@ -17,17 +17,11 @@ from scenes.optics import Quadrilaterals, RenderConfig, footprint_of
 from scenes.render import scene as variant
 from scenes.render.cache import cached_view, render_key
 from scenes.render.direct import OffFace, cast, direct_light
+from scenes.render.face import face_triangles
+from scenes.render.indirect import PathWork, gather_at_points, gather_in_pixels
+from scenes.render.range_noise import range_change_m
 from scenes.render.scene import lit_scene, load_mitsuba
-from scenes.render.view import (
-    PathWork,
-    face_triangles,
-    gather_at_points,
-    gather_in_pixels,
-    indirect_light,
-    range_change_m,
-    render_view,
-    target_region,
-)
+from scenes.render.view import indirect_light, render_view, target_region
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig

@@ -10,8 +10,8 @@ import trimesh
 
 from scenes.optics import COARSE, Quadrilaterals
 from scenes.render.direct import cast
+from scenes.render.indirect import PathWork, gather_at_points
 from scenes.render.scene import lit_scene, load_mitsuba
-from scenes.render.view import PathWork, gather_at_points
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import TargetPart
 

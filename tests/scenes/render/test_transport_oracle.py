@@ -12,8 +12,9 @@ import trimesh
 from harness.vocabulary.geometry import Lens
 from scenes.optics import Optics, RenderConfig, footprint_of
 from scenes.render.direct import direct_light
+from scenes.render.indirect import PathWork, gather_in_pixels
 from scenes.render.scene import lit_scene, load_mitsuba
-from scenes.render.view import PathWork, gather_in_pixels, render_view
+from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import TargetPart, build_target
