@@ -61,7 +61,10 @@ def plane_view(
 
 
 def image_view(
-    camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.ndarray
+    camera: AnyCamera,
+    region: Region,
+    z_m: np.ndarray,
+    light: np.ndarray,
 ) -> NoiseFreeView:
     """Return a view from a depth image, sampled at pixel centres, with direct light only. ``z_m``
     (h, w): NaN where there is nothing. ``light`` (h, w): the light that returns from each pixel,
@@ -101,7 +104,12 @@ class _Hits(NamedTuple):
 
 
 def layered_view(
-    camera: AnyCamera, region: Region, front: Plane, back: Plane, covers: Covers, albedo: float
+    camera: AnyCamera,
+    region: Region,
+    front: Plane,
+    back: Plane,
+    covers: Covers,
+    albedo: float,
 ) -> NoiseFreeView:
     """Return a view of a part of the plane ``front`` (where it ``covers``) in front of the
     infinite plane ``back``, both Lambertian with the same albedo. Each pixel sums phasors over its
@@ -153,7 +161,12 @@ def layered_view(
     )
 
 
-def _behind(points_m: np.ndarray, front: Plane, covers: Covers, optics: Optics) -> np.ndarray:
+def _behind(
+    points_m: np.ndarray,
+    front: Plane,
+    covers: Covers,
+    optics: Optics,
+) -> np.ndarray:
     """Return whether the front casts its shadow on points (..., 3)."""
     # the line to the emitter meets the front's plane, n . p = -distance, at p + t to_emitter
     to_emitter = optics.emitter_m - points_m
@@ -166,7 +179,12 @@ def _behind(points_m: np.ndarray, front: Plane, covers: Covers, optics: Optics) 
     return between & covers(slopes)
 
 
-def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> _Hits:
+def _lit(
+    slopes: np.ndarray,
+    plane: Plane,
+    albedo: float,
+    optics: Optics,
+) -> _Hits:
     """Return the ends on a plane of rays (..., 2) from the lens."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
     points = rays * plane.z_along_m(slopes)[..., None]

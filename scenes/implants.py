@@ -53,7 +53,13 @@ class Implant:
         """The largest change of distance that the damage makes."""
         return float(np.abs(self.shift_m).max()) / MM
 
-    def put_into(self, frame: Frame, number: int, z_m: np.ndarray, reason: np.ndarray) -> None:
+    def put_into(
+        self,
+        frame: Frame,
+        number: int,
+        z_m: np.ndarray,
+        reason: np.ndarray,
+    ) -> None:
         """Change ``z_m`` and ``reason`` (H, W), copies of those of a recording's frame, in place;
         pixels without range stay so. ``number``: of the frame among those drawn, from 0; beyond
         them, they are used again from the first."""
@@ -164,7 +170,11 @@ def implant_of(
 
 
 def _drawn(
-    config: CameraConfig, target: custom.TargetConfig, frames: int, seed: int, cache: Path
+    config: CameraConfig,
+    target: custom.TargetConfig,
+    frames: int,
+    seed: int,
+    cache: Path,
 ) -> tuple[SimulatedUnit, np.ndarray, np.ndarray]:
     """Return a unit of the camera before the target, z (t, h, w) of frames, and z (h, w) without
     noise."""
@@ -190,7 +200,11 @@ def _region_of_board(lens: Lens, board: custom.TargetConfig) -> Region:
     return Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
 
 
-def side_mm(damage: custom.AnyDamage, distance_m: float, config: CameraConfig) -> float:
+def side_mm(
+    damage: custom.AnyDamage,
+    distance_m: float,
+    config: CameraConfig,
+) -> float:
     """Return the side of a board with space for a damage, the reach of the camera's filter around
     it, and a rim."""
     camera = camera_of(config)

@@ -82,7 +82,11 @@ BEAM_REACH = 3.0
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals:
+def footprint_of(
+    lens: Lens,
+    region: Region,
+    beam_fwhm_rad: float | None,
+) -> Quadrilaterals:
     """Return the footprints of a region's pixels: beams if the camera has a beam width."""
     if beam_fwhm_rad:
         return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION)
@@ -98,7 +102,11 @@ class Quadrilaterals:
     # pixels
     reach_px = 0
 
-    def __init__(self, lens: Lens, region: Region) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        region: Region,
+    ) -> None:
         # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
         corners = Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1)
         self.corner = lens.region_slopes(corners, -0.5)
@@ -126,7 +134,12 @@ class Quadrilaterals:
         fy = (number * GOLDEN) % 1
         return np.stack([np.ones(count), fx, fy, fx * fy])
 
-    def slopes(self, rows: np.ndarray, cols: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def slopes(
+        self,
+        rows: np.ndarray,
+        cols: np.ndarray,
+        weights: np.ndarray,
+    ) -> np.ndarray:
         """Return slopes (n, m, 2) of the sub-rays of pixels with ``weights`` (k, m)."""
         rays = self.axes(rows, cols) @ weights
         return np.moveaxis(rays[:, :2] / rays[:, 2:], 1, 2)
@@ -138,7 +151,12 @@ class Beams(Quadrilaterals):
     shares: a knife edge cuts off its share of the Gaussian to 0.02. The coarse grid has the
     Gaussian's second moments. Angles are approximated by tangents."""
 
-    def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        region: Region,
+        deviation_rad: float,
+    ) -> None:
         super().__init__(lens, region)
         self._slopes = lens.region_slopes(region)
         self._deviation_rad = deviation_rad
@@ -150,9 +168,17 @@ class Beams(Quadrilaterals):
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): the central ray and two axes across it, for angles."""
         centre = np.concatenate([self._slopes[rows, cols], np.ones((len(rows), 1))], axis=-1)
-        centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
+        centre /= np.linalg.norm(
+            centre,
+            axis=-1,
+            keepdims=True,
+        )
         across = np.cross([0.0, 1.0, 0.0], centre)
-        across /= np.linalg.norm(across, axis=-1, keepdims=True)
+        across /= np.linalg.norm(
+            across,
+            axis=-1,
+            keepdims=True,
+        )
         return np.stack([centre, across, np.cross(centre, across)], axis=-1)
 
     def grid(self, side: int = COARSE) -> np.ndarray:
@@ -219,11 +245,33 @@ class RenderConfig(Config):
         le=32,
         description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10",
     )
-    face_spacing_mm: float = Field(80.0, gt=0, description="spacing of the nodes on the face")
-    face_samples: int = Field(8192, ge=8, description="light paths for each node on the face")
-    hole_noise_mm: float = Field(
-        0.1, gt=0, description="aim for the noise of range in pixels off the face"
+    face_spacing_mm: float = Field(
+        80.0,
+        gt=0,
+        description="spacing of the nodes on the face",
     )
-    hole_samples: int = Field(8192, ge=8, description="most light paths for each of those pixels")
-    rest_samples: int = Field(16, ge=8, description="light paths for each pixel around the board")
-    seed: int = Field(1, ge=0, le=1_000_000)
+    face_samples: int = Field(
+        8192,
+        ge=8,
+        description="light paths for each node on the face",
+    )
+    hole_noise_mm: float = Field(
+        0.1,
+        gt=0,
+        description="aim for the noise of range in pixels off the face",
+    )
+    hole_samples: int = Field(
+        8192,
+        ge=8,
+        description="most light paths for each of those pixels",
+    )
+    rest_samples: int = Field(
+        16,
+        ge=8,
+        description="light paths for each pixel around the board",
+    )
+    seed: int = Field(
+        1,
+        ge=0,
+        le=1_000_000,
+    )

@@ -100,10 +100,16 @@ class _Spread(_Guess):
         description="angle between the outermost views"
     )
     distance_jitter_mm: float = Field(
-        0.0, ge=0.0, le=500.0, description="deviation of distances but the first"
+        0.0,
+        ge=0.0,
+        le=500.0,
+        description="deviation of distances but the first",
     )
     aim_jitter_mm: float = Field(
-        0.0, ge=0.0, le=500.0, description="deviation of the aim, to the sides and up or down"
+        0.0,
+        ge=0.0,
+        le=500.0,
+        description="deviation of the aim, to the sides and up or down",
     )
 
 
@@ -175,7 +181,10 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
     return tuple(poses)
 
 
-def _jitter_mm(views: ArcViews | GridViews, number: int) -> tuple[float, float, float]:
+def _jitter_mm(
+    views: ArcViews | GridViews,
+    number: int,
+) -> tuple[float, float, float]:
     """Draw the deviation of a view's target along x, y and z."""
     distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
     aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
@@ -257,7 +266,11 @@ def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(step) for step in (paths / greatest * reach).T.tolist())
 
 
-def _moved(pose: PoseConfig, turn_deg: Sequence[float], shift_mm: Sequence[float]) -> PoseConfig:
+def _moved(
+    pose: PoseConfig,
+    turn_deg: Sequence[float],
+    shift_mm: Sequence[float],
+) -> PoseConfig:
     """Return the pose turned about x, y and z, and shifted along them."""
     return PoseConfig(
         tilt_x_deg=pose.tilt_x_deg + turn_deg[0],

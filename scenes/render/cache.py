@@ -41,7 +41,11 @@ RENDERING = ".rendering"
 LOCK = ".lock"
 
 
-def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
+def render_key(
+    target: TargetConfig,
+    optics: Optics,
+    config: RenderConfig,
+) -> str:
     """Return the digest of all inputs of a render: target, the camera's optics (not its engine),
     effort and code."""
     return digest(
@@ -55,7 +59,10 @@ def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> st
 
 
 def cached_view(
-    target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path
+    target: TargetConfig,
+    optics: Optics,
+    config: RenderConfig,
+    folder: Path,
 ) -> tuple[NoiseFreeView, bool]:
     """Return the view of a declared target, and whether it came from the cache. If another process
     renders it, wait for that. Raises UserError as `build_target` and `render_view` do, and if the
@@ -156,7 +163,10 @@ def _last_use(file: StoredFile) -> tuple[float, str]:
     return file.used_s, file.path.name
 
 
-def leftovers(folder: Path, older_than_s: float = LEFTOVER_AFTER_S) -> list[StoredFile]:
+def leftovers(
+    folder: Path,
+    older_than_s: float = LEFTOVER_AFTER_S,
+) -> list[StoredFile]:
     """Return the temporary files of renders that were never finished, if untouched for
     ``older_than_s``."""
     before_s = time.time() - older_than_s
@@ -176,7 +186,9 @@ def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
 
 
 def longest_unused(
-    renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]
+    renders: Iterable[StoredFile],
+    limit_bytes: int,
+    keep: Collection[Path],
 ) -> list[StoredFile]:
     """Return the longest unused renders to remove so that the rest fits ``limit_bytes``; none of
     ``keep`` (names)."""
@@ -191,7 +203,11 @@ def longest_unused(
     return to_remove
 
 
-def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> int:
+def trim_cache(
+    folder: Path,
+    limit_bytes: int,
+    keep: Collection[Path] = (),
+) -> int:
     """Remove the longest unused renders until the rest fits ``limit_bytes``, but none of ``keep``,
     and old leftovers of killed processes; remove nothing while another process uses the folder.
     Return how many are left."""
@@ -209,7 +225,11 @@ def in_use(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(opened_lock(folder / LOCK))
-            lock(file, shared=True, wait=True)
+            lock(
+                file,
+                shared=True,
+                wait=True,
+            )
         yield
 
 
@@ -224,7 +244,14 @@ def alone(folder: Path) -> Iterator[None]:
             raise UserError(
                 f"{folder}: cannot be written ({error.strerror})", fix="ask its owner"
             ) from error
-        if lock(file, shared=False, wait=False) == "busy":
+        if (
+            lock(
+                file,
+                shared=False,
+                wait=False,
+            )
+            == "busy"
+        ):
             raise UserError(
                 f"{folder}: a sweep that is running uses these renders",
                 fix="wait until it has ended; nothing was removed",

@@ -50,7 +50,12 @@ def comb_step(frequencies_hz: Frequencies) -> float | None:
     return float(steps.mean())
 
 
-def added(totals: list[Any], light: Any, length: Any, frequencies_hz: Frequencies) -> list[Any]:
+def added(
+    totals: list[Any],
+    light: Any,
+    length: Any,
+    frequencies_hz: Frequencies,
+) -> list[Any]:
     """Add light after a path's length to real and imaginary sums by frequency, intensity last; for
     a comb, each phasor is the previous one times that of the spacing."""
     import drjit as dr
@@ -160,7 +165,16 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     amplitude = albedo * arriving
     surface = dr.select(met.valid, mi.Int32(met.surface), -1)
     on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
-    dr.eval(range_m, path_m, amplitude, albedo, surface, uv, on_face, met.normal)
+    dr.eval(
+        range_m,
+        path_m,
+        amplitude,
+        albedo,
+        surface,
+        uv,
+        on_face,
+        met.normal,
+    )
     # vectors one by one: to interleave them, Dr.Jit would compile a kernel for each number of rays
     return Hits(
         range_m=range_m.numpy(),
@@ -281,15 +295,19 @@ class _Sums:
         off = off_face.numpy().reshape(by_lane)
         counts = np.where(unsure, 0, np.bitwise_count(off).sum(axis=1, dtype=int))
         steps = np.maximum(counts // KEPT, 1)
-        some = counts > 0
-        kept = -(-counts // steps)[some]
+        has_off_face = counts > 0
+        kept = -(-counts // steps)[has_off_face]
         slopes = np.empty((kept.sum(), 2), np.float32)
-        _slopes_kept(off[some], steps[some], axes[some], weights, slopes)
-        self.off_face.append(OffFace(pixels[some], kept, counts[some] / m, slopes))
+        _slopes_kept(off[has_off_face], steps[has_off_face], axes[has_off_face], weights, slopes)
+        self.off_face.append(OffFace(pixels[has_off_face], kept, counts[has_off_face] / m, slopes))
         return pixels[unsure]
 
     def _lane_sums(
-        self, pixels: np.ndarray, axes: np.ndarray, weights: np.ndarray, plane: bool
+        self,
+        pixels: np.ndarray,
+        axes: np.ndarray,
+        weights: np.ndarray,
+        plane: bool,
     ) -> tuple[_LaneSums, Any]:
         """Return the sums of each lane, which has A_LANE sub-rays of a pixel, and the bits of those
         that met something off the face; pixels one after the other."""
@@ -365,7 +383,7 @@ class _Sums:
         rays = np.column_stack([self.slopes[pixels], np.ones(len(pixels))])
         rays *= (central.range_m[pixels] / np.linalg.norm(rays, axis=1))[:, None]
         height = on_device(mi.Float, (normals * rays).sum(axis=1))
-        normal = mi.Normal3f(*[on_device(mi.Float, column) for column in normals.T])
+        normal = mi.Normal3f([on_device(mi.Float, column) for column in normals.T])
         on_face = on_device(mi.UInt32, central.on_face[pixels]) > 0
         clear = on_device(mi.UInt32, (central.amplitude > 0)[pixels]) > 0
 
@@ -394,7 +412,11 @@ def _means(lanes: Any, by_lane: tuple[int, int]) -> np.ndarray:
     return np.asarray(sums / (by_lane[1] * A_LANE))
 
 
-def _error_m(means: _LaneSums, strongest: np.ndarray, count: int) -> np.ndarray:
+def _error_m(
+    means: _LaneSums,
+    strongest: np.ndarray,
+    count: int,
+) -> np.ndarray:
     """Return the error of range (n,) to expect if MISPLACED of ``count`` sub-rays lie on the other
     side of an edge: the spread of the paths in a pixel, over the number of sub-rays and the root of
     its light over that of ``strongest`` (n,) alone."""
@@ -407,7 +429,13 @@ def _error_m(means: _LaneSums, strongest: np.ndarray, count: int) -> np.ndarray:
 
 
 @numba.njit(**FAST)
-def _slopes_kept(off, steps, axes, weights, slopes):  # type: ignore[no-untyped-def]
+def _slopes_kept(
+    off,
+    steps,
+    axes,
+    weights,
+    slopes,
+):  # type: ignore[no-untyped-def]
     """Write the slopes of every ``steps`` (n,)-th of a pixel's sub-rays whose bit is set in
     ``off`` (n, m / A_LANE)."""
     written = 0
@@ -476,7 +504,10 @@ def direct_light(
 
 
 def _corners(
-    lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits
+    lit: LitScene,
+    corner: np.ndarray,
+    slopes: np.ndarray,
+    central: Hits,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return, (h, w) each, how far rays through a pixel's corners hit off the plane at its centre,
     and whether they show an edge or the edge of a shadow in the pixel.
@@ -517,4 +548,9 @@ def _corners(
 def _over_albedo(hits: Hits) -> np.ndarray:
     """Return the light (n,) of hits on a surface of albedo 1; 0 where the albedo is 0."""
     nothing = np.zeros(len(hits.albedo))
-    return np.divide(hits.amplitude, hits.albedo, out=nothing, where=hits.albedo > 0)
+    return np.divide(
+        hits.amplitude,
+        hits.albedo,
+        out=nothing,
+        where=hits.albedo > 0,
+    )

@@ -56,7 +56,14 @@ def face_light(
     grid_x_m, grid_y_m = np.meshgrid(node_x_m, node_y_m)
     points_m, normals = _above_face(target, grid_x_m.ravel(), grid_y_m.ravel())
     bright = _bounds_of_face(target)
-    light = gather_at_points(lit, points_m, normals, work, config.face_samples, bright)
+    light = gather_at_points(
+        lit,
+        points_m,
+        normals,
+        work,
+        config.face_samples,
+        bright,
+    )
 
     lines = noise_lines(work.frequencies_hz)
     deviations = light[:, lines] - light[:, lines].mean(axis=0)
@@ -83,7 +90,11 @@ def _node_line_m(values_m: np.ndarray, spacing_m: float) -> np.ndarray:
     return np.linspace(low, high, max(count, LEAST_NODES))
 
 
-def _above_face(target: Target, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _above_face(
+    target: Target,
+    x_m: np.ndarray,
+    y_m: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3) above places of the face in plan, and its unit normals (n, 3) there, in
     the camera's frame."""
     face = face_of(target.config.board)
@@ -107,7 +118,16 @@ def _bounds_of_face(target: Target) -> np.ndarray:
 
 
 @numba.njit(**FAST)
-def between_nodes(position, size, mean, deviations, lines, weights, share, total):  # type: ignore[no-untyped-def]
+def between_nodes(
+    position,
+    size,
+    mean,
+    deviations,
+    lines,
+    weights,
+    share,
+    total,
+):  # type: ignore[no-untyped-def]
     """Interpolate light between nodes, bilinearly. Return it times ``share`` (f + 1, n), and its
     noise of range (n,) in metres when it is added to ``total``.
 

@@ -104,7 +104,11 @@ def gather_at_points(
     names = [part.name for part in lit.parts]
     board = names.index("board") if "board" in names else 0
 
-    def cosine_start(index: Any, u1: Any, u2: Any) -> PathStart:
+    def cosine_start(
+        index: Any,
+        u1: Any,
+        u2: Any,
+    ) -> PathStart:
         x, y, z, nx, ny, nz = [dr.gather(mi.Float, column, index) for column in columns]
         point = mi.Point3f(x, y, z)
         normal = mi.Normal3f(nx, ny, nz)
@@ -128,7 +132,12 @@ def gather_at_points(
     density = on_device(mi.Float, shares)
     guided_count = dr.opaque(mi.UInt32, guided_cells.size)
 
-    def guided_start(index: Any, u1: Any, u2: Any, _: Any) -> PathStart:
+    def guided_start(
+        index: Any,
+        u1: Any,
+        u2: Any,
+        _: Any,
+    ) -> PathStart:
         # u1 chooses a cell, and what is left of it the place across the cell
         guided = u1 < GUIDED_SHARE
         along_guided = u1 * mi.Float(guided_count) / GUIDED_SHARE
@@ -145,11 +154,20 @@ def gather_at_points(
 
     counts = np.full(len(points_m), samples)
     same_rotation = np.zeros(len(points_m))
-    return _gather(lit, guided_start, work, counts, same_rotation, bright)
+    return _gather(
+        lit,
+        guided_start,
+        work,
+        counts,
+        same_rotation,
+        bright,
+    )
 
 
 def _cells_that_meet(
-    lit: LitScene, start: Callable[[Any, Any, Any], PathStart], point_count: int
+    lit: LitScene,
+    start: Callable[[Any, Any, Any], PathStart],
+    point_count: int,
 ) -> np.ndarray:
     """Return the indices of the cells of first directions in which a probe from any point met
     something; all if none did."""
@@ -165,7 +183,11 @@ def _cells_that_meet(
 
 
 def gather_in_pixels(
-    lit: LitScene, rays: OffFace, work: PathWork, samples: np.ndarray | int, after: int = 0
+    lit: LitScene,
+    rays: OffFace,
+    work: PathWork,
+    samples: np.ndarray | int,
+    after: int = 0,
 ) -> np.ndarray:
     """Gather indirect light, the mean over the listed sub-rays of each pixel. Returns light as
     `_gather` does, with the albedos of the first vertices.
@@ -185,7 +207,12 @@ def gather_in_pixels(
     firsts = on_device(mi.UInt32, np.cumsum(rays.counts) - rays.counts)
     counts = on_device(mi.UInt32, rays.counts)
 
-    def start(index: Any, u1: Any, u2: Any, u3: Any) -> PathStart:
+    def start(
+        index: Any,
+        u1: Any,
+        u2: Any,
+        u3: Any,
+    ) -> PathStart:
         count = dr.gather(mi.UInt32, counts, index)
         chosen = dr.minimum(mi.UInt32(u3 * mi.Float(count)), count - 1)
         ray = dr.gather(mi.UInt32, firsts, index) + chosen
@@ -206,7 +233,15 @@ def gather_in_pixels(
 
     work = work._replace(bounces=work.bounces - 1)
     counts_by_pixel = np.broadcast_to(np.asarray(samples), rays.pixel.shape)
-    return _gather(lit, start, work, counts_by_pixel, rays.pixel, None, after)
+    return _gather(
+        lit,
+        start,
+        work,
+        counts_by_pixel,
+        rays.pixel,
+        None,
+        after,
+    )
 
 
 def _gather(
@@ -226,7 +261,14 @@ def _gather(
     per_batch = np.maximum(samples // BATCHES, 1)
     earlier = after // BATCHES
     longest = int(per_batch.max()) + earlier
-    walk = _Walk(lit, start, work, rotations, bright, longest)
+    walk = _Walk(
+        lit,
+        start,
+        work,
+        rotations,
+        bright,
+        longest,
+    )
     # lanes for so many paths a batch at each place; the first lane of each place and batch
     lanes_per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
     first_lanes = np.cumsum(lanes_per_pair) - lanes_per_pair
@@ -280,7 +322,8 @@ class _Walk:
 
     def _opaque_vector(self, values: np.ndarray) -> Any:
         mi = self.lit.mi
-        return mi.Vector3f(*[self.lit.dr.opaque(mi.Float, value) for value in values.tolist()])
+        components = [self.lit.dr.opaque(mi.Float, value) for value in values.tolist()]
+        return mi.Vector3f(components)
 
     def sums(self, lanes: np.ndarray) -> np.ndarray:
         """Return sums over the paths of each lane: (f + 1, n) complex64, intensity last.
@@ -357,7 +400,14 @@ class _Walk:
             # the half of the square left by the other choice is a square too
             stretched = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
             spread = _cosine_direction(lit, hit.normal, stretched, u2)
-            aimed, weight = _towards_bright(lit, self.bright, hit, spread, u1, u2)
+            aimed, weight = _towards_bright(
+                lit,
+                self.bright,
+                hit,
+                spread,
+                u1,
+                u2,
+            )
             direction = dr.select(fresh, aimed, direction)
             throughput = throughput * dr.select(fresh, weight, 1)
         throughput = throughput * lit.lobe(hit.surface, hit.normal, hit.viewer, direction)
@@ -366,7 +416,12 @@ class _Walk:
         vertex = dr.select(goes_on, vertex + 1, 0)
         return path, vertex, hit.point, hit.normal, direction, length, throughput, totals
 
-    def _uniform(self, lanes: Lanes, path: Any, dimension: Any) -> tuple[Any, Any]:
+    def _uniform(
+        self,
+        lanes: Lanes,
+        path: Any,
+        dimension: Any,
+    ) -> tuple[Any, Any]:
         """Return two co-ordinates of the low-discrepancy point of each lane's path, shifted by its
         place's rotation."""
         mi = self.lit.mi
@@ -381,7 +436,11 @@ class _Walk:
 
 
 @lru_cache(maxsize=8)
-def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
+def _sobol(
+    dimensions: int,
+    longest: int,
+    seed: int,
+) -> np.ndarray:
     """Return the low-discrepancy points of all batches as flat float32, in the order batch, point,
     dimension."""
     rng = np.random.default_rng([seed, 0x1D1EC7])
@@ -389,7 +448,12 @@ def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
     return np.ascontiguousarray(np.stack(batches), np.float32).ravel()
 
 
-def _cosine_direction(lit: LitScene, normal: Any, u1: Any, u2: Any) -> Any:
+def _cosine_direction(
+    lit: LitScene,
+    normal: Any,
+    u1: Any,
+    u2: Any,
+) -> Any:
     """Return a unit direction drawn by the cosine from the normal, with two numbers in 0..1."""
     mi = lit.mi
     local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
@@ -397,7 +461,12 @@ def _cosine_direction(lit: LitScene, normal: Any, u1: Any, u2: Any) -> Any:
 
 
 def _towards_bright(
-    lit: LitScene, bright: list[Any], hit: Any, spread: Any, u1: Any, u2: Any
+    lit: LitScene,
+    bright: list[Any],
+    hit: Any,
+    spread: Any,
+    u1: Any,
+    u2: Any,
 ) -> tuple[Any, Any]:
     """Return directions from hits, and their weights.
 

@@ -9,7 +9,9 @@ NOISE_LINES = 4
 
 
 def range_noise_m(
-    batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]
+    batches: np.ndarray,
+    total: np.ndarray,
+    frequencies_hz: tuple[float, ...],
 ) -> np.ndarray:
     """Return the standard error of range (n,) of the mean over independent batches of light.
 
@@ -23,13 +25,20 @@ def range_noise_m(
 
 
 def range_change_m(
-    change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]
+    change: np.ndarray,
+    total: np.ndarray,
+    frequencies_hz: tuple[float, ...],
 ) -> np.ndarray:
     """Return the change of range (..., n) by a small change (..., f, n) of phasors ``total`` (f,
     n); 0 without light. Phases turn by Im(dH / H) and are combined with the `range_weights`."""
     weights = range_weights(frequencies_hz)[:, None]
     nothing = np.zeros(total.shape, complex)
-    by_light = np.divide(weights, total, out=nothing, where=np.abs(total) > 0)
+    by_light = np.divide(
+        weights,
+        total,
+        out=nothing,
+        where=np.abs(total) > 0,
+    )
     turned = change.real * by_light.imag + change.imag * by_light.real
     return np.asarray(turned.sum(axis=-2))
 

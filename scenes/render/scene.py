@@ -103,7 +103,11 @@ def _point_to_llvm() -> UserError | None:
         if libraries:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(libraries[-1])
             return None
-    return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
+    return UserError(
+        "no LLVM was found that Dr.Jit can use",
+        legal=LEGAL,
+        fix=FIX,
+    )
 
 
 def on_device(kind: Any, values: np.ndarray) -> Any:
@@ -176,7 +180,12 @@ class LitScene:
     """Eight factors by which texture coordinates are affine in position: data, because constants
     would compile the kernels anew for each board."""
 
-    def meet(self, origin: Any, direction: Any, coherent: bool = False) -> Met:
+    def meet(
+        self,
+        origin: Any,
+        direction: Any,
+        coherent: bool = False,
+    ) -> Met:
         """Return the first hits of rays along unit directions. ``coherent``: neighbours are alike,
         which is a third of the time then, and twice the time otherwise, with the same hits."""
         mi = self.mi
@@ -213,7 +222,13 @@ class LitScene:
         value = self.texture.eval(self.uv(met.point), on_textured)[0]
         return dr.select(on_textured, value, plain)
 
-    def lobe(self, surface: Any, normal: Any, viewer: Any, direction: Any) -> Any:
+    def lobe(
+        self,
+        surface: Any,
+        normal: Any,
+        viewer: Any,
+        direction: Any,
+    ) -> Any:
         """Return the light that a surface reflects from ``direction`` to ``viewer``, over that of
         a Lambertian one of the same albedo: 1 - share + share (exponent + 2) / 2 cos^exponent. All
         directions leave the surface."""
@@ -227,7 +242,12 @@ class LitScene:
         cosine = dr.maximum(dr.dot(mirrored, direction), 1e-6)
         return 1 - share + share * (exponent + 2) / 2 * dr.power(cosine, exponent)
 
-    def arriving(self, met: Met, coherent: bool = False, clear: Any = None) -> tuple[Any, Any]:
+    def arriving(
+        self,
+        met: Met,
+        coherent: bool = False,
+        clear: Any = None,
+    ) -> tuple[Any, Any]:
         """Return the light from the emitter at each hit: (irradiance, distance).
 
         The irradiance is cone(direction) cos(incidence) / d^2 times the `lobe`: 1 on a facing
@@ -235,7 +255,7 @@ class LitScene:
         between, if that is known."""
         mi = self.mi
         dr = self.dr
-        emitter = mi.Point3f(*self.emitter_m.tolist())
+        emitter = mi.Point3f(self.emitter_m.tolist())
         towards = emitter - met.point
         squared = dr.squared_norm(towards)
         distance = dr.sqrt(squared)
@@ -277,7 +297,14 @@ def lit_scene(
     parameters.update()
     corners = np.asarray(joined.vertices)[joined.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    normals = across / np.maximum(
+        np.linalg.norm(
+            across,
+            axis=1,
+            keepdims=True,
+        ),
+        1e-30,
+    )
     face_counts = [len(part.mesh.faces) for part in parts]
     surface_of = np.repeat(np.arange(len(parts)), face_counts)
     flags = np.zeros(len(faces), bool)

@@ -43,7 +43,11 @@ def target_region(target: Target, optics: Optics) -> Region:
     return tight.grown(RIM_PX + optics.margin_px, optics.lens.height, optics.lens.width)
 
 
-def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFreeView:
+def render_view(
+    target: Target,
+    optics: Optics,
+    config: RenderConfig,
+) -> NoiseFreeView:
     """Render the noise-free view of a target by a camera. Raises UserError as `target_region` and
     `load_mitsuba` do."""
     began = time.perf_counter()
@@ -64,7 +68,15 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     intensity = direct.intensity
     noise_m = np.zeros(region.shape)
     if config.bounces > 0:
-        indirect, noise_m = indirect_light(lit, target, optics, slopes, direct, inside, config)
+        indirect, noise_m = indirect_light(
+            lit,
+            target,
+            optics,
+            slopes,
+            direct,
+            inside,
+            config,
+        )
         phasor = phasor + indirect[:-1]
         intensity = intensity + indirect[-1].real
     return NoiseFreeView(
@@ -85,7 +97,11 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     )
 
 
-def _inside_outline(target: Target, lens: Lens, region: Region) -> np.ndarray:
+def _inside_outline(
+    target: Target,
+    lens: Lens,
+    region: Region,
+) -> np.ndarray:
     """Return which pixels (h, w) lie within the face's outline as the camera sees it; all if a
     part of the outline is out of view."""
     outline = transform_points(target.T_camera_board, target.outline_board_m)
@@ -106,7 +122,11 @@ def _rgb_of(target: Target, direct: DirectLight) -> np.ndarray:
     return rgb
 
 
-def _at_holes(target: Target, lens: Lens, slopes: np.ndarray) -> np.ndarray:
+def _at_holes(
+    target: Target,
+    lens: Lens,
+    slopes: np.ndarray,
+) -> np.ndarray:
     """Return 1 in pixels (h, w) whose central ray passes the mouth of `NARROW` damage, 2 within
     HOLE_RIM_PX of its rim on both sides, 0 elsewhere."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
@@ -148,7 +168,14 @@ def indirect_light(
     face_pixels = np.flatnonzero(direct.face[-1].real)
     if face_pixels.size:
         work = PathWork(frequencies_hz, config.bounces - 1, config.seed)
-        light, noise_m = face_light(lit, target, direct, slopes, work, config)
+        light, noise_m = face_light(
+            lit,
+            target,
+            direct,
+            slopes,
+            work,
+            config,
+        )
         indirect[:, face_pixels] = light
         total[:, face_pixels] += light[:-1]
         variance_m2[face_pixels] = noise_m**2
@@ -157,7 +184,14 @@ def indirect_light(
     if pixels.size:
         work = PathWork(frequencies_hz, config.bounces, config.seed)
         within = inside.ravel()[pixels]
-        light = _light_in_pixels(lit, direct, total[:, pixels], within, work, config)
+        light = _light_in_pixels(
+            lit,
+            direct,
+            total[:, pixels],
+            within,
+            work,
+            config,
+        )
         mean = rays.share * light.mean(axis=0, dtype=complex)
         indirect[:, pixels] += mean
         total[:, pixels] += mean[:-1]

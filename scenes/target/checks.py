@@ -32,6 +32,14 @@ MOST_TURN = 0.8
 # between two damages, or damage and edge: a circle's polygon sticks out by 2.5 um at 1 in
 LEAST_WEB_MM = 0.01
 NEAREST_M = 0.05  # least distance of the board from the lens plane
+SIGNS = np.array(
+    [
+        (-1, -1),
+        (1, -1),
+        (1, 1),
+        (-1, 1),
+    ]
+)
 _TURN = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 _CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 
@@ -118,7 +126,10 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
     return []
 
 
-def _mesh_problems(board: custom.BoardConfig, shape: custom.MeshConfig) -> list[str]:
+def _mesh_problems(
+    board: custom.BoardConfig,
+    shape: custom.MeshConfig,
+) -> list[str]:
     """Find sizes that are not those of the part's file."""
     vertices = part_of(shape)[0]
     sizes_mm = (vertices.max(axis=0) - vertices.min(axis=0)) / MM
@@ -129,7 +140,11 @@ def _mesh_problems(board: custom.BoardConfig, shape: custom.MeshConfig) -> list[
     return [f"board: its sizes are not those of {shape.file}, which has {stated}"]
 
 
-def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: Face) -> list[str]:
+def _damage_problems(
+    damage: custom.AnyDamage,
+    board: custom.BoardConfig,
+    face: Face,
+) -> list[str]:
     """Find damage that is too deep, off the board, or on a face too bent for it."""
     problem = _centre_problem(damage, board) or _face_problem(damage, board, face)
     if problem is not None:
@@ -142,7 +157,10 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
     return [f"{_name(damage)}: {problem}" for problem in problems]
 
 
-def _centre_problem(damage: custom.AnyDamage, board: custom.BoardConfig) -> str | None:
+def _centre_problem(
+    damage: custom.AnyDamage,
+    board: custom.BoardConfig,
+) -> str | None:
     """Find a centre beside the board or, of a chip, off its edge."""
     x, y = damage.centre_m
     half_x = board.width_mm * MM / 2
@@ -164,7 +182,11 @@ def _outward(damage: custom.AnyDamage) -> np.ndarray:
     return np.round([-np.sin(damage.turn_rad), np.cos(damage.turn_rad)])
 
 
-def _face_problem(damage: custom.AnyDamage, board: custom.BoardConfig, face: Face) -> str | None:
+def _face_problem(
+    damage: custom.AnyDamage,
+    board: custom.BoardConfig,
+    face: Face,
+) -> str | None:
     """Find a face that is too bent for the damage, or of the wrong kind."""
     tightest = float(np.abs(face.curvatures(*damage.centre_m)).max())
     on_mesh = isinstance(board.shape, custom.MeshConfig)
@@ -194,7 +216,10 @@ def _face_problem(damage: custom.AnyDamage, board: custom.BoardConfig, face: Fac
     return None
 
 
-def _depth_problems(damage: custom.AnyDamage, board: custom.BoardConfig) -> list[str]:
+def _depth_problems(
+    damage: custom.AnyDamage,
+    board: custom.BoardConfig,
+) -> list[str]:
     """Find damage that is too deep for the board or for its own width."""
     problems = []
     depth_mm = board.thickness_mm
@@ -217,7 +242,11 @@ def _depth_problems(damage: custom.AnyDamage, board: custom.BoardConfig) -> list
     return problems
 
 
-def _over_edge_mm(damage: custom.AnyDamage, board: custom.BoardConfig, face: Face) -> float:
+def _over_edge_mm(
+    damage: custom.AnyDamage,
+    board: custom.BoardConfig,
+    face: Face,
+) -> float:
     """Return how far a damage reaches beyond the board's edge in plan, at the face or at its
     bottom.
 
@@ -257,7 +286,9 @@ def _reach_m(damage: custom.AnyDamage, board: custom.BoardConfig) -> float:
 
 
 def _overlap_problems(
-    damages: list[custom.AnyDamage], board: custom.BoardConfig, face: Face
+    damages: list[custom.AnyDamage],
+    board: custom.BoardConfig,
+    face: Face,
 ) -> list[str]:
     """Find pairs without a web between them: at the face or at the depth that both reach; other
     outlines in plan."""
@@ -315,8 +346,8 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
         width_mm, height_mm = tape.size_mm
         x_mm, y_mm = tape.centre_mm
         name = f"tape {number} ({width_mm:g} x {height_mm:g} mm at ({x_mm:g}, {y_mm:g}) mm)"
-        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (np.array(tape.size_mm) / 2)
-        corners = corners @ turned(np.deg2rad(tape.angle_deg)).T + tape.centre_mm
+        turn = turned(np.deg2rad(tape.angle_deg))
+        corners = SIGNS * (np.array(tape.size_mm) / 2) @ turn.T + tape.centre_mm
         over_mm = float((np.abs(corners) - board_mm / 2).max())
         if over_mm > 0:
             problems.append(f"{name}: leaves {_size(config.board)} by {over_mm:.3g} mm")

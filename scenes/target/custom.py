@@ -29,7 +29,12 @@ Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
 Chamfer = Annotated[
-    float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")
+    float,
+    Field(
+        ge=0.0,
+        le=100.0,
+        description="leg of the 45 degree chamfer at the mouth; 0: none",
+    ),
 ]
 
 
@@ -128,7 +133,9 @@ class RoughConfig(Config):
 class _FileConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
     content: str = Field(
-        "", max_length=32, description="the file's digest, filled in when the file is read"
+        "",
+        max_length=32,
+        description="the file's digest, filled in when the file is read",
     )
 
     @model_validator(mode="before")
@@ -255,7 +262,9 @@ class GlossConfig(Config):
 
     share: Albedo
     exponent: float = Field(
-        ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees"
+        ge=1.0,
+        le=500.0,
+        description="width of the lobe at half height: 7: 50, 180: 10 degrees",
     )
 
 
@@ -276,7 +285,10 @@ class ReflectanceConfig(Config):
     )
     rgb: Rgb = (0.55, 0.42, 0.28)
     grain_contrast: float = Field(
-        0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean"
+        0.05,
+        ge=0.0,
+        le=0.3,
+        description="standard deviation of the albedo over its mean",
     )
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(
         8.0, description="distance between dark lines"
@@ -295,7 +307,9 @@ class BackingConfig(Config):
     """A plane behind the board, parallel to the board frame's x and y."""
 
     distance_mm: float = Field(
-        ge=0.0, le=5e3, description="distance behind the deepest point of the board's back"
+        ge=0.0,
+        le=5e3,
+        description="distance behind the deepest point of the board's back",
     )
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
@@ -316,9 +330,17 @@ class RoomConfig(Config):
     back_wall_albedo_850: Albedo = 0.6
     back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
     width_m: float = Field(
-        4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis"
+        4.0,
+        ge=0.5,
+        le=40.0,
+        description="width of floor and wall, centred on the optical axis",
     )
-    height_m: float = Field(2.5, ge=0.5, le=20.0, description="height of the wall above the floor")
+    height_m: float = Field(
+        2.5,
+        ge=0.5,
+        le=20.0,
+        description="height of the wall above the floor",
+    )
 
 
 class WavelengthConfig(Config):
@@ -398,7 +420,12 @@ class TargetConfig(SetUpConfig):
         holes = data.get("holes")
         if not isinstance(drill, dict) or not isinstance(holes, list | tuple):
             return data
-        drilled = {"kind": "through", "depth_mm": None, "chamfer_mm": 0.0, **drill}
+        drilled = {
+            "kind": "through",
+            "depth_mm": None,
+            "chamfer_mm": 0.0,
+            **drill,
+        }
         drilled_holes = [{**hole, **drilled} if isinstance(hole, dict) else hole for hole in holes]
         return {**data, "holes": drilled_holes}
 
@@ -468,7 +495,11 @@ class TargetConfig(SetUpConfig):
             return abs(albedos.wavelength_nm - wavelength_nm)
 
         near = [albedos for albedos in self.other_wavelengths if off_nm(albedos) <= NEAR_NM]
-        nearest = min(near, key=off_nm, default=None)
+        nearest = min(
+            near,
+            key=off_nm,
+            default=None,
+        )
         limit_nm = NEAR_NM if nearest is None else off_nm(nearest)
         if abs(wavelength_nm - 850.0) <= limit_nm:
             return None

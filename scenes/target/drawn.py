@@ -223,7 +223,10 @@ class DrawnTargetConfig(Config):
     damage: AnyDrawn
     board: custom.BoardConfig = Field(
         custom.BoardConfig(
-            width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()
+            width_mm=304.8,
+            height_mm=203.2,
+            thickness_mm=12.7,
+            shape=custom.FlatConfig(),
         ),
         description="default: plywood of 12 x 8 in, as many pixels as the thesis' 24 x 4.5 in "
         "but fewer at the edge",
@@ -448,7 +451,11 @@ class DrawnTargetConfig(Config):
     def _pose(self, stream: Stream) -> custom.PoseConfig:
         """Draw the pose."""
 
-        def within(quantity: str, limit: float, count: int) -> list[float]:
+        def within(
+            quantity: str,
+            limit: float,
+            count: int,
+        ) -> list[float]:
             values: list[float] = (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
             return values
 
@@ -524,7 +531,11 @@ class DrawnTargetConfig(Config):
             "or declare a larger board",
         )
 
-    def _off_tapes_on_front(self, places_mm: np.ndarray, rim_mm: float) -> np.ndarray:
+    def _off_tapes_on_front(
+        self,
+        places_mm: np.ndarray,
+        rim_mm: float,
+    ) -> np.ndarray:
         """Return at which places (n, 2) a rim lies beside all tapes and, of a part from a mesh, on
         its front."""
         free = np.ones(len(places_mm), bool)

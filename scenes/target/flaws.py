@@ -255,7 +255,11 @@ def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return radius_m * s, radius_m * t, np.minimum(np.hypot(s, t), 1.0)
 
 
-def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
+def _mean(
+    s: np.ndarray,
+    t: np.ndarray,
+    values: np.ndarray,
+) -> float:
     """Return the mean of a grid's values over its area."""
     # twice the area of a cell is the product of its diagonals
     falling_s = s[1:, 1:] - s[:-1, :-1]
@@ -263,7 +267,8 @@ def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
     falling_t = t[1:, 1:] - t[:-1, :-1]
     rising_t = t[1:, :-1] - t[:-1, 1:]
     areas = np.abs(falling_s * rising_t - rising_s * falling_t)
-    middles = (values[1:, 1:] + values[:-1, :-1] + values[1:, :-1] + values[:-1, 1:]) / 4
+    ends_of_falling = values[1:, 1:] + values[:-1, :-1]
+    middles = (ends_of_falling + values[1:, :-1] + values[:-1, 1:]) / 4
     return float((areas * middles).sum() / areas.sum())
 
 
@@ -277,10 +282,19 @@ def turned(angle_rad: float) -> np.ndarray:
 def border(grid: np.ndarray) -> np.ndarray:
     """Return the border (n, ...) of a grid (rows, columns, ...), once round, from its first corner
     along the row."""
-    return np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
+    sides = [
+        grid[0, :-1],
+        grid[:-1, -1],
+        grid[-1, :0:-1],
+        grid[:0:-1, 0],
+    ]
+    return np.concatenate(sides)
 
 
-def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closed_grid(
+    upper: np.ndarray,
+    lower: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and outward triangles (m, 3) of the solid between two grids (rows,
     columns, 3) of points, columns running with x and rows with y as seen from above, closed by
     walls between their borders."""
@@ -291,7 +305,9 @@ def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.nd
     b = grid[:-1, 1:].ravel()
     c = grid[1:, 1:].ravel()
     d = grid[1:, :-1].ravel()
-    top = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    half_cells = np.column_stack([a, b, c])
+    other_half_cells = np.column_stack([a, c, d])
+    top = np.concatenate([half_cells, other_half_cells])
     bottom = top[:, ::-1] + below
     rim = border(grid)
     after = np.roll(rim, -1)

@@ -59,7 +59,11 @@ FIBRE_ACROSS_MM = 0.5
 FIBRE_ALONG_MM = 12.0
 
 
-def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
+def grain(
+    material: MaterialConfig,
+    width_mm: float,
+    height_mm: float,
+) -> np.ndarray:
     """Return a board's grain: (rows, columns) float64, mean 0, deviation 1. Not modelled: knots,
     seams."""
     texel_mm = max(TEXEL_MM, width_mm / MAX_TEXELS, height_mm / MAX_TEXELS)
@@ -88,7 +92,12 @@ def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.nda
 
 def _spline_weights(knots: int, count: int) -> np.ndarray:
     """Return the weights (count, knots) of a cubic spline's knots in evenly spaced values."""
-    weights: np.ndarray = zoom(np.eye(knots), (count / knots, 1), order=3, mode="nearest")
+    weights: np.ndarray = zoom(
+        np.eye(knots),
+        (count / knots, 1),
+        order=3,
+        mode="nearest",
+    )
     return weights
 
 
@@ -96,7 +105,11 @@ def _gaussian_kernel(deviation: float) -> np.ndarray:
     return cv2.getGaussianKernel(2 * int(3 * deviation + 0.5) + 1, deviation)
 
 
-def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray:
+def reflectance(
+    pattern: np.ndarray,
+    mean: float,
+    contrast: float,
+) -> np.ndarray:
     """Return albedo (rows, columns) float32 with exactly this mean: mean (1 + contrast pattern),
     clipped to 0..1. Where clipping would move the mean, the pattern is lifted to bring it back;
     the contrast then falls short."""
@@ -128,7 +141,13 @@ def image_pattern(file: str) -> np.ndarray:
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     fewer = MAX_TEXELS / max(linear.shape)
     if fewer < 1:
-        linear = cv2.resize(linear, None, fx=fewer, fy=fewer, interpolation=cv2.INTER_AREA)
+        linear = cv2.resize(
+            linear,
+            None,
+            fx=fewer,
+            fy=fewer,
+            interpolation=cv2.INTER_AREA,
+        )
     return np.asarray(linear / linear.mean() - 1)
 
 
@@ -138,10 +157,24 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     rows, columns = texture.shape[:2]
     texels = np.stack([uv[..., 1] * rows - 0.5, uv[..., 0] * columns - 0.5])
     if texture.ndim == 2:
-        return np.asarray(map_coordinates(texture, texels, order=1, mode="nearest"))
+        return np.asarray(
+            map_coordinates(
+                texture,
+                texels,
+                order=1,
+                mode="nearest",
+            )
+        )
     values = []
     for channel in np.moveaxis(texture, -1, 0):
-        values.append(map_coordinates(channel, texels, order=1, mode="nearest"))
+        values.append(
+            map_coordinates(
+                channel,
+                texels,
+                order=1,
+                mode="nearest",
+            )
+        )
     return np.stack(values, axis=-1)
 
 
@@ -223,7 +256,11 @@ def build_target(config: TargetConfig) -> Target:
         strip.apply_transform(T_camera_board)
         parts.append(TargetPart(f"tape_{number}", strip, tape.albedo_850, np.array(tape.rgb)))
     for name, corners, albedo_850, rgb in planes_of(config):
-        plane = trimesh.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False)
+        plane = trimesh.Trimesh(
+            vertices=corners,
+            faces=[(0, 1, 2), (0, 2, 3)],
+            process=False,
+        )
         parts.append(TargetPart(name, plane, albedo_850, np.array(rgb)))
     outline = outline_board_m(config.board)
     return Target(
@@ -287,7 +324,10 @@ def _tape_strip(config: TargetConfig, tape: TapeConfig) -> trimesh.Trimesh:
     )
 
 
-def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
+def board_solid(
+    config: TargetConfig,
+    truth: tuple[Damage, ...],
+) -> trimesh.Trimesh:
     """Return the board without its damage, watertight, board frame."""
     board = config.board
     thickness_m = board.thickness_mm * MM
@@ -356,7 +396,11 @@ def sheet(
     if flat_back:
         lower = np.dstack([places, np.full(places.shape[:2], bottom_m)])
     vertices, faces = closed_grid(points + top_m * normals, lower)
-    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    return trimesh.Trimesh(
+        vertices=vertices,
+        faces=faces,
+        process=False,
+    )
 
 
 def _cells(
@@ -376,8 +420,11 @@ def _cells(
     ``places`` (n, m, 2): where the face's bend is looked at. ``turn`` (2, 2): the sheet's axes in
     plan."""
     fxx, fxy, fyy = np.moveaxis(face.bend(places[..., 0], places[..., 1]), -1, 0)
-    hessian = np.stack([np.stack([fxx, fxy], -1), np.stack([fxy, fyy], -1)], -2)
-    bends = np.abs(turn.T @ hessian @ turn).sum(axis=-1).max(axis=(0, 1))
+    first_row = np.stack([fxx, fxy], -1)
+    second_row = np.stack([fxy, fyy], -1)
+    hessian = np.stack([first_row, second_row], -2)
+    along_sheet = np.abs(turn.T @ hessian @ turn)
+    bends = along_sheet.sum(axis=-1).max(axis=(0, 1))
     counts = []
     for bend, size in zip(bends, size_m, strict=True):
         count = 1
@@ -397,7 +444,9 @@ def _cells(
 
 
 def solids_of(
-    item: FlawConfig, face: Face, thickness_m: float
+    item: FlawConfig,
+    face: Face,
+    thickness_m: float,
 ) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
     """Return the solids that a flaw adds to the board and those that it takes away, in this order,
     board frame. A pressed sheet moves its back too: the volume that one side loses, the other side
@@ -409,7 +458,10 @@ def solids_of(
         points = np.concatenate([points, points[-1:] + spare_m * across])
         depth_m = np.concatenate([depth_m, depth_m[-1:]])
 
-    def between(upper_m: np.ndarray | float, lower_m: np.ndarray | float) -> trimesh.Trimesh:
+    def between(
+        upper_m: np.ndarray | float,
+        lower_m: np.ndarray | float,
+    ) -> trimesh.Trimesh:
         """Return the solid between two heights over the face, along the axis."""
         upper = np.broadcast_to(upper_m, depth_m.shape)[..., None]
         lower = np.broadcast_to(lower_m, depth_m.shape)[..., None]
@@ -473,7 +525,11 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
     return solid.apply_transform(pose)
 
 
-def _ball_profile(dent: DentConfig, depth_m: float, spare_m: float) -> np.ndarray:
+def _ball_profile(
+    dent: DentConfig,
+    depth_m: float,
+    spare_m: float,
+) -> np.ndarray:
     """Return the profile (n, 2) of a dent's cutter, radius and height: a ball from pole to rim and
     on above the face, then straight up, then a lid at ``spare_m``."""
     ball_m = dent.ball_m
@@ -491,7 +547,9 @@ def _ball_profile(dent: DentConfig, depth_m: float, spare_m: float) -> np.ndarra
 
 
 def subtract(
-    body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh], added: Sequence[trimesh.Trimesh] = ()
+    body: trimesh.Trimesh,
+    cutters: Sequence[trimesh.Trimesh],
+    added: Sequence[trimesh.Trimesh] = (),
 ) -> trimesh.Trimesh:
     """Return body and what is added, minus cutters, by Manifold, watertight; not by trimesh's
     wrapper, which rounds to float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in
@@ -563,7 +621,12 @@ def _ply(target: Target) -> bytes:
         opaque = np.append(_srgb_bytes(part.rgb), np.uint8(255))
         colours = np.tile(opaque, (len(mesh.vertices), 1))
         coloured.append(
-            trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+            trimesh.Trimesh(
+                mesh.vertices,
+                mesh.faces,
+                vertex_colors=colours,
+                process=False,
+            )
         )
     return trimesh.util.concatenate(coloured).export(None, file_type="ply")
 
@@ -582,9 +645,19 @@ def _glb(target: Target) -> bytes:
             uv = part.uv * (1, -1) + (0, 1)  # trimesh counts v upwards from the image's lower edge
         material = PBRMaterial(**colour, metallicFactor=0.0, roughnessFactor=1.0, name=part.name)
         visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-        mesh = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, visual=visual, process=False)
+        mesh = trimesh.Trimesh(
+            part.mesh.vertices,
+            part.mesh.faces,
+            visual=visual,
+            process=False,
+        )
         # No normals: glTF viewers then shade each facet flat, which keeps the rims of holes sharp.
-        scene.add_geometry(mesh, node_name=part.name, geom_name=part.name, transform=upright)
+        scene.add_geometry(
+            mesh,
+            node_name=part.name,
+            geom_name=part.name,
+            transform=upright,
+        )
     return scene.export(file_type="glb", include_normals=False)
 
 

@@ -32,7 +32,12 @@ class MeshTargetConfig(custom.SetUpConfig):
 
     name: Literal["mesh"]
     file: Annotated[
-        str, Field(min_length=1, max_length=1000, description="a .stl, .ply, .obj or .glb file")
+        str,
+        Field(
+            min_length=1,
+            max_length=1000,
+            description="a .stl, .ply, .obj or .glb file",
+        ),
     ]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
@@ -40,7 +45,12 @@ class MeshTargetConfig(custom.SetUpConfig):
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Raises UserError if the file cannot be used."""
-        shape = custom.MeshConfig(kind="mesh", file=self.file, unit=self.unit, front=self.front)
+        shape = custom.MeshConfig(
+            kind="mesh",
+            file=self.file,
+            unit=self.unit,
+            front=self.front,
+        )
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
         width_mm, height_mm, thickness_mm = sizes.tolist()
         board = custom.BoardConfig(
@@ -70,7 +80,11 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
 
-    def refuse(wrong: np.ndarray, what: str, fix: str) -> None:
+    def refuse(
+        wrong: np.ndarray,
+        what: str,
+        fix: str,
+    ) -> None:
         if len(wrong):
             first = mesh.vertices[wrong[0]].mean(axis=0)
             position = ", ".join(f"{value:.4g}" for value in first)
@@ -81,7 +95,11 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
                 fix=f"{fix} in a mesh editor, such as MeshLab",
             )
 
-    edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    edges, counts = np.unique(
+        mesh.edges_sorted,
+        axis=0,
+        return_counts=True,
+    )
     refuse(edges[counts > 2], "edges that three faces or more share", "split them")
     refuse(edges[counts == 1], "open edges", "close them")
     if not len(mesh.faces):
@@ -130,7 +148,11 @@ def crossing(corners: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _sweep(
-    corners: np.ndarray, low: np.ndarray, high: np.ndarray, strips: np.ndarray, crosses: np.ndarray
+    corners: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    strips: np.ndarray,
+    crosses: np.ndarray,
 ) -> None:
     """Mark in ``crosses`` (n,) the triangles that cross another of their strip; sorted by strip,
     then by their least x."""
@@ -174,7 +196,12 @@ def _pierces(edged: np.ndarray, triangle: np.ndarray) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
+def _volume(
+    a: np.ndarray,
+    b: np.ndarray,
+    c: np.ndarray,
+    d: np.ndarray,
+) -> float:
     """Return six times the signed volume of a tetrahedron."""
     u = b - a
     v = c - a
@@ -202,7 +229,9 @@ def front_of(shape: custom.MeshConfig) -> tuple[np.ndarray, float]:
 
 
 def front_derivatives(
-    shape: custom.MeshConfig, x_m: np.ndarray, y_m: np.ndarray
+    shape: custom.MeshConfig,
+    x_m: np.ndarray,
+    y_m: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return z, its slopes and its second derivatives (taken as 0) of a part's front; NaN beyond
     it."""
@@ -211,14 +240,23 @@ def front_derivatives(
     nodes = [np.ravel(y_m) / step_m + rows // 2, np.ravel(x_m) / step_m + columns // 2]
     derivatives = []
     for image in images:
-        values = map_coordinates(image, nodes, order=1, cval=np.nan)
+        values = map_coordinates(
+            image,
+            nodes,
+            order=1,
+            cval=np.nan,
+        )
         derivatives.append(values.reshape(x_m.shape))
     none = np.zeros(x_m.shape)
     return (*derivatives, none, none, none)
 
 
 @numba.njit(cache=True, nogil=True)
-def _raise_to_triangles(heights: np.ndarray, corners: np.ndarray, step: float) -> None:
+def _raise_to_triangles(
+    heights: np.ndarray,
+    corners: np.ndarray,
+    step: float,
+) -> None:
     """Raise each node (rows, columns) to the highest of the triangles (n, 3, 3) above it."""
     rows, columns = heights.shape
     for n in range(len(corners)):

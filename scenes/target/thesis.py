@@ -19,7 +19,19 @@ from scenes.target.part import MeshTargetConfig
 
 THICKNESS_MM = 12.7  # half an inch (stated)
 # stated, Table I
-DIAMETERS_IN = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 5 / 16, 3 / 8, 7 / 16, 1 / 2, 5 / 8, 3 / 4, 1.0)
+DIAMETERS_IN = (
+    1 / 16,
+    1 / 8,
+    3 / 16,
+    1 / 4,
+    5 / 16,
+    3 / 8,
+    7 / 16,
+    1 / 2,
+    5 / 8,
+    3 / 4,
+    1.0,
+)
 Degrees = Annotated[float, Field(ge=-70.0, le=70.0)]
 NonNegativeMm = Annotated[float, Field(ge=0.0, le=5e3)]
 

@@ -22,8 +22,23 @@ OUTLINE_STEPS = 64  # points along each side of the outline
 LINE_STEP = 8  # columns of a flaw's grid between two points of its centre line
 # reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m
 OPEN_FLOOR_M = 3.0
-ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of a face's derivatives in x and y
-_UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+# of a face's derivatives in x and y
+ORDERS = (
+    (0, 0),  # z
+    (1, 0),  # dz/dx
+    (0, 1),  # dz/dy
+    (2, 0),  # d2z/dx2
+    (1, 1),  # d2z/dxdy
+    (0, 2),  # d2z/dy2
+)
+_UNIT_CORNERS = np.array(
+    [
+        (-0.5, -0.5),
+        (0.5, -0.5),
+        (0.5, 0.5),
+        (-0.5, 0.5),
+    ]
+)
 
 
 Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -69,7 +84,11 @@ class Face:
         """Return (..., 3): unit normals out of the face."""
         slope = self.slope(x_m, y_m)
         upward = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
-        return upward / np.linalg.norm(upward, axis=-1, keepdims=True)
+        return upward / np.linalg.norm(
+            upward,
+            axis=-1,
+            keepdims=True,
+        )
 
     def axis(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return (..., 3): the direction from which a damage's depth counts: the normal, or z for
@@ -185,7 +204,10 @@ def _round_face(shape: custom.CylinderConfig | custom.SphereConfig) -> Face:
     return Face(round_)
 
 
-def _polynomial_face(shape: custom.PolynomialConfig, size_m: tuple[float, float]) -> Face:
+def _polynomial_face(
+    shape: custom.PolynomialConfig,
+    size_m: tuple[float, float],
+) -> Face:
     """Return the face whose height is the sum of the declared terms."""
     half_x = size_m[0] / 2
     half_y = size_m[1] / 2
@@ -234,9 +256,21 @@ def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
     spline = RectBivariateSpline(knots[0], knots[1], heights)
 
     def rough(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(spline.ev(x, y, dx=dx, dy=dy) for dx, dy in ORDERS)
+        return tuple(
+            spline.ev(
+                x,
+                y,
+                dx=dx,
+                dy=dy,
+            )
+            for dx, dy in ORDERS
+        )
 
-    return Face(rough, rough=True, height=spline.ev)
+    return Face(
+        rough,
+        rough=True,
+        height=spline.ev,
+    )
 
 
 def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
@@ -257,7 +291,11 @@ def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
 
 
 @lru_cache(maxsize=100)
-def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
+def face_grid_m(
+    board: custom.BoardConfig,
+    depth_m: float = 0.0,
+    steps: int = 32,
+) -> np.ndarray:
     """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the
     board; board frame."""
     face = face_of(board)
@@ -273,7 +311,8 @@ def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32
 
 
 def backing_corners_board_m(
-    config: custom.TargetConfig, backing: custom.BackingConfig
+    config: custom.TargetConfig,
+    backing: custom.BackingConfig,
 ) -> np.ndarray:
     """Return the backing's corners in the board's frame; it faces the board."""
     deepest_m = -float(face_grid_m(config.board, config.board.thickness_mm * MM)[..., 2].min())
@@ -359,7 +398,12 @@ class Damage:
             return self.diameter_m / 2
         return float(np.linalg.norm(self.outline_board_m - self.centre_board_m[:2], axis=1).max())
 
-    def within(self, x_m: np.ndarray, y_m: np.ndarray, margin_m: float = 0.0) -> np.ndarray:
+    def within(
+        self,
+        x_m: np.ndarray,
+        y_m: np.ndarray,
+        margin_m: float = 0.0,
+    ) -> np.ndarray:
         """Return which places in plan lie inside the outline, or within ``margin_m`` of it; shaped
         like ``x_m``."""
         centre_x, centre_y, _ = self.centre_board_m
@@ -403,7 +447,10 @@ class Damage:
         return row
 
 
-def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
+def truth_of(
+    config: custom.TargetConfig,
+    T_camera_board: np.ndarray,
+) -> tuple[Damage, ...]:
     """Return the truth of a declaration: holes, dents, then other kinds, in the order of their
     declaration."""
     face = face_of(config.board)
@@ -443,7 +490,11 @@ def _dent_measures(item: custom.DentConfig, face: Face) -> dict[str, Any]:
     return {"diameter_m": 2 * rim_m, "depth_m": item.depth_mm * MM, "volume_m3": volume_m3}
 
 
-def _hole_measures(item: custom.HoleConfig, face: Face, thickness_m: float) -> dict[str, Any]:
+def _hole_measures(
+    item: custom.HoleConfig,
+    face: Face,
+    thickness_m: float,
+) -> dict[str, Any]:
     """Return the size, depth and volume of a drilled hole, by field of `Damage`.
 
     Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) /
@@ -464,7 +515,9 @@ def _hole_measures(item: custom.HoleConfig, face: Face, thickness_m: float) -> d
 
 
 def relief_points(
-    item: FlawConfig, face: Face, thickness_m: float
+    item: FlawConfig,
+    face: Face,
+    thickness_m: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return a flaw's grid on the face: points (rows, columns, 3) on it, depths (rows, columns)
     along the axis, that axis (3,) out of the board, and the direction (3,) of t; board frame,
@@ -481,7 +534,11 @@ def relief_points(
     return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
 
 
-def _flaw_measures(item: FlawConfig, face: Face, thickness_m: float) -> dict[str, Any]:
+def _flaw_measures(
+    item: FlawConfig,
+    face: Face,
+    thickness_m: float,
+) -> dict[str, Any]:
     """Return what describes a damage with an outline of its own, by field of `Damage`."""
     points, depth_m, axis, _ = relief_points(item, face, thickness_m)
     plan = points[..., :2]
