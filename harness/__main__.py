@@ -6,6 +6,7 @@ import shlex
 import sys
 from typing import NamedTuple
 
+from harness import __version__
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import shipped
 
@@ -181,9 +182,7 @@ def _run(name: str, rest: list[str]) -> int:
         print('\nshell completion: eval "$(tofpod completion bash)"')
         return 0
     if name == "--version":
-        from importlib.metadata import version
-
-        print(f"tofpod {version('tofpod')}")
+        print(f"tofpod {__version__}")
         return 0
     if name == "completion":
         if rest not in (["bash"], ["zsh"]):

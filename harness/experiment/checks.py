@@ -277,13 +277,13 @@ def _capture_problems(
             "capture.flat_field",
             config.capture.flat_field,
             apart,
-            "use tofpod flatfield, harness.detect --flat-field",
+            "use tofpod flatfield, tofpod detect --flat-field",
         ),
         (
             "mapping",
             config.mapping,
             "a mapping needs the views of a simulated source",
-            "use harness.detect --register",
+            "use tofpod detect --register",
         ),
         (
             "threshold.calibrate",

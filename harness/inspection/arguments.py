@@ -1,4 +1,4 @@
-"""The arguments of `harness.detect` as settings: a detector, the merging of views, captures,
+"""The arguments of `tofpod detect` as settings: a detector, the merging of views, captures,
 stated poses."""
 
 from __future__ import annotations

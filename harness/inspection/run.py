@@ -1,4 +1,4 @@
-"""The steps of `harness.detect`: one capture, or several views merged into one cloud, judged and
+"""The steps of `tofpod detect`: one capture, or several views merged into one cloud, judged and
 reported alike."""
 
 from __future__ import annotations
@@ -552,7 +552,7 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
         "settings": settings,
         "provenance": {
-            **record("python -m harness.detect " + shlex.join(sys.argv[1:])),
+            **record("tofpod detect " + shlex.join(sys.argv[1:])),
             "files": files,
         },
     }

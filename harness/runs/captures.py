@@ -1,4 +1,4 @@
-"""An experiment on a real capture: each point judges it once, by the steps of `harness.detect`."""
+"""An experiment on a real capture: each point judges it once, by the steps of `tofpod detect`."""
 
 from pathlib import Path
 
