@@ -429,13 +429,13 @@ def _error_m(
 
 
 @numba.njit(**FAST)
-def _slopes_kept(
+def _slopes_kept(  # type: ignore[no-untyped-def]
     off,
     steps,
     axes,
     weights,
     slopes,
-):  # type: ignore[no-untyped-def]
+):
     """Write the slopes of every ``steps`` (n,)-th of a pixel's sub-rays whose bit is set in
     ``off`` (n, m / A_LANE)."""
     written = 0

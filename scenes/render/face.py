@@ -118,7 +118,7 @@ def _bounds_of_face(target: Target) -> np.ndarray:
 
 
 @numba.njit(**FAST)
-def between_nodes(
+def between_nodes(  # type: ignore[no-untyped-def]
     position,
     size,
     mean,
@@ -127,7 +127,7 @@ def between_nodes(
     weights,
     share,
     total,
-):  # type: ignore[no-untyped-def]
+):
     """Interpolate light between nodes, bilinearly. Return it times ``share`` (f + 1, n), and its
     noise of range (n,) in metres when it is added to ``total``.
 
