@@ -16,7 +16,11 @@ EMITTER = CAMERA.optics.emitter_m
 REGION = Region(140, 152, 150, 170)
 
 
-def ray_light(slope: np.ndarray, plane: Plane, albedo: float) -> tuple[np.ndarray, float, float]:
+def ray_light(
+    slope: np.ndarray,
+    plane: Plane,
+    albedo: float,
+) -> tuple[np.ndarray, float, float]:
     """Return where a ray meets a plane, its light and its path, step by step."""
     z = plane.distance_m / (1 - plane.slope_x * slope[0] - plane.slope_y * slope[1])
     point = z * np.array([slope[0], slope[1], 1.0])
@@ -54,7 +58,14 @@ def test_a_planes_normal_is_a_unit_vector_towards_the_camera() -> None:
 
 def test_a_plane_is_seen_at_pixel_centres() -> None:
     plane = Plane(0.6, 0.3, -0.2)
-    view = plane_view(CAMERA, REGION, 0.6, 0.7, 0.3, -0.2)
+    view = plane_view(
+        CAMERA,
+        REGION,
+        0.6,
+        0.7,
+        0.3,
+        -0.2,
+    )
     for row, col in ((0, 0), (5, 13), (11, 19)):
         u = np.array(float(REGION.col0 + col))
         v = np.array(float(REGION.row0 + row))
@@ -112,7 +123,14 @@ def left_of_edge(slopes: np.ndarray) -> np.ndarray:
 def test_each_footprint_of_a_layered_view_is_summed_ray_by_ray() -> None:
     """Light of the front, of the back, and none where the front's shadow lies on the back; the
     emitter stands to the left, so that the shadow falls to the right of the edge."""
-    view = layered_view(CAMERA, REGION, FRONT, BACK, left_of_edge, 0.5)
+    view = layered_view(
+        CAMERA,
+        REGION,
+        FRONT,
+        BACK,
+        left_of_edge,
+        0.5,
+    )
     footprint = footprint_of(LENS, REGION, CAMERA.optics.beam_fwhm_rad)
     shadowed_rays = 0
     for row in (2, 9):

@@ -26,10 +26,25 @@ TARGET = custom.TargetConfig(
         shape=custom.FlatConfig(),
     ),
     holes=(
-        custom.HoleConfig(id=3, diameter_mm=12.0, centre_mm=(10.0, 5.0)),
-        custom.HoleConfig(id=4, diameter_mm=9.0, centre_mm=(60.0, 5.0)),
+        custom.HoleConfig(
+            id=3,
+            diameter_mm=12.0,
+            centre_mm=(10.0, 5.0),
+        ),
+        custom.HoleConfig(
+            id=4,
+            diameter_mm=9.0,
+            centre_mm=(60.0, 5.0),
+        ),
     ),
-    dents=(custom.DentConfig(id=5, diameter_mm=12.0, depth_mm=2.0, centre_mm=(-40.0, 5.0)),),
+    dents=(
+        custom.DentConfig(
+            id=5,
+            diameter_mm=12.0,
+            depth_mm=2.0,
+            centre_mm=(-40.0, 5.0),
+        ),
+    ),
     backing=custom.BackingConfig(distance_mm=20.0, size_mm=(50.0, 60.0)),
 )
 PLACE_M = np.array([0.02, -0.01, 0.6])
@@ -37,26 +52,46 @@ NORMAL = np.array([0.2, -0.1, -1.0]) / np.sqrt(1.05)
 
 
 def own_lens() -> Lens:
-    return camera_of(unit_config(CAMERA, Lens(1, 1, 1.0, 1.0, 0.0, 0.0))[0]).nominal_lens
+    return camera_of(
+        unit_config(
+            CAMERA,
+            Lens(
+                1,
+                1,
+                1.0,
+                1.0,
+                0.0,
+                0.0,
+            ),
+        )[0]
+    ).nominal_lens
 
 
 def test_a_unit_keeps_what_a_recording_lacks() -> None:
     config, same = unit_config(CAMERA, own_lens())
     assert same
-    drawn = {name for name, on in config.effects.model_dump().items() if on}
+    drawn = {name for name, is_on in config.effects.model_dump().items() if is_on}
     assert drawn == {"noise", "multipath", "wiggling", "ambient", "saturation"}
     assert config.numbers["engine.output_step_mm"] == 1e-3
 
 
 def test_a_unit_has_the_recordings_lens_where_its_size_is_the_cameras() -> None:
     lens = own_lens()
-    moved = Lens(lens.width, lens.height, lens.fx + 1, lens.fy, lens.cx, lens.cy, lens.distortion)
+    moved = Lens(
+        lens.width,
+        lens.height,
+        lens.fx + 1,
+        lens.fy,
+        lens.cx,
+        lens.cy,
+        lens.distortion,
+    )
     config, same = unit_config(CAMERA, moved)
     assert same
     assert camera_of(config).nominal_lens.fx == pytest.approx(lens.fx + 1)
     for size in ((lens.width + 1, lens.height), (lens.width, lens.height + 1)):
-        other = Lens(*size, lens.fx + 1, lens.fy, lens.cx, lens.cy)
-        config, same = unit_config(CAMERA, other)
+        other_lens = Lens(*size, lens.fx + 1, lens.fy, lens.cx, lens.cy)
+        config, same = unit_config(CAMERA, other_lens)
         assert not same
         assert camera_of(config).nominal_lens.fx == pytest.approx(lens.fx)
 
@@ -119,7 +154,11 @@ def seen_plane(distance_m: float, albedo: float) -> NoiseFreeView:
     return plane_view(camera, region, distance_m, albedo)
 
 
-def noise_variance(config: CameraConfig, distance_m: float, albedo: float) -> float:
+def noise_variance(
+    config: CameraConfig,
+    distance_m: float,
+    albedo: float,
+) -> float:
     """Return the mean variance of z over the view's inner pixels."""
     unit = SimulatedUnit(camera_of(config), config, seen_plane(distance_m, albedo))
     frames = [frame.z_m for frame in unit.capture(implants.LEAST_DRAWS, 9, "other").frames()]
@@ -145,7 +184,15 @@ FACING = np.array([0.0, 0.0, -1.0])
 def test_the_difference_between_two_views(planes: dict, tmp_path: Path) -> None:
     config, same = unit_config(CAMERA, own_lens())
     board = local_board(TARGET, TARGET.holes[0], PLACE_M, FACING, side_mm=100.0)
-    implant = implant_of(config, same, own_lens(), board, 10, 3, tmp_path)
+    implant = implant_of(
+        config,
+        same,
+        own_lens(),
+        board,
+        10,
+        3,
+        tmp_path,
+    )
     assert implant.noise_m.shape[0] == implants.LEAST_DRAWS
     changed = implant.shift_m != 0
     assert implant.shift_m[changed] == pytest.approx(3e-3, abs=2e-4)
@@ -164,28 +211,65 @@ def test_the_difference_between_two_views(planes: dict, tmp_path: Path) -> None:
     assert added > recorded
     assert (implant.noise_m[:, ~changed] == 0).all()
     planes[True] = planes[False]
-    none = implant_of(config, same, own_lens(), board, 10, 3, tmp_path)
+    none = implant_of(
+        config,
+        same,
+        own_lens(),
+        board,
+        10,
+        3,
+        tmp_path,
+    )
     assert np.abs(none.shift_m).max() == 0
     assert np.abs(none.noise_m).max() == 0
     planes[False] = (0.603, 0.2)
-    quiet = implant_of(config, same, own_lens(), board, 50, 3, tmp_path)
+    quiet = implant_of(
+        config,
+        same,
+        own_lens(),
+        board,
+        50,
+        3,
+        tmp_path,
+    )
     assert quiet.noise_m.shape[0] == 50
     assert np.abs(quiet.noise_m).max() == 0  # noise is never removed
     assert quiet.shift_m[quiet.shift_m != 0] == pytest.approx(-3e-3, abs=2e-4)
 
 
-def test_what_the_camera_loses_before_the_damage_is_lost(planes: dict, tmp_path: Path) -> None:
+def test_what_the_camera_loses_before_the_damage_is_lost(
+    planes: dict,
+    tmp_path: Path,
+) -> None:
     config, same = unit_config(CAMERA, own_lens())
     board = local_board(TARGET, TARGET.holes[0], PLACE_M, FACING, side_mm=100.0)
     planes[True] = (0.6, 0.0)
-    implant = implant_of(config, same, own_lens(), board, 10, 3, tmp_path)
+    implant = implant_of(
+        config,
+        same,
+        own_lens(),
+        board,
+        10,
+        3,
+        tmp_path,
+    )
     assert 100 < implant.lost[0].sum() < implant.lost[0].size / 2
-    planes[True], planes[False] = planes[False], planes[True]
-    assert not implant_of(config, same, own_lens(), board, 10, 3, tmp_path).lost.any()
+    planes[True] = (0.6, 0.6)
+    planes[False] = (0.6, 0.0)
+    assert not implant_of(
+        config,
+        same,
+        own_lens(),
+        board,
+        10,
+        3,
+        tmp_path,
+    ).lost.any()
 
 
 def test_a_recording_of_other_pixels_gets_the_difference_between_them(
-    planes: dict, tmp_path: Path
+    planes: dict,
+    tmp_path: Path,
 ) -> None:
     """Twice as many pixels along each side: the same difference, on the same part of the view."""
     lens = own_lens()
@@ -201,8 +285,24 @@ def test_a_recording_of_other_pixels_gets_the_difference_between_them(
     config, same = unit_config(CAMERA, larger)
     assert not same
     board = local_board(TARGET, TARGET.holes[0], PLACE_M, FACING, side_mm=100.0)
-    fine = implant_of(config, same, larger, board, 10, 3, tmp_path)
-    coarse = implant_of(config, True, lens, board, 10, 3, tmp_path)
+    fine = implant_of(
+        config,
+        same,
+        larger,
+        board,
+        10,
+        3,
+        tmp_path,
+    )
+    coarse = implant_of(
+        config,
+        True,
+        lens,
+        board,
+        10,
+        3,
+        tmp_path,
+    )
     side_px = 100.0 * MM / 0.6 * larger.fx
     assert fine.region.shape == pytest.approx((side_px, side_px), abs=2)
     assert fine.shift_m.shape == fine.region.shape

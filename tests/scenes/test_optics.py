@@ -71,14 +71,14 @@ def test_what_changes_a_render_is_content(changed: dict) -> None:
 
 
 def test_title_and_range_change_no_render() -> None:
-    other = replace(
+    renamed = replace(
         OPTICS,
         title="another",
         nearest_m=0.2,
         farthest_m=3.0,
         limits_along="axis",
     )
-    assert other.content() == OPTICS.content()
+    assert renamed.content() == OPTICS.content()
 
 
 def test_an_imagers_footprint_ends_at_its_corners() -> None:
@@ -107,24 +107,24 @@ def test_an_imagers_footprint_ends_at_its_corners() -> None:
 
 def test_a_grid_has_the_centres_of_cells_row_by_row() -> None:
     footprint = Quadrilaterals(LENS, REGION)
-    one, across, down, both = footprint.grid(2)
-    assert one.tolist() == [1, 1, 1, 1]
+    ones, across, down, products = footprint.grid(2)
+    assert ones.tolist() == [1, 1, 1, 1]
     assert across.tolist() == [0.25, 0.75, 0.25, 0.75]
     assert down.tolist() == [0.25, 0.25, 0.75, 0.75]
-    assert both == pytest.approx(across * down)
+    assert products == pytest.approx(across * down)
     assert footprint.grid().shape == (4, 16)
 
 
 def test_every_row_and_column_of_a_lattice_is_crossed_once() -> None:
     """Sub-rays lie evenly in both directions: an edge crosses them one by one."""
-    one, across, down, both = Quadrilaterals(LENS, REGION).lattice(256)
-    assert one.tolist() == [1.0] * 256
+    ones, across, down, products = Quadrilaterals(LENS, REGION).lattice(256)
+    assert ones.tolist() == [1.0] * 256
     assert across == pytest.approx((np.arange(256) + 0.5) / 256)
     gaps = np.diff(np.sort(down))
     assert gaps.min() > 0.4 / 256
     assert gaps.max() < 2.0 / 256
     assert (down.min(), down.max()) == pytest.approx((0.0, 1.0), abs=1.5 / 256)
-    assert both == pytest.approx(across * down)
+    assert products == pytest.approx(across * down)
 
 
 def test_a_beams_sub_rays_have_its_mean_and_deviation() -> None:

@@ -42,12 +42,12 @@ def between_nodes_in_numpy(
     light = np.zeros((len(batches), batches.shape[1], count), complex)
     for index in range(count):
         x, y = position[:, index]
-        left = int(np.clip(np.floor(x), 0, COLUMNS - 2))
-        top = int(np.clip(np.floor(y), 0, ROWS - 2))
-        for row in (top, top + 1):
-            for column in (left, left + 1):
-                weight_x = 1 - (x - left) if column == left else x - left
-                weight_y = 1 - (y - top) if row == top else y - top
+        first_column = int(np.clip(np.floor(x), 0, COLUMNS - 2))
+        first_row = int(np.clip(np.floor(y), 0, ROWS - 2))
+        for row in (first_row, first_row + 1):
+            for column in (first_column, first_column + 1):
+                weight_x = 1 - (x - first_column) if column == first_column else x - first_column
+                weight_y = 1 - (y - first_row) if row == first_row else y - first_row
                 light[..., index] += weight_x * weight_y * batches[..., row, column]
     light *= share
     mean = light.mean(axis=0)
@@ -113,9 +113,19 @@ def target() -> Target:
     )
     config = TargetConfig(
         board=board,
-        holes=(HoleConfig(id=1, diameter_mm=20.0, centre_mm=(20.0, 5.0)),),
+        holes=(
+            HoleConfig(
+                id=1,
+                diameter_mm=20.0,
+                centre_mm=(20.0, 5.0),
+            ),
+        ),
         tapes=(TapeConfig(centre_mm=(-30.0, 0.0), size_mm=(20.0, 10.0)),),
-        pose=PoseConfig(distance_m=0.6, tilt_x_deg=10.0, offset_x_mm=30.0),
+        pose=PoseConfig(
+            distance_m=0.6,
+            tilt_x_deg=10.0,
+            offset_x_mm=30.0,
+        ),
     )
     return build_target(config)
 

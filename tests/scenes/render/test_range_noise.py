@@ -45,7 +45,10 @@ def test_weights_are_those_of_least_squares() -> None:
         (32, [0, 10, 21, 31]),
     ],
 )
-def test_noise_is_estimated_at_four_lines_or_all(count: int, lines: list[int]) -> None:
+def test_noise_is_estimated_at_four_lines_or_all(
+    count: int,
+    lines: list[int],
+) -> None:
     assert noise_lines(tuple(1e6 * (k + 1) for k in range(count))) == lines
 
 

@@ -34,7 +34,11 @@ LENS = Lens(
     cy=59.5,
 )
 FREQUENCIES_HZ = (20e6, 100e6)
-WORK = PathWork(FREQUENCIES_HZ, bounces=2, seed=1)
+WORK = PathWork(
+    FREQUENCIES_HZ,
+    bounces=2,
+    seed=1,
+)
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +51,22 @@ def target() -> Target:
             thickness_mm=12.0,
             shape=FlatConfig(),
         ),
-        holes=(HoleConfig(id=1, diameter_mm=38.0, centre_mm=(-40.0, 0.0), chamfer_mm=1.0),),
-        dents=(DentConfig(id=2, diameter_mm=40.0, depth_mm=4.0, centre_mm=(50.0, 0.0)),),
+        holes=(
+            HoleConfig(
+                id=1,
+                diameter_mm=38.0,
+                centre_mm=(-40.0, 0.0),
+                chamfer_mm=1.0,
+            ),
+        ),
+        dents=(
+            DentConfig(
+                id=2,
+                diameter_mm=40.0,
+                depth_mm=4.0,
+                centre_mm=(50.0, 0.0),
+            ),
+        ),
         pose=PoseConfig(distance_m=0.5),
     )
     return build_target(config)
@@ -138,7 +156,11 @@ def test_paths_are_doubled_until_the_noise_is_what_is_wanted(
     calls = []
 
     def gather(
-        lit: Any, rays: OffFace, work: PathWork, samples: np.ndarray, after: int = 0
+        lit: Any,
+        rays: OffFace,
+        work: PathWork,
+        samples: np.ndarray,
+        after: int = 0,
     ) -> np.ndarray:
         calls.append((rays.pixel.tolist(), np.asarray(samples).tolist(), after))
         return np.full((BATCHES, 3, len(rays.pixel)), 2.0 if after else 1.0, np.complex64)
@@ -150,10 +172,21 @@ def test_paths_are_doubled_until_the_noise_is_what_is_wanted(
     pixels = np.array([3, 4, 5, 6])
     direct = direct_with(rays_in(pixels, 0.5), (2, 10))
     within = np.array([True, True, True, False])
-    config = RenderConfig(hole_noise_mm=0.1, hole_samples=1024, rest_samples=24)
+    config = RenderConfig(
+        hole_noise_mm=0.1,
+        hole_samples=1024,
+        rest_samples=24,
+    )
     lit: Any = None
     total = np.ones((2, 4), complex)
-    light = _light_in_pixels(lit, direct, total, within, WORK, config)
+    light = _light_in_pixels(
+        lit,
+        direct,
+        total,
+        within,
+        WORK,
+        config,
+    )
     assert calls[0] == ([3, 4, 5, 6], [16, 16, 16, 24], 0)
     assert calls[1] == ([3, 5], [240, 1008], 16)
     means = light.mean(axis=(0, 1)).real
@@ -171,24 +204,33 @@ class CountingWalk:
     def sums(self, lanes: np.ndarray) -> np.ndarray:
         self.lanes.append(lanes)
         sums = np.zeros((3, lanes.shape[1]), np.complex64)
-        for lane, (place, batch, first, count) in enumerate(lanes.T):
+        for lane, (place_index, batch, first, count) in enumerate(lanes.T):
             numbers = np.arange(first, first + count)
             sums[0, lane] = numbers.sum()
-            sums[1, lane] = count * place
+            sums[1, lane] = count * place_index
             sums[2, lane] = count * batch
         return sums
 
 
 @pytest.mark.parametrize("after", [0, 16])
 def test_paths_are_shared_out_over_lanes_and_batches(
-    monkeypatch: pytest.MonkeyPatch, after: int
+    monkeypatch: pytest.MonkeyPatch,
+    after: int,
 ) -> None:
     """Each batch of a place follows its share of the paths, numbered on from those before."""
     monkeypatch.setattr(indirect, "_Walk", CountingWalk)
     monkeypatch.setattr(indirect, "FLOATS_AT_ONCE", 50)
     samples = np.array([8, 3, 8 * 150])
     none: Any = None
-    light = _gather(none, none, WORK, samples, np.zeros(3), None, after)
+    light = _gather(
+        none,
+        none,
+        WORK,
+        samples,
+        np.zeros(3),
+        None,
+        after,
+    )
     walk = CountingWalk.last
     lanes = np.concatenate(walk.lanes, axis=1)
     assert walk.longest == 150 + after // BATCHES
@@ -236,7 +278,11 @@ def test_an_edges_error_is_that_of_misplaced_sub_rays() -> None:
     strongest = np.array([0.8])
     expected_m = 1.5 * np.sqrt(share * (1 - share)) / (count * np.sqrt(0.25))
     assert _error_m(means, strongest, count) == pytest.approx([expected_m])
-    dark = means._replace(light=np.zeros((2, 1)), first=np.zeros(1), second=np.zeros(1))
+    dark = means._replace(
+        light=np.zeros((2, 1)),
+        first=np.zeros(1),
+        second=np.zeros(1),
+    )
     assert _error_m(dark, strongest, count).tolist() == [0.0]
 
 
@@ -300,15 +346,23 @@ def test_indirect_light_adds_face_and_pixels(monkeypatch: pytest.MonkeyPatch) ->
     none: Any = None
     inside = np.array([[True, False, True]])
     config = RenderConfig(bounces=7, seed=5)
-    light, noise_m = view.indirect_light(none, none, optics, none, direct, inside, config)
+    light, noise_m = view.indirect_light(
+        none,
+        none,
+        optics,
+        none,
+        direct,
+        inside,
+        config,
+    )
     assert works == [PathWork(FREQUENCIES_HZ, 6, 5), PathWork(FREQUENCIES_HZ, 7, 5)]
     assert totals[0].tolist() == [[3.0, 2.0], [3.0, 2.0]]
     mean = 0.25 * batches.mean(axis=0)
     assert light[:, 0, 0] == pytest.approx([1.0] * 3)
     assert light[:, 0, 1] == pytest.approx(1.0 + mean[:, 0])
     assert light[:, 0, 2] == pytest.approx(mean[:, 1])
-    whole = totals[0] + mean[:-1]
-    from_paths_m = range_noise_m(0.25 * batches[:, :2], whole, FREQUENCIES_HZ)
+    all_light = totals[0] + mean[:-1]
+    from_paths_m = range_noise_m(0.25 * batches[:, :2], all_light, FREQUENCIES_HZ)
     assert noise_m[0, 0] == pytest.approx(3e-4)
     assert noise_m[0, 1] == pytest.approx(np.hypot(4e-4, from_paths_m[0]))
     assert noise_m[0, 2] == pytest.approx(from_paths_m[1])

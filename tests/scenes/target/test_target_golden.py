@@ -1,7 +1,7 @@
 """Golden numbers: boards as they were drawn and built before, to nine digits.
 
 Other tests say why these numbers are right; this one notices that any of them moved, such as a
-random stream or a cutter's facets, which would change all studies. After a wanted change, print the
+random stream or a cutter's facets, which would change all studies. After a wanted change, print
 new lines with `python -m tests.scenes.target.test_target_golden`."""
 
 from __future__ import annotations
@@ -326,4 +326,11 @@ def test_distances_from_a_bent_line() -> None:
 if __name__ == "__main__":
     for case in dict.fromkeys(CASES):
         for long_line in lines_of(*case):
-            print(fill(long_line, 96, subsequent_indent="    ", break_on_hyphens=False))
+            print(
+                fill(
+                    long_line,
+                    96,
+                    subsequent_indent="    ",
+                    break_on_hyphens=False,
+                )
+            )

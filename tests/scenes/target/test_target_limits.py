@@ -279,14 +279,14 @@ def lines_of(config: type[BaseModel]) -> Iterator[str]:
 
 def declarations() -> Iterator[type[BaseModel]]:
     """Yield all declarations of the modules, in the order of their names."""
-    named = {}
+    models = {}
     for module in MODULES:
         for name, value in vars(module).items():
             is_model = isinstance(value, type) and issubclass(value, BaseModel)
             if is_model and value.__module__ == module.__name__ and name[0] != "_":
-                named[name] = value
-    for name in sorted(named):
-        yield named[name]
+                models[name] = value
+    for name in sorted(models):
+        yield models[name]
 
 
 @pytest.mark.parametrize("config", list(declarations()), ids=lambda config: config.__name__)
