@@ -272,14 +272,13 @@ class _Sums:
         sampling.
 
         ``weights`` (k, m): of m sub-rays, axes (n, 3, k) @ weights."""
+        m = weights.shape[1]
         axes = self.footprint.axes(self.rows[pixels], self.cols[pixels])
-        lanes_a_pixel = weights.shape[1] // A_LANE
-        sums, off_face = self._lane_sums(pixels, axes, weights, plane)
-        by_lane = (len(pixels), lanes_a_pixel)
+        sums, off_bits = self._lane_sums(pixels, axes, weights, plane)
+        by_lane = (len(pixels), m // A_LANE)
         means = _LaneSums._make([_means(lanes, by_lane) for lanes in sums])
         strongest = np.maximum(sums.strongest.numpy().reshape(by_lane).max(axis=1), 1e-30)
 
-        m = weights.shape[1]
         light = means.light
         face = means.face
         self.phasor[:, pixels] = light[:-1:2] + 1j * light[1::2]
@@ -291,15 +290,9 @@ class _Sums:
         unsure = np.zeros(len(pixels), bool)
         if again is not None:
             unsure = again[pixels] & (_error_m(means, strongest, m) > UNSURE_M)
-
-        off = off_face.numpy().reshape(by_lane)
-        counts = np.where(unsure, 0, np.bitwise_count(off).sum(axis=1, dtype=int))
-        steps = np.maximum(counts // KEPT, 1)
-        has_off_face = counts > 0
-        kept = -(-counts // steps)[has_off_face]
-        slopes = np.empty((kept.sum(), 2), np.float32)
-        _slopes_kept(off[has_off_face], steps[has_off_face], axes[has_off_face], weights, slopes)
-        self.off_face.append(OffFace(pixels[has_off_face], kept, counts[has_off_face] / m, slopes))
+        bits = off_bits.numpy().reshape(by_lane)
+        sure = ~unsure
+        self.off_face.append(_off_face(pixels[sure], bits[sure], axes[sure], weights))
         return pixels[unsure]
 
     def _lane_sums(
@@ -426,6 +419,24 @@ def _error_m(
     spread_m = np.sqrt(np.maximum(variance_m2, 0.0))
     bright_share = np.maximum(light / strongest, 1 / count)
     return np.asarray(MISPLACED * spread_m / (count * np.sqrt(bright_share)))
+
+
+def _off_face(
+    pixels: np.ndarray,
+    bits: np.ndarray,
+    axes: np.ndarray,
+    weights: np.ndarray,
+) -> OffFace:
+    """Return the sub-rays of pixels (n,) whose bit is set in ``bits`` (n, m / A_LANE)."""
+    counts = np.bitwise_count(bits).sum(axis=1, dtype=int)
+    any_off = counts > 0
+    counts = counts[any_off]
+    steps = np.maximum(counts // KEPT, 1)
+    kept = -(-counts // steps)
+    slopes = np.empty((kept.sum(), 2), np.float32)
+    _slopes_kept(bits[any_off], steps, axes[any_off], weights, slopes)
+    share = counts / weights.shape[1]
+    return OffFace(pixels[any_off], kept, share, slopes)
 
 
 @numba.njit(**FAST)
