@@ -147,6 +147,15 @@ def test_a_comb_is_summed_as_its_lines_one_by_one(
 def test_uneven_frequencies_are_no_comb():
     assert comb_step((198e6, 189e6, 54e6)) is None
     assert comb_step((1e6, 2e6, 3e6, 4.1e6)) is None
+    assert comb_step((1e6, 2e6, 3e6)) is None
+
+
+def test_a_comb_may_be_uneven_by_a_billionth_of_its_highest_frequency():
+    thirds = tuple(1e6 * k / 3 for k in range(8))
+    assert comb_step(thirds) == pytest.approx(1e6 / 3)
+    # of four lines, the last moved by d is 2 / 3 d off the mean step
+    assert comb_step((1e6, 2e6, 3e6, 4e6 + 5.9e-3)) == pytest.approx(1e6)
+    assert comb_step((1e6, 2e6, 3e6, 4e6 + 6.1e-3)) is None
 
 
 @pytest.mark.slow  # a long reference
