@@ -273,6 +273,6 @@ def test_a_lost_render_costs_what_needs_it(home, tmp_path, monkeypatch):
     assert (outcome.trials.done, outcome.trials.failed) == (6, 6)
     assert {failure.state for failure in outcome.failures} == {"failed", "skipped"}
     assert {failure.why for failure in outcome.failures} == {"no such view"}
-    monkeypatch.setattr(engine_run, "render_into_cache", real)
+    monkeypatch.setattr(job_batches, "render_into_cache", real)
     outcome = run_serially(plan, tmp_path)
     assert (outcome.trials.found, outcome.trials.done, outcome.failures) == (6, 6, [])
