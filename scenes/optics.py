@@ -36,7 +36,7 @@ class Optics:
     cutoff_half_angle_deg: float
     """Angle at which nothing is left of it."""
     frequencies_hz: tuple[float, ...]
-    """Where phasors are wanted."""
+    """Modulation frequencies at which phasors are wanted."""
     wavelength_nm: float
     """Wavelength of the light."""
     margin_px: int
@@ -49,7 +49,7 @@ class Optics:
     farthest_m: float = float("inf")
     """The camera gives no range beyond; this changes no render."""
     limits_along: Literal["ray", "axis"] = "ray"
-    """Whether these two count along the camera's rays or its axis."""
+    """Direction along which these two count: the camera's rays or its axis."""
 
     def cone(self, slopes: np.ndarray) -> np.ndarray:
         """Return the emitter's light along rays from it (..., 2) relative to the axis."""
@@ -233,7 +233,7 @@ class NoiseFreeView:
     seconds: float
     """Time that it took to compute."""
     variant: str
-    """What computed it: the variant of Mitsuba, or "closed form"."""
+    """Name of what computed it: the variant of Mitsuba, or "closed form"."""
 
 
 class RenderConfig(Config):

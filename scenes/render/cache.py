@@ -147,11 +147,11 @@ class StoredFile:
     """A file of the cache."""
 
     path: Path
-    """Where it is."""
+    """Its path."""
     size_bytes: int
     """Its size."""
     used_s: float
-    """When it was last read or written, in seconds since 1970 (file system's time)."""
+    """Time when it was last read or written, in seconds since 1970 (file system's)."""
 
 
 def stored_renders(folder: Path) -> list[StoredFile]:

@@ -57,7 +57,7 @@ class PathStart(NamedTuple):
     direction: Any
     """Unit direction of the ray to the next vertex."""
     lobe: Any
-    """What the surface reflects from there to the lens (`LitScene.lobe`)."""
+    """Share that the surface reflects from there to the lens (`LitScene.lobe`)."""
     weight: Any
     """Factor of all light of the path."""
     length_m: Any

@@ -1,4 +1,4 @@
-"""How small changes of phasors change range, and the noise that batches of paths leave in it."""
+"""Changes of range by small changes of phasors, and the noise that batches of paths leave in it."""
 
 import numpy as np
 

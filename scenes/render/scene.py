@@ -125,11 +125,11 @@ class Met(NamedTuple):
     """Hits of rays, as Dr.Jit arrays."""
 
     valid: Any
-    """Whether there is a hit."""
+    """True where there is a hit."""
     distance: Any
     """Metres from the ray's origin; 0 without a hit."""
     point: Any
-    """Where it is, in the camera's frame."""
+    """Position in the camera's frame."""
     normal: Any
     """Unit normal of the surface, towards the ray's origin."""
     surface: Any
@@ -167,7 +167,7 @@ class LitScene:
     normal_of: Any
     """Unit normal, by triangle."""
     on_face: Any
-    """Whether on the undamaged face, by triangle."""
+    """True on the undamaged face, by triangle."""
     albedos: Any
     """Mean albedo, by surface."""
     gloss: tuple[Any, Any] | None

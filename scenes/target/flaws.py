@@ -49,7 +49,7 @@ class Relief:
     depth_m: np.ndarray
     """(rows, columns): negative where the damage stands out of the face, NaN through the board."""
     open_row: bool = False
-    """Whether the last row lies on the board's edge, beyond which a cutter goes on."""
+    """True if the last row lies on the board's edge, beyond which a cutter goes on."""
 
 
 class PlacedConfig(Config):

@@ -204,7 +204,7 @@ class TargetPart:
     """A surface of a target."""
 
     name: str
-    """As in `Target.parts`."""
+    """Name, as in `Target.parts`."""
     mesh: trimesh.Trimesh
     """Camera frame, metres, normals outwards; sharp edges share vertices, so use face normals."""
     albedo_850: float

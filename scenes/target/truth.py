@@ -54,7 +54,7 @@ class Face:
     derivatives: Derivatives
     """Gives z and its derivatives."""
     rough: bool = False
-    """Whether slope and curvature at one place do not describe the places around it."""
+    """True if slope and curvature at one place do not describe the places around it."""
     height: Heights | None = None
     """Gives z alone, if that is much quicker."""
 
@@ -357,15 +357,15 @@ class Damage:
     id: int
     """Its number in the declaration."""
     kind: str
-    """What it is: "through", "blind", "dent" or a kind of `scenes.target.flaws`."""
+    """Its kind: "through", "blind", "dent" or a kind of `scenes.target.flaws`."""
     diameter_m: float
-    """Of the drill, of a dent's rim on this face (by equal area), or of other kinds the size in
-    plan that ``size_of`` names."""
+    """Diameter of the drill, of a dent's rim on this face (by equal area), or of other kinds the
+    size in plan that ``size_of`` names."""
     depth_m: float
-    """Along the axis; for corrosion the mean, for ``raised`` damage its height, for through-damage
+    """Depth along the axis; for corrosion the mean, for ``raised`` damage its height, for through-damage
     the board's thickness."""
     volume_m3: float
-    """Of holes and dents: exact on a flat face, to second order in diameter over radius of
+    """Volume of holes and dents: exact on a flat face, to second order in diameter over radius of
     curvature on a curved one; of other kinds as `scenes.target.flaws` meshes them, of a pressed
     sheet on its front."""
     centre_board_m: np.ndarray
@@ -379,7 +379,7 @@ class Damage:
     size_of: str = "diameter"
     """The size in plan that a limit states."""
     raised: bool = False
-    """Whether it stands out of the face."""
+    """True if it stands out of the face."""
     outline_board_m: np.ndarray | None = None
     """(n, 2): outline in plan of kinds with an outline of their own."""
     line_board_m: np.ndarray | None = None
