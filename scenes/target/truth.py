@@ -362,8 +362,8 @@ class Damage:
     """Diameter of the drill, of a dent's rim on this face (by equal area), or of other kinds the
     size in plan that ``size_of`` names."""
     depth_m: float
-    """Depth along the axis; for corrosion the mean, for ``raised`` damage its height, for through-damage
-    the board's thickness."""
+    """Depth along the axis; for corrosion the mean, for ``raised`` damage its height, for
+    through-damage the board's thickness."""
     volume_m3: float
     """Volume of holes and dents: exact on a flat face, to second order in diameter over radius of
     curvature on a curved one; of other kinds as `scenes.target.flaws` meshes them, of a pressed

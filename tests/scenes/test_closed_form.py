@@ -117,6 +117,7 @@ EDGE = 0.004
 
 
 def left_of_edge(slopes: np.ndarray) -> np.ndarray:
+    assert slopes.shape[-1] == 2
     return slopes[..., 0] < EDGE
 
 
