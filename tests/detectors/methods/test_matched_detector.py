@@ -17,23 +17,25 @@ from detectors.findings.hole_model import (
     straight_sight,
     whitened,
 )
+from detectors.findings.templates import (
+    bank,
+    halved,
+    responses,
+    spectra,
+    transformed,
+    window_of,
+    worths,
+)
 from detectors.findings.whitening import (
     CONVERGED,
     GRID,
     LONGEST_LAG_PX,
-    bank,
     covariance_factor,
     filters,
     grid_of,
-    halved,
     inverse_times,
     noise_covariance,
-    responses,
-    spectra,
     spectrum,
-    transformed,
-    window_of,
-    worths,
 )
 from detectors.interface import Detection
 from detectors.masks import grown
