@@ -59,20 +59,21 @@ AMBIGUOUS = (
 
 
 class HoleModelConfig(Config):
-    """Assumptions of the model of a blurred hole."""
+    """Assumptions of the model of a blurred hole.
+
+    - ``blur_px``: side of the square over which the camera averages: 5 for the Azure Kinect's depth
+      engine (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none.
+    - ``emitter_mm``: position of the light source in the camera's frame.
+    - ``linear_depth_mm``: at greater depths, the filter weights a deep neighbour by less than half,
+      and the contour at half depth is more reliable.
+    - ``largest_invalid``: share of the disc that may lack a range.
+    - ``largest_relative_error``: of the diameter; beyond it, diameter and depth are ambiguous."""
 
     blur_px: int = Field(default=5, ge=1, le=31)
-    """Side of the square over which the camera averages: 5 for the Azure Kinect's depth engine
-    (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none."""
     emitter_mm: tuple[float, float, float] = (-14.0, 0.0, 1.0)
-    """Position of the light source in the camera's frame."""
     linear_depth_mm: float = Field(default=75.0, gt=0)
-    """At greater depths, the filter weights a deep neighbour by less than half, and the contour at
-    half depth is more reliable."""
     largest_invalid: float = Field(default=0.1, ge=0, le=1)
-    """Share of the disc that may lack a range."""
     largest_relative_error: float = Field(default=0.3, gt=0)
-    """Of the diameter; beyond it, diameter and depth are ambiguous."""
 
     @field_validator("blur_px")
     @classmethod
