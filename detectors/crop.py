@@ -152,7 +152,7 @@ class Candidate:
         """An even sample (n, 3) of its points."""
         pixels = np.flatnonzero(self.own)
         step = max(1, len(pixels) // MOST_SAMPLES)
-        return np.asarray(self.grid.points_m.reshape(-1, 3)[pixels[::step]])
+        return self.grid.points_m.reshape(-1, 3)[pixels[::step]]
 
     @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
@@ -165,7 +165,7 @@ class Candidate:
 def _centre_weights(length: int) -> np.ndarray:
     """Return the weights (n,) of the pixels along an axis of the picture, highest in its middle."""
     position = (np.arange(length) + 0.5) / length - 0.5
-    return np.asarray(np.exp(-0.5 * position**2 / CENTRE_SPREAD**2))
+    return np.exp(-0.5 * position**2 / CENTRE_SPREAD**2)
 
 
 @dataclass(frozen=True)
@@ -586,7 +586,7 @@ def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
             inside = inside & (values > low * MM) & (values < high * MM)
         if config.range_max_m is not None:
             inside = inside & (np.hypot(x, z) < config.range_max_m)
-    return np.asarray(inside)
+    return inside
 
 
 def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:

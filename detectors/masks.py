@@ -19,7 +19,7 @@ def holes_filled(mask: np.ndarray, rim_px: int = 0) -> np.ndarray:
     cv2.floodFill(image, None, (0, 0), 2)
     if not rim_px:
         image = image[1:-1, 1:-1]
-    return np.asarray(image != 2)
+    return image != 2
 
 
 def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
@@ -30,7 +30,7 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
 
     def deep_in(gaps: np.ndarray) -> np.ndarray:
         padded = np.pad(gaps, 1).astype(np.uint8)
-        depth_px = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5))[1:-1, 1:-1]
+        depth_px = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
         return depth_px > 1 + radius_px / 4
 
     # a closing is slow and stays within the convex hull, so it is computed only there
@@ -56,13 +56,13 @@ def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndar
     """Return the mask grown by all pixels within this distance: in a square, or in OpenCV's
     ``shape``."""
     kernel = cv2.getStructuringElement(shape, (2 * pixels + 1, 2 * pixels + 1))
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    return cv2.dilate(mask.astype(np.uint8), kernel) > 0
 
 
 def shrunk(mask: np.ndarray, side: int) -> np.ndarray:
     """Return the pixels whose square of ``side`` pixels lies inside the mask; beyond the picture
     counts as inside."""
-    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+    return cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
 def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
@@ -76,7 +76,10 @@ def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def parts_with(
-    mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least: int = 0
+    mask: np.ndarray,
+    seeds: np.ndarray,
+    connectivity: int = 8,
+    least: int = 0,
 ) -> np.ndarray:
     """Return the connected parts of the mask that hold a seed (h, w) and at least ``least``
     pixels."""
@@ -86,7 +89,7 @@ def parts_with(
     if least:
         has_seed &= np.bincount(labels.ravel(), minlength=count) >= least
     has_seed[0] = False
-    return np.asarray(has_seed[labels])
+    return has_seed[labels]
 
 
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +97,10 @@ def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     nearest pixel."""
     beyond = (~mask).astype(np.uint8)
     distance_px, labels = cv2.distanceTransformWithLabels(
-        beyond, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        beyond,
+        cv2.DIST_L2,
+        3,
+        labelType=cv2.DIST_LABEL_PIXEL,
     )
     inside = np.flatnonzero(mask)
     pixel_of_label = np.zeros(len(inside) + 1, dtype=np.int64)
@@ -103,7 +109,9 @@ def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def components(
-    nodes: np.ndarray, right: np.ndarray, down: np.ndarray
+    nodes: np.ndarray,
+    right: np.ndarray,
+    down: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number the sets of nodes (h, w) that links join, largest first; return the numbers (h, w)
     and the sizes. ``right`` and ``down`` (h, w) bool: whether a pixel is linked to the next in its

@@ -61,7 +61,10 @@ class ScoreMapDetector(ABC, Generic[S]):
         return self.findings(cloud, evidence, [threshold])[0].detections
 
     def findings(
-        self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        thresholds: Sequence[float],
     ) -> list[Findings]:
         """Return the result of `find` at each of several rising thresholds."""
         pixels = _scored_pixels(cloud, evidence, thresholds[0])
@@ -99,11 +102,18 @@ class ScoreMapDetector(ABC, Generic[S]):
         return points_m
 
     def _clusters(
-        self, places_m: np.ndarray, scores: np.ndarray, thresholds: Sequence[float]
+        self,
+        places_m: np.ndarray,
+        scores: np.ndarray,
+        thresholds: Sequence[float],
     ) -> tuple[np.ndarray, np.ndarray]:
         distance_m = self.settings.cluster_distance_mm * MM
         return nested_clusters(
-            places_m, scores, distance_m, self.settings.min_points, np.array(thresholds)
+            places_m,
+            scores,
+            distance_m,
+            self.settings.min_points,
+            np.array(thresholds),
         )
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
@@ -146,7 +156,10 @@ class Findings:
         detections = [
             Detection(score, pixels, centre_m)
             for score, pixels, centre_m in zip(
-                self.scores.tolist(), groups, self.centres_m, strict=True
+                self.scores.tolist(),
+                groups,
+                self.centres_m,
+                strict=True,
             )
         ]
         detections.sort(key=lambda detection: (-detection.score, int(detection.pixels[0])))
@@ -154,7 +167,10 @@ class Findings:
 
 
 def findings_at(
-    detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    thresholds: Sequence[float],
 ) -> list[Findings]:
     """Return a detector's detections at each of several rising thresholds.
 

@@ -54,7 +54,9 @@ class AverageConfig(Config):
     disturbed_fraction: float = Field(default=0.05, gt=0, le=1)
     clip_sigmas: float = Field(default=5.0, ge=2)
     median_memory_mb: float = Field(
-        default=2000.0, gt=0, description="most memory that the median may use"
+        default=2000.0,
+        gt=0,
+        description="most memory that the median may use",
     )
 
 
@@ -89,7 +91,9 @@ def average(source: FrameSource, config: AverageConfig) -> Cloud:
 
 
 def prefix_averages(
-    source: FrameSource, counts: Sequence[int], config: AverageConfig
+    source: FrameSource,
+    counts: Sequence[int],
+    config: AverageConfig,
 ) -> dict[int, Cloud]:
     """Average the first ``n`` frames for each of ``counts`` in one pass, exactly like `average`.
     Raises UserError."""
@@ -103,7 +107,9 @@ def prefix_averages(
 
 
 def _averages(
-    source: FrameSource, counts: list[int] | None, config: AverageConfig
+    source: FrameSource,
+    counts: list[int] | None,
+    config: AverageConfig,
 ) -> dict[int, Cloud]:
     """Return the averages at these numbers of frames, ascending; if None, the average of all
     frames."""
@@ -406,7 +412,14 @@ def _frame_sigma(sampled: np.ndarray, middle: int) -> float:
 
 @numba.njit(**PLAIN)
 def _added(  # type: ignore[no-untyped-def]
-    z, reason, gate, offset, count, total, squares, reasons
+    z,
+    reason,
+    gate,
+    offset,
+    count,
+    total,
+    squares,
+    reasons,
 ):
     """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts:
     within the ``gate``. A pixel without an offset takes its first z for it."""

@@ -126,7 +126,10 @@ class Separated:
 
 
 def flattened(
-    cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndarray | None = None
+    cloud: Cloud,
+    mask: np.ndarray,
+    name: str,
+    T_first_camera: np.ndarray | None = None,
 ) -> FlatCapture:
     """Return an averaged cloud of a flat surface, of the pixels in ``mask`` (h, w), minus its
     smooth fit. With a pose, the places are x and y in the first capture's camera frame, until
@@ -227,7 +230,10 @@ def _disagreement_m2(residuals: np.ndarray, variances: np.ndarray, counts: np.nd
 
 
 def _solved(
-    captures: Sequence[FlatCapture], residuals: np.ndarray, variances: np.ndarray, shape_m2: float
+    captures: Sequence[FlatCapture],
+    residuals: np.ndarray,
+    variances: np.ndarray,
+    shape_m2: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pattern (h, w), its variance, and the surface's shape as each capture sees it (c, h,
     w), by the least sum of squares of noise, pattern and shape, each over its own variance.
@@ -252,7 +258,12 @@ def _solved(
     parts = np.concatenate([per_noise * np.sqrt(pattern_m2), per_noise * np.sqrt(shape_m2)])
     system = sparse.csr_array((parts, (rows, columns)), shape=(len(value), pixels + cells))
     unknowns = lsqr(
-        system, per_noise * value, damp=1.0, atol=SOLVED, btol=SOLVED, iter_lim=MOST_STEPS
+        system,
+        per_noise * value,
+        damp=1.0,
+        atol=SOLVED,
+        btol=SOLVED,
+        iter_lim=MOST_STEPS,
     )[0]
     error_m = unknowns[:pixels] * np.sqrt(pattern_m2)
     shapes_m = np.full(finite.shape, np.nan)
@@ -285,7 +296,7 @@ def _cells_of(captures: Sequence[FlatCapture], finite: np.ndarray) -> np.ndarray
     corner_m = position_m.min(axis=0)
     row, column = np.floor((position_m - corner_m) / float(min(steps_m))).astype(np.int64).T
     _, cell = np.unique(row * (column.max() + 1) + column, return_inverse=True)
-    return np.asarray(cell)
+    return cell
 
 
 def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
@@ -315,7 +326,10 @@ def _groups(distances_m: Sequence[float]) -> Iterator[list[int]]:
 
 
 def _change(
-    patterns: np.ndarray, variances: np.ndarray, first: Sequence[int], second: Sequence[int]
+    patterns: np.ndarray,
+    variances: np.ndarray,
+    first: Sequence[int],
+    second: Sequence[int],
 ) -> PatternChange | None:
     """Return how the pattern (c, h, w) of the first captures differs from that of the second; None
     if there are too few."""

@@ -175,7 +175,9 @@ def load_flat_field(path: Path) -> FlatField:
     except (KeyError, ValueError, TypeError) as error:
         why = f"it has no {error}" if isinstance(error, KeyError) else str(error)[:200]
         raise UserError(
-            f"{path}: not a flat field ({why})", legal="a file of tofpod flatfield", fix=AGAIN
+            f"{path}: not a flat field ({why})",
+            legal="a file of tofpod flatfield",
+            fix=AGAIN,
         ) from error
     return field
 

@@ -28,7 +28,11 @@ def euclidean_clusters(points_m: np.ndarray, distance_m: float, min_points: int 
     finite = np.flatnonzero(np.isfinite(points_m).all(axis=1))
     equal_scores = np.zeros(len(finite))
     by_threshold, _ = nested_clusters(
-        points_m[finite], equal_scores, distance_m, min_points, np.array([-1.0])
+        points_m[finite],
+        equal_scores,
+        distance_m,
+        min_points,
+        np.array([-1.0]),
     )
     labels[finite] = by_threshold[0]
     return labels
@@ -102,7 +106,17 @@ def root_of(parent: np.ndarray, i: int) -> int:
 
 @numba.njit(**PLAIN)
 def _nested(  # type: ignore[no-untyped-def]
-    points, scores, falling, order, starts, keys, limit, least, thresholds, labels, strengths
+    points,
+    scores,
+    falling,
+    order,
+    starts,
+    keys,
+    limit,
+    least,
+    thresholds,
+    labels,
+    strengths,
 ):
     """Write the results of `nested_clusters` into ``labels`` and ``strengths``.
 
@@ -196,7 +210,12 @@ def _neighbours(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(**PLAIN)
 def _touches(
-    points: np.ndarray, i: int, order: np.ndarray, start: int, count: int, limit: float
+    points: np.ndarray,
+    i: int,
+    order: np.ndarray,
+    start: int,
+    count: int,
+    limit: float,
 ) -> bool:
     """Return whether point i is within the squared distance ``limit`` of one of the ``count``
     points in ``order`` from ``start`` on."""

@@ -73,7 +73,10 @@ def normal_of(per_px_m: np.ndarray) -> np.ndarray:
 
 
 def sight(
-    centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, share: float = 1.0
+    centre_m: np.ndarray,
+    per_px_m: np.ndarray,
+    emitter_m: np.ndarray,
+    share: float = 1.0,
 ) -> np.ndarray:
     """Return the viewpoint (8,) of a hole, reduced to what moves in the image.
 
@@ -229,7 +232,13 @@ def _painted(
 
 @numba.njit(**PLAIN)
 def _cut(  # type: ignore[no-untyped-def]
-    radius, depth, wall, sights, metric, weights, chords
+    radius,
+    depth,
+    wall,
+    sights,
+    metric,
+    weights,
+    chords,
 ):
     """Write the ``weights`` (k,) of a hole's layers and their ``chords`` (2, k, s): each layer's
     start and end in each strip, in pixels along u from the centre.
@@ -325,7 +334,10 @@ class HoleFit:
 
 
 def whitened(
-    patch: HolePatch, by_lag: np.ndarray | None, offset_m: float, near: np.ndarray
+    patch: HolePatch,
+    by_lag: np.ndarray | None,
+    offset_m: float,
+    near: np.ndarray,
 ) -> HolePatch:
     """Return the patch with the covariance of its errors; without a covariance, as it is.
 
@@ -343,7 +355,12 @@ def whitened(
 
 
 def fit_hole(
-    patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float
+    patch: HolePatch,
+    u: float,
+    v: float,
+    radius_m: float,
+    depth_m: float,
+    offset_m: float,
 ) -> HoleFit:
     """Fit a hole to at least six used pixels by least squares (Levenberg and Marquardt) from start
     values. With the covariance in the patch, the fit has maximum likelihood; else the covariance
@@ -395,7 +412,10 @@ def fit_hole(
 
 
 def _likelihood_covariance(
-    patch: HolePatch, derivatives: np.ndarray, variance: float, depth_m: float
+    patch: HolePatch,
+    derivatives: np.ndarray,
+    variance: float,
+    depth_m: float,
 ) -> np.ndarray:
     """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) by whitened derivatives
     (6, n): the inverse of the information times the residuals' ``variance``, and the model's
@@ -405,7 +425,7 @@ def _likelihood_covariance(
     covariance = np.linalg.pinv(information, hermitian=True) * variance
     covariance[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
     covariance[3, 3] += (DEPTH_ERROR * depth_m) ** 2
-    return np.asarray(covariance)
+    return covariance
 
 
 def sandwich_covariance(patch: HolePatch, derivatives: np.ndarray, square_m2: float) -> np.ndarray:
@@ -435,7 +455,7 @@ def sandwich_covariance(patch: HolePatch, derivatives: np.ndarray, square_m2: fl
     if freedom <= 0:
         return np.full((6, 6), np.nan)
     prior_variance = patch.noise_m**2 * blur_u * blur_v
-    return np.asarray(bread @ (square_m2 / freedom * meat + prior_variance * prior) @ bread)
+    return bread @ (square_m2 / freedom * meat + prior_variance * prior) @ bread
 
 
 def _nearest_odd(blur: float) -> int:
@@ -445,7 +465,17 @@ def _nearest_odd(blur: float) -> int:
 
 @numba.njit(**PLAIN)
 def _descent(  # type: ignore[no-untyped-def]
-    data, pixels, factor, weight, start, sights, metric, blur_u, blur_v, h, w
+    data,
+    pixels,
+    factor,
+    weight,
+    start,
+    sights,
+    metric,
+    blur_u,
+    blur_v,
+    h,
+    w,
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start``
     (6,) has converged.

@@ -124,7 +124,7 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
 def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
     """Return the centres (count, 3) by `extents` of clusters of points (n, 3). ``labels`` (n,): -1
     for no cluster."""
-    return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
+    return points_m[_extremes(points_m, labels, count)].mean(axis=1)
 
 
 @numba.njit(**PLAIN)
@@ -258,7 +258,10 @@ class _Surroundings:
 
 
 def _surroundings(
-    cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig
+    cloud: Cloud,
+    evidence: Evidence,
+    detection: Detection,
+    config: HoleModelConfig,
 ) -> _Surroundings | None:
     """Cut out the detection with a margin of twice the blur on each side; None with too few valid
     pixels around."""
@@ -324,7 +327,10 @@ def _centroid(mask: np.ndarray) -> tuple[float, float]:
 
 
 def _sights(
-    cloud: Cloud, origin_m: np.ndarray, per_px_m: np.ndarray, config: HoleModelConfig
+    cloud: Cloud,
+    origin_m: np.ndarray,
+    per_px_m: np.ndarray,
+    config: HoleModelConfig,
 ) -> np.ndarray:
     """Return the viewpoints (s, 8) of the camera that sees the surface's point (3,), or of all the
     cameras of a map."""
@@ -343,7 +349,11 @@ def _sights(
 
 
 def local_plane(
-    points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
+    points: np.ndarray,
+    surface_z: np.ndarray,
+    finite: np.ndarray,
+    own: np.ndarray,
+    projection: str,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v
     (2, 3), by linear regression of directions (in a parallel projection of x and y) and of the
@@ -413,7 +423,9 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 
 
 def _modelled(
-    around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray | None
+    around: _Surroundings,
+    config: HoleModelConfig,
+    by_lag: np.ndarray | None,
 ) -> tuple[HoleFit | None, str]:
     """Return the fitted hole, or None and the reason why the model does not hold."""
     own = around.own

@@ -165,7 +165,7 @@ def missing_evidence(cloud: Cloud, evidence: Evidence) -> np.ndarray | None:
 def _counted(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     """Return the sums (h, w) of an image around each pixel, weighted by a kernel."""
     image = image.astype(np.float64)
-    return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_CONSTANT))
+    return cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_CONSTANT)
 
 
 def _local_rate(missing: np.ndarray, known: np.ndarray, rate: float) -> np.ndarray:
@@ -252,7 +252,9 @@ def _filled(shape: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
 
 
 def _surface_at(
-    cloud: Cloud, evidence: Evidence, area: np.ndarray
+    cloud: Cloud,
+    evidence: Evidence,
+    area: np.ndarray,
 ) -> tuple[np.ndarray, float] | None:
     """Return the surface's point (3,) at an area's centroid, and the area in m2 that one pixel
     covers there; None if too few pixels around are judged."""
@@ -276,7 +278,9 @@ def _surface_at(
 
 
 def one_damage_once(
-    shape: tuple[int, int], found: tuple[Detection, ...], missing: tuple[Detection, ...]
+    shape: tuple[int, int],
+    found: tuple[Detection, ...],
+    missing: tuple[Detection, ...],
 ) -> tuple[Detection, ...]:
     """Return findings by depth and by missing returns (flat indices into a grid of ``shape``) as
     one list, strongest first. Of those that are one damage with a cluster without return
@@ -375,7 +379,7 @@ def _in_window(image: np.ndarray) -> np.ndarray:
     window = (RATE_WINDOW_PX, RATE_WINDOW_PX)
     image = image.astype(np.float32)
     border = cv2.BORDER_CONSTANT
-    return np.asarray(cv2.boxFilter(image, -1, window, normalize=False, borderType=border))
+    return cv2.boxFilter(image, -1, window, normalize=False, borderType=border)
 
 
 def _fields(shape: tuple[int, ...], side: int, count: int) -> Iterator[np.ndarray]:
@@ -385,9 +389,8 @@ def _fields(shape: tuple[int, ...], side: int, count: int) -> Iterator[np.ndarra
     first = margin // 2
     random = random_stream(0, "missing returns", height, width, side)
     for _ in range(count):
-        field = random.standard_normal((height + margin, width + margin), dtype=np.float32)
-        if margin:
-            field = cv2.blur(field, (side, side)) * side
+        white = random.standard_normal((height + margin, width + margin), dtype=np.float32)
+        field = cv2.blur(white, (side, side)) * side if margin else white
         yield field[first : first + height, first : first + width]
 
 

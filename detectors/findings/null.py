@@ -104,7 +104,10 @@ class OwnThreshold:
 
 
 def own_threshold(
-    detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    false_calls: float,
 ) -> OwnThreshold:
     """Find the threshold at which ``false_calls`` (above 0) are expected, from the capture's own
     peaks towards the camera; at least `LEAST`. With too few peaks the numbers are NaN, and
@@ -190,7 +193,7 @@ def behind(evidence: Evidence) -> np.ndarray:
     if evidence.behind is not None:
         return evidence.behind
     with np.errstate(invalid="ignore"):
-        return np.asarray(evidence.residual_m >= 0)
+        return evidence.residual_m >= 0
 
 
 def _only(evidence: Evidence, where: np.ndarray) -> Evidence:
@@ -294,7 +297,7 @@ def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
     The exponent 2 is that of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2)
     (Adler 1981)."""
     power = np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
-    return np.asarray(floor**2 * (power - _crowd(floor) * np.log(ratios)))
+    return floor**2 * (power - _crowd(floor) * np.log(ratios))
 
 
 def _crowd(floor: float) -> float:
@@ -304,7 +307,10 @@ def _crowd(floor: float) -> float:
 
 
 def _peaks(
-    detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarray
+    detector: Detector,
+    cloud: Cloud,
+    before: Evidence,
+    covered: np.ndarray,
 ) -> tuple[float, np.ndarray]:
     """Return a floor with about `WANTED_PEAKS` findings above it, and their scores (n,).
 
@@ -343,7 +349,9 @@ def _floor_among(counts: list[int]) -> int:
 
 
 def each_object_once(
-    cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]
+    cloud: Cloud,
+    evidence: Evidence,
+    found: tuple[Detection, ...],
 ) -> tuple[Detection, ...]:
     """Return the findings, strongest first, with each object on the target as one finding:
     findings that reach its margin and are weaker belong to it.
@@ -418,14 +426,17 @@ def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
 
 
 def _boxed(image: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.blur(image, (PATCH_PX, PATCH_PX), borderType=cv2.BORDER_REFLECT))
+    return cv2.blur(image, (PATCH_PX, PATCH_PX), borderType=cv2.BORDER_REFLECT)
 
 
 # --- the target's rim ---
 
 
 def _mixed_rim(
-    detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    threshold: float,
 ) -> np.ndarray:
     """Return (h, w) bool: a band along the outline, as wide as the zone of frequent calls behind
     the surface."""
@@ -440,10 +451,10 @@ def _mixed_rim(
     along = [reach_px for reach_px in reaches_px if reach_px <= RIM_PX]
     if len(along) < RIM_CALLS or filled.all():
         return np.zeros(known.shape, bool)
-    return np.asarray((depth_px <= max(along)) & known)
+    return (depth_px <= max(along)) & known
 
 
 def _depth_px(mask: np.ndarray) -> np.ndarray:
     """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge does not
     count as a rim."""
-    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1])
+    return ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]

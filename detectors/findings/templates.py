@@ -72,7 +72,7 @@ def bank(window_px: int) -> tuple[Template, ...]:
     window = (window_px, window_px)
     templates = []
     for template in sharp:
-        image = np.asarray(cv2.blur(template.image, window, borderType=cv2.BORDER_CONSTANT))
+        image = cv2.blur(template.image, window, borderType=cv2.BORDER_CONSTANT)
         templates.append(template._replace(image=image))
     if window_px == DEEP_WINDOW_PX:
         templates += [_disc(DEEP_PX, offset) for offset in HALVES_PX]
@@ -119,7 +119,7 @@ def _drawn(height: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: flo
     fine = height(positions[None, :], positions[:, None]).astype(float)
     pixels = fine.reshape(side, FINER, side, FINER).mean(axis=(1, 3))
     border = cv2.BORDER_CONSTANT
-    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), LENS_BLUR_PX, borderType=border))
+    return cv2.GaussianBlur(pixels, (0, 0), LENS_BLUR_PX, borderType=border)
 
 
 # --- correlation with a picture ---
@@ -129,7 +129,7 @@ def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the spectrum, complex (r, c), of an image on a grid of this shape, 0 beside it."""
     padded = np.zeros((*shape, 2), np.float32)
     padded[: image.shape[0], : image.shape[1], 0] = image
-    return np.asarray(cv2.dft(padded, dst=padded)).view(np.complex64)[..., 0]
+    return cv2.dft(padded, dst=padded).view(np.complex64)[..., 0]
 
 
 def halved(image_spectrum: np.ndarray) -> np.ndarray:
@@ -180,7 +180,10 @@ def spectra(
 
 
 def _pair_spectrum(
-    pair: tuple[int, ...], shape: tuple[int, ...], window_px: int, coarse: bool
+    pair: tuple[int, ...],
+    shape: tuple[int, ...],
+    window_px: int,
+    coarse: bool,
 ) -> np.ndarray:
     both: np.ndarray | int = 0
     for channel, number in enumerate(pair):
@@ -191,13 +194,15 @@ def _pair_spectrum(
 
 
 def responses(
-    image_spectrum: np.ndarray, pair: np.ndarray, out: np.ndarray | None = None
+    image_spectrum: np.ndarray,
+    pair: np.ndarray,
+    out: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and
     theirs (`spectra`). For a `halved` picture, they are those in the middles of 2 x 2 pixels."""
     product = np.multiply(image_spectrum, pair, out=out).view(np.float32)
     product = product.reshape(*pair.shape, 2)
-    return np.asarray(cv2.dft(product, dst=product, flags=cv2.DFT_INVERSE))
+    return cv2.dft(product, dst=product, flags=cv2.DFT_INVERSE)
 
 
 # --- what a score of each template is worth ---

@@ -48,7 +48,9 @@ class Filters(NamedTuple):
 
 
 def grid_of(
-    shape: tuple[int, ...], least: int = GRID, margin: int = LONGEST_LAG_PX
+    shape: tuple[int, ...],
+    least: int = GRID,
+    margin: int = LONGEST_LAG_PX,
 ) -> tuple[int, ...]:
     """Return the grid for transforms of pictures of this shape, as they are fast.
 
@@ -83,7 +85,7 @@ def _by_lag(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     padded[: image.shape[0], : image.shape[1]] = image
     cv2.dft(padded, dst=padded)
     cv2.mulSpectrums(padded, padded, 0, c=padded, conjB=True)
-    products = np.asarray(cv2.dft(padded, dst=padded, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))
+    products = cv2.dft(padded, dst=padded, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE)
     return products[_lags()]
 
 
@@ -105,7 +107,7 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     `scipy.fft.rfft2`."""
     power = scipy.fft.rfft2(centred(covariance, shape)).real
     least = max(LEAST_POWER * float(power.mean()), LEAST_VARIANCE)
-    return np.asarray(np.maximum(power, least).astype(np.float32))
+    return np.maximum(power, least).astype(np.float32)
 
 
 def correlation(covariance: np.ndarray) -> np.ndarray:
@@ -133,7 +135,7 @@ def _packed_power(covariance: np.ndarray, grid: tuple[int, ...]) -> np.ndarray:
     power[:, 2::2] = power[:, 1:-1:2]
     power[2::2, :: grid[1] - 1] = power[1:-1:2, :: grid[1] - 1]
     least = max(LEAST_POWER * float(covariance.max()), LEAST_VARIANCE)
-    return np.asarray(np.maximum(power, np.float32(least)))
+    return np.maximum(power, np.float32(least))
 
 
 # --- the inverse over the known pixels ---
@@ -210,12 +212,16 @@ def inverse_times(
 def _filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
     """Return ``out``, which gets the image with its frequencies multiplied by factors."""
     np.multiply(cv2.dft(image, dst=out), factors, out=out)
-    return np.asarray(cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE))
+    return cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE)
 
 
 @numba.njit(**PLAIN)
 def _spread(
-    image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool, out: np.ndarray
+    image: np.ndarray,
+    inner: np.ndarray,
+    outer: np.ndarray,
+    back: bool,
+    out: np.ndarray,
 ) -> None:
     """Write s + ``outer`` x (s blurred by `TAPS`) into the grid ``out``, where s is ``image`` x
     ``inner``, on a grid that is 0 elsewhere.
@@ -274,7 +280,10 @@ def _spread(
 
 
 def covariance_factor(
-    used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
+    used: np.ndarray,
+    correlation: np.ndarray | None,
+    deviation: float,
+    model_error: np.ndarray,
 ) -> np.ndarray | None:
     """Return the lower triangular L (n, n) of the covariance L L' of the errors at some pixels.
 
@@ -297,7 +306,11 @@ def covariance_factor(
 
 @numba.njit(**PLAIN)
 def _lower_covariance(  # type: ignore[no-untyped-def]
-    rows, columns, error, variance, correlation
+    rows,
+    columns,
+    error,
+    variance,
+    correlation,
 ):
     """Return the lower triangle (n, n) of the covariance of pixels, 0 above it."""
     covariance = np.zeros((len(rows), len(rows)))
@@ -327,4 +340,4 @@ def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarr
         borderType=cv2.BORDER_CONSTANT,
     )
     summed = summed.reshape(-1, count)
-    return np.asarray(summed.T @ summed)
+    return summed.T @ summed

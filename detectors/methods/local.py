@@ -172,7 +172,10 @@ class LocalDetector:
         )
 
     def scored(
-        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+        self,
+        residual_m: np.ndarray,
+        weights: np.ndarray,
+        rounding_m2: tuple[float, float],
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c) of a picture of residuals with weights, 0 where nothing is
         known; the deviation in metres of the narrowest filter at a typical point; and the meaning
@@ -191,7 +194,10 @@ class LocalDetector:
         return self.findings(cloud, evidence, [threshold])[0].detections
 
     def findings(
-        self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        thresholds: Sequence[float],
     ) -> list[Findings]:
         """Return the results of `find` at each of the thresholds, which ascend."""
         assert isinstance(evidence, LocalEvidence)
@@ -210,7 +216,7 @@ class LocalDetector:
 
         def sums_above(values: np.ndarray) -> np.ndarray:
             sums = np.bincount(cells, values, shape[0] * shape[1]).reshape(shape)
-            return np.asarray(np.cumsum(sums[::-1], axis=0)[::-1])
+            return np.cumsum(sums[::-1], axis=0)[::-1]
 
         excess = np.maximum(scores - CORE * strengths[labels], 0.0)
         x, y, z = cloud.points_m.reshape(-1, 3)[pixels].T
@@ -268,7 +274,9 @@ def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndar
 
 
 def _scored(
-    residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+    residual_m: np.ndarray,
+    weights: np.ndarray,
+    rounding_m2: tuple[float, float],
 ) -> tuple[np.ndarray, list[int], float]:
     """Return signed scores (r, c) of a picture of residuals (r, c) with ``weights`` (r, c), 0 where
     nothing is known; the filters' widths in pixels; and the deviation of the narrowest at a typical
@@ -339,7 +347,9 @@ def _filter_count(seen: np.ndarray) -> int:
 
 
 def _levelled(
-    values: np.ndarray, weights: np.ndarray, widest: int
+    values: np.ndarray,
+    weights: np.ndarray,
+    widest: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values (r, c) minus their level over the widest surroundings, and their local noise
     (r, c). Values count for the level only within `LEVEL_SIGMAS` of this noise."""
@@ -364,7 +374,7 @@ def _tent(image: np.ndarray, half: int) -> np.ndarray:
     """Average over a square of 2 ``half`` + 1 pixels, twice; values beyond the edges count as 0."""
     size = (2 * half + 1, 2 * half + 1)
     once = cv2.blur(np.ascontiguousarray(image, np.float32), size, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT))
+    return cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT)
 
 
 def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
@@ -377,7 +387,7 @@ def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
     exact = weights.astype(np.float64)
     squares = cv2.sepFilter2D(exact, -1, side, side, borderType=cv2.BORDER_CONSTANT)
     worth = covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)
-    return np.asarray(worth.astype(np.float32))
+    return worth.astype(np.float32)
 
 
 def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
@@ -403,7 +413,10 @@ def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> 
 
 
 def local_sigma(
-    values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0, samples: int = SAMPLES_SIDE
+    values: np.ndarray,
+    half: int = LEAST_WINDOW,
+    floor: float = 0.0,
+    samples: int = SAMPLES_SIDE,
 ) -> np.ndarray:
     """Return the robust standard deviation (r, c) of the values' finite neighbours, from so many
     ``samples`` from the window's middle to its edge, interpolated between nodes ``half`` apart."""
@@ -416,7 +429,7 @@ def local_sigma(
     everywhere = median_of(finite) if len(finite) else floor
     nodes = np.maximum(np.where(known, nodes, everywhere), floor).astype(np.float32)
     even = cv2.blur(nodes, (3, 3), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_LINEAR))
+    return cv2.resize(even, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _nodes(length: int, half: int) -> np.ndarray:
@@ -429,12 +442,16 @@ def _nodes(length: int, half: int) -> np.ndarray:
         half_pixel = 0.5
     from_middle = (np.arange(count) + 0.5) * length / count - 0.5 * length
     moved = np.sign(from_middle) * (np.round(np.abs(from_middle) - half_pixel) + half_pixel)
-    return np.asarray(np.round(moved + 0.5 * (length - 1)).astype(np.int64))
+    return np.round(moved + 0.5 * (length - 1)).astype(np.int64)
 
 
 @numba.njit(**PLAIN)
 def _local_medians(
-    values: np.ndarray, rows: np.ndarray, columns: np.ndarray, half: int, stride: int
+    values: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    half: int,
+    stride: int,
 ) -> np.ndarray:
     """Return the medians (r, c) of finite sizes in windows of 2 ``half`` + 1 around nodes, every
     ``stride``-th."""

@@ -119,7 +119,10 @@ class MatchedDetector(LocalDetector):
         return super().picture(cloud, max(pixels, windows))
 
     def scored(
-        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+        self,
+        residual_m: np.ndarray,
+        weights: np.ndarray,
+        rounding_m2: tuple[float, float],
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and
         the unit of score."""
@@ -173,7 +176,9 @@ class _Residuals(NamedTuple):
 
 
 def _in_deviations(
-    residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+    residual_m: np.ndarray,
+    weights: np.ndarray,
+    rounding_m2: tuple[float, float],
 ) -> _Residuals:
     """Return residuals (r, c) with weights (r, c), 0 where unknown, in units of the noise nearby,
     which is at least that of rounding."""
@@ -225,7 +230,10 @@ def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
 
 @numba.njit(**PLAIN)
 def _sum_layers(
-    noise: np.ndarray, depth_px: np.ndarray, total: np.ndarray, count: np.ndarray
+    noise: np.ndarray,
+    depth_px: np.ndarray,
+    total: np.ndarray,
+    count: np.ndarray,
 ) -> None:
     """Add clipped residuals to ``total``, and their numbers to ``count`` (r, c, `RIM_PX` + 1), in
     squares of `LAYER_PX`, for each distance from the outline within the rim, and for those next to
@@ -305,7 +313,9 @@ def _judged(residuals: _Residuals, covariance: np.ndarray | None) -> tuple[np.nd
     window_px = templates.window_of(covariance)
     power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
     noise = _Noise(
-        whitening.filters(covariance, known.shape), window_px, templates.worths(power, window_px)
+        whitening.filters(covariance, known.shape),
+        window_px,
+        templates.worths(power, window_px),
     )
     tamed = _tamed(residuals.values)
     radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
@@ -343,8 +353,8 @@ def _tamed(values: np.ndarray) -> np.ndarray:
     neighbours."""
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0
-    low = np.asarray(cv2.erode(values, ring))
-    high = np.asarray(cv2.dilate(values, ring))
+    low = cv2.erode(values, ring)
+    high = cv2.dilate(values, ring)
     return np.clip(values, np.minimum(low, -CLIP_SIGMAS), np.maximum(high, CLIP_SIGMAS))
 
 
@@ -352,8 +362,8 @@ def _side_lobes(signed: np.ndarray) -> np.ndarray:
     """Return (r, c) bool: scores that are less than `LOBE_SHARE` of one of the other sign within
     `RIM_PX`."""
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    low = np.asarray(cv2.erode(signed, reach))
-    high = np.asarray(cv2.dilate(signed, reach))
+    low = cv2.erode(signed, reach)
+    high = cv2.dilate(signed, reach)
     return (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
 
 
@@ -375,11 +385,14 @@ def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
 
 def _highest(size: np.ndarray) -> np.ndarray:
     """Return (r, c) bool: pixels that are the largest within `ALONE_PX`."""
-    return np.asarray(size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
+    return size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8))
 
 
 def _cores(
-    peaks: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
+    peaks: np.ndarray,
+    radius_px: np.ndarray,
+    values: np.ndarray,
+    known: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the pixels of strong findings.
 
@@ -513,7 +526,14 @@ def _scored(
             kept = slot_best if template.slot else coarse_best
         down, right = template.halves
         _keep_stronger(
-            kept.signed, kept.template, score, 1 / deviation, worth.raised, down, right, number
+            kept.signed,
+            kept.template,
+            score,
+            1 / deviation,
+            worth.raised,
+            down,
+            right,
+            number,
         )
     # linear interpolation would lower the narrow ridges of slots' scores by a seventh
     _merge(best, coarse_best, cv2.INTER_LINEAR)
@@ -522,7 +542,10 @@ def _scored(
 
 
 def _responses(
-    fine: _View, coarse: _View, noise: _Noise, only_centred: bool
+    fine: _View,
+    coarse: _View,
+    noise: _Noise,
+    only_centred: bool,
 ) -> Iterator[tuple[_View, int, np.ndarray]]:
     """Yield for each template the view on which it is scored, its number, and its response t' C^-1
     r (r, c), which the next one overwrites."""
@@ -545,7 +568,7 @@ def _halved(image: np.ndarray) -> np.ndarray:
     odd_rows = image.shape[0] % 2
     odd_columns = image.shape[1] % 2
     even = cv2.copyMakeBorder(image, 0, odd_rows, 0, odd_columns, cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    return cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
 def _merge(best: _Best, halved: _Best, interpolation: int) -> None:
@@ -579,7 +602,14 @@ def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
 
 @numba.njit(**PLAIN)
 def _keep_stronger(  # type: ignore[no-untyped-def]
-    signed, by, score, per_deviation, raised, down, right, number
+    signed,
+    by,
+    score,
+    per_deviation,
+    raised,
+    down,
+    right,
+    number,
 ):
     """Keep the larger of each pixel's scores (r, c) by size in ``signed``, and that template's
     ``number`` in ``by``.

@@ -183,7 +183,10 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         )
 
     def _feet(
-        self, cloud: Cloud, mask: np.ndarray, points: np.ndarray
+        self,
+        cloud: Cloud,
+        mask: np.ndarray,
+        points: np.ndarray,
     ) -> tuple[dict[str, Any], list[str], np.ndarray]:
         """Return notes and warnings on the surface or the reference, and where the rays through
         points (n, 3) meet it (n, 3)."""
@@ -229,7 +232,10 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         return np.column_stack([plan * feet_z[:, None] if central else plan, feet_z])
 
     def _distances(
-        self, feet: np.ndarray, before: np.ndarray, after: np.ndarray
+        self,
+        feet: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance (n,) of points ``after`` (m, 3) behind points ``before`` (k, 3) at
         each foot (n, 3), and its deviation; NaN if a cylinder holds too few points."""
@@ -298,7 +304,9 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     version = 2
 
     def __init__(
-        self, settings: FpfhMemoryConfig, learned: Mapping[str, np.ndarray] | None = None
+        self,
+        settings: FpfhMemoryConfig,
+        learned: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         super().__init__(settings)
         self._learned = learned
@@ -352,7 +360,9 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         )
 
     def _features(
-        self, cloud: Cloud, mask: np.ndarray
+        self,
+        cloud: Cloud,
+        mask: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the averaged features (n, 33) of the masked points, and their rows and columns
         (n,)."""
@@ -405,4 +415,4 @@ def coreset(features: np.ndarray, size: int) -> np.ndarray:
 
 def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of each feature (n, k) to the nearest in the memory (m, k)."""
-    return np.asarray(cKDTree(memory).query(features)[0])
+    return cKDTree(memory).query(features)[0]

@@ -161,7 +161,12 @@ def _by_square(score: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @numba.njit(**PLAIN)
 def _by_zone(  # type: ignore[no-untyped-def]
-    score, loud, pixels, ends, total, number
+    score,
+    loud,
+    pixels,
+    ends,
+    total,
+    number,
 ):
     """Return the deviation (z,) of each zone. The last zone holds what is left of the ``total``
     and the ``number``, or all if that is too little."""

@@ -59,15 +59,11 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         fitted = surface.evaluate(x, y)
         residual_m = z - fitted
         floor_m = rounding_floor(cloud, mask)
-        deviation_m = self._stated_deviation(cloud, mask)
-        if deviation_m is None:
-            spread = self._spread(residual_m, z)
-            spread_m = spread
-            scale_m = max(spread, floor_m)
-        else:
-            spread = self._spread(residual_m / deviation_m, z)
-            spread_m = spread * median_of(deviation_m)
-            scale_m = np.maximum(spread * deviation_m, floor_m)
+        deviation = self._stated_deviation(cloud, mask)
+        if deviation is None:
+            deviation = np.ones(len(z))
+        spread = self._spread(residual_m / deviation, z)
+        scale_m = np.maximum(spread * deviation, floor_m)
         return Evidence(
             score=on_grid(np.abs(residual_m) / scale_m, mask),
             residual_m=on_grid(residual_m, mask),
@@ -76,7 +72,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             notes={
                 "surface": surface.note,
                 "points": len(z),
-                "spread_m": spread_m,
+                "spread_m": spread * median_of(deviation),
                 "floor_m": floor_m,
             },
         )
@@ -120,4 +116,4 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             return None
         if self.settings.scale == "raw_z_std":
             return None
-        return np.asarray(np.sqrt(variance_m2[mask]))
+        return np.sqrt(variance_m2[mask])
