@@ -193,7 +193,12 @@ class Detector(Protocol):
         points)."""
         ...
 
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+    def find(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        threshold: float,
+    ) -> tuple[Detection, ...]:
         """Return the findings at a threshold, strongest first."""
         ...
 
@@ -201,6 +206,11 @@ class Detector(Protocol):
         """Return the lowest threshold at which `find` returns nothing."""
         ...
 
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+    def measure(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        detection: Detection,
+    ) -> Measurement:
         """Measure size and place of one detection."""
         ...

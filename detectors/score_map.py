@@ -56,7 +56,12 @@ class ScoreMapDetector(ABC, Generic[S]):
         """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few
         points)."""
 
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+    def find(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        threshold: float,
+    ) -> tuple[Detection, ...]:
         """Return clusters of pixels whose score is above the threshold, strongest first."""
         return self.findings(cloud, evidence, [threshold])[0].detections
 
@@ -116,7 +121,12 @@ class ScoreMapDetector(ABC, Generic[S]):
             np.array(thresholds),
         )
 
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+    def measure(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        detection: Detection,
+    ) -> Measurement:
         """Measure the thesis' extents and fit the model of a blurred hole."""
         return measure_detection(cloud, evidence, detection, self.settings.hole_model)
 

@@ -170,7 +170,12 @@ class FrameSums:
     Sums are float64, of z minus a per-pixel offset. The first frames define a good frame: the
     median of those that agree."""
 
-    def __init__(self, source: FrameSource, frames: list[Frame], config: AverageConfig) -> None:
+    def __init__(
+        self,
+        source: FrameSource,
+        frames: list[Frame],
+        config: AverageConfig,
+    ) -> None:
         """Sum the ``frames``, at most `REFERENCE_FRAMES`, which are also the reference."""
         self.source = source
         self.config = config
@@ -464,7 +469,12 @@ def _points(offset, count, total, squares, medians, across, slopes):  # type: ig
 
 
 @numba.njit(**PLAIN)
-def _add_where(values: np.ndarray, used: np.ndarray, total: np.ndarray, count: np.ndarray) -> None:
+def _add_where(
+    values: np.ndarray,
+    used: np.ndarray,
+    total: np.ndarray,
+    count: np.ndarray,
+) -> None:
     """Add finite values (n,) where they are used to their total, and their numbers to the count."""
     for i in range(len(values)):
         counts = used[i] & np.isfinite(values[i])

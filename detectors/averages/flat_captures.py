@@ -180,7 +180,12 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     shape_m2 = _disagreement_m2(residuals, variances, counts)
     is_solved = captures[0].places_m is not None and len(captures) > 1 and shape_m2 > 0
     if is_solved:
-        error_m, variance_m2, shapes_m = _solved(captures, residuals, variances, shape_m2)
+        error_m, variance_m2, shapes_m = _solved(
+            captures,
+            residuals,
+            variances,
+            shape_m2,
+        )
         patterns = residuals - shapes_m
     else:
         error_m, variance_m2 = _averaged(residuals, variances + shape_m2)
@@ -198,7 +203,12 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     if len(groups) > 1:
         in_range = _change(patterns, variances, groups[0], groups[-1])
     found = Separated(
-        field=FlatField(error_m, variance_m2, lens, (min(distances_m), max(distances_m))),
+        field=FlatField(
+            error_m,
+            variance_m2,
+            lens,
+            (min(distances_m), max(distances_m)),
+        ),
         captures=captures,
         surface_m=float(np.sqrt(shape_m2)) if len(captures) > 1 else np.nan,
         separated=is_solved,
@@ -217,7 +227,11 @@ def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray,
         return mean, np.where(total > 0, 1 / total, np.nan)
 
 
-def _disagreement_m2(residuals: np.ndarray, variances: np.ndarray, counts: np.ndarray) -> float:
+def _disagreement_m2(
+    residuals: np.ndarray,
+    variances: np.ndarray,
+    counts: np.ndarray,
+) -> float:
     """Return the variance between captures at a pixel beyond their noise, by the moments of a
     random effect."""
     several = counts > 1

@@ -203,4 +203,10 @@ def _field_of(arrays: Mapping[str, np.ndarray], path: Path) -> FlatField:
     )
     if not is_sound:
         raise ValueError("its arrays do not belong together")
-    return FlatField(error_m, variance_m2, lens, (nearest_m, farthest_m), tuple(warnings))
+    return FlatField(
+        error_m,
+        variance_m2,
+        lens,
+        (nearest_m, farthest_m),
+        tuple(warnings),
+    )

@@ -19,7 +19,11 @@ MAX_CELLS = 1 << 20  # cells along one axis that a 63-bit key of three axes can 
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 
 
-def euclidean_clusters(points_m: np.ndarray, distance_m: float, min_points: int = 1) -> np.ndarray:
+def euclidean_clusters(
+    points_m: np.ndarray,
+    distance_m: float,
+    min_points: int = 1,
+) -> np.ndarray:
     """Label points (n, 3): two are in one cluster if a chain of steps of at most ``distance_m``
     joins them, as in MATLAB's ``pcsegdist``. Returns (n,) int64: 0, 1, ... in the order of each
     cluster's first point, -1 for points with a NaN and in clusters smaller than ``min_points``.
@@ -152,7 +156,15 @@ def _nested(  # type: ignore[no-untyped-def]
                 c = neighbours[k]
                 other = root_of(parent, c) if filled[c] else -1
                 if other < 0 or (
-                    other != root and not _touches(points, i, order, starts[c], filled[c], limit)
+                    other != root
+                    and not _touches(
+                        points,
+                        i,
+                        order,
+                        starts[c],
+                        filled[c],
+                        limit,
+                    )
                 ):
                     k += 1
                     continue

@@ -428,7 +428,11 @@ def _likelihood_covariance(
     return covariance
 
 
-def sandwich_covariance(patch: HolePatch, derivatives: np.ndarray, square_m2: float) -> np.ndarray:
+def sandwich_covariance(
+    patch: HolePatch,
+    derivatives: np.ndarray,
+    square_m2: float,
+) -> np.ndarray:
     """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) if the square filter
     correlates the noise; NaN if it is singular.
 

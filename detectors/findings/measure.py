@@ -268,7 +268,12 @@ def _surroundings(
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
     blur_px = blur_in_cells(cloud, config)
-    tight = Region(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
+    tight = Region(
+        int(rows.min()),
+        int(rows.max()) + 1,
+        int(columns.min()),
+        int(columns.max()) + 1,
+    )
     corner = tight.grown(math.ceil(2 * max(blur_px)) + 2, h, w)
     cut = corner.within(Region(0, h, 0, w))
     residual_m = evidence.residual_m[cut]
@@ -283,7 +288,13 @@ def _surroundings(
         return None
     offset_m = median_of(ring_m)
     noise_m = sigma_of(ring_m - offset_m)
-    plane = local_plane(points_m, evidence.surface_z_m[cut], finite, own, cloud.projection)
+    plane = local_plane(
+        points_m,
+        evidence.surface_z_m[cut],
+        finite,
+        own,
+        cloud.projection,
+    )
     if plane is None:
         return None
     origin_m, per_px_m = plane
@@ -523,7 +534,11 @@ def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Mea
     height, width = residual_m.shape
     size = (CONTOUR_ZOOM * width, CONTOUR_ZOOM * height)
     fine_m = cv2.resize(residual_m, size, interpolation=cv2.INTER_LINEAR)
-    seeds = cv2.resize(around.own.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    seeds = cv2.resize(
+        around.own.astype(np.uint8),
+        size,
+        interpolation=cv2.INTER_NEAREST,
+    )
     inside = parts_with(fine_m > 0.5 * top_m, seeds > 0)
     if not inside.any():
         return replace(measured, model_note=doubt + "; no half-depth contour")

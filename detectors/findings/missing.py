@@ -206,7 +206,12 @@ def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
     )
 
 
-def _detections(cloud: Cloud, evidence: Evidence, gaps: _Gaps, chance: _Chance) -> list[Detection]:
+def _detections(
+    cloud: Cloud,
+    evidence: Evidence,
+    gaps: _Gaps,
+    chance: _Chance,
+) -> list[Detection]:
     """Return the clusters that chance does not explain, largest first."""
     detections = []
     for number in np.flatnonzero(gaps.free & (gaps.sizes >= chance.least_points)):
@@ -222,7 +227,11 @@ def _detections(cloud: Cloud, evidence: Evidence, gaps: _Gaps, chance: _Chance) 
     return detections
 
 
-def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+def measure_missing(
+    cloud: Cloud,
+    evidence: Evidence,
+    detection: Detection,
+) -> Measurement:
     """Measure place and size of pixels without return, on a plane through the fitted surface
     around: the diameter of a circle of the same area, and its centre. No depth or volume; the
     camera's blur is not allowed for."""
@@ -399,9 +408,10 @@ def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
     standard errors."""
     pairs = 0
     both = 0
-    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        pairs += int((scattered[first] & known[second]).sum())
-        both += int((scattered[first] & scattered[second]).sum())
+    # along columns, then along rows
+    for image, known_image in ((scattered, known), (scattered.T, known.T)):
+        pairs += int((image[:-1] & known_image[1:]).sum())
+        both += int((image[:-1] & image[1:]).sum())
     pairs = max(pairs, 1)
     measured = both / pairs
     error = np.sqrt(max(measured * (1.0 - measured), 1.0 / pairs) / pairs)

@@ -64,7 +64,11 @@ def grid_of(
 # --- the covariance of a picture's noise ---
 
 
-def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def noise_covariance(
+    noise: np.ndarray,
+    quiet: np.ndarray,
+    shape: tuple[int, ...],
+) -> np.ndarray:
     """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels.
 
     Lag 0 is in the middle. It is the mean product of pairs of quiet pixels by their lag, faded
@@ -166,7 +170,12 @@ def inverse_times(
 
     # what is known around each pixel damps; unknown pixels are means of what is known around them
     filled[:height, :width] = mask
-    known_around = cv2.GaussianBlur(filled, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)
+    known_around = cv2.GaussianBlur(
+        filled,
+        (13, 13),
+        2.0,
+        borderType=cv2.BORDER_CONSTANT,
+    )
     known_around = known_around[:height, :width]
     damping = mask * np.sqrt(known_around)
     filling = np.empty_like(by.inverse)
@@ -184,7 +193,13 @@ def inverse_times(
     def condition(image: np.ndarray) -> None:
         """Write the approximate C^-1 times an image into ``conditioned``."""
         _spread(image, damping, filling, False, filled)
-        _spread(_filtered(filled, by.inverse, filled), filling, damping, True, conditioned)
+        _spread(
+            _filtered(filled, by.inverse, filled),
+            filling,
+            damping,
+            True,
+            conditioned,
+        )
 
     solution = np.zeros_like(mask)
     residual = values * mask
@@ -298,9 +313,20 @@ def covariance_factor(
     if correlation is None or np.count_nonzero(used) > MOST_WHITENED:
         return None
     rows, columns = np.nonzero(used)
-    matrix = _lower_covariance(rows, columns, model_error[used], deviation**2, correlation)
+    matrix = _lower_covariance(
+        rows,
+        columns,
+        model_error[used],
+        deviation**2,
+        correlation,
+    )
     # in LAPACK's order of elements its transpose is an upper triangle, which needs no copy
-    _, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=False, clean=False, overwrite_a=True)
+    _, failed = scipy.linalg.lapack.dpotrf(
+        matrix.T,
+        lower=False,
+        clean=False,
+        overwrite_a=True,
+    )
     return None if failed else matrix
 
 

@@ -187,7 +187,12 @@ class LocalDetector:
         )
         return signed, typical_m, unit
 
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+    def find(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        threshold: float,
+    ) -> tuple[Detection, ...]:
         """Return peaks of the score, strongest first, each with the pixels above the threshold
         that belong to it. The centre is the mean of a finding's core, with pixels weighted by how
         far their score exceeds the core's least."""
@@ -242,7 +247,12 @@ class LocalDetector:
         """Return the highest score."""
         return float(np.nanmax(evidence.score, initial=0.0))
 
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+    def measure(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        detection: Detection,
+    ) -> Measurement:
         """Measure the thesis' extents and the model of a blurred hole on the finding's core."""
         scores = evidence.score.reshape(-1)[detection.pixels]
         core = replace(detection, pixels=detection.pixels[scores >= CORE * detection.score])
@@ -363,7 +373,11 @@ def _levelled(
     return values - level, sigma
 
 
-def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+def _mean(
+    values: np.ndarray,
+    weights: np.ndarray,
+    half: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the weighted mean (r, c) of values, drawn towards 0 where little is known, and the
     mean of weights."""
     covered = _tent(weights, half)
@@ -373,7 +387,11 @@ def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarra
 def _tent(image: np.ndarray, half: int) -> np.ndarray:
     """Average over a square of 2 ``half`` + 1 pixels, twice; values beyond the edges count as 0."""
     size = (2 * half + 1, 2 * half + 1)
-    once = cv2.blur(np.ascontiguousarray(image, np.float32), size, borderType=cv2.BORDER_CONSTANT)
+    once = cv2.blur(
+        np.ascontiguousarray(image, np.float32),
+        size,
+        borderType=cv2.BORDER_CONSTANT,
+    )
     return cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT)
 
 
@@ -390,7 +408,11 @@ def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
     return worth.astype(np.float32)
 
 
-def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+def _strongest(
+    means: np.ndarray,
+    around: np.ndarray,
+    deviation: np.ndarray,
+) -> np.ndarray:
     """Return the largest (n,) (mean - around) / deviation by size, with its sign, over filters (k,
     n) from narrow to wide; 0 where no filter counts.
 
@@ -493,7 +515,12 @@ def _peak_of_cells(signed: np.ndarray, threshold: float) -> np.ndarray:
 
 
 @numba.njit(**PLAIN)
-def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: float) -> np.ndarray:
+def _peaks(
+    score: np.ndarray,
+    order: np.ndarray,
+    saddle: float,
+    prominence: float,
+) -> np.ndarray:
     """Return (n,), for each of the pixels ``order`` (n,), flat indices in falling size of the
     score (h, w), the index in ``order`` of the peak that it belongs to.
 

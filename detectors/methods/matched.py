@@ -198,7 +198,12 @@ def _in_deviations(
     share = short_size / max(size, 1e-12)
     unit_m = np.maximum(local.local_sigma(short) / max(share, 1e-3), floor_m)
     depth_px = _depth_px(known)
-    return _Residuals(_without_rim(values / unit_m, depth_px * known), known, depth_px, unit_m)
+    return _Residuals(
+        _without_rim(values / unit_m, depth_px * known),
+        known,
+        depth_px,
+        unit_m,
+    )
 
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
@@ -247,7 +252,11 @@ def _sum_layers(
 
 
 @numba.njit(**PLAIN)
-def _subtract_layers(noise: np.ndarray, depth_px: np.ndarray, shared: np.ndarray) -> None:
+def _subtract_layers(
+    noise: np.ndarray,
+    depth_px: np.ndarray,
+    shared: np.ndarray,
+) -> None:
     """Subtract from the rim's residuals what they share (r, c, `RIM_PX` + 1) in their square and
     at their distance."""
     for i in range(noise.shape[0]):
@@ -443,7 +452,12 @@ class _View:
     the outline of the seen pixels. ``spectrum``: of C^-1 r on the grid of transforms. ``score`` (r,
     c) and ``products``: memory for one template's scores and one pair's transform."""
 
-    def __init__(self, seen: np.ndarray, depth_px: np.ndarray, spectrum: np.ndarray) -> None:
+    def __init__(
+        self,
+        seen: np.ndarray,
+        depth_px: np.ndarray,
+        spectrum: np.ndarray,
+    ) -> None:
         self.seen = seen
         self.depth_px = depth_px
         self.spectrum = spectrum
@@ -576,7 +590,13 @@ def _merge(best: _Best, halved: _Best, interpolation: int) -> None:
     height, width = best.signed.shape
     signed = cv2.resize(halved.signed, None, fx=2, fy=2, interpolation=interpolation)
     signed = np.ascontiguousarray(signed[:height, :width])
-    template = cv2.resize(halved.template, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    template = cv2.resize(
+        halved.template,
+        None,
+        fx=2,
+        fy=2,
+        interpolation=cv2.INTER_NEAREST,
+    )
     template = np.ascontiguousarray(template[:height, :width])
     stronger = (np.abs(signed) > np.abs(best.signed)).view(np.uint8)
     cv2.copyTo(signed, stronger, best.signed)

@@ -71,7 +71,8 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
         points = cloud.points_m[mask]
         # sorted by z, so that the triples do not depend on the orientation of the grid
         ordered = np.ascontiguousarray(points[np.argsort(points[:, 2], kind="stable")])
-        a, b, c, d = self._plane(ordered) if len(points) > 2 else (0.0, 0.0, 0.0, 0.0)
+        plane = self._plane(ordered) if len(points) > 2 else (0.0, 0.0, 0.0, 0.0)
+        a, b, c, d = plane
         if abs(c) < 1e-3:
             raise UserError(
                 f"{len(points)} points determine no plane that is seen from the front",

@@ -79,8 +79,10 @@ def evened(score: np.ndarray, template: Template, zones: Zones) -> float:
     loud = zones.loud
     if template.radius_px >= WIDE_PX and not template.slot:
         most = FAINT * scatter(score, zones, np.zeros_like(loud)).deviations[-1]
-        strong = loud | (np.abs(score) > most) if cv2.norm(score, cv2.NORM_INF) > most else loud
-        loud = grown(strong, round(template.radius_px / step)) if strong.any() else loud
+        if cv2.norm(score, cv2.NORM_INF) > most:
+            loud = loud | (np.abs(score) > most)
+        if loud.any():
+            loud = grown(loud, round(template.radius_px / step))
     measured = scatter(score, zones, loud)
     deviations = measured.deviations
     if measured.counts.sum() <= FEWEST:
@@ -96,12 +98,22 @@ def evened(score: np.ndarray, template: Template, zones: Zones) -> float:
         excess = np.interp(size, CAPPED, DEVIATIONS) / (UNEVEN * deviation)
         divisor = np.maximum(excess, 1.0).astype(np.float32)
         score /= cv2.resize(divisor, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    _multiply(score, zones.pixels, zones.ends, (deviation / deviations).astype(np.float32))
+    _multiply(
+        score,
+        zones.pixels,
+        zones.ends,
+        (deviation / deviations).astype(np.float32),
+    )
     return deviation
 
 
 @numba.njit(**PLAIN)
-def _multiply(score: np.ndarray, pixels: np.ndarray, ends: np.ndarray, factors: np.ndarray) -> None:
+def _multiply(
+    score: np.ndarray,
+    pixels: np.ndarray,
+    ends: np.ndarray,
+    factors: np.ndarray,
+) -> None:
     """Multiply the scores in each zone by its factor."""
     flat = score.ravel()
     start = 0

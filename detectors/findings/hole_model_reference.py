@@ -1,0 +1,103 @@
+"""The model of a blurred hole and its fit (`detectors.findings.hole_model`), written plainly: the
+picture from points between pixels, the fit by SciPy, the covariance in dense matrices."""
+
+import math
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from detectors.findings.hole_model import NODES, WALL_PRIOR, WEIGHTS, HolePatch
+
+FINER = 12  # points along each axis of a pixel
+
+Start = tuple[float, float, float, float, float]
+
+
+def picture(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
+    """Return the residual (h, w), without offset, of a hole (5,): u, v, radius, depth, wall.
+
+    It is the mean over the blur's rectangle of the sum of layers. A layer at the depth t along the
+    normal counts with its weight at the points d from the centre that lie in four circles, where
+    |d| is the length on the surface, s = 1 / (1 + t * shrinking) and e the depth that is lit:
+
+        |d| < radius                                        the mouth, seen
+        |d - t * drift * s| < radius * s                    the circle at t, seen
+        |d + e / (e + height) * beam| < radius              the mouth, lit
+        |d - t * drift * s + b * beam| < radius * s         the circle at t, lit
+
+    with b = (e - t) / (e - t + height)."""
+    u, v, radius, depth, wall = hole
+    columns, across = _fine(patch.used.shape[1], patch.blur_px[0])
+    rows, down = _fine(patch.used.shape[0], patch.blur_px[1])
+    offset = np.stack(np.meshgrid(columns - u, rows - v), axis=-1)
+
+    def within(shift: np.ndarray, radius_m: float) -> np.ndarray:
+        apart = offset - shift
+        return np.einsum("...i,ij,...j", apart, patch.metric_m2, apart) < radius_m**2
+
+    total = np.zeros(offset.shape[:2])
+    for cosine, drift_u, drift_v, shrinking, beam_u, beam_v, height, share in patch.sights:
+        drift = np.array([drift_u, drift_v])
+        beam = np.array([beam_u, beam_v])
+        deepest = depth * cosine
+        length = max(wall * deepest, 0.0)
+        for node, weight in zip(NODES, WEIGHTS, strict=True):
+            t = length * node
+            lit = t if node < 1.0 else max(deepest, 0.0)
+            thick = length * weight if node < 1.0 else deepest - length
+            scale = 1.0 / (1.0 + t * shrinking)
+            seen = within(np.zeros(2), radius) & within(t * drift * scale, radius * scale)
+            below = (lit - t) / (lit - t + height)
+            entered = within(-lit / (lit + height) * beam, radius)
+            passed = within(t * drift * scale - below * beam, radius * scale)
+            total += share / cosine * thick * (seen & entered & passed)
+    return down @ total @ across.T
+
+
+def _fine(length: int, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (n,) between the pixels of an axis, and their weights (length, n) in the
+    mean over the blur around each pixel."""
+    positions = (np.arange((length + 20) * FINER) + 0.5) / FINER - 10.5
+    inside = np.abs(positions - np.arange(length)[:, None]) < blur_px / 2
+    return positions, inside / (FINER * blur_px)
+
+
+def fitted(patch: HolePatch, start: Start) -> tuple[np.ndarray, float]:
+    """Return the hole (5,) and the offset with the least sum of squares of the used pixels'
+    residuals and of the prior's misfit, weight * (wall - 0.5)."""
+    u, v, radius_m, depth_m, offset_m = start
+    used_m = patch.residual_m[patch.used]
+
+    def misfit(q: np.ndarray) -> np.ndarray:
+        hole = hole_of(q)
+        prior = patch.prior_weight * (hole[4] - WALL_PRIOR[0])
+        return np.append(picture(patch, hole)[patch.used] + q[4] - used_m, prior)
+
+    begin = [u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]]
+    scale = [1.0, 1.0, 1.0, depth_m * radius_m**2, 1e-4, 1.0]
+    found = least_squares(misfit, begin, method="lm", x_scale=scale, diff_step=1e-2)
+    return hole_of(found.x), float(found.x[4])
+
+
+def hole_of(q: np.ndarray) -> np.ndarray:
+    """Return the hole (5,) of q = (u, v, ln radius, depth * radius^2, offset, x): the wall is
+    sin^2(pi x / 2)."""
+    radius = math.exp(q[2])
+    return np.array([q[0], q[1], radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
+
+
+def sandwich(patch: HolePatch, derivatives: np.ndarray, square_m2: float) -> np.ndarray:
+    """Return the covariance (6, 6) A^-1 (s^2 J' C J + p^2 W) A^-1 with A = J' J + W and s^2 =
+    square / (n - trace(A^-1 J' C J)), where C (n, n) is the correlation of pixels that share
+    samples of a square filter. ``derivatives``: J' (6, n)."""
+    lags = np.abs(np.argwhere(patch.used)[:, None] - np.argwhere(patch.used))
+    side_v = round(patch.blur_px[1])
+    side_u = round(patch.blur_px[0])
+    shared = np.maximum(side_v - lags[..., 0], 0) * np.maximum(side_u - lags[..., 1], 0)
+    meat = derivatives @ (shared / (side_u * side_v)) @ derivatives.T
+    prior = np.zeros((6, 6))
+    prior[5, 5] = patch.prior_weight**2
+    inverse = np.linalg.inv(derivatives @ derivatives.T + prior)
+    variance = square_m2 / (derivatives.shape[1] - np.trace(inverse @ meat))
+    prior_variance = patch.noise_m**2 * patch.blur_px[0] * patch.blur_px[1]
+    return inverse @ (variance * meat + prior_variance * prior) @ inverse
