@@ -2,15 +2,18 @@
 picture from points between pixels, the fit by SciPy, the covariance in dense matrices."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from detectors.findings.hole_model import NODES, WALL_PRIOR, WEIGHTS, HolePatch
 
-FINER = 12  # points along each axis of a pixel
+FINER = 8  # points along each axis of a pixel
+MARGIN_PX = 4  # half of the widest blur, and more
 
 Start = tuple[float, float, float, float, float]
+Draw = Callable[[HolePatch, np.ndarray], np.ndarray]
 
 
 def picture(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
@@ -57,26 +60,40 @@ def picture(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
 def _fine(length: int, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (n,) between the pixels of an axis, and their weights (length, n) in the
     mean over the blur around each pixel."""
-    positions = (np.arange((length + 20) * FINER) + 0.5) / FINER - 10.5
+    positions = (np.arange((length + 2 * MARGIN_PX) * FINER) + 0.5) / FINER - MARGIN_PX - 0.5
     inside = np.abs(positions - np.arange(length)[:, None]) < blur_px / 2
     return positions, inside / (FINER * blur_px)
 
 
-def fitted(patch: HolePatch, start: Start) -> tuple[np.ndarray, float]:
-    """Return the hole (5,) and the offset with the least sum of squares of the used pixels'
-    residuals and of the prior's misfit, weight * (wall - 0.5)."""
+def fitted(patch: HolePatch, start: Start, draw: Draw = picture) -> tuple[np.ndarray, float, bool]:
+    """Return the hole (5,), the offset, and whether SciPy's descent has converged, with the least
+    sum of squares of the used pixels' residuals and of the prior's misfit, weight * (wall - 0.5).
+    ``draw``: the picture of a hole; a fast one saves minutes."""
     u, v, radius_m, depth_m, offset_m = start
     used_m = patch.residual_m[patch.used]
 
     def misfit(q: np.ndarray) -> np.ndarray:
         hole = hole_of(q)
         prior = patch.prior_weight * (hole[4] - WALL_PRIOR[0])
-        return np.append(picture(patch, hole)[patch.used] + q[4] - used_m, prior)
+        return np.append(draw(patch, hole)[patch.used] + q[4] - used_m, prior)
+
+    def jacobian(q: np.ndarray) -> np.ndarray:
+        hole = hole_of(q)
+        by = []
+        for step in np.diag([1e-3, 1e-3, 1e-6, 1e-6, 1e-3]):
+            change = draw(patch, hole + step / 2) - draw(patch, hole - step / 2)
+            by.append(change[patch.used] / step.max())
+        bend = 0.5 * math.pi * math.sin(math.pi * q[5])
+        by_log_radius = hole[2] * by[2] - 2.0 * hole[3] * by[3]
+        by_volume = by[3] / hole[2] ** 2
+        offset = np.ones(len(used_m))
+        rows = np.stack([by[0], by[1], by_log_radius, by_volume, offset, by[4] * bend], axis=1)
+        return np.vstack([rows, [0.0, 0.0, 0.0, 0.0, 0.0, patch.prior_weight * bend]])
 
     begin = [u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]]
-    scale = [1.0, 1.0, 1.0, depth_m * radius_m**2, 1e-4, 1.0]
-    found = least_squares(misfit, begin, method="lm", x_scale=scale, diff_step=1e-2)
-    return hole_of(found.x), float(found.x[4])
+    limits = {"xtol": 1e-9, "ftol": 1e-9, "gtol": 1e-12, "max_nfev": 500}
+    found = least_squares(misfit, begin, jacobian, method="lm", x_scale="jac", **limits)
+    return hole_of(found.x), float(found.x[4]), bool(found.success)
 
 
 def hole_of(q: np.ndarray) -> np.ndarray:

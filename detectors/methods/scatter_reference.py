@@ -10,7 +10,8 @@ from detectors.methods.scatter import CAP, FAINT, FEWEST, RIM_ENDS_PX
 
 def deviation_of(sizes: np.ndarray) -> float:
     """Return the deviation d of a Gaussian whose size, of which no more than `CAP` counts, has the
-    same mean as these sizes (n,): d sqrt(2 / pi) (1 - exp(-CAP^2 / 2 d^2)) + 2 CAP Phi(-CAP / d)."""
+    same mean as these sizes (n,): d sqrt(2 / pi) (1 - exp(-CAP^2 / 2 d^2)) + 2 CAP Phi(-CAP /
+    d)."""
     mean = np.minimum(sizes, CAP).mean()
 
     def excess(deviation: float) -> float:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detectors.findings.whitening import filters, inverse_times, noise_covariance, spectrum
 from detectors.interface import Detection
 from detectors.methods.local import LocalConfig, LocalDetector
 from detectors.methods.matched import MatchedDetector
@@ -197,35 +196,6 @@ def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
     # a spectrum knows of the columns, even where nobody states variances
     gain = 1.2 if isinstance(detector, MatchedDetector) else 2.0
     assert scores[1] > gain * scores[0] and scores[1] > 8
-
-
-def test_the_matched_filter_is_the_likelihoods_with_pixels_missing() -> None:
-    """Beside the dense covariance of the known pixels alone, for noise that a filter over 3 x 3
-    pixels correlates."""
-    rng = np.random.default_rng(6)
-    raw = rng.standard_normal((66, 70)).astype(np.float32)
-    noise = sum(np.roll(raw, (i, j), (0, 1)) for i in range(3) for j in range(3)) / 3.0
-    known = rng.random(noise.shape) > 0.1
-    shape = (128, 128)
-    lags = noise_covariance(noise, known, shape)
-    power = spectrum(lags, shape)
-    part = (slice(20, 42), slice(24, 46))
-    known_part = known[part]
-    noise_part = noise[part]
-    covariance = np.fft.irfft2(power, shape)
-    places = np.argwhere(known_part)
-    apart = places[:, None] - places
-    dense = covariance[apart[..., 0], apart[..., 1]]
-    # the products of neighbours are two thirds of the variance; the least power adds to the
-    # variance alone
-    assert 0.5 < covariance[0, 1] / covariance[0, 0] < 2 / 3
-    by = filters(lags, known_part.shape)
-    solved = inverse_times(
-        np.where(known_part, noise_part, 0).astype(np.float32), known_part, by, error=0.01
-    )
-    expected = np.linalg.solve(dense, noise_part[known_part])
-    np.testing.assert_allclose(solved[known_part], expected, atol=0.02 * np.abs(expected).max())
-    assert not solved[~known_part].any()
 
 
 MOUTHS_U = (190, 300, 407, 517, 626, 736, 218, 321, 423, 729, 836, 944, 1059)
