@@ -13,8 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors.averages.average import (
+    CORRELATED_PIXELS,
     RECORDED,
+    SAMPLED_PIXELS,
     AverageConfig,
+    FrameSums,
     average,
     prefix_averages,
     unsteadiness,
@@ -142,6 +145,51 @@ def test_a_step_below_the_allowance_is_no_jump() -> None:
     stack = noisy()
     stack.z_m[6] += np.float32(0.002)
     assert average(stack, AverageConfig()).left_out == ()
+
+
+@pytest.mark.parametrize(("frames", "shape"), [(5, (40, 50)), (3, (100, 130)), (1, (40, 50))])
+def test_the_limit_of_jumps_is_that_of_the_difference_of_two_medians(frames, shape) -> None:
+    """Six standard errors of the difference of two frames' medians, each 1.2533 times that of a
+    mean, where 25 pixels share one value; the noise is known to some per cent."""
+    stack = noisy(frames, shape, sigma_m=2e-3)
+    config = AverageConfig(jump_mm=1e-3, changed_mm=1e-3)
+    sums = FrameSums(stack, list(stack.frames()), config)
+    pixels = len(sums.sample)
+    assert SAMPLED_PIXELS / 2 < pixels <= SAMPLED_PIXELS or pixels == shape[0] * shape[1]
+    if frames == 1:
+        # one frame shows no noise
+        assert sums.jump_m == pytest.approx(1e-6)
+        return
+    standard_error_m = 1.2533 * 2e-3 * np.sqrt(2 * CORRELATED_PIXELS / pixels)
+    assert sums.jump_m == pytest.approx(6.0 * standard_error_m, rel=0.05)
+    assert sums.change_m == pytest.approx(6.0 * 2e-3, rel=0.05)
+
+
+def test_rounding_sets_the_least_noise() -> None:
+    stack = replace(noisy(5, sigma_m=0.0), z_step_m=0.012)
+    sums = FrameSums(stack, list(stack.frames()), AverageConfig(jump_mm=1e-3, changed_mm=1e-3))
+    assert sums.change_m == pytest.approx(6.0 * 0.012 / np.sqrt(12), rel=1e-6)
+
+
+def test_changes_beyond_the_usual_count() -> None:
+    """A tenth of the pixels flicker: the allowed share is the setting's and half as much again as
+    the reference frames have."""
+    stack = noisy(5)
+    flicker = np.random.default_rng(5).random(stack.z_m.shape) < 0.1
+    stack.z_m[flicker] = np.nan
+    sums = FrameSums(stack, list(stack.frames()), AverageConfig())
+    assert sums.fraction == pytest.approx(0.05 + 1.5 * 0.1, abs=0.02)
+
+
+def test_the_clipped_mean_allows_sigmas_of_the_frame_or_of_the_pixel() -> None:
+    stack = noisy(5, (60, 80), sigma_m=1e-3)
+    stack.z_m[:, 0, 0] = np.float32(0.8) + np.float32(0.05) * np.array([-1, -0.5, 0, 0.5, 1], "f4")
+    config = AverageConfig(method="clipped", changed_mm=200.0)
+    gate = FrameSums(stack, list(stack.frames()), config).gate.reshape(60, 80)
+    assert gate[0, 0] == pytest.approx(5.0 * 0.025 / 0.6745, rel=1e-4)
+    # a pixel's own median deviation of five frames is seldom above the frame's
+    assert np.median(gate) == pytest.approx(5e-3, rel=0.2)
+    assert gate.min() == pytest.approx(5e-3, rel=0.05)
 
 
 def test_of_two_frames_that_disagree_the_first_is_kept() -> None:

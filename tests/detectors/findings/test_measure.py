@@ -11,9 +11,14 @@ import pytest
 from pydantic import ValidationError
 
 from detectors.findings.hole_model import HolePatch, pictures, sight
-from detectors.findings.measure import HoleModelConfig, extents, measure_detection
+from detectors.findings.measure import (
+    HoleModelConfig,
+    blur_in_cells,
+    extents,
+    measure_detection,
+)
 from detectors.interface import Detection, Evidence, Measurement
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud, MapViews, Region
 
 FOCAL_PX = 504.0
 HEIGHT = 60
@@ -393,6 +398,66 @@ def test_without_a_grid_only_extents_are_given() -> None:
     m = measure_detection(flat, evidence, detection, HoleModelConfig())
     assert m.model_note == "no pixel grid: extents only" and m.points == len(detection.pixels)
     assert m.extent_diameter_m > 12.7e-3 and np.isnan(m.model_diameter_m) and np.isnan(m.u_px)
+
+
+def frontal(height: int, width: int, pitch_m: float = 1e-3, **changes: object) -> Cloud:
+    """A map of equal cells of a plane at z = 0."""
+    v, u = np.mgrid[:height, :width] * pitch_m
+    flat = np.zeros((height, width), np.uint8)
+    cloud = Cloud(
+        points_m=np.stack([u, v, np.zeros(u.shape)], axis=-1),
+        reason=flat,
+        count=flat.astype(int) + 1,
+        variance_m2=np.full(u.shape, np.nan),
+        region=Region(0, height, 0, width),
+        z_step_m=0.0,
+        n_frames=1,
+        projection="parallel",
+    )
+    return replace(cloud, **changes)
+
+
+def test_volume_and_sides_are_those_of_a_box() -> None:
+    """A box of 20 x 8 mm, 3 mm deep, on a map that nothing blurs, along a diagonal too."""
+    cloud = frontal(60, 70)
+    v, u = np.mgrid[:60, :70]
+    for turn_deg in (0.0, 30.0):
+        turned = ((u - 34.5) + 1j * (v - 29.5)) * np.exp(-1j * np.radians(turn_deg))
+        inside = (np.abs(turned.real) < 10) & (np.abs(turned.imag) < 4)
+        residual_m = np.where(inside, -3e-3, 0.0) + 2e-4
+        evidence = Evidence(np.abs(residual_m), residual_m, np.zeros((60, 70)), 1e-4)
+        detection = detection_of(cloud, 9.0, np.flatnonzero(inside))
+        m = measure_detection(cloud, evidence, detection, HoleModelConfig(blur_px=1))
+        assert m.volume_m3 == pytest.approx(-3e-3 * inside.sum() * 1e-6, rel=1e-6)
+        assert m.length_m == pytest.approx(20e-3, rel=0.03)
+        assert m.width_m == pytest.approx(8e-3, rel=0.04)
+        along = np.array([np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg)), 0.0])
+        assert abs(m.along @ along) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_sides_are_without_the_blur() -> None:
+    """A filter of 5 x 5 pixels adds 25 / 12 to the second moments, which the sides leave out."""
+    board = Board(25.4, -3.0, blur=5)
+    blurred = measured(board, 0.005, 1, threshold=50.0)
+    sharp = Board(25.4, -3.0, blur=1)
+    cloud, evidence = sharp.seen(0.005, 1)
+    detection = strongest(cloud, evidence, 50.0)
+    plain = measure_detection(cloud, evidence, detection, HoleModelConfig(blur_px=1))
+    assert blurred.length_m == pytest.approx(plain.length_m, rel=0.015)
+    assert blurred.width_m == pytest.approx(plain.width_m, rel=0.015)
+    assert plain.length_m == pytest.approx(np.sqrt(3) / 2 * 25.4e-3, rel=0.03)
+
+
+def test_the_blur_of_a_map_counts_in_its_cells() -> None:
+    """Cells of 1 mm; the views' pixels are 1.5 mm across and 0.4 mm down, so that a cell holds
+    several of these."""
+    views = MapViews(np.eye(4)[None], np.ones(1), pixel_m=(1.5e-3, 0.4e-3))
+    cloud = frontal(8, 9, map_views=views)
+    along_u, along_v = blur_in_cells(cloud, HoleModelConfig(blur_px=5))
+    assert along_u == pytest.approx(1.5 * np.sqrt(27))
+    assert along_v == pytest.approx(np.sqrt(0.4**2 * 27 + 1.0))
+    assert blur_in_cells(frontal(8, 9), HoleModelConfig(blur_px=3)) == (3.0, 3.0)
+    assert blur_in_cells(frontal(8, 9, noise_reach_px=4.0), HoleModelConfig()) == (4.0, 4.0)
 
 
 def test_an_isolated_pixel_is_measured_without_a_crash() -> None:

@@ -10,10 +10,16 @@ import cv2
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from detectors import load_detector
-from detectors.findings.missing import ALPHA, measure_missing, missing_returns, one_damage_once
+from detectors.findings.missing import (
+    ALPHA,
+    measure_missing,
+    missing_evidence,
+    missing_returns,
+    one_damage_once,
+)
 from detectors.interface import Detection, Evidence
 from harness.evaluation.study.limit import limit_of
 from harness.inspection.run import judged as judged_cloud
@@ -178,6 +184,68 @@ def test_cells_that_no_view_saw_are_blind_on_a_map() -> None:
     measured = measure_missing(cloud, evidence, found)
     assert measured.extent_diameter_m == pytest.approx(2e-3 * np.sqrt(gone.sum() / np.pi), rel=1e-6)
     np.testing.assert_allclose(measured.extent_centre_m, [0.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_evidence_is_the_likelihood_ratio_of_the_number_in_a_disc() -> None:
+    """Five missing pixels in a row of 40,000 others without any: a disc of radius 2.5 holds all,
+    one less half a pixel counts, and the rate is that of the target and its window. The excess of
+    the spread over chance does not reach the nine pixels of one bad sample."""
+    shape = (200, 200)
+    gone = np.zeros(shape, bool)
+    gone[100, 98:103] = True
+    score = np.where(gone, np.nan, 0.0)
+    flat = np.zeros(shape, np.uint8)
+    points_m = np.where(gone[..., None], np.nan, 1.0) * np.ones((*shape, 3))
+    cloud = Cloud(points_m, flat, flat + 1, score, Region(0, 200, 0, 200), 0.0, 1)
+
+    found = missing_evidence(cloud, Evidence(score, score, score, 1e-3))
+
+    assert found is not None
+    rate = (5 + 200 * 5 / 40_000) / (65**2 + 200)
+    ratios = []
+    for pixels, number in ((9, 3), (21, 5), (37, 5)):
+        expected = pixels * rate
+        seen = number - 0.5
+        ratios.append(seen * np.log(seen / expected) - (seen - expected))
+    assert found[100, 100] == pytest.approx(2.0 * max(ratios) / 9.0, rel=1e-3)
+    assert found[100, 110] == 0.0
+    assert (found >= 0.0).all()
+
+
+def test_missing_pixels_beside_high_scores_do_not_count_as_chance() -> None:
+    """Clusters that touch a high score tell of damage: without them the rate is lower, and what
+    they add is more."""
+    gone = np.random.default_rng(4).random(SHAPE) < 0.01
+    gone[45, 60:63] = True
+    cloud, evidence = looked(gone)
+    quiet = missing_evidence(cloud, evidence)
+    score = evidence.score.copy()
+    score[44, 61] = 3.5
+    loud = missing_evidence(cloud, replace(evidence, score=score))
+    assert quiet is not None and loud is not None
+    assert loud[45, 61] > 1.02 * quiet[45, 61]
+    score[44, 61] = 2.5
+    np.testing.assert_array_equal(missing_evidence(cloud, replace(evidence, score=score)), quiet)
+
+
+def test_nothing_missing_and_clusters_that_may_be_findings_are_no_evidence() -> None:
+    assert missing_evidence(*looked(np.zeros(SHAPE, bool))) is None
+    assert missing_evidence(*looked(disc(60, 45, 8))) is None
+
+
+def test_a_score_is_as_improbable_as_the_expected_number_of_clusters() -> None:
+    gone = scattered(np.random.default_rng(7), 0.2, 1) | disc(60.2, 45.3, 10)
+    missing = missing_returns(*looked(gone))
+    assert missing is not None
+    (found,) = missing.detections
+    # one cluster of the least size is expected in 1 / expected targets; each further pixel makes
+    # it rarer, at least by half
+    further = len(found.pixels) - missing.least_points
+    most = norm.isf(missing.expected * 0.5**further)
+    least = norm.isf(missing.expected)
+    assert least < found.score
+    assert found.score < max(3.0 * most, 37.0)
+    assert missing.expected <= ALPHA < 3.0 * missing.expected
 
 
 def depth_finding(pixels: np.ndarray, score: float = 9.0) -> Detection:

@@ -4,17 +4,24 @@ what is refused."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage, stats
+from scipy.stats import poisson
 
 from detectors import load_detector
 from detectors.findings.null import (
+    EXPONENTS,
     FEWEST_PEAKS,
     MOST,
+    PRIOR,
     Tail,
+    _fitting_tail,
+    _floor_among,
+    behind,
     each_object_once,
     own_threshold,
     skew_of,
@@ -131,6 +138,94 @@ def test_the_interval_holds_the_truth() -> None:
     # an interval over exponents that are not this one's is wider than it need be
     assert stats.binom.sf(held, captures, 0.95 - 0.02) < 1.0 and held / captures > 0.90
     assert 0.5 / 1.5 < np.mean(expected) < 0.5 * 1.5
+
+
+def test_the_interval_and_the_expectation_are_those_of_both_sides() -> None:
+    """Twice those of the peaks in front of the surface, whose tail is computed here again."""
+    cloud = plane(noise("smooth", 5))
+    evidence = analysed(cloud)
+    own = own_threshold(DETECTOR, cloud, evidence, 2.0)
+    before = replace(evidence, score=np.where(behind(evidence), np.nan, evidence.score))
+    scores = [call.score for call in DETECTOR.find(cloud, before, own.floor)]
+    assert len(scores) == own.peaks
+    tail = Tail.of(np.array(scores), own.floor)
+    low, high = tail.interval(own.threshold)
+    assert own.expected == pytest.approx(2.0 * tail.expected(own.threshold), rel=1e-9)
+    assert (own.low, own.high) == pytest.approx((2.0 * low, 2.0 * high), rel=1e-9)
+    assert own.threshold == pytest.approx(max(tail.threshold(1.0), 3.0), rel=1e-9)
+
+
+def test_a_tail_of_normal_peaks_is_the_closed_form() -> None:
+    """One exponent alone: the expected number is n (1 + E / S)^-(n + 10) with E and S of the excess
+    f^2 ((r^2 - 1) / 2 - ln r / f^2) of ratios r to the floor f."""
+    floor = 3.0
+    peaks = np.array([3.2, 3.4, 3.5, 4.1, 3.05, 3.3, 3.9, 3.6])
+
+    def excess(scores: np.ndarray) -> np.ndarray:
+        ratios = scores / floor
+        return floor**2 * ((ratios**2 - 1) / 2 - np.log(ratios) / floor**2)
+
+    tail = Tail.of(peaks, floor)
+    normal = replace(tail, weights=np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+    total = excess(peaks).sum() + 10.0
+    expected = 8 * (1 + excess(np.array([5.0]))[0] / total) ** -18.0
+    assert normal.expected(5.0) == pytest.approx(expected, rel=1e-12)
+    assert normal.expected(normal.threshold(0.3)) == pytest.approx(0.3, rel=1e-9)
+    assert tail.weights.sum() == pytest.approx(1.0)
+    # as many as there are, or more, are expected at the floor
+    assert tail.threshold(8.0) == tail.threshold(20.0) == floor
+
+
+def test_the_exponents_are_weighed_by_their_likelihood() -> None:
+    """The marginal likelihood of the excesses E_i of n peaks, whose scale has a Gamma prior of ten
+    peaks: product of dE_i/ds over (10 + sum E_i)^(n + 10)."""
+    floor = 4.0
+    peaks = 4.0 + np.random.default_rng(3).exponential(0.8, 40)
+    ratios = peaks / floor
+    logs = []
+    for exponent in EXPONENTS:
+        power = np.log(ratios) if exponent == 0 else (ratios**exponent - 1) / exponent
+        total = 10.0 + (floor**2 * (power - np.log(ratios) / floor**2)).sum()
+        slope = ratios ** (exponent - 1) - 1 / floor**2 / ratios
+        logs.append(np.log(slope).sum() - 50 * np.log(total))
+    weights = PRIOR * np.exp(np.array(logs) - max(logs))
+    np.testing.assert_allclose(Tail.of(peaks, floor).weights, weights / weights.sum(), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("counts", "floor"),
+    [
+        ([10, 90, 150, 100, 85, 70, 61, 50, 20], 6),  # the last with sixty, below 60 % of the most
+        ([10, 40, 50, 45, 29, 12], 4),  # too few everywhere: the first below 60 %
+        ([10, 40, 50, 45, 40], 2),  # never below: where most are found
+        ([150, 90, 60, 59], 2),
+    ],
+)
+def test_the_floor_has_enough_peaks_that_do_not_join(counts: list[int], floor: int) -> None:
+    assert _floor_among(counts) == floor
+
+
+def test_a_tail_that_too_many_peaks_exceed_is_that_of_the_higher_half() -> None:
+    """Two hundred peaks of noise and twenty of a pattern twice as high."""
+    random = np.random.default_rng(6)
+    low = 3.0 + random.exponential(0.15, 200)
+    high = 8.0 + random.exponential(0.5, 20)
+    alone = _fitting_tail(low, 3.0, 0.5)
+    assert (alone.peaks, alone.floor) == (200, 3.0)
+    peaks = np.append(low, high)
+    mixed = _fitting_tail(peaks, 3.0, 0.5)
+    assert mixed.peaks == 110
+    assert mixed.floor == np.sort(peaks)[-111]
+    # of all together, more exceed the threshold than a Poisson number of mean 0.5 has in a tenth
+    together = Tail.of(peaks, 3.0).threshold(0.5)
+    assert poisson.sf((peaks > together).sum() - 1, 0.5) < 0.1
+
+
+def test_skewness_is_that_of_the_quartiles() -> None:
+    cloud = plane(np.zeros((4, 5)))
+    evidence = analysed(cloud)
+    residual_m = np.array([0.0, 1.0, 2.0, 4.0, 8.0] * 4).reshape(4, 5)
+    assert skew_of(replace(evidence, residual_m=residual_m)) == pytest.approx((4 + 1 - 4) / 3)
 
 
 def test_an_object_on_the_target_does_not_raise_the_threshold_and_is_reported() -> None:
