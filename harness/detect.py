@@ -1,4 +1,4 @@
-"""``python -m harness.detect``: finds the damage in a real capture, prints a table and, with
+"""``tofpod detect``: finds the damage in a real capture, prints a table and, with
 --out, writes files."""
 
 import argparse
@@ -88,8 +88,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "Find damage in a real capture: average its frames, fit the surface, and list what deviates from it."
     " With --register, each PATH is one view of the same target, and all views are merged into one cloud.",
-    epilog="examples: python -m harness.detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
-    "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
+    epilog="examples: tofpod detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
+    "; tofpod detect left.mcap right.mcap --register marks --merge fusion --out found/",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

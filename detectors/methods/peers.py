@@ -105,7 +105,7 @@ class M3c2Config(ScoreMapConfig):
     """Settings of M3C2.
 
     - ``reference``: a capture of the same target without damage, in any format that
-      ``harness.detect`` reads and in the frame of the clouds; without it, distances are to
+      ``tofpod detect`` reads and in the frame of the clouds; without it, distances are to
       ``surface``, fitted to the cloud itself.
     - ``registration_error_mm``: the error between both; null: estimated from the scatter of the
       distances.

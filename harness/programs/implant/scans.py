@@ -166,7 +166,7 @@ class Scan:
         return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
-        """Return the average of some frames, computed as in `harness.detect`."""
+        """Return the average of some frames, computed as in `tofpod detect`."""
         cloud = average(
             replace(self.recording, read=lambda: iter(frames), selection=None), RECORDED
         )

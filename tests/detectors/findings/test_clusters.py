@@ -59,11 +59,10 @@ def test_a_distance_exactly_reached_joins() -> None:
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.0, -0.8)])
 def test_points_are_joined_up_to_the_distance_and_no_farther(direction) -> None:
+    first = np.array([0.03, 0.01, 0.7])
     for distance_m, count in ((0.0099, 1), (0.0101, 2)):
-        points = np.array(
-            [[0.03, 0.01, 0.7], np.array([0.03, 0.01, 0.7]) + distance_m * np.array(direction)]
-        )
-        labels = euclidean_clusters(points, 0.01)
+        second = first + distance_m * np.array(direction)
+        labels = euclidean_clusters(np.stack([first, second]), 0.01)
         assert labels.max() + 1 == count
 
 
@@ -85,10 +84,9 @@ def test_nested_clusters_are_those_of_each_threshold() -> None:
             cluster_scores = scores[above][alone == number]
             strength = strengths[level, number]
             just_below = cluster_scores > np.nextafter(strength, 0.0)
+            highest = cluster[cluster_scores > strength]
             assert euclidean_clusters(cluster[just_below], 0.012, 3).max() >= 0
-            assert (
-                euclidean_clusters(cluster[cluster_scores > strength], 0.012, 3).max(initial=-1) < 0
-            )
+            assert euclidean_clusters(highest, 0.012, 3).max(initial=-1) < 0
 
 
 def test_small_clusters_and_missing_points_get_no_label() -> None:

@@ -260,7 +260,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
     takes those near it; so no false call (all of them lie on the rim) counts as a hit."""
     numbers = {"fixed_pattern.smooth_mm": 3.0, "fixed_pattern.pixel_mm": 4.0}
     experiment = Path(__file__).resolve().parents[4] / "experiments" / "detection_limit.yaml"
-    judged = {"crop": {"kind": "auto"}, "surface": {"shape": "auto"}}  # as harness.detect has them
+    judged = {"crop": {"kind": "auto"}, "surface": {"shape": "auto"}}  # as tofpod detect has them
     changes = [
         "source.target.distance_m=0.5",
         "detector.name=local",
