@@ -591,8 +591,8 @@ def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
 
 def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:
     if not cloud.organised:
-        what = "a polygon in pixels cannot crop a cloud without a pixel grid"
-        raise UserError(what, legal="crop.kind none, box or auto")
+        problem = "a polygon in pixels cannot crop a cloud without a pixel grid"
+        raise UserError(problem, legal="crop.kind none, box or auto")
     region = cloud.region
     v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1].astype(float)
     inside = np.zeros(u.shape, dtype=bool)

@@ -113,8 +113,8 @@ def _averages(
 ) -> dict[int, Cloud]:
     """Return the averages at these numbers of frames, ascending; if None, the average of all
     frames."""
-    most = counts[-1] if counts else None
-    frames = _of_one_size(source, islice(source.frames(), most))
+    last_count = counts[-1] if counts else None
+    frames = _of_one_size(source, islice(source.frames(), last_count))
     reference = list(islice(frames, REFERENCE_FRAMES))
     offered = len(reference)
     clouds = {}
@@ -135,12 +135,12 @@ def _averages(
             clouds[offered] = sums.cloud()
     elif counts is None:
         raise UserError(f"{source.name}: no frames to average", fix="check the path")
-    if most is not None and offered < most:
-        what = f"{source.name}: {most} frames to average, but there are {offered}"
+    if last_count is not None and offered < last_count:
+        problem = f"{source.name}: {last_count} frames to average, but there are {offered}"
         if not offered:
-            raise UserError(what, fix="check the path")
+            raise UserError(problem, fix="check the path")
         fix = "ask for fewer frames, or leave the number out to use all"
-        raise UserError(what, legal=f"1 to {offered} frames", fix=fix)
+        raise UserError(problem, legal=f"1 to {offered} frames", fix=fix)
     return clouds
 
 
@@ -370,12 +370,12 @@ class FrameSums:
 
     def _refuse_nothing(self) -> NoReturn:
         """Raise UserError because no sample was used."""
-        what = f"{self.source.name}: no pixel has a range in any frame"
+        problem = f"{self.source.name}: no pixel has a range in any frame"
         if self.left_out:
             reasons = "; ".join(f"{frame.name}: {frame.why}" for frame in self.left_out[:3])
-            what = f"{what} ({reasons})"
+            problem = f"{problem} ({reasons})"
         raise UserError(
-            what,
+            problem,
             legal="at least one frame with valid depth",
             fix="check the files, their unit and the camera's mode",
         )

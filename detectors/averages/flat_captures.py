@@ -202,7 +202,7 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     in_range = None
     if len(groups) > 1:
         in_range = _change(patterns, variances, groups[0], groups[-1])
-    found = Separated(
+    result = Separated(
         field=FlatField(
             error_m,
             variance_m2,
@@ -215,7 +215,7 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
         in_time=_change(patterns, variances, firsts, lasts),
         in_range=in_range,
     )
-    return _with_doubts(found)
+    return _with_doubts(result)
 
 
 def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -316,8 +316,8 @@ def _cells_of(captures: Sequence[FlatCapture], finite: np.ndarray) -> np.ndarray
 def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
     """Return the captures with places (h, w, 2) along the first one's plane if all have a pose,
     else without places."""
-    places = [capture.places_m for capture in captures if capture.places_m is not None]
-    if len(places) < len(captures):
+    all_places_m = [capture.places_m for capture in captures if capture.places_m is not None]
+    if len(all_places_m) < len(captures):
         return tuple(replace(capture, places_m=None) for capture in captures)
     normal = captures[0].normal
     across = np.cross([0.0, 1.0, 0.0], normal)
@@ -325,7 +325,7 @@ def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
     axes = np.stack([across, np.cross(normal, across)], axis=-1)
     return tuple(
         replace(capture, places_m=places_m @ axes)
-        for capture, places_m in zip(captures, places, strict=True)
+        for capture, places_m in zip(captures, all_places_m, strict=True)
     )
 
 
@@ -351,24 +351,24 @@ def _change(
         return None
     first_m, first_m2 = _averaged(patterns[list(first)], variances[list(first)])
     second_m, second_m2 = _averaged(patterns[list(second)], variances[list(second)])
-    both = np.isfinite(first_m) & np.isfinite(second_m)
-    if both.sum() < 2:
+    is_common = np.isfinite(first_m) & np.isfinite(second_m)
+    if is_common.sum() < 2:
         return None
     return PatternChange(
-        correlation=float(np.corrcoef(first_m[both], second_m[both])[0, 1]),
-        difference_m=_rms((first_m - second_m)[both]),
-        noise_m=float(np.sqrt((first_m2 + second_m2)[both].mean())),
+        correlation=float(np.corrcoef(first_m[is_common], second_m[is_common])[0, 1]),
+        difference_m=_rms((first_m - second_m)[is_common]),
+        noise_m=float(np.sqrt((first_m2 + second_m2)[is_common].mean())),
     )
 
 
-def _with_doubts(found: Separated) -> Separated:
+def _with_doubts(result: Separated) -> Separated:
     """Return the pattern with warnings, and with a variance that holds for a pattern that is not
     stable."""
     notes = []
-    field = found.field
-    if not _moved(found.captures):
+    field = result.field
+    if not _moved(result.captures):
         why = "nothing shows that the camera moved between the captures"
-        if len(found.captures) == 1:
+        if len(result.captures) == 1:
             why = "one capture"
         notes.append(
             f"{why}: the surface's shape cannot be separated from the pattern and is assumed to be"
@@ -376,10 +376,10 @@ def _with_doubts(found: Separated) -> Separated:
             " --poses)"
         )
     changes = {}
-    if found.in_time is not None:
-        changes["from the first captures to the last"] = found.in_time
-    if found.in_range is not None:
-        changes["with distance"] = found.in_range
+    if result.in_time is not None:
+        changes["from the first captures to the last"] = result.in_time
+    if result.in_range is not None:
+        changes["with distance"] = result.in_range
     texts = []
     largest_m = 0.0
     for cause, change in changes.items():
@@ -389,7 +389,7 @@ def _with_doubts(found: Separated) -> Separated:
             largest_m = max(largest_m, change.excess_m)
     if texts:
         also = ""
-        if not found.separated:
+        if not result.separated:
             also = ", or the surface is not flat (state --poses to separate the two)"
         notes.append(
             f"the pattern, {field.rms_m / MM:.2g} mm, is not stable: it changes"
@@ -398,7 +398,7 @@ def _with_doubts(found: Separated) -> Separated:
     # of two parts that scatter by t each, the mean is off a third part by 3/2 t^2, and their
     # difference is 2 t^2
     variance_m2 = field.variance_m2 + 0.75 * largest_m**2
-    return replace(found, field=replace(field, variance_m2=variance_m2, warnings=tuple(notes)))
+    return replace(result, field=replace(field, variance_m2=variance_m2, warnings=tuple(notes)))
 
 
 def _moved(captures: Sequence[FlatCapture]) -> bool:

@@ -69,13 +69,13 @@ def corrected(cloud: Cloud, field: FlatField) -> Cloud:
     cut = cloud.region.within(field.lens.whole)
     error_m = field.error_m[cut].astype(float)
     variance_m2 = field.variance_m2[cut].astype(float)
-    known = np.isfinite(error_m)
+    is_known = np.isfinite(error_m)
     range_m = np.linalg.norm(cloud.points_m, axis=-1)
-    moved = cloud.points_m * (1 - np.where(known, error_m, 0.0) / range_m)[..., None]
+    moved = cloud.points_m * (1 - np.where(is_known, error_m, 0.0) / range_m)[..., None]
     noise_m2 = average_variance_m2(cloud, cloud.valid)
     if noise_m2 is not None:
         axial = (cloud.points_m[..., 2] / range_m) ** 2
-        pattern_m2 = np.where(known, variance_m2, field.rms_m**2)
+        pattern_m2 = np.where(is_known, variance_m2, field.rms_m**2)
         noise_m2 = noise_m2 + axial * pattern_m2
     return replace(cloud, points_m=moved, mean_variance_m2=noise_m2)
 
@@ -83,11 +83,11 @@ def corrected(cloud: Cloud, field: FlatField) -> Cloud:
 def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
     """Return full sentences on doubts about the correction of a cloud. ``name``: of the field."""
     notes = [f"the flat field {name}: {warning}" for warning in field.warnings]
-    known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
+    is_known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
     share = 1.0
     distance_m = np.nan
     if cloud.valid.any():
-        share = float(known[cloud.valid].mean())
+        share = float(is_known[cloud.valid].mean())
         distance_m = float(np.median(cloud.points_m[cloud.valid][:, 2]))
     if share < WELL_COVERED:
         notes.append(
@@ -134,9 +134,9 @@ def _refuse_other(cloud: Cloud, field: FlatField) -> None:
 
 def _is_same_lens(lens: Lens, other: Lens) -> bool:
     """Return whether two lenses may belong to one camera and mode; the second sets the scale."""
-    most = SAME_LENS * max(other.fx, other.width)
+    limit = SAME_LENS * max(other.fx, other.width)
     names = ("fx", "fy", "cx", "cy")
-    return all(abs(getattr(lens, name) - getattr(other, name)) <= most for name in names)
+    return all(abs(getattr(lens, name) - getattr(other, name)) <= limit for name in names)
 
 
 def _lens_text(lens: Lens) -> str:
@@ -192,12 +192,12 @@ def _field_of(arrays: Mapping[str, np.ndarray], path: Path) -> FlatField:
     variance_m2 = arrays["variance_m2"].astype(np.float32)
     nearest_m, farthest_m = arrays["distances_m"].astype(float).tolist()
     warnings = json.loads(str(arrays["warnings"]))
-    known = np.isfinite(error_m)
+    is_known = np.isfinite(error_m)
     is_sound = (
         error_m.shape == variance_m2.shape == (lens.height, lens.width)
         and len(lens.distortion) == 8
-        and known.any()
-        and bool((variance_m2[known] >= 0).all())
+        and is_known.any()
+        and bool((variance_m2[is_known] >= 0).all())
         and 0 < nearest_m <= farthest_m < np.inf
         and all(isinstance(warning, str) for warning in warnings)
     )

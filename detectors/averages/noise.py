@@ -104,13 +104,17 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
     scatter of its frames nearby, or the typical variance if that is unknown. None without a pixel
     grid, with fewer than `LEAST_FRAMES` frames, or if fewer than half of the pixels have a
     scatter."""
-    seen = where & np.isfinite(cloud.variance_m2)
-    if not cloud.organised or cloud.n_frames < LEAST_FRAMES or seen.sum() < 0.5 * where.sum():
+    has_scatter = where & np.isfinite(cloud.variance_m2)
+    if (
+        not cloud.organised
+        or cloud.n_frames < LEAST_FRAMES
+        or has_scatter.sum() < 0.5 * where.sum()
+    ):
         return None
     side = (SCATTER_PX, SCATTER_PX)
     border = cv2.BORDER_CONSTANT
-    known = cv2.blur(seen.astype(np.float64), side, borderType=border)
-    scatter = cv2.blur(np.where(seen, cloud.variance_m2, 0.0), side, borderType=border)
+    known = cv2.blur(has_scatter.astype(np.float64), side, borderType=border)
+    scatter = cv2.blur(np.where(has_scatter, cloud.variance_m2, 0.0), side, borderType=border)
     mean = scatter / np.maximum(known, 1e-9)
     variance = np.where(where & (known > 0), mean, np.nan) / cloud.n_frames
     typical = median_of(variance[np.isfinite(variance)])

@@ -154,9 +154,9 @@ def _nested(  # type: ignore[no-untyped-def]
             k = stops[cell]
             while k < ends[cell]:
                 c = neighbours[k]
-                other = root_of(parent, c) if filled[c] else -1
-                if other < 0 or (
-                    other != root
+                other_root = root_of(parent, c) if filled[c] else -1
+                if other_root < 0 or (
+                    other_root != root
                     and not _touches(
                         points,
                         i,
@@ -168,10 +168,10 @@ def _nested(  # type: ignore[no-untyped-def]
                 ):
                     k += 1
                     continue
-                if other != root:
-                    parent[other] = root
-                    sizes[root] += sizes[other]
-                    completed[root] = max(completed[root], completed[other])
+                if other_root != root:
+                    parent[other_root] = root
+                    sizes[root] += sizes[other_root]
+                    completed[root] = max(completed[root], completed[other_root])
                 # what is joined stays so: the last one takes its position
                 ends[cell] -= 1
                 neighbours[k] = neighbours[ends[cell]]

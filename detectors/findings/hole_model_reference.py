@@ -35,8 +35,8 @@ def picture(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
     offset = np.stack(np.meshgrid(columns - u, rows - v), axis=-1)
 
     def within(shift: np.ndarray, radius_m: float) -> np.ndarray:
-        apart = offset - shift
-        return np.einsum("...i,ij,...j", apart, patch.metric_m2, apart) < radius_m**2
+        from_centre = offset - shift
+        return np.einsum("...i,ij,...j", from_centre, patch.metric_m2, from_centre) < radius_m**2
 
     total = np.zeros(offset.shape[:2])
     for cosine, drift_u, drift_v, shrinking, beam_u, beam_v, height, share in patch.sights:
@@ -49,11 +49,11 @@ def picture(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
             lit = t if node < 1.0 else max(deepest, 0.0)
             thick = length * weight if node < 1.0 else deepest - length
             scale = 1.0 / (1.0 + t * shrinking)
-            seen = within(np.zeros(2), radius) & within(t * drift * scale, radius * scale)
+            is_seen = within(np.zeros(2), radius) & within(t * drift * scale, radius * scale)
             below = (lit - t) / (lit - t + height)
             entered = within(-lit / (lit + height) * beam, radius)
             passed = within(t * drift * scale - below * beam, radius * scale)
-            total += share / cosine * thick * (seen & entered & passed)
+            total += share / cosine * thick * (is_seen & entered & passed)
     return down @ total @ across.T
 
 
@@ -79,21 +79,23 @@ def fitted(patch: HolePatch, start: Start, draw: Draw = picture) -> tuple[np.nda
 
     def jacobian(q: np.ndarray) -> np.ndarray:
         hole = hole_of(q)
-        by = []
+        slopes = []
         for step in np.diag([1e-3, 1e-3, 1e-6, 1e-6, 1e-3]):
             change = draw(patch, hole + step / 2) - draw(patch, hole - step / 2)
-            by.append(change[patch.used] / step.max())
+            slopes.append(change[patch.used] / step.max())
         bend = 0.5 * math.pi * math.sin(math.pi * q[5])
-        by_log_radius = hole[2] * by[2] - 2.0 * hole[3] * by[3]
-        by_volume = by[3] / hole[2] ** 2
+        by_log_radius = hole[2] * slopes[2] - 2.0 * hole[3] * slopes[3]
+        by_volume = slopes[3] / hole[2] ** 2
         offset = np.ones(len(used_m))
-        rows = np.stack([by[0], by[1], by_log_radius, by_volume, offset, by[4] * bend], axis=1)
+        rows = np.stack(
+            [slopes[0], slopes[1], by_log_radius, by_volume, offset, slopes[4] * bend], axis=1
+        )
         return np.vstack([rows, [0.0, 0.0, 0.0, 0.0, 0.0, patch.prior_weight * bend]])
 
     begin = [u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]]
     limits = {"xtol": 1e-9, "ftol": 1e-9, "gtol": 1e-12, "max_nfev": 500}
-    found = least_squares(misfit, begin, jacobian, method="lm", x_scale="jac", **limits)
-    return hole_of(found.x), float(found.x[4]), bool(found.success)
+    descent = least_squares(misfit, begin, jacobian, method="lm", x_scale="jac", **limits)
+    return hole_of(descent.x), float(descent.x[4]), bool(descent.success)
 
 
 def hole_of(q: np.ndarray) -> np.ndarray:

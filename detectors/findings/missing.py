@@ -407,13 +407,13 @@ def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
     """Return the side of the smallest square whose fields have as many missing neighbours, to two
     standard errors."""
     pairs = 0
-    both = 0
+    missing_pairs = 0
     # along columns, then along rows
     for image, known_image in ((scattered, known), (scattered.T, known.T)):
         pairs += int((image[:-1] & known_image[1:]).sum())
-        both += int((image[:-1] & image[1:]).sum())
+        missing_pairs += int((image[:-1] & image[1:]).sum())
     pairs = max(pairs, 1)
-    measured = both / pairs
+    measured = missing_pairs / pairs
     error = np.sqrt(max(measured * (1.0 - measured), 1.0 / pairs) / pairs)
     level = ndtri(rate)
     for side in SQUARES:

@@ -112,8 +112,8 @@ def own_threshold(
     """Find the threshold at which ``false_calls`` (above 0) are expected, from the capture's own
     peaks towards the camera; at least `LEAST`. With too few peaks the numbers are NaN, and
     ``doubts`` says so."""
-    known = np.isfinite(evidence.score)
-    covered = np.zeros(known.shape, bool)
+    judged = np.isfinite(evidence.score)
+    covered = np.zeros(judged.shape, bool)
     if cloud.organised:
         objects = _proud(cloud, evidence) | _marked(cloud, evidence)
         covered = grown(objects, _margin(cloud), cv2.MORPH_ELLIPSE)
@@ -141,7 +141,7 @@ def own_threshold(
     tail = _fitting_tail(peaks, floor, false_calls / 2.0)
     threshold = max(tail.threshold(false_calls / 2.0), LEAST)
     low, high = tail.interval(threshold)
-    rim = np.zeros(known.shape, bool)
+    rim = np.zeros(judged.shape, bool)
     if cloud.organised:
         rim = _mixed_rim(detector, cloud, evidence, threshold)
     if threshold > MOST:
@@ -150,10 +150,10 @@ def own_threshold(
             f" tails, raise it above {MOST:g} units of score, and fainter damage is not found"
             " (--threshold states another)"
         )
-    hidden = int((covered & known).sum())
-    if hidden > MOST_MASKED * known.sum():
+    hidden = int((covered & judged).sum())
+    if hidden > MOST_MASKED * judged.sum():
         doubts.append(
-            f"{100 * hidden / known.sum():.0f} % of what is judged lies under or beside objects,"
+            f"{100 * hidden / judged.sum():.0f} % of what is judged lies under or beside objects,"
             " and the rest may not stand for the whole"
         )
     return OwnThreshold(
@@ -317,11 +317,11 @@ def _peaks(
     ``before``: evidence with scores in front of the surface only. ``covered`` (h, w) bool: pixels
     at objects, where findings do not count."""
     evidence = _only(before, ~covered)
-    known = evidence.score[np.isfinite(evidence.score)]
-    if not (len(known) and known.max() > 0):
+    judged = evidence.score[np.isfinite(evidence.score)]
+    if not (len(judged) and judged.max() > 0):
         return 1.0, np.zeros(0)
-    least = max(float(np.median(known)), 1e-3 * float(known.max()))
-    steps = np.arange(np.log(known.max() / least) / np.log(LADDER) + 1)
+    least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
+    steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
     counts = [len(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
     floor = thresholds[_floor_among(counts)]
@@ -361,8 +361,8 @@ def each_object_once(
     if not cloud.organised or not found:
         return found
     proud = _proud(cloud, evidence)
-    known = np.isfinite(evidence.score)
-    if (proud & known).sum() > MOST_MASKED * known.sum():
+    judged = np.isfinite(evidence.score)
+    if (proud & judged).sum() > MOST_MASKED * judged.sum():
         return found
     labels, count = ndimage.label(proud, np.ones((3, 3)))
     kept = list(found)
@@ -392,13 +392,13 @@ def _margin(cloud: Cloud) -> int:
 def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
     """Return (h, w) bool: connected regions, wider than noise, that are in front of the surface as
     a whole."""
-    known = np.isfinite(evidence.residual_m)
-    weights = _boxed(known.astype(np.float64))
+    judged = np.isfinite(evidence.residual_m)
+    weights = _boxed(judged.astype(np.float64))
     with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = _boxed(np.where(known, evidence.residual_m, 0.0)) / weights
-    smooth[~known | (weights < 0.5)] = np.nan
+        smooth = _boxed(np.where(judged, evidence.residual_m, 0.0)) / weights
+    smooth[~judged | (weights < 0.5)] = np.nan
     if not np.isfinite(smooth).any():
-        return np.zeros_like(known)
+        return np.zeros_like(judged)
     before = np.nanmedian(smooth) - smooth
     spread = 1.4826 * np.nanmedian(np.abs(before))
     before /= max(spread, cloud.z_step_m / PATCH_PX, 1e-9)
@@ -415,13 +415,13 @@ def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
     if cloud.amplitude is not None:
         channels.append(cloud.amplitude)
     for channel in channels:
-        known = np.isfinite(channel) & inside
-        if not known.any():
+        judged = np.isfinite(channel) & inside
+        if not judged.any():
             continue
-        filled = np.where(np.isfinite(channel), channel, np.median(channel[known]))
+        filled = np.where(np.isfinite(channel), channel, np.median(channel[judged]))
         steepness = np.hypot(*np.gradient(_boxed(_boxed(filled))))
-        typical = max(float(np.median(steepness[known])), 1e-9)
-        edges |= known & (steepness > MARKED * typical)
+        typical = max(float(np.median(steepness[judged])), 1e-9)
+        edges |= judged & (steepness > MARKED * typical)
     return parts_with(edges, edges, least=LEAST_OBJECT_PX)
 
 
@@ -440,8 +440,8 @@ def _mixed_rim(
 ) -> np.ndarray:
     """Return (h, w) bool: a band along the outline, as wide as the zone of frequent calls behind
     the surface."""
-    known = np.isfinite(evidence.score)
-    filled = holes_filled(known)
+    judged = np.isfinite(evidence.score)
+    filled = holes_filled(judged)
     depth_px = _depth_px(filled)
     flat_px = depth_px.reshape(-1)
     calls = detector.find(cloud, _only(evidence, behind(evidence)), threshold)
@@ -450,8 +450,8 @@ def _mixed_rim(
     ]
     along = [reach_px for reach_px in reaches_px if reach_px <= RIM_PX]
     if len(along) < RIM_CALLS or filled.all():
-        return np.zeros(known.shape, bool)
-    return (depth_px <= max(along)) & known
+        return np.zeros(judged.shape, bool)
+    return (depth_px <= max(along)) & judged
 
 
 def _depth_px(mask: np.ndarray) -> np.ndarray:

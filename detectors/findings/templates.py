@@ -185,12 +185,12 @@ def _pair_spectrum(
     window_px: int,
     coarse: bool,
 ) -> np.ndarray:
-    both: np.ndarray | int = 0
+    total: np.ndarray | int = 0
     for channel, number in enumerate(pair):
         drawn = transformed(centred(bank(window_px)[number].image, shape), shape)
-        both = both + np.conj(_low(drawn) if coarse else drawn) * 1j**channel
+        total = total + np.conj(_low(drawn) if coarse else drawn) * 1j**channel
     pixels = math.prod(shape)
-    return np.asarray(both / pixels * (4 if coarse else 1), np.complex64)
+    return np.asarray(total / pixels * (4 if coarse else 1), np.complex64)
 
 
 def responses(
@@ -246,14 +246,14 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
         sides += [(2 * across + 1, 2 * down + 1) for across, down in half_sides.tolist()]
         # the density of maxima is the root of the score's second spectral moments (Adler 1981)
         maxima += (np.sqrt(row_moment * column_moment) / energy * side**2).tolist()
-    found = []
-    most = max(maxima)
+    template_worths = []
+    highest = max(maxima)
     for number, template in enumerate(bank(window_px)):
         # slots of all angles together are as rare as one round template
         crowd = maxima[number] * (len(SLOTS_DEG) if template.slot else 1)
-        raised = max(math.log(most / crowd), 0.0)
-        found.append(Worth(energies[number], sides[number], raised))
-    return tuple(found)
+        raised = max(math.log(highest / crowd), 0.0)
+        template_worths.append(Worth(energies[number], sides[number], raised))
+    return tuple(template_worths)
 
 
 class _Sums(NamedTuple):

@@ -13,8 +13,8 @@ def autocovariance(noise: np.ndarray, quiet: np.ndarray, down: int, across: int)
     height, width = noise.shape
     first = np.s_[: height - down, : width - across]
     second = np.s_[down:, across:]
-    both = quiet[first] & quiet[second]
-    mean = (noise[first] * noise[second])[both].mean()
+    is_quiet = quiet[first] & quiet[second]
+    mean = (noise[first] * noise[second])[is_quiet].mean()
     lag = min(np.hypot(down, across) / LONGEST_LAG_PX, 1.0)
     if lag <= 0.5:
         return float(mean * (1.0 - 6.0 * lag**2 * (1.0 - lag)))

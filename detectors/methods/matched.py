@@ -569,11 +569,11 @@ def _responses(
             continue
         view = coarse if bank[numbers[0]].coarse else fine
         height, width = view.seen.shape
-        both = templates.responses(view.spectrum, pair, view.products)[:height, :width]
+        pair_response = templates.responses(view.spectrum, pair, view.products)[:height, :width]
         for channel, number in enumerate(numbers):
             if only_centred and any(bank[number].halves):
                 continue
-            cv2.extractChannel(both, channel, dst=view.score)
+            cv2.extractChannel(pair_response, channel, dst=view.score)
             yield view, number, view.score
 
 

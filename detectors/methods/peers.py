@@ -143,13 +143,13 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         points = cloud.points_m[mask]
         notes, warnings, feet = self._feet(cloud, mask, points)
         compared = notes["surface"]
-        known = np.isfinite(feet[:, 2])
+        has_foot = np.isfinite(feet[:, 2])
         distance_m = np.full(len(points), np.nan)
         deviation_m = np.full(len(points), np.nan)
-        if known.any():
-            before = feet[known] if self.settings.reference is None else self._reference_m
-            distances = self._distances(feet[known], before, points)
-            distance_m[known], deviation_m[known] = distances
+        if has_foot.any():
+            before = feet[has_foot] if self.settings.reference is None else self._reference_m
+            distances = self._distances(feet[has_foot], before, points)
+            distance_m[has_foot], deviation_m[has_foot] = distances
         judged = np.isfinite(distance_m)
         alone = 1.0 - float(judged.mean())
         if not judged.any():
@@ -255,8 +255,10 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
                 max_distance=self.settings.reach_mm * MM,
             )
             distance, uncertainty = algorithm.run()
-        few = np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
-        return np.where(few, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
+        is_sparse = (
+            np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
+        )
+        return np.where(is_sparse, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
 
 
 def _py4dgeo() -> Any:

@@ -31,11 +31,11 @@ def deviations(scores: np.ndarray, depth_px: np.ndarray, loud: np.ndarray) -> np
     if inside.sum() < FEWEST:
         inside = counted
     last = deviation_of(np.abs(scores[inside]))
-    found = []
+    by_zone = []
     for number in range(len(RIM_ENDS_PX)):
         sizes = np.abs(scores[counted & (zone == number)])
-        found.append(max(deviation_of(sizes), last) if len(sizes) >= FEWEST else last)
-    return np.array([*found, last])
+        by_zone.append(max(deviation_of(sizes), last) if len(sizes) >= FEWEST else last)
+    return np.array([*by_zone, last])
 
 
 def raised(scores: np.ndarray, deviation: float, more: float) -> np.ndarray:

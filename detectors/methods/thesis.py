@@ -97,8 +97,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         stated_m = self._stated_deviation(cloud, mask)
         if stated_m is not None:
             deviation_m = on_grid(stated_m, mask)
-            known = np.isfinite(ground.residual_m)
-            ratio = sigma_of(ground.residual_m[known] / deviation_m[known])
+            is_known = np.isfinite(ground.residual_m)
+            ratio = sigma_of(ground.residual_m[is_known] / deviation_m[is_known])
             unit_m = np.maximum(unit_m, ratio * deviation_m)
         return Evidence(
             score=np.abs(ground.residual_m) / unit_m,

@@ -89,8 +89,8 @@ def test_the_target_is_the_board_and_not_the_wall() -> None:
     within = np.zeros_like(board)
     within[33:117, 43:167] = True
     np.testing.assert_array_equal(crop(cloud, AutoCrop()), within)
-    near = cloud_of(np.where(board, cloud.points_m[..., 2], np.nan))
-    np.testing.assert_array_equal(crop(near, AutoCrop()), within)
+    nearer = cloud_of(np.where(board, cloud.points_m[..., 2], np.nan))
+    np.testing.assert_array_equal(crop(nearer, AutoCrop()), within)
 
 
 def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
@@ -135,10 +135,10 @@ def judged(kind: str, seed: int, camera: str, flat: bool = False) -> tuple[bool,
     mask = np.zeros(cloud.valid.shape, dtype=bool)
     mask[cloud.valid] = choice.mask[0] if flat else choice.mask[cloud.valid]
     target = scene.name == 1
-    whole = holes_filled(target).astype(np.uint8)
+    full_mask = holes_filled(target).astype(np.uint8)
     kernel = np.ones((3, 3), np.uint8)
-    outside = cv2.dilate(whole, kernel, iterations=2) == 0
-    inside = target & (cv2.erode(whole, kernel, iterations=10 if flat else 6) > 0) & cloud.valid
+    outside = cv2.dilate(full_mask, kernel, iterations=2) == 0
+    inside = target & (cv2.erode(full_mask, kernel, iterations=10 if flat else 6) > 0) & cloud.valid
     right = (mask & outside).sum() <= 0.03 * mask.sum() and (
         mask & inside
     ).sum() >= 0.8 * inside.sum()
@@ -297,10 +297,10 @@ def drilled_board_before_a_wall(
     z = np.where(target, 0.7, 0.9)
     hole = np.zeros(z.shape, dtype=int)
     for number, centre_x, diameter in ((1, 0.1, 0.014), (2, 0.19, 0.025)):
-        apart = np.stack([x - centre_x, y - 0.02], axis=-1)
+        distance_px = np.stack([x - centre_x, y - 0.02], axis=-1)
         a = (slopes**2).sum(-1)
-        b = (apart * slopes).sum(-1)
-        c = (apart**2).sum(-1) - diameter**2 / 4
+        b = (distance_px * slopes).sum(-1)
+        c = (distance_px**2).sum(-1) - diameter**2 / 4
         inside = c < 0
         wall = (np.sqrt(np.where(inside, b * b - a * c, 0.0)) - b) / a
         hole[inside] = number
@@ -345,21 +345,21 @@ def test_without_a_grid_holes_with_a_backing_are_found_and_the_wall_past_the_rim
     kept = np.isfinite(evidence.score[0])
     # of 85 x 86 pixels at most 6 on each side go: 3 of rim, 3 for the raster's cells
     assert not kept[~target].any() and kept[target].mean() > 0.73
-    found = np.zeros(len(points), dtype=bool)
+    taken_choice = np.zeros(len(points), dtype=bool)
     for detection in detector.find(flat, evidence, 5.0):
-        found[detection.pixels] = True
-    assert not found[hole == 0].any()
-    assert found[hole == 1].mean() > 0.8 and found[hole == 2].mean() > 0.8
+        taken_choice[detection.pixels] = True
+    assert not taken_choice[hole == 0].any()
+    assert taken_choice[hole == 1].mean() > 0.8 and taken_choice[hole == 2].mean() > 0.8
 
 
 def test_without_a_grid_the_crop_is_the_grids_but_for_the_rim() -> None:
     cloud, target, _ = drilled_board_before_a_wall()
     flat = without_grid(cloud.points_m.reshape(-1, 3))
-    whole = crop(flat, AutoCrop(inset_px=0))[0]
-    assert whole[target[cloud.valid]].all()
+    full_mask = crop(flat, AutoCrop(inset_px=0))[0]
+    assert full_mask[target[cloud.valid]].all()
     # a cell on the rim may hold a point of the wall too
-    near = cv2.dilate(target.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    assert not whole[~near[cloud.valid]].any()
+    nearer = cv2.dilate(target.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not full_mask[~nearer[cloud.valid]].any()
     for inset in (1, 2, 3, 5, 8):
         mask = crop(flat, AutoCrop(inset_px=inset))[0]
         assert not (mask & ~crop(cloud, AutoCrop(inset_px=inset))[cloud.valid]).any()

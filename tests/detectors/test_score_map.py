@@ -59,16 +59,16 @@ def test_pixels_above_the_threshold_are_clusters() -> None:
     scores[10:12, 10:12] = [[3.0, 4.0], [5.0, 6.0]]
     scores[40, 50] = 7.0
     scores[60, 60] = 2.0
-    found = detector().find(CLOUD, evidence(scores), 2.0)
-    assert [detection.score for detection in found] == [7.0, 6.0]
-    rows, columns = np.unravel_index(found[1].pixels, SHAPE)
+    results = detector().find(CLOUD, evidence(scores), 2.0)
+    assert [detection.score for detection in results] == [7.0, 6.0]
+    rows, columns = np.unravel_index(results[1].pixels, SHAPE)
     assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [
         (10, 10),
         (10, 11),
         (11, 10),
         (11, 11),
     ]
-    np.testing.assert_allclose(found[0].centre_m, CLOUD.points_m[40, 50], atol=1e-12)
+    np.testing.assert_allclose(results[0].centre_m, CLOUD.points_m[40, 50], atol=1e-12)
     assert above(evidence(scores), 6.0).tolist() == [40 * SHAPE[1] + 50]
 
 
@@ -78,8 +78,8 @@ def test_invalid_points_are_in_no_cluster() -> None:
     points_m = CLOUD.points_m.copy()
     points_m[10, 12] = np.nan
     holed = replace(CLOUD, points_m=points_m)
-    (found,) = detector().find(holed, evidence(scores), 1.0)
-    assert len(found.pixels) == 2
+    (results,) = detector().find(holed, evidence(scores), 1.0)
+    assert len(results.pixels) == 2
     assert detector(3).quiet_threshold(holed, evidence(scores)) == 0.0
 
 
@@ -114,18 +114,18 @@ def test_arrays_and_detections_are_two_forms_of_findings() -> None:
     assert arrays.labels.tolist() == [0, 0, 1, 2, 2]
     # of equal scores, the one with the first pixel comes first
     expected = (detections[0], detections[2], detections[1])
-    for found, detection in zip(arrays.detections, expected, strict=True):
-        assert found.score == detection.score
-        np.testing.assert_array_equal(found.pixels, detection.pixels)
-        np.testing.assert_array_equal(found.centre_m, detection.centre_m)
+    for results, detection in zip(arrays.detections, expected, strict=True):
+        assert results.score == detection.score
+        np.testing.assert_array_equal(results.pixels, detection.pixels)
+        np.testing.assert_array_equal(results.centre_m, detection.centre_m)
     assert Findings.of(()).detections == ()
 
 
 def test_many_thresholds_at_once_are_each_alone() -> None:
     scores = evidence(np.random.default_rng(3).exponential(size=SHAPE))
     thresholds = [1.0, 2.5, 4.0]
-    found = findings_at(detector(2), CLOUD, scores, thresholds)
-    for findings, threshold in zip(found, thresholds, strict=True):
+    results = findings_at(detector(2), CLOUD, scores, thresholds)
+    for findings, threshold in zip(results, thresholds, strict=True):
         alone = detector(2).find(CLOUD, scores, threshold)
         assert len(findings.detections) == len(alone) > 0
         for detection, expected in zip(findings.detections, alone, strict=True):

@@ -134,7 +134,7 @@ def test_a_frame_that_jumps_is_left_out_and_named_wherever_it_stands(bad: int) -
     good = np.delete(stack.z_m, bad, axis=0)
     stack.z_m[bad] += np.float32(0.018)
     cloud = average(stack, AverageConfig())
-    assert [left.name for left in cloud.left_out] == [f"frame {bad}"]
+    assert [frame_left_out.name for frame_left_out in cloud.left_out] == [f"frame {bad}"]
     assert (
         "jumps by +18.0 mm" in cloud.left_out[0].why and "allowed 3.0 mm" in cloud.left_out[0].why
     )
@@ -196,7 +196,9 @@ def test_of_two_frames_that_disagree_the_first_is_kept() -> None:
     stack = noisy(2)
     stack.z_m[1] -= np.float32(0.018)
     cloud = average(stack, AverageConfig())
-    assert [left.name for left in cloud.left_out] == ["frame 1"] and cloud.n_frames == 1
+    assert [frame_left_out.name for frame_left_out in cloud.left_out] == [
+        "frame 1"
+    ] and cloud.n_frames == 1
     np.testing.assert_array_equal(cloud.points_m[..., 2].astype(np.float32), stack.z_m[0])
 
 
@@ -204,8 +206,10 @@ def test_of_two_frames_that_disagree_the_first_is_kept() -> None:
 def test_a_disturbed_frame_is_left_out_with_its_fraction(bad: int) -> None:
     stack = noisy()
     stack.z_m[bad, :, :10] = 0.4  # a hand over a fifth of the picture
-    [left] = average(stack, AverageConfig()).left_out
-    assert left.name == f"frame {bad}" and left.why.startswith("disturbed: 20.0 %")
+    [frame_left_out] = average(stack, AverageConfig()).left_out
+    assert frame_left_out.name == f"frame {bad}" and frame_left_out.why.startswith(
+        "disturbed: 20.0 %"
+    )
 
 
 def test_a_frame_that_lost_its_range_is_left_out() -> None:
@@ -327,7 +331,9 @@ def read_pngs(folder: Path) -> Stack:
 def test_the_jump_of_a_real_capture_is_named(shared_data: Path) -> None:
     stack = read_pngs(shared_data / "azure_drilled_board" / "depth")
     cloud = average(stack, AverageConfig())
-    assert [left.name for left in cloud.left_out] == ["00003.png"] and cloud.n_frames == 17
+    assert [frame_left_out.name for frame_left_out in cloud.left_out] == [
+        "00003.png"
+    ] and cloud.n_frames == 17
     assert "+17.0 mm" in cloud.left_out[0].why
 
 

@@ -75,17 +75,17 @@ def wall(rms_m: float) -> np.ndarray:
 def capture(
     number: int,
     shape_m: np.ndarray,
-    place: tuple[float, float, float] = (0.8, 0.0, 0.0),
+    pose_m: tuple[float, float, float] = (0.8, 0.0, 0.0),
     fixed_m: np.ndarray | None = None,
     noise_m: float = NOISE_M,
 ) -> Cloud:
     """An average of a wall with a shape, seen from a place, each frame's z with white noise."""
-    distance_m, x_m, y_m = place
+    distance_m, x_m, y_m = pose_m
     slopes = LENS.region_slopes(LENS.whole)
     rng = np.random.default_rng([3, number])
-    at = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
+    position = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
     length = np.sqrt(1 + (slopes**2).sum(axis=-1))
-    z_m = distance_m + ndimage.map_coordinates(shape_m, np.moveaxis(at, -1, 0), order=1)
+    z_m = distance_m + ndimage.map_coordinates(shape_m, np.moveaxis(position, -1, 0), order=1)
     z_m = z_m + (pattern() if fixed_m is None else fixed_m) / length
     z_m = z_m + rng.standard_normal(z_m.shape) * noise_m / np.sqrt(FRAMES)
     scatter_m2 = noise_m**2 * rng.chisquare(FRAMES - 1, z_m.shape) / (FRAMES - 1)
@@ -127,7 +127,6 @@ def errors(result: Separated, truth_m: np.ndarray) -> tuple[float, float]:
 
 
 # ---- the pattern and the surface
-# -------------------------------------------------------------------------------------
 
 
 def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
@@ -205,21 +204,20 @@ def test_few_frames_cannot_tell_their_noise():
 
 
 # ---- the correction
-# --------------------------------------------------------------------------------------------------
 
 
 def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
     field = found(wall(0.0), poses=False).field
     cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
-    made = corrected(cloud, field)
-    residual_m = flattened(made, made.valid, "corrected").residual_m
-    assert made.mean_variance_m2 is not None
+    exit_code = corrected(cloud, field)
+    residual_m = flattened(exit_code, exit_code.valid, "corrected").residual_m
+    assert exit_code.mean_variance_m2 is not None
     axial_m = residual_m * cloud.points_m[..., 2] / np.linalg.norm(cloud.points_m, axis=-1)
     assert np.nanstd(axial_m) == pytest.approx(
-        float(np.sqrt(made.mean_variance_m2.mean())), rel=0.03
+        float(np.sqrt(exit_code.mean_variance_m2.mean())), rel=0.03
     )
     np.testing.assert_allclose(
-        np.cross(made.points_m, cloud.points_m), 0.0, atol=1e-15
+        np.cross(exit_code.points_m, cloud.points_m), 0.0, atol=1e-15
     )  # along the rays
     part = Region(10, 90, 30, 120)
     rows, columns = part.within(LENS.whole)
@@ -228,7 +226,8 @@ def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
         for name in ("points_m", "reason", "count", "variance_m2")
     }
     np.testing.assert_array_equal(
-        corrected(replace(cloud, region=part, **cut), field).points_m, made.points_m[rows, columns]
+        corrected(replace(cloud, region=part, **cut), field).points_m,
+        exit_code.points_m[rows, columns],
     )
     single = corrected(replace(cloud, n_frames=1), field)
     assert single.mean_variance_m2 is None
@@ -240,10 +239,12 @@ def test_pixels_without_a_pattern_stay_and_are_told():
     error_m = field.error_m.copy()
     error_m[:, :40] = np.nan
     holed = replace(field, error_m=error_m, warnings=("it drifts",))
-    made = corrected(cloud, holed)
-    np.testing.assert_array_equal(made.points_m[:, :40], cloud.points_m[:, :40])
-    assert made.mean_variance_m2 is not None
-    assert made.mean_variance_m2[:, :40].mean() > 10 * made.mean_variance_m2[:, 40:].mean()
+    exit_code = corrected(cloud, holed)
+    np.testing.assert_array_equal(exit_code.points_m[:, :40], cloud.points_m[:, :40])
+    assert exit_code.mean_variance_m2 is not None
+    assert (
+        exit_code.mean_variance_m2[:, :40].mean() > 10 * exit_code.mean_variance_m2[:, 40:].mean()
+    )
     assert doubts(cloud, holed, "unit.npz") == (
         "the flat field unit.npz: it drifts",
         "the flat field unit.npz covers 75 % of the valid pixels; others are not corrected",
@@ -273,7 +274,6 @@ def test_another_camera_s_cloud_is_refused(changes, message):
 
 
 # ---- files and programs
-# ----------------------------------------------------------------------------------------------
 
 
 def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
@@ -283,9 +283,9 @@ def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
     flat.error_m[0, 0] = np.nan
     path = tmp_path / "unit.npz"
     save_flat_field(path, flat)
-    held = load_flat_field(path)
-    np.testing.assert_array_equal(held.error_m, flat.error_m.astype(np.float32))
-    assert (held.lens, held.distances_m, held.warnings) == (LENS, (0.5, 1.0), ("it drifts",))
+    stored = load_flat_field(path)
+    np.testing.assert_array_equal(stored.error_m, flat.error_m.astype(np.float32))
+    assert (stored.lens, stored.distances_m, stored.warnings) == (LENS, (0.5, 1.0), ("it drifts",))
     arrays = dict(np.load(path))
     for changes, message in (
         ({"version": np.array(2)}, "was written by a newer tofpod"),
@@ -312,8 +312,8 @@ def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three captures of 8 frames each as .npy in metres, with a lens."""
     folder = tmp_path_factory.mktemp("walls")
-    for number, place in enumerate(SHIFTS[:3]):
-        z_m = capture(number, wall(0.0), place, noise_m=0.0).points_m[..., 2]
+    for number, pose_m in enumerate(SHIFTS[:3]):
+        z_m = capture(number, wall(0.0), pose_m, noise_m=0.0).points_m[..., 2]
         noise = np.random.default_rng([4, number]).standard_normal((8, *z_m.shape)) * NOISE_M
         np.save(folder / f"wall{number}.npy", (z_m + noise).astype(np.float32))
     stated = {name: getattr(LENS, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
@@ -324,23 +324,23 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures("unpictured")
 def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_path, capsys, truth_m):
     walls = [str(path) for path in sorted(recorded.glob("*.npy"))]
-    given = ["--unit", "m"]
-    given += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
+    options = ["--unit", "m"]
+    options += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
     unit = tmp_path / "unit.npz"
-    assert flatfield.main([*walls, *given, "--out", str(unit)]) == 0
-    first, *rest = capsys.readouterr().out.splitlines()
+    assert flatfield.main([*walls, *options, "--out", str(unit)]) == 0
+    first, *remainder = capsys.readouterr().out.splitlines()
     assert first.startswith("warning: nothing shows that the camera moved")
-    assert rest[0].startswith("fixed pattern 0.4")
-    told = json.loads(unit.with_suffix(".json").read_text())
-    assert told["warnings"] == list(load_flat_field(unit).warnings)
-    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    assert remainder[0].startswith("fixed pattern 0.4")
+    printed = json.loads(unit.with_suffix(".json").read_text())
+    assert printed["warnings"] == list(load_flat_field(unit).warnings)
+    figures = {row["figure"]: row["value"] for row in printed["figures"]}
     assert figures["noise of the map"] == pytest.approx(NOISE_M / MM / np.sqrt(24), rel=0.05)
     assert figures["pattern"] == pytest.approx(float(np.nanstd(truth_m)) / MM, rel=0.03)
     assert figures["change, near and far captures"] is None
-    assert len(told["captures"]) == 3
+    assert len(printed["captures"]) == 3
     assert unit.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 
-    judged = [walls[0], *given, "--threshold", "5"]
+    judged = [walls[0], *options, "--threshold", "5"]
     assert detect.main([*judged, "--flat-field", str(unit), "--out", str(tmp_path / "with")]) == 0
     assert capsys.readouterr().out.startswith(f"warning: the flat field {unit}: nothing shows that")
     assert detect.main(judged) == 0
@@ -353,15 +353,15 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
 
 
 def test_the_program_refuses_what_makes_no_flat_field(recorded, tmp_path, capsys):
-    one = str(recorded / "wall0.npy")
+    lone = str(recorded / "wall0.npy")
     lens = ["--unit", "m", "--intrinsics", str(recorded / "lens.json")]
     single = tmp_path.parent / "single.npy"
-    np.save(single, np.load(one)[:1])
+    np.save(single, np.load(lone)[:1])
     for arguments, message in (
-        ([one, "--unit", "m", "--out", "unit.npz"], "the lens of these depth images is unknown"),
-        ([one, *lens, "--out", "unit.png"], "a name that ends in .npz"),
-        ([one, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
-        ([one, one, *lens, "--out", "unit.npz"], "is named twice"),
+        ([lone, "--unit", "m", "--out", "unit.npz"], "the lens of these depth images is unknown"),
+        ([lone, *lens, "--out", "unit.png"], "a name that ends in .npz"),
+        ([lone, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
+        ([lone, lone, *lens, "--out", "unit.npz"], "is named twice"),
         ([str(single), *lens, "--out", "unit.npz"], "record 50 frames"),
     ):
         assert flatfield.main(arguments) == 2
@@ -375,12 +375,12 @@ def test_a_lone_capture_is_judged_by_its_halves(recorded, tmp_path, capsys):
         flatfield.main([str(recorded / "wall0.npy"), *lens, "--out", str(tmp_path / "unit.npz")])
         == 0
     )
-    told = json.loads((tmp_path / "unit.json").read_text())
-    assert [row["capture"] for row in told["captures"]] == [
+    printed = json.loads((tmp_path / "unit.json").read_text())
+    assert [row["capture"] for row in printed["captures"]] == [
         "wall0.npy, first half",
         "wall0.npy, second half",
     ]
-    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    figures = {row["figure"]: row["value"] for row in printed["figures"]}
     # 4 frames in each half
     signal = figures["pattern"] ** 2
     noise = (NOISE_M / MM) ** 2 / 4
@@ -401,17 +401,16 @@ def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path,
         flatfield.main([str(walls), "--intrinsics", "azure_kinect_nfov", "--out", str(unit)]) == 0
     )
     assert "is assumed to be flat" in capsys.readouterr().out.splitlines()[0]
-    told = json.loads(unit.with_suffix(".json").read_text())
-    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    printed = json.loads(unit.with_suffix(".json").read_text())
+    figures = {row["figure"]: row["value"] for row in printed["figures"]}
     assert figures["pattern"] > 2 * figures["noise of the map"]
     assert figures["change, first and last captures"] < 0.1
-    noise_mm = told["captures"][0]["noise_mm"]
+    noise_mm = printed["captures"][0]["noise_mm"]
     expected = figures["pattern"] ** 2 / (figures["pattern"] ** 2 + noise_mm**2)
     assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.05)
 
 
 # ---- experiments
-# -----------------------------------------------------------------------------------------------------
 
 BINNED = "source.camera.name=azure_kinect_nfov_binned"  # a quarter of the pixels
 FLAT = "capture.flat_field={frames: 20, distance_m: 1.0}"

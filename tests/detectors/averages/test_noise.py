@@ -77,18 +77,18 @@ def test_a_median_that_lies_on_half_steps_keeps_the_whole_rounding(frames, parts
     cloud = cloud_with(1e-6, frames)
     points_m = cloud.points_m.copy()
     points_m[..., 2] = np.round(points_m[..., 2] / STEP_M * parts) / parts * STEP_M
-    found = rounding_variances(replace(cloud, points_m=points_m), np.ones(SHAPE, bool))
-    assert (found == (STEP_M**2 / 12, 0.0)) == is_whole
+    result = rounding_variances(replace(cloud, points_m=points_m), np.ones(SHAPE, bool))
+    assert (result == (STEP_M**2 / 12, 0.0)) == is_whole
 
 
 def test_the_variance_of_an_average_is_the_scatter_nearby_over_its_frames() -> None:
     scatter_m2 = np.random.default_rng(1).chisquare(4, SHAPE) * 1e-6
     cloud = replace(plane(seed=1), variance_m2=scatter_m2, n_frames=5)
     everywhere = np.ones(SHAPE, bool)
-    found = average_variance_m2(cloud, everywhere)
-    assert found is not None
+    result = average_variance_m2(cloud, everywhere)
+    assert result is not None
     expected = cv2.blur(scatter_m2, (7, 7))[10:-10, 10:-10] / 5
-    np.testing.assert_allclose(found[10:-10, 10:-10], expected, rtol=1e-9)
+    np.testing.assert_allclose(result[10:-10, 10:-10], expected, rtol=1e-9)
     # unknown ones have the typical variance; their neighbours do not count them
     scatter_m2[20:40, 20:40] = np.nan
     gap = average_variance_m2(replace(cloud, variance_m2=scatter_m2), everywhere)
@@ -103,11 +103,11 @@ def test_the_variance_of_an_average_is_unknown_with_few_frames_or_pixels() -> No
     assert average_variance_m2(cloud, everywhere) is not None
     assert average_variance_m2(replace(cloud, n_frames=LEAST_FRAMES - 1), everywhere) is None
     assert average_variance_m2(replace(cloud, organised=False), everywhere) is None
-    few = cloud.variance_m2.copy()
-    few[: SHAPE[0] // 2 + 1] = np.nan
-    assert average_variance_m2(replace(cloud, variance_m2=few), everywhere) is None
-    few[SHAPE[0] // 2 - 1 :] = 1e-6
-    assert average_variance_m2(replace(cloud, variance_m2=few), everywhere) is not None
+    sparse_m2 = cloud.variance_m2.copy()
+    sparse_m2[: SHAPE[0] // 2 + 1] = np.nan
+    assert average_variance_m2(replace(cloud, variance_m2=sparse_m2), everywhere) is None
+    sparse_m2[SHAPE[0] // 2 - 1 :] = 1e-6
+    assert average_variance_m2(replace(cloud, variance_m2=sparse_m2), everywhere) is not None
 
 
 def frames_of(

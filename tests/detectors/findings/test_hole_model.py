@@ -123,11 +123,11 @@ def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
 def test_a_straight_sight_moves_deep_circles_along_the_normal() -> None:
     """A circle at the depth h along the normal n stands h (n_x, n_y) beside the mouth: so many
     pixels, of which one is per_px long."""
-    found = straight_sight(PER_PX_M)
+    result = straight_sight(PER_PX_M)
     normal = np.cross(*PER_PX_M) / np.linalg.norm(np.cross(*PER_PX_M))
-    drift = found[1:3] @ PER_PX_M[:, :2]
+    drift = result[1:3] @ PER_PX_M[:, :2]
     np.testing.assert_allclose(drift, normal[:2], rtol=1e-12)
-    np.testing.assert_allclose(found[[0, 3, 4, 5, 6, 7]], [normal[2], 0, 0, 0, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(result[[0, 3, 4, 5, 6, 7]], [normal[2], 0, 0, 0, 1, 1], rtol=1e-12)
 
 
 # ---- fits
@@ -191,8 +191,8 @@ def test_a_sandwich_is_that_of_the_dense_covariance(blur_px: tuple[float, float]
     patch = replace(blank_patch(shape=(9, 11), blur_px=blur_px), used=random.random((9, 11)) > 0.1)
     derivatives = random.standard_normal((6, int(patch.used.sum()))) * 1e-4
     expected = reference.sandwich(patch, derivatives, 3e-7)
-    found = sandwich_covariance(patch, derivatives, 3e-7)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    result = sandwich_covariance(patch, derivatives, 3e-7)
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
 def test_a_sandwich_without_freedom_or_rank_is_not_a_number() -> None:
@@ -205,14 +205,14 @@ def test_a_sandwich_without_freedom_or_rank_is_not_a_number() -> None:
 def test_a_likelihood_s_covariance_is_the_inverse_information_and_the_model_s_errors() -> None:
     patch = blank_patch()
     derivatives = np.random.default_rng(4).standard_normal((6, 40)) * 1e3
-    found = _likelihood_covariance(patch, derivatives, 1.7, 0.02)
+    result = _likelihood_covariance(patch, derivatives, 1.7, 0.02)
     information = derivatives @ derivatives.T
     information[5, 5] += 12.0
     expected = np.linalg.inv(information) * 1.7
     pitch_m2 = (PER_PX_M[0] @ PER_PX_M[0] + PER_PX_M[1] @ PER_PX_M[1]) / 2
     expected[2, 2] += 0.05**2 * pitch_m2
     expected[3, 3] += (0.05 * 0.02) ** 2
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-24)
+    np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-24)
 
 
 def test_a_deep_hole_without_noise_has_the_errors_of_the_model() -> None:
@@ -243,17 +243,17 @@ def test_the_misfit_of_noise_as_stated_is_1_and_that_of_twice_as_much_2() -> Non
 
 def test_far_pixels_are_thinned_and_errors_of_the_model_added() -> None:
     patch = replace(blank_patch(noise_m=2e-4), residual_m=np.full((34, 37), 5e-3))
-    near = np.zeros((34, 37), bool)
-    near[10:20, 12:25] = True
-    thin = np.zeros_like(near)
+    vicinity = np.zeros((34, 37), bool)
+    vicinity[10:20, 12:25] = True
+    thin = np.zeros_like(vicinity)
     thin[::THIN_PX, ::THIN_PX] = True
-    found = whitened(patch, WHITE, 1e-3, near)
-    np.testing.assert_array_equal(found.used, near | thin)
-    assert found.left_out == 34 * 37 - (near | thin).sum()
-    assert found.factor is not None
+    result = whitened(patch, WHITE, 1e-3, vicinity)
+    np.testing.assert_array_equal(result.used, vicinity | thin)
+    assert result.left_out == 34 * 37 - (vicinity | thin).sum()
+    assert result.factor is not None
     deviation_m = np.hypot(2e-4, MODEL_ERROR * 4e-3)
-    np.testing.assert_allclose(np.tril(found.factor), np.eye(len(found.factor)) * deviation_m)
-    assert whitened(patch, None, 1e-3, near) is patch
+    np.testing.assert_allclose(np.tril(result.factor), np.eye(len(result.factor)) * deviation_m)
+    assert whitened(patch, None, 1e-3, vicinity) is patch
 
 
 # ---- their parts

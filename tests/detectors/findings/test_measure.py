@@ -131,8 +131,8 @@ class Board:
         return residual
 
     def within(self, points: np.ndarray, depth: float) -> np.ndarray:
-        apart = points - self.centre - depth * self.normal
-        return (apart**2).sum(axis=-1) < self.radius**2
+        from_axis = points - self.centre - depth * self.normal
+        return (from_axis**2).sum(axis=-1) < self.radius**2
 
     def passes(self, points: np.ndarray, rim: float, depth: float) -> np.ndarray:
         """Whether light from the emitter to points at a depth passes the circle at the depth
@@ -142,8 +142,8 @@ class Board:
         return self.within(points + part * (self.emitter - points), rim)
 
     def surface(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        place = np.stack([u + REGION.col0, v + REGION.row0], axis=-1)
-        slopes = (place - np.array(self.middle)) / FOCAL_PX
+        position = np.stack([u + REGION.col0, v + REGION.row0], axis=-1)
+        slopes = (position - np.array(self.middle)) / FOCAL_PX
         z = 0.75 / (1 - slopes @ self.tilt)
         return np.concatenate([slopes * z[..., None], z[..., None]], axis=-1)
 
@@ -374,11 +374,11 @@ def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
 
 def test_a_neighbour_is_masked() -> None:
     board = Board(12.7, 12.7)
-    other = Board(12.7, 12.7, at=(24e-3, 2e-3))
+    neighbour = Board(12.7, 12.7, at=(24e-3, 2e-3))
     cloud, evidence = board.seen(0.1, 3)
     alone = measure_detection(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig())
     pixels = strongest(cloud, evidence, 5.0)
-    evidence.residual_m[:] += other.image
+    evidence.residual_m[:] += neighbour.image
     m = measure_detection(cloud, evidence, pixels, HoleModelConfig())
     assert m.model_note == ""
     assert m.model_diameter_m == pytest.approx(alone.model_diameter_m, abs=0.15e-3)

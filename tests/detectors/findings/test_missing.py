@@ -65,11 +65,11 @@ def test_a_hole_without_return_is_found_where_it_is_and_as_large_as_it_is(
     missing = missing_returns(cloud, evidence)
 
     assert missing is not None
-    (found,) = missing.detections
-    assert found.kind == "no return"
-    np.testing.assert_array_equal(found.pixels, np.flatnonzero(gone))
+    (detection,) = missing.detections
+    assert detection.kind == "no return"
+    np.testing.assert_array_equal(detection.pixels, np.flatnonzero(gone))
     assert missing.blind == pytest.approx(gone.mean())
-    measured = measure_missing(cloud, evidence, found)
+    measured = measure_missing(cloud, evidence, detection)
     rows, columns = np.nonzero(gone)
     slope = LENS.slopes(columns.mean(), rows.mean())
     z = 0.7 / (1.0 - tilt * slope[0])
@@ -85,8 +85,8 @@ def test_a_hole_without_return_is_found_where_it_is_and_as_large_as_it_is(
 
 
 MANY = [
-    pytest.param(*each, 50, marks=pytest.mark.slow)
-    for each in ((0.02, 1), (0.15, 1), (0.35, 1), (0.1, 3))
+    pytest.param(*case, 50, marks=pytest.mark.slow)
+    for case in ((0.02, 1), (0.15, 1), (0.35, 1), (0.1, 3))
 ]
 
 
@@ -111,8 +111,8 @@ def test_the_rate_of_dropouts_is_measured_and_a_hole_stands_out_of_them() -> Non
     missing = missing_returns(*looked(gone))
 
     assert missing is not None
-    (found,) = missing.detections
-    assert np.isin(np.flatnonzero(disc(60.2, 45.3, 16)), found.pixels).all()
+    (detection,) = missing.detections
+    assert np.isin(np.flatnonzero(disc(60.2, 45.3, 16)), detection.pixels).all()
     assert missing.dropouts == pytest.approx(0.35, abs=0.03)
     assert missing.least_points > 20
 
@@ -136,8 +136,8 @@ def test_what_touches_the_rim_of_the_target_or_of_the_image_is_not_enclosed() ->
     missing = missing_returns(*looked(gone))
 
     assert missing is not None
-    (found,) = missing.detections
-    np.testing.assert_array_equal(found.pixels, np.flatnonzero(disc(100, 20, 8)))
+    (detection,) = missing.detections
+    np.testing.assert_array_equal(detection.pixels, np.flatnonzero(disc(100, 20, 8)))
 
 
 def test_a_pixel_that_seldom_returns_counts_as_missing() -> None:
@@ -180,8 +180,8 @@ def test_cells_that_no_view_saw_are_blind_on_a_map() -> None:
     missing = missing_returns(cloud, evidence)
 
     assert missing is not None
-    (found,) = missing.detections
-    measured = measure_missing(cloud, evidence, found)
+    (detection,) = missing.detections
+    measured = measure_missing(cloud, evidence, detection)
     assert measured.extent_diameter_m == pytest.approx(2e-3 * np.sqrt(gone.sum() / np.pi), rel=1e-6)
     np.testing.assert_allclose(measured.extent_centre_m, [0.0, 0.0, 0.0], atol=1e-9)
 
@@ -198,18 +198,18 @@ def test_evidence_is_the_likelihood_ratio_of_the_number_in_a_disc() -> None:
     points_m = np.where(gone[..., None], np.nan, 1.0) * np.ones((*shape, 3))
     cloud = Cloud(points_m, flat, flat + 1, score, Region(0, 200, 0, 200), 0.0, 1)
 
-    found = missing_evidence(cloud, Evidence(score, score, score, 1e-3))
+    detection = missing_evidence(cloud, Evidence(score, score, score, 1e-3))
 
-    assert found is not None
+    assert detection is not None
     rate = (5 + 200 * 5 / 40_000) / (65**2 + 200)
     ratios = []
     for pixels, number in ((9, 3), (21, 5), (37, 5)):
         expected = pixels * rate
-        seen = number - 0.5
-        ratios.append(seen * np.log(seen / expected) - (seen - expected))
-    assert found[100, 100] == pytest.approx(2.0 * max(ratios) / 9.0, rel=1e-3)
-    assert found[100, 110] == 0.0
-    assert (found >= 0.0).all()
+        by_both = number - 0.5
+        ratios.append(by_both * np.log(by_both / expected) - (by_both - expected))
+    assert detection[100, 100] == pytest.approx(2.0 * max(ratios) / 9.0, rel=1e-3)
+    assert detection[100, 110] == 0.0
+    assert (detection >= 0.0).all()
 
 
 def test_missing_pixels_beside_high_scores_do_not_count_as_chance() -> None:
@@ -237,14 +237,14 @@ def test_a_score_is_as_improbable_as_the_expected_number_of_clusters() -> None:
     gone = scattered(np.random.default_rng(7), 0.2, 1) | disc(60.2, 45.3, 10)
     missing = missing_returns(*looked(gone))
     assert missing is not None
-    (found,) = missing.detections
+    (detection,) = missing.detections
     # one cluster of the least size is expected in 1 / expected targets; each further pixel makes
     # it rarer, at least by half
-    further = len(found.pixels) - missing.least_points
-    most = norm.isf(missing.expected * 0.5**further)
-    least = norm.isf(missing.expected)
-    assert least < found.score
-    assert found.score < max(3.0 * most, 37.0)
+    further_pixels = len(detection.pixels) - missing.least_points
+    score_at_most = norm.isf(missing.expected * 0.5**further_pixels)
+    score_at_least = norm.isf(missing.expected)
+    assert score_at_least < detection.score
+    assert detection.score < max(3.0 * score_at_most, 37.0)
     assert missing.expected <= ALPHA < 3.0 * missing.expected
 
 
@@ -260,21 +260,30 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
     # a ring of valid deep pixels around a core that returned nothing: the larger ring stands for
     # the hole
     kept = one_damage_once(SHAPE, (depth_finding(ring), far), (nothing,))
-    assert [one.kind for one in kept] == ["depth", "depth"]
+    assert [found_once.kind for found_once in kept] == ["depth", "depth"]
     # a ring without return around a small valid floor: what it encloses counts as its own
     hollow = Detection(12.0, np.flatnonzero(ring), np.zeros(3), "no return")
     kept = one_damage_once(SHAPE, (depth_finding(core), far), (hollow,))
-    assert [(one.kind, one.score) for one in kept] == [("no return", 12.0), ("depth", 6.0)]
+    assert [(found_once.kind, found_once.score) for found_once in kept] == [
+        ("no return", 12.0),
+        ("depth", 6.0),
+    ]
     # specks on the rim of a hole that returned nothing
     specks = (depth_finding(disc(55, 45, 2), 8.0), depth_finding(disc(65, 45, 2), 7.0))
     kept = one_damage_once(SHAPE, (*specks, far), (nothing,))
-    assert [(one.kind, one.score) for one in kept] == [("no return", 12.0), ("depth", 6.0)]
+    assert [(found_once.kind, found_once.score) for found_once in kept] == [
+        ("no return", 12.0),
+        ("depth", 6.0),
+    ]
     # a hole most of which is deep; a part of it and of its rim returned nothing, and a speck of
     # the rim did
     hole = disc(60, 45, 12)
     gap = Detection(12.0, np.flatnonzero(hole & (U >= 62)), np.zeros(3), "no return")
-    found = (depth_finding(hole & (U < 62)), depth_finding(disc(67, 45, 4), 8.0), far)
-    assert [one.score for one in one_damage_once(SHAPE, found, (gap,))] == [9.0, 6.0]
+    detection = (depth_finding(hole & (U < 62)), depth_finding(disc(67, 45, 4), 8.0), far)
+    assert [found_once.score for found_once in one_damage_once(SHAPE, detection, (gap,))] == [
+        9.0,
+        6.0,
+    ]
 
 
 def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
@@ -283,7 +292,7 @@ def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
     hole = disc(60, 62, 10)
     nothing = Detection(12.0, np.flatnonzero(gone), np.zeros(3), "no return")
     kept = one_damage_once(SHAPE, (depth_finding(hole),), (nothing,))
-    assert [one.kind for one in kept] == ["no return", "depth"]
+    assert [found_once.kind for found_once in kept] == ["no return", "depth"]
     # one hole, half of which returned nothing
     half = Detection(12.0, np.flatnonzero(gone & (U >= 60)), np.zeros(3), "no return")
     kept = one_damage_once(SHAPE, (depth_finding(gone & (U < 60)),), (half,))
@@ -301,7 +310,7 @@ def test_findings_without_return_stand_in_the_table_and_a_map_of_blind_pixels_be
 
     kinds = [finding.kind for finding in judged.findings]
     assert sorted(kinds) == ["bump", "hole", "hole", "no return"]
-    row = next(one for one in judged.findings if one.kind == "no return")
+    row = next(found_once for found_once in judged.findings if found_once.kind == "no return")
     assert np.isnan(row.depth_mm) and np.isnan(row.volume_mm3)
     assert (row.size_from, row.depth_from) == ("area", "none")
     assert (row.u_px, row.v_px) == pytest.approx((30.2, 70.1), abs=0.3)
@@ -319,14 +328,16 @@ def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
     lost = np.flatnonzero(~by_depth)[:5]
     unseen = np.zeros(len(by_depth), bool)
     unseen[lost] = True
-    seen = replace(record.inspected, hit=by_depth | unseen, by_depth=by_depth, by_no_return=unseen)
+    by_both = replace(
+        record.inspected, hit=by_depth | unseen, by_depth=by_depth, by_no_return=unseen
+    )
 
-    limits = [limit_of(replace(record, inspected=seen), draws=50), limit_of(record, draws=50)]
+    limits = [limit_of(replace(record, inspected=by_both), draws=50), limit_of(record, draws=50)]
     grid = LIMITS.grid(limits)
-    both, alone = (row[grid.heads.index("found")].text for row in grid.rows)
+    row_of_both, row_of_depth = (row[grid.heads.index("found")].text for row in grid.rows)
 
     n = len(by_depth)
     hits = int(by_depth.sum())
-    assert both == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
+    assert row_of_both == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
     assert f"5 of {hits + 5} hits by missing returns alone" in "; ".join(notes_of(limits[0]))
-    assert alone == f"{hits} of {n}"
+    assert row_of_depth == f"{hits} of {n}"

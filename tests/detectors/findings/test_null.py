@@ -85,11 +85,13 @@ def test_as_many_false_calls_as_expected(name: str, kind: str) -> None:
     for seed in range(BOARDS):
         cloud = plane(noise(kind, seed))
         evidence = detector.analyse(cloud)
-        own = own_threshold(detector, cloud, evidence, wanted)
-        assert own.low < wanted < own.high and (own.threshold > MOST) == bool(own.doubts)
-        assert all("noise with heavy tails" in doubt for doubt in own.doubts)
-        assert own.expected == pytest.approx(wanted, rel=1e-6)
-        count += len(detector.find(cloud, own.evidence, own.threshold))
+        result = own_threshold(detector, cloud, evidence, wanted)
+        assert result.low < wanted < result.high and (result.threshold > MOST) == bool(
+            result.doubts
+        )
+        assert all("noise with heavy tails" in doubt for doubt in result.doubts)
+        assert result.expected == pytest.approx(wanted, rel=1e-6)
+        count += len(detector.find(cloud, result.evidence, result.threshold))
     beyond = stats.norm.isf(ALPHA / (2 * len(CASES)))
     low = wanted * BOARDS * (1 / 1.5)
     high = wanted * BOARDS * 1.5
@@ -109,21 +111,23 @@ def test_as_many_false_calls_as_stated_on_rendered_boards(camera: str, tmp_path:
     for number in range(10):
         for frames, board in boards(camera, "hole-free", number, tmp_path).items():
             evidence = detector.analyse(board.cloud)
-            own = own_threshold(detector, board.cloud, evidence, 3.0)
+            result = own_threshold(detector, board.cloud, evidence, 3.0)
             # the average of 50 frames of the L515 leaves little but its fixed pattern: the
             # threshold is up to 13 there, which the capture says
-            assert bool(own.doubts) == (own.threshold > MOST)
-            assert not own.doubts or (camera, frames) == ("realsense_l515", 50)
-            count[frames] += len(detector.find(board.cloud, own.evidence, own.threshold))
-            low = low + own.low
-            high = high + own.high
+            assert bool(result.doubts) == (result.threshold > MOST)
+            assert not result.doubts or (camera, frames) == ("realsense_l515", 50)
+            count[frames] += len(detector.find(board.cloud, result.evidence, result.threshold))
+            low = low + result.low
+            high = high + result.high
     assert low < sum(count.values()) < high
-    assert all(15 - 3 * np.sqrt(15) < each < 60 + 3 * np.sqrt(60) for each in count.values())
+    assert all(
+        15 - 3 * np.sqrt(15) < detection < 60 + 3 * np.sqrt(60) for detection in count.values()
+    )
 
 
 def test_the_interval_holds_the_truth() -> None:
     """Peaks whose tail is known: exponential in the square of the score."""
-    held = 0
+    inside_count = 0
     expected = []
     captures = 150
     for seed in range(captures):
@@ -133,10 +137,12 @@ def test_the_interval_holds_the_truth() -> None:
         threshold = tail.threshold(0.5)
         true = 50.0 * np.exp(-(threshold**2 - 9.0) / 2.0)
         low, high = tail.interval(threshold)
-        held += low < true < high
+        inside_count += low < true < high
         expected.append(true)
     # an interval over exponents that are not this one's is wider than it need be
-    assert stats.binom.sf(held, captures, 0.95 - 0.02) < 1.0 and held / captures > 0.90
+    assert (
+        stats.binom.sf(inside_count, captures, 0.95 - 0.02) < 1.0 and inside_count / captures > 0.90
+    )
     assert 0.5 / 1.5 < np.mean(expected) < 0.5 * 1.5
 
 
@@ -144,15 +150,15 @@ def test_the_interval_and_the_expectation_are_those_of_both_sides() -> None:
     """Twice those of the peaks in front of the surface, whose tail is computed here again."""
     cloud = plane(noise("smooth", 5))
     evidence = analysed(cloud)
-    own = own_threshold(DETECTOR, cloud, evidence, 2.0)
+    result = own_threshold(DETECTOR, cloud, evidence, 2.0)
     before = replace(evidence, score=np.where(behind(evidence), np.nan, evidence.score))
-    scores = [call.score for call in DETECTOR.find(cloud, before, own.floor)]
-    assert len(scores) == own.peaks
-    tail = Tail.of(np.array(scores), own.floor)
-    low, high = tail.interval(own.threshold)
-    assert own.expected == pytest.approx(2.0 * tail.expected(own.threshold), rel=1e-9)
-    assert (own.low, own.high) == pytest.approx((2.0 * low, 2.0 * high), rel=1e-9)
-    assert own.threshold == pytest.approx(max(tail.threshold(1.0), 3.0), rel=1e-9)
+    scores = [call.score for call in DETECTOR.find(cloud, before, result.floor)]
+    assert len(scores) == result.peaks
+    tail = Tail.of(np.array(scores), result.floor)
+    low, high = tail.interval(result.threshold)
+    assert result.expected == pytest.approx(2.0 * tail.expected(result.threshold), rel=1e-9)
+    assert (result.low, result.high) == pytest.approx((2.0 * low, 2.0 * high), rel=1e-9)
+    assert result.threshold == pytest.approx(max(tail.threshold(1.0), 3.0), rel=1e-9)
 
 
 def test_a_tail_of_normal_peaks_is_the_closed_form() -> None:
@@ -261,31 +267,33 @@ def test_a_rim_that_mixes_in_the_background_is_not_judged() -> None:
     offset_m[10, 20:60] += 12e-3
     offset_m[10, 80:100] += 12e-3
     cloud = plane(offset_m)
-    own = own_threshold(DETECTOR, cloud, analysed(cloud), 1.0)
-    assert own.rim_pixels >= 150
+    result = own_threshold(DETECTOR, cloud, analysed(cloud), 1.0)
+    assert result.rim_pixels >= 150
     assert (
-        not np.isfinite(own.evidence.score[10]).any()
-        and np.isfinite(own.evidence.score[-1, :-11]).all()
+        not np.isfinite(result.evidence.score[10]).any()
+        and np.isfinite(result.evidence.score[-1, :-11]).all()
     )
-    assert len(DETECTOR.find(cloud, own.evidence, own.threshold)) <= 4
+    assert len(DETECTOR.find(cloud, result.evidence, result.threshold)) <= 4
     # a hole at the rim is no rim: it reaches deeper, and it is alone
     offset_m = noise("smooth", 3)
     offset_m[:10] = np.nan
     offset_m[10:16, 60:66] += 12e-3
     hole = plane(offset_m)
-    own = own_threshold(DETECTOR, hole, analysed(hole), 1.0)
-    assert own.rim_pixels == 0
-    assert DETECTOR.find(hole, own.evidence, own.threshold)[0].score > 5.0
+    result = own_threshold(DETECTOR, hole, analysed(hole), 1.0)
+    assert result.rim_pixels == 0
+    assert DETECTOR.find(hole, result.evidence, result.threshold)[0].score > 5.0
 
 
 def test_it_says_what_it_cannot_know() -> None:
-    few = own_threshold(
+    result = own_threshold(
         DETECTOR,
         plane(noise("smooth", 4)[:12, :12]),
         analysed(plane(noise("smooth", 4)[:12, :12])),
         1.0,
     )
-    assert few.peaks < FEWEST_PEAKS and np.isnan(few.threshold) and "too few" in few.doubts[0]
+    assert (
+        result.peaks < FEWEST_PEAKS and np.isnan(result.threshold) and "too few" in result.doubts[0]
+    )
     skewed = plane(SIGMA_M * np.random.default_rng(4).exponential(size=(110, 150)))
     evidence = analysed(skewed)
     assert skew_of(evidence) > 0.15
@@ -304,8 +312,8 @@ def test_bumps_that_raise_the_threshold_are_told() -> None:
         8e-3 * 2 * np.pi * 4
     )
     cloud = plane(noise("normal", 4) - ndimage.gaussian_filter(bumps, 2.0))
-    own = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
-    assert own.threshold > MOST and "bumps or structure of the surface" in own.doubts[0]
+    result = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
+    assert result.threshold > MOST and "bumps or structure of the surface" in result.doubts[0]
 
 
 def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
@@ -313,21 +321,25 @@ def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
     offset[40:80, 60:110] -= 0.03  # an object of 50 x 40 pixels, 30 mm high
     offset[80:84, 60:110] += 0.004  # the shadow along its edge
     v, u = np.mgrid[:160, :200]
-    for at in ((120, 50), (60, 150)):
-        offset[np.hypot(v - at[0], u - at[1]) < 5] += 0.02
+    for centre in ((120, 50), (60, 150)):
+        offset[np.hypot(v - centre[0], u - centre[1]) < 5] += 0.02
     cloud = plane(offset)
     detector = load_detector("local", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
     evidence = detector.analyse(cloud)
-    found = each_object_once(cloud, evidence, detector.find(cloud, evidence, 8.0))
-    assert [each.kind for each in found].count("object") == 1
-    (thing,) = (each for each in found if each.kind == "object")
+    detections = each_object_once(cloud, evidence, detector.find(cloud, evidence, 8.0))
+    assert [detection.kind for detection in detections].count("object") == 1
+    (thing,) = (detection for detection in detections if detection.kind == "object")
     # the square that residuals are smoothed over adds two pixels at each side
     assert len(thing.pixels) == pytest.approx(54 * 44, rel=0.05)
-    holes = [np.unravel_index(each.pixels, offset.shape) for each in found if each.kind == "depth"]
-    places = [(float(np.mean(rows)), float(np.mean(columns))) for rows, columns in holes]
-    assert len(places) == 2
-    for place in ((120, 50), (60, 150)):
-        assert min(np.hypot(place[0] - r, place[1] - c) for r, c in places) < 3
+    holes = [
+        np.unravel_index(detection.pixels, offset.shape)
+        for detection in detections
+        if detection.kind == "depth"
+    ]
+    centres = [(float(np.mean(rows)), float(np.mean(columns))) for rows, columns in holes]
+    assert len(centres) == 2
+    for centre in ((120, 50), (60, 150)):
+        assert min(np.hypot(centre[0] - r, centre[1] - c) for r, c in centres) < 3
 
 
 def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
@@ -336,5 +348,5 @@ def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
     offset -= 0.006 * np.exp(-0.5 * (np.hypot(v - 60, u - 70) / 5.0) ** 2)
     cloud = plane(offset)
     evidence = analysed(cloud)
-    found = DETECTOR.find(cloud, evidence, 8.0)
-    assert len(found) == 1 and each_object_once(cloud, evidence, found) == found
+    detections = DETECTOR.find(cloud, evidence, 8.0)
+    assert len(detections) == 1 and each_object_once(cloud, evidence, detections) == detections

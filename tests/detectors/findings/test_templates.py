@@ -101,14 +101,14 @@ def test_slots_have_their_length_width_and_angle() -> None:
 
 def test_responses_are_sums_of_products_with_the_picture() -> None:
     picture = np.random.default_rng(1).standard_normal(SHAPE).astype(np.float32)
-    whole = transformed(picture, GRID_SHAPE)
-    half = halved(whole)
-    seen = set()
+    fine_spectrum = transformed(picture, GRID_SHAPE)
+    coarse_spectrum = halved(fine_spectrum)
+    checked_numbers = set()
     for pair, numbers in spectra(GRID_SHAPE, 3):
         coarse = bank(3)[numbers[0]].coarse
-        fields = responses(half if coarse else whole, pair)
+        fields = responses(coarse_spectrum if coarse else fine_spectrum, pair)
         for channel, number in enumerate(numbers):
-            seen.add(number)
+            checked_numbers.add(number)
             image = bank(3)[number].image
             direct = cv2.filter2D(
                 picture.astype(np.float64), -1, image, borderType=cv2.BORDER_CONSTANT
@@ -122,7 +122,7 @@ def test_responses_are_sums_of_products_with_the_picture() -> None:
             between = cv2.blur(direct, (2, 2), anchor=(0, 0))[20:60:2, 20:80:2]
             error = fields[10:30, 10:40, channel] - between
             assert error.std() < 0.1 * direct.std()
-    assert seen == set(range(len(bank(3))))
+    assert checked_numbers == set(range(len(bank(3))))
 
 
 # ---- worth

@@ -55,12 +55,12 @@ def test_a_grid_holds_picture_template_and_margin_and_its_half_is_even() -> None
 def test_a_covariance_is_the_mean_product_of_quiet_pixels(lag: tuple[int, int]) -> None:
     noise = blurred(1, (60, 70))
     quiet = np.random.default_rng(2).random(noise.shape) > 0.2
-    found = noise_covariance(noise, quiet, grid_of(noise.shape))
+    result = noise_covariance(noise, quiet, grid_of(noise.shape))
     expected = reference.autocovariance(noise, quiet, *lag)
     middle = LONGEST_LAG_PX
     down, across = lag
-    assert found[middle + down, middle + across] == pytest.approx(expected, abs=2e-6)
-    assert found[middle - down, middle - across] == pytest.approx(expected, abs=2e-6)
+    assert result[middle + down, middle + across] == pytest.approx(expected, abs=2e-6)
+    assert result[middle - down, middle - across] == pytest.approx(expected, abs=2e-6)
 
 
 def test_a_correlation_is_the_covariance_over_the_variance() -> None:
@@ -100,9 +100,9 @@ def test_unknown_pixels_are_filled_as_by_the_reference(image_shape, grid_shape, 
         image_rows, image_columns = np.maximum(image_shape, grid_shape)
         image = random.standard_normal((image_rows, image_columns)).astype(np.float32)
         inner = random.random(image.shape).astype(np.float32)
-    found = np.zeros(grid_shape, np.float32)
-    _spread(image, inner, outer, back, found)
-    np.testing.assert_allclose(found, reference.spread(image, inner, outer, back), atol=2e-6)
+    result = np.zeros(grid_shape, np.float32)
+    _spread(image, inner, outer, back, result)
+    np.testing.assert_allclose(result, reference.spread(image, inner, outer, back), atol=2e-6)
 
 
 @pytest.mark.parametrize("side", [3, 5])
@@ -122,9 +122,9 @@ def test_a_solution_goes_on_from_another() -> None:
     known = np.random.default_rng(6).random(SHAPE) > 0.1
     by_lag = noise_covariance(blurred(3, (90, 120)), np.ones((90, 120), bool), (128, 160))
     values = np.where(known, blurred(1, SHAPE), np.float32(0.0))
-    by = filters(by_lag, SHAPE)
-    solved = inverse_times(values, known, by, error=0.01)
-    again = inverse_times(values, known, by, solved)
+    noise_filters = filters(by_lag, SHAPE)
+    solved = inverse_times(values, known, noise_filters, error=0.01)
+    again = inverse_times(values, known, noise_filters, solved)
     # nothing is left to do
     np.testing.assert_array_equal(again, solved)
 
@@ -139,9 +139,9 @@ def test_scores_are_the_likelihoods_where_pixels_are_missing() -> None:
     dense = dense_of(known, by_lag, grid_of(SHAPE))
     assert window_of(by_lag) == BLUR_PX
     values = np.where(known, noise, np.float32(0.0))
-    by = filters(by_lag, SHAPE)
-    solved = inverse_times(values, known, by, error=0.01)
-    rough = inverse_times(values, known, by)
+    noise_filters = filters(by_lag, SHAPE)
+    solved = inverse_times(values, known, noise_filters, error=0.01)
+    rough = inverse_times(values, known, noise_filters)
     all_worths = worths(spectrum(by_lag, (GRID, GRID)), BLUR_PX)
     for drawn, worth in zip(bank(BLUR_PX)[:10], all_worths, strict=False):
         half = len(drawn.image) // 2

@@ -54,13 +54,15 @@ def disc(
     return lambda u, v: depth_m * (np.hypot(u - u0, v - v0) < radius_px)
 
 
-def found(detector: LocalDetector, cloud: Cloud, threshold: float = 6.0) -> tuple[Detection, ...]:
+def detections_in(
+    detector: LocalDetector, cloud: Cloud, threshold: float = 6.0
+) -> tuple[Detection, ...]:
     return detector.find(cloud, detector.analyse(cloud), threshold)
 
 
 def places_px(cloud: Cloud, detections: tuple[Detection, ...]) -> np.ndarray:
     """(n, 2) column and row, by column."""
-    centres = np.array([one.centre_m for one in detections]).reshape(-1, 3)
+    centres = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
     slopes = centres[:, :2] / centres[:, 2:]
     return np.array(sorted((slopes * [LENS.fx, LENS.fy] + [119.5, 99.5]).tolist())).reshape(-1, 2)
 
@@ -87,7 +89,7 @@ def test_peaks_are_the_same_at_every_threshold(detector: LocalDetector) -> None:
     cloud = seen(lambda u, v: 0 * u)
     evidence = detector.analyse(cloud)
     scores = [
-        [each.score for each in detector.find(cloud, evidence, threshold)]
+        [detection.score for detection in detector.find(cloud, evidence, threshold)]
         for threshold in (2.2, 3.0, 3.4)
     ]
     for above, threshold in zip(scores[1:], (3.0, 3.4), strict=True):
@@ -99,8 +101,8 @@ def test_what_no_single_pixel_shows_is_found_by_its_mean(detector: LocalDetector
     """A dent of one deviation, 30 pixels wide: 700 pixels, so that their mean stands out by 20
     deviations."""
     cloud = seen(disc(120, 100, 15, NOISE_M))
-    places = places_px(cloud, found(detector, cloud))
-    assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 4
+    centres_px = places_px(cloud, detections_in(detector, cloud))
+    assert len(centres_px) == 1 and np.abs(centres_px[0] - [120, 100]).max() < 4
 
 
 def test_a_flying_pixel_alone_is_no_finding_but_a_small_hole_is(detector: LocalDetector) -> None:
@@ -109,8 +111,8 @@ def test_a_flying_pixel_alone_is_no_finding_but_a_small_hole_is(detector: LocalD
         return flying + disc(170, 120, 2.0, 0.005)(u, v)
 
     cloud = seen(holes)
-    places = places_px(cloud, found(detector, cloud))
-    assert len(places) == 1 and np.abs(places[0] - [170, 120]).max() < 1
+    centres_px = places_px(cloud, detections_in(detector, cloud))
+    assert len(centres_px) == 1 and np.abs(centres_px[0] - [170, 120]).max() < 1
 
 
 def test_neighbours_stay_apart_and_a_deep_hole_hides_no_shallow_one(
@@ -122,20 +124,22 @@ def test_neighbours_stay_apart_and_a_deep_hole_hides_no_shallow_one(
     cloud = seen(
         lambda u, v: sum((disc(u0, 100, 2.5, depth)(u, v) for u0, depth in row), start=0 * u)
     )
-    places = places_px(cloud, found(detector, cloud))
-    assert np.abs(places[:, 0] - [u0 for u0, _ in row]).max() < 1.5
+    centres_px = places_px(cloud, detections_in(detector, cloud))
+    assert np.abs(centres_px[:, 0] - [u0 for u0, _ in row]).max() < 1.5
 
 
 def test_a_deep_hole_leaves_no_ring_of_false_findings(detector: LocalDetector) -> None:
     cloud = seen(disc(120, 100, 12, 0.03))
-    assert len(found(detector, cloud, 5.5)) == 1
+    assert len(detections_in(detector, cloud, 5.5)) == 1
 
 
 def test_holes_and_bumps_side_by_side_are_findings_of_their_own(detector: LocalDetector) -> None:
     cloud = seen(lambda u, v: disc(100, 100, 5, 0.004)(u, v) - disc(111, 100, 5, 0.004)(u, v))
     evidence = detector.analyse(cloud)
     detections = detector.find(cloud, evidence, 6.0)
-    depths = [detector.measure(cloud, evidence, one).model_depth_m for one in detections]
+    depths = [
+        detector.measure(cloud, evidence, detection).model_depth_m for detection in detections
+    ]
     assert sorted(np.sign(depths)) == [-1, 1]
 
 
@@ -152,8 +156,8 @@ def test_noise_counts_where_it_is(detector: LocalDetector) -> None:
     # the noisy half draws the surface by a fifth of a deviation of the quiet one, which wide
     # templates see
     threshold = 6.5 if isinstance(detector, MatchedDetector) else 6.0
-    places = places_px(seen(half), found(detector, seen(half), threshold))
-    away = places[np.abs(places[:, 0] - 120) > 50]
+    centres_px = places_px(seen(half), detections_in(detector, seen(half), threshold))
+    away = centres_px[np.abs(centres_px[:, 0] - 120) > 50]
     assert len(away) == 1 and abs(away[0, 0] - 60) < 2
 
 
@@ -162,8 +166,8 @@ def test_invalid_pixels_and_borders_are_not_evidence(detector: LocalDetector) ->
     gone = np.random.default_rng(3).random(SHAPE) < 0.3
     gone[40:60, 40:60] = True
     holed = replace(cloud, points_m=np.where(gone[..., None], np.nan, cloud.points_m))
-    places = places_px(holed, found(detector, holed))
-    assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 2
+    centres_px = places_px(holed, detections_in(detector, holed))
+    assert len(centres_px) == 1 and np.abs(centres_px[0] - [120, 100]).max() < 2
 
 
 def test_a_cloud_without_a_grid_is_judged_on_a_raster(detector: LocalDetector) -> None:
@@ -181,8 +185,8 @@ def test_a_cloud_without_a_grid_is_judged_on_a_raster(detector: LocalDetector) -
         region=region,
         **{name: listed(getattr(cloud, name)) for name in names},
     )
-    places = places_px(loose, found(detector, loose))
-    assert len(places) == 1 and np.abs(places[0] - [120, 100]).max() < 2
+    centres_px = places_px(loose, detections_in(detector, loose))
+    assert len(centres_px) == 1 and np.abs(centres_px[0] - [120, 100]).max() < 2
 
 
 def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
@@ -192,7 +196,9 @@ def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
     cloud = seen(lambda u, v: np.where(u % 2 == 1, rough, 0.0) + disc(120, 100, 6, 0.0015)(u, v))
     noise = np.where(np.arange(SHAPE[1]) % 2 == 1, 10 * NOISE_M, NOISE_M)
     stated = replace(cloud, mean_variance_m2=np.broadcast_to(noise**2, SHAPE).copy())
-    scores = [detector.analyse(one).score[97:104, 117:124].max() for one in (cloud, stated)]
+    scores = [
+        detector.analyse(detection).score[97:104, 117:124].max() for detection in (cloud, stated)
+    ]
     # a spectrum knows of the columns, even where nobody states variances
     gain = 1.2 if isinstance(detector, MatchedDetector) else 2.0
     assert scores[1] > gain * scores[0] and scores[1] > 8
@@ -226,13 +232,13 @@ def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> Non
     # the thresholds that one false call on this capture needs by its own noise
     threshold = 5.7 if isinstance(detector, MatchedDetector) else 5.0
     holes = [
-        detector.measure(cloud, evidence, one)
-        for one in detector.find(cloud, evidence, threshold)
-        if np.median(evidence.residual_m.reshape(-1)[one.pixels]) > 0
+        detector.measure(cloud, evidence, detection)
+        for detection in detector.find(cloud, evidence, threshold)
+        if np.median(evidence.residual_m.reshape(-1)[detection.pixels]) > 0
     ]
-    places = np.array([(one.u_px, one.v_px) for one in holes])
-    apart = np.linalg.norm(MOUTHS_PX[:, None] - places[None], axis=-1)
-    hit = apart.min(axis=1) < 12
+    centres_px = np.array([(detection.u_px, detection.v_px) for detection in holes])
+    distances_px = np.linalg.norm(MOUTHS_PX[:, None] - centres_px[None], axis=-1)
+    hit = distances_px.min(axis=1) < 12
     assert hit.sum() >= len(MOUTHS_PX) - 1
     # the plate has some 60 holes behind its face
     assert len(holes) <= 75
@@ -248,7 +254,7 @@ def test_findings_at_many_thresholds_are_those_of_each(detector: LocalDetector) 
     ):
         alone = detector.find(cloud, evidence, threshold)
         assert len(together.detections) == len(alone)
-        for one, other in zip(together.detections, alone, strict=True):
-            assert one.score == other.score
-            np.testing.assert_array_equal(one.pixels, other.pixels)
-            np.testing.assert_allclose(one.centre_m, other.centre_m, atol=1e-12)
+        for detection, expected in zip(together.detections, alone, strict=True):
+            assert detection.score == expected.score
+            np.testing.assert_array_equal(detection.pixels, expected.pixels)
+            np.testing.assert_allclose(detection.centre_m, expected.centre_m, atol=1e-12)

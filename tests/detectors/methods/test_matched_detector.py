@@ -245,8 +245,8 @@ def test_a_hole_in_correlated_noise_leaves_no_score_of_the_other_sign_beside_it(
     score = np.where(evidence.behind, evidence.score, -evidence.score)[near]
     assert score.max() > 10.0
     assert score.min() > -1.0
-    both = hole(60, 45, 3.0, 0.006) - hole(68, 45, 3.0, 0.006) + 3e-4 * blurred(5)
-    assert len(detections_in(cloud_of(both), 6.0)) == 2
+    hole_and_bump = hole(60, 45, 3.0, 0.006) - hole(68, 45, 3.0, 0.006) + 3e-4 * blurred(5)
+    assert len(detections_in(cloud_of(hole_and_bump), 6.0)) == 2
 
 
 @pytest.mark.parametrize(("score", "is_lobe"), [(-4.9, True), (-5.1, False), (1.0, False)])
@@ -275,13 +275,13 @@ def test_residuals_are_in_units_of_the_noise_and_weights() -> None:
     """White noise of 0.3 mm, weights of 4 on one half: there a residual counts twice."""
     noise_m = 3e-4 * np.random.default_rng(1).standard_normal(SHAPE)
     weights = np.ones(SHAPE, np.float32)
-    found = _in_deviations(noise_m, weights, (0.0, 0.0))
-    assert found.values[10:-10, 10:-10].std() == pytest.approx(1.0, abs=0.05)
-    assert np.median(found.unit_m) == pytest.approx(3e-4, rel=0.06)
+    result = _in_deviations(noise_m, weights, (0.0, 0.0))
+    assert result.values[10:-10, 10:-10].std() == pytest.approx(1.0, abs=0.05)
+    assert np.median(result.unit_m) == pytest.approx(3e-4, rel=0.06)
     # the wave is wider than a filter's window: the unit stays that of the noise
     wave_m = 2e-3 * np.sin(np.arange(SHAPE[1]) / 12.0)
     waved = _in_deviations(noise_m + wave_m, weights, (0.0, 0.0))
-    ratio = np.median(waved.unit_m) / np.median(found.unit_m)
+    ratio = np.median(waved.unit_m) / np.median(result.unit_m)
     size = np.median(np.abs(noise_m + wave_m)) / np.median(np.abs(noise_m))
     assert ratio == pytest.approx(size, rel=0.15)
     # rounding sets the least unit
@@ -289,8 +289,8 @@ def test_residuals_are_in_units_of_the_noise_and_weights() -> None:
     np.testing.assert_allclose(rounded.unit_m, 3e-3)
     weights[::3, ::3] = 4.0
     weighed = _in_deviations(noise_m, weights, (0.0, 0.0))
-    gain = weighed.values[20:60:3, 21:90:3] / found.values[20:60:3, 21:90:3]
-    assert np.median(weighed.values[21:60:3, 21:90:3] / found.values[21:60:3, 21:90:3]) > 1.7
+    gain = weighed.values[20:60:3, 21:90:3] / result.values[20:60:3, 21:90:3]
+    assert np.median(weighed.values[21:60:3, 21:90:3] / result.values[21:60:3, 21:90:3]) > 1.7
     assert np.median(gain) < 1.0
 
 
@@ -302,11 +302,11 @@ def test_what_the_rim_shares_is_taken_out_at_each_distance() -> None:
     shared = np.zeros_like(noise)
     shared[:, 0] = 1.5
     shared[:, 2] = -1.0
-    found = _without_rim(noise + shared, depth_px)
-    left = found.mean(axis=0)
+    result = _without_rim(noise + shared, depth_px)
+    remainder = result.mean(axis=0)
     # 100 pixels, of which some 65 count at each
-    assert np.abs(left[:RIM_PX]).max() < 0.35
-    np.testing.assert_array_equal(found[:, RIM_PX:], noise[:, RIM_PX:])
+    assert np.abs(remainder[:RIM_PX]).max() < 0.35
+    np.testing.assert_array_equal(result[:, RIM_PX:], noise[:, RIM_PX:])
 
 
 def test_wide_templates_fill_their_discs() -> None:
@@ -333,14 +333,14 @@ def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
     inside = np.hypot(*(np.indices(values.shape) - np.array([20, 25])[:, None, None])) < 4.5
     values[inside] = 9.0
     values[20, 25] = 0.5
-    known = np.ones(values.shape, bool)
+    is_known = np.ones(values.shape, bool)
     peaks = np.array([[20, 25]])
-    core, heights, peak_of = _cores(peaks, np.array([4.5]), values, known)
+    core, heights, peak_of = _cores(peaks, np.array([4.5]), values, is_known)
     assert core[inside].all()
     assert not core[~grown(inside, 1)].any()
     assert heights[inside].min() > 0.3
     assert heights.max() == 1.0
     assert (peak_of[core] == 0).all()
     # loud pixels that fill less than half of the template's disc are not its finding
-    core, _, _ = _cores(peaks, np.array([9.0]), values, known)
+    core, _, _ = _cores(peaks, np.array([9.0]), values, is_known)
     assert not core.any()

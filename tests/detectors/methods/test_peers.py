@@ -47,9 +47,9 @@ def learned() -> FpfhMemoryDetector:
     blank = FpfhMemoryDetector(
         FpfhMemoryConfig.from_data({**WHOLE, "feature_neighbours": 40, "memory": 60})
     )
-    found = blank.calibrated(blank.calibrate([undamaged(seed) for seed in (11, 12, 13)]))
-    assert isinstance(found, FpfhMemoryDetector)
-    return found
+    detections = blank.calibrated(blank.calibrate([undamaged(seed) for seed in (11, 12, 13)]))
+    assert isinstance(detections, FpfhMemoryDetector)
+    return detections
 
 
 def made(name: str, **settings: Any) -> Detector:
@@ -76,9 +76,9 @@ def test_they_find_dents_and_nothing_else(name: str) -> None:
     apart_m = np.linalg.norm(quiet.points_m[..., None, :2] - centres, axis=-1)
     dents = 6e-3 * np.exp(-0.5 * (apart_m / 5e-3) ** 2).sum(axis=-1)
     cloud = replace(quiet, points_m=quiet.points_m + dents[..., None] * [0.0, 0.0, 1.0])
-    found = detector.find(cloud, detector.analyse(cloud), threshold)
-    places = np.array(sorted(one.centre_m[:2].tolist() for one in found))
-    assert places.shape == (2, 2) and np.abs(places - centres).max() < 3e-3
+    detections = detector.find(cloud, detector.analyse(cloud), threshold)
+    found_centres = np.array(sorted(detection.centre_m[:2].tolist() for detection in detections))
+    assert found_centres.shape == (2, 2) and np.abs(found_centres - centres).max() < 3e-3
 
 
 def test_a_rim_and_what_lies_deep_behind_it_are_one_finding_of_m3c2_and_none_of_fpfh() -> None:
@@ -130,9 +130,9 @@ def test_m3c2_is_the_formula_of_its_paper() -> None:
     surface = evidence.surface_z_m.ravel()
     for row, column in ((45, 60), (20, 31), (37, 20), (59, 81)):
         place = row * 120 + column
-        near = np.hypot(*(points[:, :2] - points[place, :2]).T) < 4e-3
-        behind_m = points[near, 2] - surface[near]
-        error_m = behind_m.std(ddof=1) / np.sqrt(near.sum()) + 2e-4
+        vicinity = np.hypot(*(points[:, :2] - points[place, :2]).T) < 4e-3
+        behind_m = points[vicinity, 2] - surface[vicinity]
+        error_m = behind_m.std(ddof=1) / np.sqrt(vicinity.sum()) + 2e-4
         # the plane's normal is the optical axis to a thousandth
         assert evidence.score.ravel()[place] == pytest.approx(
             abs(behind_m.mean()) / error_m, rel=0.03, abs=0.02
@@ -174,8 +174,8 @@ def test_a_reference_scan_of_any_shape(tmp_path: Path) -> None:
     )
     assert 11 <= best[0] <= 20 and 9 <= best[1] <= 18 and evidence.warnings == ()
     of_map = detector.analyse(replace(cloud, projection="parallel", lens=None))
-    for one in (evidence, of_map):
-        assert np.nanmedian(one.residual_m[13:19, 11:17]) == pytest.approx(2e-3, abs=2e-4)
+    for detection in (evidence, of_map):
+        assert np.nanmedian(detection.residual_m[13:19, 11:17]) == pytest.approx(2e-3, abs=2e-4)
     moved = detector.analyse(replace(cloud, points_m=again + np.array([0.0, 0.0, 3e-3])))
     assert "3 mm off its reference scan" in moved.warnings[0]
     np.save(path, stepped[:, :45])
@@ -230,7 +230,8 @@ def test_what_was_learned_is_plain_arrays_that_give_the_same_scores() -> None:
     arrays = detector.calibrate([undamaged(seed) for seed in (11, 12, 13)])
     assert arrays["memory"].shape == (60, 33) and arrays["unit"].shape == ()
     scores = [
-        one.analyse(undamaged(17)).score for one in (learned(), detector.calibrated(dict(arrays)))
+        detection.analyse(undamaged(17)).score
+        for detection in (learned(), detector.calibrated(dict(arrays)))
     ]
     np.testing.assert_array_equal(*scores)
     # the memory has not seen this plane either
@@ -246,6 +247,8 @@ def test_the_nearest_and_the_farthest() -> None:
     )
     # each is as far from those before it as any feature is
     for count in range(1, 20):
-        apart = cdist(features, taken[:count]).min(axis=1)
-        assert cdist(taken[count : count + 1], taken[:count]).min() == pytest.approx(apart.max())
+        from_dents_m = cdist(features, taken[:count]).min(axis=1)
+        assert cdist(taken[count : count + 1], taken[:count]).min() == pytest.approx(
+            from_dents_m.max()
+        )
     assert len(coreset(np.repeat(features[:4], 3, axis=0), 20)) == 4

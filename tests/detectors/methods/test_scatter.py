@@ -46,17 +46,17 @@ def zones(loud: np.ndarray | None = None) -> Zones:
 
 
 def test_zones_are_the_pixels_by_their_distance_from_the_outline() -> None:
-    seen = np.ones(SHAPE, np.float32)
-    seen[40:50, 40:50] = 0.0
-    found = zones_of(seen, depth_px(), np.zeros(SHAPE, bool))
+    is_seen = np.ones(SHAPE, np.float32)
+    is_seen[40:50, 40:50] = 0.0
+    result = zones_of(is_seen, depth_px(), np.zeros(SHAPE, bool))
     start = 0
     least_px = 0.0
-    for most_px, end in zip(RIM_ENDS_PX, found.ends, strict=True):
-        inside = (depth_px() > least_px) & (depth_px() <= most_px) & (seen > 0)
-        np.testing.assert_array_equal(np.sort(found.pixels[start:end]), np.flatnonzero(inside))
+    for most_px, end in zip(RIM_ENDS_PX, result.ends, strict=True):
+        inside = (depth_px() > least_px) & (depth_px() <= most_px) & (is_seen > 0)
+        np.testing.assert_array_equal(np.sort(result.pixels[start:end]), np.flatnonzero(inside))
         start = end
         least_px = most_px
-    assert start == len(found.pixels)
+    assert start == len(result.pixels)
 
 
 @pytest.mark.parametrize("rim", [0.5, 1.0, 1.7, 4.0])
@@ -65,11 +65,11 @@ def test_deviations_are_those_of_the_reference(rim: float) -> None:
     loud = np.random.default_rng(2).random(SHAPE) < 0.1
     scores[loud] = 100.0
     scores[::7] = 0.0
-    found = scatter(scores, zones(loud), loud).deviations
+    result = scatter(scores, zones(loud), loud).deviations
     expected = reference.deviations(scores, depth_px(), loud)
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    np.testing.assert_allclose(result, expected, rtol=2e-3)
     # no zone has less than the inside of the picture
-    assert found.min() == found[-1]
+    assert result.min() == result[-1]
 
 
 def test_zones_with_few_scores_have_the_deviation_of_the_inside() -> None:
@@ -77,10 +77,10 @@ def test_zones_with_few_scores_have_the_deviation_of_the_inside() -> None:
     hidden = depth_px() == 1
     count = FEWEST - 1
     scores.ravel()[np.flatnonzero(hidden)[count:]] = 0.0
-    found = scatter(scores, zones(), np.zeros(SHAPE, bool)).deviations
-    assert found[0] == found[-1]
+    result = scatter(scores, zones(), np.zeros(SHAPE, bool)).deviations
+    assert result[0] == result[-1]
     # the next one is wide
-    assert found[1] > 3.0
+    assert result[1] > 3.0
 
 
 def test_sums_and_counts_are_those_of_squares() -> None:
@@ -88,12 +88,12 @@ def test_sums_and_counts_are_those_of_squares() -> None:
     scores[:10] = 0.0
     loud = np.zeros(SHAPE, bool)
     loud[50:60, 20:30] = True
-    found = scatter(scores, zones(), loud)
-    assert found.sums.shape == (SHAPE[0] // PART_PX, SHAPE[1] // PART_PX)
+    result = scatter(scores, zones(), loud)
+    assert result.sums.shape == (SHAPE[0] // PART_PX, SHAPE[1] // PART_PX)
     sizes = np.minimum(np.abs(scores), 2.0) * ~loud
     rows = np.arange(12) * SHAPE[0] // 11
     columns = np.arange(16) * SHAPE[1] // 15
-    for image, counted in ((sizes, found.sums), (sizes > 0, found.counts)):
+    for image, counted in ((sizes, result.sums), (sizes > 0, result.counts)):
         by_row = np.add.reduceat(image.astype(float), rows[:-1], axis=0)
         expected = np.add.reduceat(by_row, columns[:-1], axis=1)
         np.testing.assert_allclose(counted, expected, rtol=1e-5)
@@ -103,8 +103,8 @@ def test_evened_scores_have_one_deviation_in_all_zones() -> None:
     scores = noisy(4, 2.5)
     deviation = evened(scores, NARROW, zones())
     assert deviation == pytest.approx(1.0, rel=0.03)
-    found = scatter(scores, zones(), np.zeros(SHAPE, bool)).deviations
-    np.testing.assert_allclose(found, deviation, rtol=0.05)
+    result = scatter(scores, zones(), np.zeros(SHAPE, bool)).deviations
+    np.testing.assert_allclose(result, deviation, rtol=0.05)
 
 
 def test_scores_where_the_noise_is_higher_are_divided() -> None:
@@ -114,12 +114,12 @@ def test_scores_where_the_noise_is_higher_are_divided() -> None:
     inside = np.full(scores.shape, 100.0, np.float32)
     still = np.zeros(scores.shape, bool)
     deviation = evened(scores, NARROW, zones_of(np.ones_like(inside), inside, still))
-    left = scores[:, :80].std() / deviation
-    right = scores[:, 200:].std() / deviation
-    assert left == pytest.approx(UNEVEN, rel=0.15)
+    left_share = scores[:, :80].std() / deviation
+    right_share = scores[:, 200:].std() / deviation
+    assert left_share == pytest.approx(UNEVEN, rel=0.15)
     # the quiet part stays as it is
     assert scores[:, 200:].std() == pytest.approx(1.0, rel=0.02)
-    assert right < 1.0
+    assert right_share < 1.0
 
 
 @pytest.mark.parametrize("slot", [False, True])
@@ -136,15 +136,15 @@ def test_strong_scores_of_wide_templates_do_not_count(slot: bool) -> None:
 def test_a_tail_is_measured_on_its_shorter_side() -> None:
     scores = np.random.default_rng(7).standard_normal((300, 400)).astype(np.float32)
     assert tail_of(scores, 1.0) == pytest.approx(1.0, abs=0.04)
-    both = scores.copy()
-    both[::20, ::20] = 6.0
+    two_sided = scores.copy()
+    two_sided[::20, ::20] = 6.0
     # one side alone is damage
-    assert tail_of(both, 1.0) == pytest.approx(1.0, abs=0.04)
-    both[::20, 1::20] = -5.0
-    assert tail_of(both, 1.0) == pytest.approx(5.0 / 3.29, rel=1e-4)
+    assert tail_of(two_sided, 1.0) == pytest.approx(1.0, abs=0.04)
+    two_sided[::20, 1::20] = -5.0
+    assert tail_of(two_sided, 1.0) == pytest.approx(5.0 / 3.29, rel=1e-4)
     assert tail_of(2.0 * scores, 2.0) == pytest.approx(tail_of(scores, 1.0), rel=1e-6)
     # too few scores show no tail
-    assert tail_of(both[:3, :3], 1.0) == 1.0
+    assert tail_of(two_sided[:3, :3], 1.0) == 1.0
 
 
 @pytest.mark.parametrize(("down", "right"), [(0, 0), (1, 1), (0, 1), (1, 0)])
@@ -152,9 +152,9 @@ def test_the_stronger_of_two_templates_is_kept(down: int, right: int) -> None:
     random = np.random.default_rng(8)
     scores = (6.0 * random.standard_normal((12, 15))).astype(np.float32)
     signed = (4.0 * random.standard_normal((12, 15))).astype(np.float32)
-    by = np.full(signed.shape, 7, np.uint8)
+    template = np.full(signed.shape, 7, np.uint8)
     expected = signed.copy()
-    expected_by = by.copy()
+    expected_by = template.copy()
     raised = reference.raised(scores.astype(float), 2.0, 1.3)
     for i, j in np.ndindex(12, 15):
         # a score between pixels belongs to all around
@@ -165,6 +165,6 @@ def test_the_stronger_of_two_templates_is_kept(down: int, right: int) -> None:
                 if fits and abs(raised[i, j]) > abs(expected[row, column]):
                     expected[row, column] = raised[i, j]
                     expected_by[row, column] = 3
-    _keep_stronger(signed, by, scores, 1 / 2.0, 1.3, down, right, 3)
+    _keep_stronger(signed, template, scores, 1 / 2.0, 1.3, down, right, 3)
     np.testing.assert_allclose(signed, expected, rtol=1e-5)
-    np.testing.assert_array_equal(by, expected_by)
+    np.testing.assert_array_equal(template, expected_by)

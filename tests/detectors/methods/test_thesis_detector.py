@@ -60,13 +60,13 @@ def test_holes_are_found_strongest_first_and_nothing_else() -> None:
     detector: Detector = load_detector("thesis", {})
     cloud = board(HOLES)
     evidence = detector.analyse(cloud)
-    found = detector.find(cloud, evidence, 6.0)
-    assert len(found) == 3
-    assert [d.score for d in found] == sorted((d.score for d in found), reverse=True)
+    detections = detector.find(cloud, evidence, 6.0)
+    assert len(detections) == 3
+    assert [d.score for d in detections] == sorted((d.score for d in detections), reverse=True)
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     expected = {tuple(np.flatnonzero((u - a) ** 2 + (v - b) ** 2 < r**2)) for a, b, r in HOLES}
-    assert {tuple(d.pixels) for d in found} == expected
-    measured = [detector.measure(cloud, evidence, d) for d in found]
+    assert {tuple(d.pixels) for d in detections} == expected
+    measured = [detector.measure(cloud, evidence, d) for d in detections]
     assert {(round(m.u_px), round(m.v_px)) for m in measured} == {(30, 40), (80, 60), (120, 90)}
 
 
@@ -128,8 +128,8 @@ def test_the_quiet_threshold_is_the_lowest_that_finds_nothing(
     evidence = detector.analyse(cloud)
     quiet = detector.quiet_threshold(cloud, evidence)
     assert detector.find(cloud, evidence, quiet) == ()
-    found = detector.find(cloud, evidence, np.nextafter(quiet, 0.0))
-    assert len(found) >= 1 and found[0].score == quiet
+    detections = detector.find(cloud, evidence, np.nextafter(quiet, 0.0))
+    assert len(detections) >= 1 and detections[0].score == quiet
     if min_points == 1:
         assert quiet == np.nanmax(evidence.score)
 
@@ -138,13 +138,14 @@ def test_a_detections_score_is_the_threshold_at_which_it_vanishes() -> None:
     detector = load_detector("thesis", {"min_points": 3})
     cloud = board(HOLES)
     evidence = detector.analyse(cloud)
-    for found in detector.find(cloud, evidence, 6.0):
+    for detections in detector.find(cloud, evidence, 6.0):
         kept = [
-            set(d.pixels) for d in detector.find(cloud, evidence, np.nextafter(found.score, 0.0))
+            set(d.pixels)
+            for d in detector.find(cloud, evidence, np.nextafter(detections.score, 0.0))
         ]
-        gone = [set(d.pixels) for d in detector.find(cloud, evidence, found.score)]
-        assert any(pixels & set(found.pixels) for pixels in kept)
-        assert not any(pixels & set(found.pixels) for pixels in gone)
+        gone = [set(d.pixels) for d in detector.find(cloud, evidence, detections.score)]
+        assert any(pixels & set(detections.pixels) for pixels in kept)
+        assert not any(pixels & set(detections.pixels) for pixels in gone)
 
 
 def test_nothing_can_be_found_among_too_few_points() -> None:
@@ -220,5 +221,7 @@ def test_the_threshold_of_the_cloud_itself_is_its_largest_residual_towards_the_c
     assert evidence.scale_m == pytest.approx(-np.nanmin(evidence.residual_m))
     # Gaussian noise: the highest of 19,000 is about four deviations, and holes are 40 deep
     assert 3.5 * 3e-4 < evidence.scale_m < 5.5 * 3e-4
-    found = detector.find(cloud, evidence, 1.0)
-    assert {len(one.pixels) > 10 for one in found[:3]} == {True} and len(found) < 10
+    detections = detector.find(cloud, evidence, 1.0)
+    assert {len(detection.pixels) > 10 for detection in detections[:3]} == {True} and len(
+        detections
+    ) < 10
