@@ -54,8 +54,10 @@ def test_links_are_steps_within_tilt_and_noise(seed: int, central: bool) -> None
             step = np.abs(true_pixels[..., 2] - inside[..., 2])
             expected = step <= 6.0 * np.hypot(across[..., 0], across[..., 1]) + 3e-3
         np.testing.assert_array_equal(result, expected)
-        assert expected.any() and not expected.all()
-    assert not right[:, -1].any() and not down[-1].any()
+        assert expected.any()
+        assert not expected.all()
+    assert not right[:, -1].any()
+    assert not down[-1].any()
 
 
 def test_a_step_far_off_the_axis_is_a_step() -> None:
@@ -89,7 +91,8 @@ def test_the_components_are_those_of_a_graph(seed: int, share: float) -> None:
 def test_no_node_has_no_component() -> None:
     nothing = np.zeros((4, 5), dtype=bool)
     result, sizes = components(nothing, ~nothing, ~nothing)
-    assert not result.any() and not len(sizes)
+    assert not result.any()
+    assert not len(sizes)
 
 
 @pytest.mark.parametrize("half", [1, 4])
@@ -106,7 +109,8 @@ def test_normals_and_their_turns_equal_plain_ones(half: int) -> None:
         cosine = np.einsum("ijk,ijk->ij", n[2 * half :], n[: -2 * half])
         np.moveaxis(expected, axis, 0)[half:-half] |= cosine < 0.8
     np.testing.assert_array_equal(turns(normals, half, 0.8), expected)
-    assert expected.any() and not expected.all()
+    assert expected.any()
+    assert not expected.all()
 
 
 def test_a_line_of_points_has_no_normal() -> None:

@@ -68,7 +68,11 @@ def test_pixels_above_the_threshold_are_clusters() -> None:
         (11, 10),
         (11, 11),
     ]
-    np.testing.assert_allclose(results[0].centre_m, CLOUD.points_m[40, 50], atol=1e-12)
+    np.testing.assert_allclose(
+        results[0].centre_m,
+        CLOUD.points_m[40, 50],
+        atol=1e-12,
+    )
     assert above(evidence(scores), 6.0).tolist() == [40 * SHAPE[1] + 50]
 
 

@@ -48,9 +48,16 @@ Places = tuple[tuple[float, float, float], ...]
 
 
 def smooth(
-    rng: np.random.Generator, shape: tuple[int, int], length: float, rms_m: float
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    length: float,
+    rms_m: float,
 ) -> np.ndarray:
-    field = ndimage.gaussian_filter(rng.standard_normal(shape, np.float32), length, mode="wrap")
+    field = ndimage.gaussian_filter(
+        rng.standard_normal(shape, np.float32),
+        length,
+        mode="wrap",
+    )
     return rms_m * field / field.std()
 
 
@@ -59,7 +66,10 @@ def pattern() -> np.ndarray:
     """(h, w): as an imager's, filtered over pixels and smooth, 0.5 mm."""
     rng = np.random.default_rng(1)
     return smooth(rng, (LENS.height, LENS.width), 3.0, 0.4 * MM) + smooth(
-        rng, (128, 160), 1.0, 0.3 * MM
+        rng,
+        (128, 160),
+        1.0,
+        0.3 * MM,
     )
 
 
@@ -85,14 +95,25 @@ def capture(
     rng = np.random.default_rng([3, number])
     position = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
     length = np.sqrt(1 + (slopes**2).sum(axis=-1))
-    z_m = distance_m + ndimage.map_coordinates(shape_m, np.moveaxis(position, -1, 0), order=1)
+    z_m = distance_m + ndimage.map_coordinates(
+        shape_m,
+        np.moveaxis(position, -1, 0),
+        order=1,
+    )
     z_m = z_m + (pattern() if fixed_m is None else fixed_m) / length
     z_m = z_m + rng.standard_normal(z_m.shape) * noise_m / np.sqrt(FRAMES)
     scatter_m2 = noise_m**2 * rng.chisquare(FRAMES - 1, z_m.shape) / (FRAMES - 1)
     points = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
     count = np.full(z_m.shape, FRAMES)
     return Cloud(
-        points, np.zeros(z_m.shape, np.uint8), count, scatter_m2, LENS.whole, 0.0, FRAMES, lens=LENS
+        points,
+        np.zeros(z_m.shape, np.uint8),
+        count,
+        scatter_m2,
+        LENS.whole,
+        0.0,
+        FRAMES,
+        lens=LENS,
     )
 
 
@@ -105,7 +126,12 @@ def found(
 ) -> Separated:
     captures = []
     for number, (distance_m, x_m, y_m) in enumerate(shifts):
-        cloud = capture(number, shape_m, (distance_m, x_m, y_m), patterns and patterns[number])
+        cloud = capture(
+            number,
+            shape_m,
+            (distance_m, x_m, y_m),
+            patterns and patterns[number],
+        )
         pose = np.eye(4)
         pose[:3, 3] = x_m, y_m, shifts[0][0] - distance_m
         captures.append(flattened(cloud, cloud.valid, f"capture {number}", pose if poses else None))
@@ -141,7 +167,13 @@ def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
     assert result.field.distances_m == pytest.approx((0.55, 1.0), rel=0.01)
 
 
-@pytest.mark.parametrize(("rough_mm", "gain", "most_ratio"), [(0.1, 0.85, 1.15), (0.25, 0.6, 1.35)])
+@pytest.mark.parametrize(
+    ("rough_mm", "gain", "most_ratio"),
+    [
+        (0.1, 0.85, 1.15),
+        (0.25, 0.6, 1.35),
+    ],
+)
 def test_the_surface_is_parted_from_the_pattern(truth_m, rough_mm, gain, most_ratio):
     """Walls rough by a fifth and by half of the pattern: with poses the map is better than
     without, and says nothing; the stated deviation is too small by no more than
@@ -152,14 +184,16 @@ def test_the_surface_is_parted_from_the_pattern(truth_m, rough_mm, gain, most_ra
     error_mm, ratio = errors(solved, truth_m)
     assert error_mm < gain * errors(averaged, truth_m)[0]
     assert 0.85 < ratio < most_ratio
-    assert solved.separated and solved.field.warnings == ()
+    assert solved.separated
+    assert solved.field.warnings == ()
     assert solved.surface_m / MM == pytest.approx(rough_mm, rel=0.1)
 
 
 def test_without_poses_a_rough_surface_counts_as_noise_and_is_told(truth_m):
     result = found(wall(0.4 * MM), poses=False)
     (warning,) = result.field.warnings
-    assert "is not stable" in warning and "or the surface is not flat (state --poses" in warning
+    assert "is not stable" in warning
+    assert "or the surface is not flat (state --poses" in warning
     assert errors(result, truth_m)[1] < 1.0
     assert found(wall(0.4 * MM), poses=True).field.warnings == ()
 
@@ -182,14 +216,17 @@ def test_a_pattern_that_drifts_or_depends_on_distance_is_told_with_its_size(trut
     result = found(wall(0.0), poses=False, patterns=by_range)
     assert result.in_range is not None
     assert result.in_range.excess_m == pytest.approx(0.8 * float(np.nanstd(truth_m)), rel=0.1)
-    assert (
-        "with distance by" in result.field.warnings[0]
-        and "from the first" not in result.field.warnings[0]
-    )
+    assert "with distance by" in result.field.warnings[0]
+    assert "from the first" not in result.field.warnings[0]
 
 
 @pytest.mark.parametrize(
-    "shifts", [((0.8, 0.0, 0.0),), ((0.8, 0.0, 0.0),) * 2, ((0.8, 0.0, 0.0), (0.8, 0.01, 0.0))]
+    "shifts",
+    [
+        ((0.8, 0.0, 0.0),),
+        ((0.8, 0.0, 0.0),) * 2,
+        ((0.8, 0.0, 0.0), (0.8, 0.01, 0.0)),
+    ],
 )
 @pytest.mark.parametrize("poses", [True, False])
 def test_one_place_cannot_part_surface_and_pattern(shifts, poses):
@@ -217,7 +254,9 @@ def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
         float(np.sqrt(exit_code.mean_variance_m2.mean())), rel=0.03
     )
     np.testing.assert_allclose(
-        np.cross(exit_code.points_m, cloud.points_m), 0.0, atol=1e-15
+        np.cross(exit_code.points_m, cloud.points_m),
+        0.0,
+        atol=1e-15,
     )  # along the rays
     part = Region(10, 90, 30, 120)
     rows, columns = part.within(LENS.whole)
@@ -278,7 +317,11 @@ def test_another_camera_s_cloud_is_refused(changes, message):
 
 def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
     flat = FlatField(
-        np.full((128, 160), 2e-4), np.full((128, 160), 1e-8), LENS, (0.5, 1.0), ("it drifts",)
+        np.full((128, 160), 2e-4),
+        np.full((128, 160), 1e-8),
+        LENS,
+        (0.5, 1.0),
+        ("it drifts",),
     )
     flat.error_m[0, 0] = np.nan
     path = tmp_path / "unit.npz"

@@ -47,12 +47,21 @@ def test_rounding_leaves_what_an_average_of_many_frames_shows(noise_steps: float
         rounded = np.round(positions[:, None] + noise)
         errors = rounded @ (density / density.sum()) - positions
     left_m2 = rounding_left_m2(STEP_M, (noise_steps * STEP_M) ** 2)
-    assert left_m2 / STEP_M**2 == pytest.approx((errors**2).mean(), rel=0.01, abs=2e-7)
+    assert left_m2 / STEP_M**2 == pytest.approx(
+        (errors**2).mean(),
+        rel=0.01,
+        abs=2e-7,
+    )
 
 
 def cloud_with(variance_m2: float, frames: int, step_m: float = STEP_M) -> Cloud:
     flat = plane(seed=1, tilt=0.1)
-    return replace(flat, variance_m2=np.full(SHAPE, variance_m2), n_frames=frames, z_step_m=step_m)
+    return replace(
+        flat,
+        variance_m2=np.full(SHAPE, variance_m2),
+        n_frames=frames,
+        z_step_m=step_m,
+    )
 
 
 def test_what_rounding_leaves_is_fixed_or_averages_out() -> None:
@@ -71,7 +80,12 @@ def test_what_rounding_leaves_is_fixed_or_averages_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "parts", "is_whole"), [(3, 2, True), (2, 2, False), (3, 4, False)]
+    ("frames", "parts", "is_whole"),
+    [
+        (3, 2, True),
+        (2, 2, False),
+        (3, 4, False),
+    ],
 )
 def test_a_median_that_lies_on_half_steps_keeps_the_whole_rounding(frames, parts, is_whole) -> None:
     cloud = cloud_with(1e-6, frames)
@@ -111,7 +125,10 @@ def test_the_variance_of_an_average_is_unknown_with_few_frames_or_pixels() -> No
 
 
 def frames_of(
-    side: int, count: int, tilt: float = 0.0, shape: tuple[int, int] = (200, 260)
+    side: int,
+    count: int,
+    tilt: float = 0.0,
+    shape: tuple[int, int] = (200, 260),
 ) -> list[Frame]:
     """Frames of a plane whose noise a square of pixels correlates."""
     frames = []

@@ -57,7 +57,15 @@ def test_a_distance_exactly_reached_joins() -> None:
     np.testing.assert_array_equal(euclidean_clusters(points, 0.25), [0, 0, 1])
 
 
-@pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.0, -0.8)])
+@pytest.mark.parametrize(
+    "direction",
+    [
+        (1, 0, 0),
+        (0, 1, 0),
+        (0, 0, 1),
+        (0.6, 0.0, -0.8),
+    ],
+)
 def test_points_are_joined_up_to_the_distance_and_no_farther(direction) -> None:
     first = np.array([0.03, 0.01, 0.7])
     for distance_m, count in ((0.0099, 1), (0.0101, 2)):
@@ -104,7 +112,8 @@ def test_a_dense_sheet_of_100_000_points_is_one_cluster() -> None:
     points = np.stack([u.ravel(), v.ravel(), np.full(u.size, 0.7)], axis=1)
     points[points[:, 0] > 0.2, 0] += 0.0101
     labels = euclidean_clusters(points, 0.01)
-    assert labels.max() == 1 and (labels == 0).sum() == 320 * 201
+    assert labels.max() == 1
+    assert (labels == 0).sum() == 320 * 201
 
 
 def test_a_wrong_unit_is_a_clear_mistake() -> None:

@@ -58,7 +58,11 @@ def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> HolePatch:
     blank = blank_patch(noise_m)
     used = random.random(blank.used.shape) > 0.02
     noise = cv2.blur(random.standard_normal(used.shape), (5, 5)) * 5.0 * noise_m
-    residual_m = np.where(used, pictures(blank, hole[None])[0] + noise + 1e-4, np.nan)
+    residual_m = np.where(
+        used,
+        pictures(blank, hole[None])[0] + noise + 1e-4,
+        np.nan,
+    )
     return replace(blank, residual_m=residual_m, used=used)
 
 
@@ -92,7 +96,11 @@ def test_a_picture_is_that_of_the_reference(sights, blur_px, radius_mm, depth_mm
     image = pictures(patch, hole[None])[0]
     expected = reference.picture(patch, hole)
     # chords are those of the middles of strips, points lie an eighth of a pixel apart
-    np.testing.assert_allclose(image, expected, atol=0.06e-3 * abs(depth_mm) / blur_px[0])
+    np.testing.assert_allclose(
+        image,
+        expected,
+        atol=0.06e-3 * abs(depth_mm) / blur_px[0],
+    )
     assert image.sum() == pytest.approx(expected.sum(), rel=6e-3)
 
 
@@ -103,7 +111,11 @@ def test_pictures_of_several_holes_are_those_of_each():
     for image, hole in zip(together, holes, strict=True):
         np.testing.assert_array_equal(image, pictures(patch, hole[None])[0])
     # the second is cut by the patch's edge
-    np.testing.assert_allclose(together[1], reference.picture(patch, holes[1]), atol=2e-4)
+    np.testing.assert_allclose(
+        together[1],
+        reference.picture(patch, holes[1]),
+        atol=2e-4,
+    )
 
 
 def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
@@ -127,7 +139,11 @@ def test_a_straight_sight_moves_deep_circles_along_the_normal() -> None:
     normal = np.cross(*PER_PX_M) / np.linalg.norm(np.cross(*PER_PX_M))
     drift = result[1:3] @ PER_PX_M[:, :2]
     np.testing.assert_allclose(drift, normal[:2], rtol=1e-12)
-    np.testing.assert_allclose(result[[0, 3, 4, 5, 6, 7]], [normal[2], 0, 0, 0, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(
+        result[[0, 3, 4, 5, 6, 7]],
+        [normal[2], 0, 0, 0, 1, 1],
+        rtol=1e-12,
+    )
 
 
 # ---- fits
@@ -183,7 +199,14 @@ def test_a_hopeless_start_is_told_and_not_looped_over() -> None:
 # ---- stated errors
 
 
-@pytest.mark.parametrize("blur_px", [(5.0, 5.0), (3.0, 5.0), (1.0, 1.0)])
+@pytest.mark.parametrize(
+    "blur_px",
+    [
+        (5.0, 5.0),
+        (3.0, 5.0),
+        (1.0, 1.0),
+    ],
+)
 def test_a_sandwich_is_that_of_the_dense_covariance(blur_px: tuple[float, float]) -> None:
     """Few pixels, of which the six parameters and the correlation of the noise leave half as
     degrees of freedom."""
@@ -259,13 +282,26 @@ def test_far_pixels_are_thinned_and_errors_of_the_model_added() -> None:
 # ---- their parts
 
 
-@pytest.mark.parametrize("window", [(5, 5), (1, 1), (3, 7)])
+@pytest.mark.parametrize(
+    "window",
+    [
+        (5, 5),
+        (1, 1),
+        (3, 7),
+    ],
+)
 def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
     across, down = window
     columns = np.random.default_rng(1).standard_normal((6, 19, 23))
     padded = np.pad(columns, ((0, 0), (down - 1, down - 1), (across - 1, across - 1)))
     filtered = [
-        cv2.boxFilter(image, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        cv2.boxFilter(
+            image,
+            -1,
+            window,
+            normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
         for image in padded
     ]
     summed = np.stack(filtered).reshape(6, -1)

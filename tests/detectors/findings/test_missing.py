@@ -41,7 +41,12 @@ def looked(gone: np.ndarray, tilt: float = 0.1) -> tuple[Cloud, Evidence]:
     # the plane itself, as a detector fits it: z = 0.7 + tilt x
     slopes = LENS.region_slopes(LENS.whole)
     surface = 0.7 / (1.0 - tilt * slopes[..., 0])
-    return cloud, Evidence(score, score, np.where(cloud.valid, surface, np.nan), 1e-3)
+    return cloud, Evidence(
+        score,
+        score,
+        np.where(cloud.valid, surface, np.nan),
+        1e-3,
+    )
 
 
 def disc(u: float, v: float, diameter: float) -> np.ndarray:
@@ -55,7 +60,15 @@ def scattered(random: np.random.Generator, rate: float, square: int) -> np.ndarr
     return z[4:-4, 4:-4] < ndtri(rate)
 
 
-@pytest.mark.parametrize(("tilt", "width_px"), [(0.0, 4), (0.5, 6), (0.0, 10), (0.5, 30)])
+@pytest.mark.parametrize(
+    ("tilt", "width_px"),
+    [
+        (0.0, 4),
+        (0.5, 6),
+        (0.0, 10),
+        (0.5, 30),
+    ],
+)
 def test_a_hole_without_return_is_found_where_it_is_and_as_large_as_it_is(
     tilt: float, width_px: int
 ) -> None:
@@ -73,14 +86,19 @@ def test_a_hole_without_return_is_found_where_it_is_and_as_large_as_it_is(
     rows, columns = np.nonzero(gone)
     slope = LENS.slopes(columns.mean(), rows.mean())
     z = 0.7 / (1.0 - tilt * slope[0])
-    np.testing.assert_allclose(measured.extent_centre_m, [*(slope * z), z], atol=2e-4)
+    np.testing.assert_allclose(
+        measured.extent_centre_m,
+        [*(slope * z), z],
+        atol=2e-4,
+    )
     # a pixel covers (z / f)^2 across the axis, on the tilted plane by sqrt(1 + tilt^2) / (1 - tilt
     # x/z) more
     pixel_m2 = (z / LENS.fx) ** 2 * np.sqrt(1.0 + tilt**2) / (1.0 - tilt * slope[0])
     assert measured.extent_diameter_m == pytest.approx(
         2.0 * np.sqrt(gone.sum() * pixel_m2 / np.pi), rel=0.02
     )
-    assert np.isnan(measured.model_depth_m) and np.isnan(measured.volume_m3)
+    assert np.isnan(measured.model_depth_m)
+    assert np.isnan(measured.volume_m3)
     assert measured.points == gone.sum()
 
 
@@ -91,7 +109,13 @@ MANY = [
 
 
 @pytest.mark.parametrize(
-    ("rate", "square", "fields"), [(0.02, 3, 8), (0.15, 1, 4), (0.05, 5, 8), *MANY]
+    ("rate", "square", "fields"),
+    [
+        (0.02, 3, 8),
+        (0.15, 1, 4),
+        (0.05, 5, 8),
+        *MANY,
+    ],
 )
 def test_scattered_dropouts_are_no_findings(rate: float, square: int, fields: int) -> None:
     """At most ALPHA = 0.01 findings are expected in a field, so that the number of fields with a
@@ -162,7 +186,11 @@ def test_cells_that_no_view_saw_are_blind_on_a_map() -> None:
     gone = disc(60, 45, 10)
     x = (U - 60) * 1e-3
     y = (V - 45) * 1e-3
-    points = np.where(gone[..., None], np.nan, np.stack([x, y, np.zeros(SHAPE)], axis=-1))
+    points = np.where(
+        gone[..., None],
+        np.nan,
+        np.stack([x, y, np.zeros(SHAPE)], axis=-1),
+    )
     flat = np.zeros(SHAPE, np.uint8)
     cloud = Cloud(
         points,
@@ -222,7 +250,8 @@ def test_missing_pixels_beside_high_scores_do_not_count_as_chance() -> None:
     score = evidence.score.copy()
     score[44, 61] = 3.5
     loud = missing_evidence(cloud, replace(evidence, score=score))
-    assert quiet is not None and loud is not None
+    assert quiet is not None
+    assert loud is not None
     assert loud[45, 61] > 1.02 * quiet[45, 61]
     score[44, 61] = 2.5
     np.testing.assert_array_equal(missing_evidence(cloud, replace(evidence, score=score)), quiet)
@@ -294,7 +323,12 @@ def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
     kept = one_damage_once(SHAPE, (depth_finding(hole),), (nothing,))
     assert [found_once.kind for found_once in kept] == ["no return", "depth"]
     # one hole, half of which returned nothing
-    half = Detection(12.0, np.flatnonzero(gone & (U >= 60)), np.zeros(3), "no return")
+    half = Detection(
+        12.0,
+        np.flatnonzero(gone & (U >= 60)),
+        np.zeros(3),
+        "no return",
+    )
     kept = one_damage_once(SHAPE, (depth_finding(gone & (U < 60)),), (half,))
     assert len(kept) == 1
 
@@ -311,7 +345,8 @@ def test_findings_without_return_stand_in_the_table_and_a_map_of_blind_pixels_be
     kinds = [finding.kind for finding in judged.findings]
     assert sorted(kinds) == ["bump", "hole", "hole", "no return"]
     row = next(found_once for found_once in judged.findings if found_once.kind == "no return")
-    assert np.isnan(row.depth_mm) and np.isnan(row.volume_mm3)
+    assert np.isnan(row.depth_mm)
+    assert np.isnan(row.volume_mm3)
     assert (row.size_from, row.depth_from) == ("area", "none")
     assert (row.u_px, row.v_px) == pytest.approx((30.2, 70.1), abs=0.3)
     line = next(
@@ -329,7 +364,10 @@ def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
     unseen = np.zeros(len(by_depth), bool)
     unseen[lost] = True
     by_both = replace(
-        record.inspected, hit=by_depth | unseen, by_depth=by_depth, by_no_return=unseen
+        record.inspected,
+        hit=by_depth | unseen,
+        by_depth=by_depth,
+        by_no_return=unseen,
     )
 
     limits = [limit_of(replace(record, inspected=by_both), draws=50), limit_of(record, draws=50)]

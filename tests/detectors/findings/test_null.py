@@ -55,7 +55,15 @@ def plane(offset_m: np.ndarray) -> Cloud:
         [(u - w / 2) * PITCH_M, (v - h / 2) * PITCH_M, DISTANCE_M + offset_m], axis=-1
     )
     empty = np.zeros((h, w), np.uint8)
-    return Cloud(points, empty, empty + 1, np.full((h, w), np.nan), Region(0, h, 0, w), 0.0, 1)
+    return Cloud(
+        points,
+        empty,
+        empty + 1,
+        np.full((h, w), np.nan),
+        Region(0, h, 0, w),
+        0.0,
+        1,
+    )
 
 
 def noise(kind: str, seed: int, shape: tuple[int, int] = (110, 150)) -> np.ndarray:
@@ -86,9 +94,8 @@ def test_as_many_false_calls_as_expected(name: str, kind: str) -> None:
         cloud = plane(noise(kind, seed))
         evidence = detector.analyse(cloud)
         result = own_threshold(detector, cloud, evidence, wanted)
-        assert result.low < wanted < result.high and (result.threshold > MOST) == bool(
-            result.doubts
-        )
+        assert result.low < wanted < result.high
+        assert (result.threshold > MOST) == bool(result.doubts)
         assert all("noise with heavy tails" in doubt for doubt in result.doubts)
         assert result.expected == pytest.approx(wanted, rel=1e-6)
         count += len(detector.find(cloud, result.evidence, result.threshold))
@@ -140,9 +147,8 @@ def test_the_interval_holds_the_truth() -> None:
         inside_count += low < true < high
         expected.append(true)
     # an interval over exponents that are not this one's is wider than it need be
-    assert (
-        stats.binom.sf(inside_count, captures, 0.95 - 0.02) < 1.0 and inside_count / captures > 0.90
-    )
+    assert stats.binom.sf(inside_count, captures, 0.95 - 0.02) < 1.0
+    assert inside_count / captures > 0.90
     assert 0.5 / 1.5 < np.mean(expected) < 0.5 * 1.5
 
 
@@ -195,7 +201,11 @@ def test_the_exponents_are_weighed_by_their_likelihood() -> None:
         slope = ratios ** (exponent - 1) - 1 / floor**2 / ratios
         logs.append(np.log(slope).sum() - 50 * np.log(total))
     weights = PRIOR * np.exp(np.array(logs) - max(logs))
-    np.testing.assert_allclose(Tail.of(peaks, floor).weights, weights / weights.sum(), rtol=1e-9)
+    np.testing.assert_allclose(
+        Tail.of(peaks, floor).weights,
+        weights / weights.sum(),
+        rtol=1e-9,
+    )
 
 
 @pytest.mark.parametrize(
@@ -242,7 +252,9 @@ def test_an_object_on_the_target_does_not_raise_the_threshold_and_is_reported() 
     with_object = plane(offset_m - 15e-3 * inside)
     alone = own_threshold(DETECTOR, bare, analysed(bare), 1.0)
     beside = own_threshold(DETECTOR, with_object, analysed(with_object), 1.0)
-    assert beside.objects == 1 and alone.objects == 0 and not beside.doubts
+    assert beside.objects == 1
+    assert alone.objects == 0
+    assert not beside.doubts
     assert beside.threshold == pytest.approx(alone.threshold, rel=0.25)
     strongest = DETECTOR.find(with_object, beside.evidence, beside.threshold)[0]
     assert len(strongest.pixels) > 27 * 39 * 0.9
@@ -269,10 +281,8 @@ def test_a_rim_that_mixes_in_the_background_is_not_judged() -> None:
     cloud = plane(offset_m)
     result = own_threshold(DETECTOR, cloud, analysed(cloud), 1.0)
     assert result.rim_pixels >= 150
-    assert (
-        not np.isfinite(result.evidence.score[10]).any()
-        and np.isfinite(result.evidence.score[-1, :-11]).all()
-    )
+    assert not np.isfinite(result.evidence.score[10]).any()
+    assert np.isfinite(result.evidence.score[-1, :-11]).all()
     assert len(DETECTOR.find(cloud, result.evidence, result.threshold)) <= 4
     # a hole at the rim is no rim: it reaches deeper, and it is alone
     offset_m = noise("smooth", 3)
@@ -291,9 +301,9 @@ def test_it_says_what_it_cannot_know() -> None:
         analysed(plane(noise("smooth", 4)[:12, :12])),
         1.0,
     )
-    assert (
-        result.peaks < FEWEST_PEAKS and np.isnan(result.threshold) and "too few" in result.doubts[0]
-    )
+    assert result.peaks < FEWEST_PEAKS
+    assert np.isnan(result.threshold)
+    assert "too few" in result.doubts[0]
     skewed = plane(SIGMA_M * np.random.default_rng(4).exponential(size=(110, 150)))
     evidence = analysed(skewed)
     assert skew_of(evidence) > 0.15
@@ -313,7 +323,8 @@ def test_bumps_that_raise_the_threshold_are_told() -> None:
     )
     cloud = plane(noise("normal", 4) - ndimage.gaussian_filter(bumps, 2.0))
     result = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
-    assert result.threshold > MOST and "bumps or structure of the surface" in result.doubts[0]
+    assert result.threshold > MOST
+    assert "bumps or structure of the surface" in result.doubts[0]
 
 
 def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
@@ -326,7 +337,11 @@ def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
     cloud = plane(offset)
     detector = load_detector("local", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
     evidence = detector.analyse(cloud)
-    detections = each_object_once(cloud, evidence, detector.find(cloud, evidence, 8.0))
+    detections = each_object_once(
+        cloud,
+        evidence,
+        detector.find(cloud, evidence, 8.0),
+    )
     assert [detection.kind for detection in detections].count("object") == 1
     (thing,) = (detection for detection in detections if detection.kind == "object")
     # the square that residuals are smoothed over adds two pixels at each side
@@ -349,4 +364,5 @@ def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
     cloud = plane(offset)
     evidence = analysed(cloud)
     detections = DETECTOR.find(cloud, evidence, 8.0)
-    assert len(detections) == 1 and each_object_once(cloud, evidence, detections) == detections
+    assert len(detections) == 1
+    assert each_object_once(cloud, evidence, detections) == detections

@@ -66,7 +66,9 @@ def test_a_disc_has_the_volume_of_its_area(radius_px: float) -> None:
         area_px2 = np.pi * radius_px**2
         assert template.image.sum() == pytest.approx(area_px2, rel=0.05)
         np.testing.assert_allclose(
-            centroid(template.image), np.array(template.halves) / 2, atol=0.01
+            centroid(template.image),
+            np.array(template.halves) / 2,
+            atol=0.01,
         )
 
 
@@ -111,11 +113,16 @@ def test_responses_are_sums_of_products_with_the_picture() -> None:
             checked_numbers.add(number)
             image = bank(3)[number].image
             direct = cv2.filter2D(
-                picture.astype(np.float64), -1, image, borderType=cv2.BORDER_CONSTANT
+                picture.astype(np.float64),
+                -1,
+                image,
+                borderType=cv2.BORDER_CONSTANT,
             )
             if not coarse:
                 np.testing.assert_allclose(
-                    fields[: SHAPE[0], : SHAPE[1], channel], direct, atol=2e-4
+                    fields[: SHAPE[0], : SHAPE[1], channel],
+                    direct,
+                    atol=2e-4,
                 )
                 continue
             # in the middles of 2 x 2 pixels, to what a smooth template leaves between them
@@ -176,7 +183,9 @@ def test_templates_with_fewer_independent_maxima_are_raised() -> None:
     # a coarse picture has a quarter of the pixels
     wide = coarse & (raised > 0)
     np.testing.assert_allclose(
-        raised[wide] - raised[wide][0], expected[wide] - expected[wide][0], atol=0.1
+        raised[wide] - raised[wide][0],
+        expected[wide] - expected[wide][0],
+        atol=0.1,
     )
     assert (raised >= 0).all()
     assert raised.min() == 0.0

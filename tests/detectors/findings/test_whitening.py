@@ -51,7 +51,18 @@ def test_a_grid_holds_picture_template_and_margin_and_its_half_is_even() -> None
     assert grid_of((100, 200), 56, 4) == (112, 216)
 
 
-@pytest.mark.parametrize("lag", [(0, 0), (0, 1), (2, 0), (3, 4), (5, 13), (0, 20), (12, 25)])
+@pytest.mark.parametrize(
+    "lag",
+    [
+        (0, 0),
+        (0, 1),
+        (2, 0),
+        (3, 4),
+        (5, 13),
+        (0, 20),
+        (12, 25),
+    ],
+)
 def test_a_covariance_is_the_mean_product_of_quiet_pixels(lag: tuple[int, int]) -> None:
     noise = blurred(1, (60, 70))
     quiet = np.random.default_rng(2).random(noise.shape) > 0.2
@@ -102,25 +113,41 @@ def test_unknown_pixels_are_filled_as_by_the_reference(image_shape, grid_shape, 
         inner = random.random(image.shape).astype(np.float32)
     result = np.zeros(grid_shape, np.float32)
     _spread(image, inner, outer, back, result)
-    np.testing.assert_allclose(result, reference.spread(image, inner, outer, back), atol=2e-6)
+    np.testing.assert_allclose(
+        result,
+        reference.spread(image, inner, outer, back),
+        atol=2e-6,
+    )
 
 
 @pytest.mark.parametrize("side", [3, 5])
 def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(side: int) -> None:
     known = np.random.default_rng(6).random(SHAPE) > 0.1
     known[10:14, 8:12] = False
-    by_lag = noise_covariance(blurred(3, (90, 120), side), np.ones((90, 120), bool), (128, 160))
+    by_lag = noise_covariance(
+        blurred(3, (90, 120), side),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
     values = np.where(known, blurred(1, SHAPE, side), np.float32(0.0))
     solved = inverse_times(values, known, filters(by_lag, SHAPE), error=0.01)
     dense = dense_of(known, by_lag, grid_of(SHAPE))
     expected = np.linalg.solve(dense, values[known])
-    np.testing.assert_allclose(solved[known], expected, atol=0.02 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        solved[known],
+        expected,
+        atol=0.02 * np.abs(expected).max(),
+    )
     assert not solved[~known].any()
 
 
 def test_a_solution_goes_on_from_another() -> None:
     known = np.random.default_rng(6).random(SHAPE) > 0.1
-    by_lag = noise_covariance(blurred(3, (90, 120)), np.ones((90, 120), bool), (128, 160))
+    by_lag = noise_covariance(
+        blurred(3, (90, 120)),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
     values = np.where(known, blurred(1, SHAPE), np.float32(0.0))
     noise_filters = filters(by_lag, SHAPE)
     solved = inverse_times(values, known, noise_filters, error=0.01)
@@ -135,7 +162,11 @@ def test_scores_are_the_likelihoods_where_pixels_are_missing() -> None:
     """
     noise = blurred(1, SHAPE)
     known = np.random.default_rng(2).random(SHAPE) > 0.1
-    by_lag = noise_covariance(blurred(3, (90, 120)), np.ones((90, 120), bool), (128, 160))
+    by_lag = noise_covariance(
+        blurred(3, (90, 120)),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
     dense = dense_of(known, by_lag, grid_of(SHAPE))
     assert window_of(by_lag) == BLUR_PX
     values = np.where(known, noise, np.float32(0.0))

@@ -29,7 +29,9 @@ def detector(request: pytest.FixtureRequest) -> LocalDetector:
 
 
 def seen(
-    depth_m: Callable[[np.ndarray, np.ndarray], np.ndarray], seed: int = 1, noise_m: float = NOISE_M
+    depth_m: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    seed: int = 1,
+    noise_m: float = NOISE_M,
 ) -> Cloud:
     """A frontal plane at 0.7 m, 1.4 mm a pixel, with ``depth_m(u, v)`` of pixels added and white
     noise."""
@@ -49,13 +51,18 @@ def seen(
 
 
 def disc(
-    u0: float, v0: float, radius_px: float, depth_m: float
+    u0: float,
+    v0: float,
+    radius_px: float,
+    depth_m: float,
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     return lambda u, v: depth_m * (np.hypot(u - u0, v - v0) < radius_px)
 
 
 def detections_in(
-    detector: LocalDetector, cloud: Cloud, threshold: float = 6.0
+    detector: LocalDetector,
+    cloud: Cloud,
+    threshold: float = 6.0,
 ) -> tuple[Detection, ...]:
     return detector.find(cloud, detector.analyse(cloud), threshold)
 
@@ -102,7 +109,8 @@ def test_what_no_single_pixel_shows_is_found_by_its_mean(detector: LocalDetector
     deviations."""
     cloud = seen(disc(120, 100, 15, NOISE_M))
     centres_px = places_px(cloud, detections_in(detector, cloud))
-    assert len(centres_px) == 1 and np.abs(centres_px[0] - [120, 100]).max() < 4
+    assert len(centres_px) == 1
+    assert np.abs(centres_px[0] - [120, 100]).max() < 4
 
 
 def test_a_flying_pixel_alone_is_no_finding_but_a_small_hole_is(detector: LocalDetector) -> None:
@@ -112,7 +120,8 @@ def test_a_flying_pixel_alone_is_no_finding_but_a_small_hole_is(detector: LocalD
 
     cloud = seen(holes)
     centres_px = places_px(cloud, detections_in(detector, cloud))
-    assert len(centres_px) == 1 and np.abs(centres_px[0] - [170, 120]).max() < 1
+    assert len(centres_px) == 1
+    assert np.abs(centres_px[0] - [170, 120]).max() < 1
 
 
 def test_neighbours_stay_apart_and_a_deep_hole_hides_no_shallow_one(
@@ -158,7 +167,8 @@ def test_noise_counts_where_it_is(detector: LocalDetector) -> None:
     threshold = 6.5 if isinstance(detector, MatchedDetector) else 6.0
     centres_px = places_px(seen(half), detections_in(detector, seen(half), threshold))
     away = centres_px[np.abs(centres_px[:, 0] - 120) > 50]
-    assert len(away) == 1 and abs(away[0, 0] - 60) < 2
+    assert len(away) == 1
+    assert abs(away[0, 0] - 60) < 2
 
 
 def test_invalid_pixels_and_borders_are_not_evidence(detector: LocalDetector) -> None:
@@ -167,7 +177,8 @@ def test_invalid_pixels_and_borders_are_not_evidence(detector: LocalDetector) ->
     gone[40:60, 40:60] = True
     holed = replace(cloud, points_m=np.where(gone[..., None], np.nan, cloud.points_m))
     centres_px = places_px(holed, detections_in(detector, holed))
-    assert len(centres_px) == 1 and np.abs(centres_px[0] - [120, 100]).max() < 2
+    assert len(centres_px) == 1
+    assert np.abs(centres_px[0] - [120, 100]).max() < 2
 
 
 def test_a_cloud_without_a_grid_is_judged_on_a_raster(detector: LocalDetector) -> None:
@@ -186,7 +197,8 @@ def test_a_cloud_without_a_grid_is_judged_on_a_raster(detector: LocalDetector) -
         **{name: listed(getattr(cloud, name)) for name in names},
     )
     centres_px = places_px(loose, detections_in(detector, loose))
-    assert len(centres_px) == 1 and np.abs(centres_px[0] - [120, 100]).max() < 2
+    assert len(centres_px) == 1
+    assert np.abs(centres_px[0] - [120, 100]).max() < 2
 
 
 def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
@@ -201,7 +213,8 @@ def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
     ]
     # a spectrum knows of the columns, even where nobody states variances
     gain = 1.2 if isinstance(detector, MatchedDetector) else 2.0
-    assert scores[1] > gain * scores[0] and scores[1] > 8
+    assert scores[1] > gain * scores[0]
+    assert scores[1] > 8
 
 
 MOUTHS_U = (190, 300, 407, 517, 626, 736, 218, 321, 423, 729, 836, 944, 1059)
@@ -250,11 +263,17 @@ def test_findings_at_many_thresholds_are_those_of_each(detector: LocalDetector) 
     evidence = detector.analyse(cloud)
     thresholds = [0.8, 1.1, 1.6, 2.2, 3.1, 4.4]
     for together, threshold in zip(
-        detector.findings(cloud, evidence, thresholds), thresholds, strict=True
+        detector.findings(cloud, evidence, thresholds),
+        thresholds,
+        strict=True,
     ):
         alone = detector.find(cloud, evidence, threshold)
         assert len(together.detections) == len(alone)
         for detection, expected in zip(together.detections, alone, strict=True):
             assert detection.score == expected.score
             np.testing.assert_array_equal(detection.pixels, expected.pixels)
-            np.testing.assert_allclose(detection.centre_m, expected.centre_m, atol=1e-12)
+            np.testing.assert_allclose(
+                detection.centre_m,
+                expected.centre_m,
+                atol=1e-12,
+            )

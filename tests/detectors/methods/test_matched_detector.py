@@ -208,7 +208,11 @@ def test_the_learned_covariance_is_that_of_the_noise_and_is_used() -> None:
     learned = dict(DETECTOR.calibrate(clouds))
     covariance = learned["covariance"]
     middle_row = covariance[LONGEST_LAG_PX, LONGEST_LAG_PX:]
-    np.testing.assert_allclose(middle_row[1:4] / covariance.max(), [0.8, 0.6, 0.4], atol=0.08)
+    np.testing.assert_allclose(
+        middle_row[1:4] / covariance.max(),
+        [0.8, 0.6, 0.4],
+        atol=0.08,
+    )
     # in squared deviations
     assert covariance.max() == pytest.approx(1.0, abs=0.1)
     cloud = cloud_of(3e-4 * blurred(13) + hole(60, 45, 2.0, 0.002))
@@ -249,7 +253,14 @@ def test_a_hole_in_correlated_noise_leaves_no_score_of_the_other_sign_beside_it(
     assert len(detections_in(cloud_of(hole_and_bump), 6.0)) == 2
 
 
-@pytest.mark.parametrize(("score", "is_lobe"), [(-4.9, True), (-5.1, False), (1.0, False)])
+@pytest.mark.parametrize(
+    ("score", "is_lobe"),
+    [
+        (-4.9, True),
+        (-5.1, False),
+        (1.0, False),
+    ],
+)
 def test_a_side_lobe_is_weaker_than_half_of_a_score_of_the_other_sign(score, is_lobe) -> None:
     for sign in (1.0, -1.0):
         for offset, is_near in ((RIM_PX, True), (RIM_PX + 1, False)):

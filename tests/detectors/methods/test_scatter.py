@@ -147,7 +147,15 @@ def test_a_tail_is_measured_on_its_shorter_side() -> None:
     assert tail_of(two_sided[:3, :3], 1.0) == 1.0
 
 
-@pytest.mark.parametrize(("down", "right"), [(0, 0), (1, 1), (0, 1), (1, 0)])
+@pytest.mark.parametrize(
+    ("down", "right"),
+    [
+        (0, 0),
+        (1, 1),
+        (0, 1),
+        (1, 0),
+    ],
+)
 def test_the_stronger_of_two_templates_is_kept(down: int, right: int) -> None:
     random = np.random.default_rng(8)
     scores = (6.0 * random.standard_normal((12, 15))).astype(np.float32)
