@@ -207,7 +207,7 @@ class _Border(NamedTuple):
     part: float
     """Its share of the outline."""
     is_step: bool
-    """Whether the other surface lies behind it."""
+    """True if the other surface lies behind it."""
     behind_m: float
     """Height of the step."""
 

@@ -49,9 +49,9 @@ class Detection:
     centre_m: np.ndarray
     """(3,): its position in the cloud's frame, by which it is matched with damage."""
     kind: Literal["depth", "no return", "object"] = "depth"
-    """What it consists of: "depth" for points that depart from the surface; "no return" for
-    connected pixels without return (then invalid) inside the target's outline; "object" for an
-    object on the target."""
+    """Kinds: "depth" for points that depart from the surface; "no return" for connected pixels
+    without return (then invalid) inside the target's outline; "object" for an object on the
+    target."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Measurement:
     points: int
     """Number of its points."""
     score: float
-    """Of the detection."""
+    """The detection's."""
     extent_diameter_m: float
     """Mean of the distances between the extreme points in x and in y."""
     extent_centre_m: np.ndarray
@@ -125,7 +125,7 @@ class Measurement:
     model_centre_se_m: float = np.nan
     """Along one axis of the surface."""
     volume_m3: float = np.nan
-    """Between the surface and the points, positive behind it."""
+    """Volume between the surface and the points, positive behind it."""
     length_m: float = np.nan
     """Longer side of the rectangle with the second moments of the residual, less the camera's
     blur: a slot's length; for a round hole of diameter d, 0.87 d."""
@@ -134,7 +134,7 @@ class Measurement:
     along: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     """(3,): direction of the longer side."""
     model_note: str = ""
-    """Why an estimate is missing."""
+    """Reason why an estimate is missing."""
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ class Separated:
     surface_m: float
     """Standard deviation of the part that captures do not share, beyond their noise, or NaN."""
     separated: bool
-    """Whether the surface's shape was solved for."""
+    """True if the surface's shape was solved for."""
     in_time: PatternChange | None
     """First captures beside last ones, at equal distances; None if there are not enough."""
     in_range: PatternChange | None

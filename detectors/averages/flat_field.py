@@ -47,7 +47,7 @@ class FlatField:
     variance_m2: np.ndarray
     """(h, w): of that error."""
     lens: Lens
-    """Of the camera and mode."""
+    """The lens of the camera in its mode."""
     distances_m: tuple[float, float]
     """The nearest and the farthest at which it was measured."""
     warnings: tuple[str, ...] = ()

@@ -46,7 +46,7 @@ MOST_FIELDS = 100
 TAIL_CLUSTERS = 60
 """Largest simulated clusters, from which the fall of their number with size is estimated."""
 SLOWEST_FALL = math.log(2.0)
-"""Without simulated clusters, each further pixel halves a cluster's probability."""
+"""Fall without simulated clusters: each further pixel halves a cluster's probability."""
 HIGHEST_SCORE = 37.0  # in standard deviations; float64 has no probabilities beyond
 
 # --- missing pixels as evidence ---
@@ -335,7 +335,7 @@ class _Chance:
     log_number: float = 0.0
     """Logarithm of the expected number of clusters of at least that size."""
     fall: float = SLOWEST_FALL
-    """By how much the logarithm falls with each further pixel."""
+    """Fall of the logarithm with each further pixel."""
 
     def log_expected(self, points: int) -> float:
         """Return the logarithm of the expected number of clusters of at least this many pixels on

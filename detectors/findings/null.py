@@ -82,7 +82,7 @@ class OwnThreshold:
     """A threshold that a capture's own noise determines. With too few peaks the numbers are NaN."""
 
     threshold: float
-    """In units of score."""
+    """Units of score."""
     expected: float
     """False calls expected at the threshold, in front of and behind the surface."""
     low: float
@@ -92,13 +92,13 @@ class OwnThreshold:
     peaks: int
     """Number of peaks above the floor on which it is based."""
     floor: float
-    """In units of score."""
+    """Units of score."""
     objects: int
     """Number of regions that are excluded as objects."""
     rim_pixels: int
     """Number of pixels along the rim that mix in what lies behind the target."""
     evidence: Evidence
-    """What to search: without the rim pixels."""
+    """Evidence to search: without the rim pixels."""
     doubts: tuple[str, ...]
     """Full sentences on why the numbers cannot be trusted."""
 
@@ -226,10 +226,10 @@ def _doubts_about_symmetry(evidence: Evidence) -> list[str]:
 
 @dataclass(frozen=True)
 class Tail:
-    """How often noise exceeds a threshold, by its peaks above a floor."""
+    """The law by which noise exceeds a threshold, from its peaks above a floor."""
 
     floor: float
-    """In units of score."""
+    """Units of score."""
     peaks: int
     """Number of peaks above it."""
     sums: np.ndarray

@@ -58,7 +58,7 @@ class Template(NamedTuple):
     """Offset (down, right) of its centre from the middle, in half pixels."""
     slot: bool = False
     coarse: bool = False
-    """Whether it is scored on every second pixel."""
+    """True if it is scored on every second pixel."""
 
 
 @lru_cache(maxsize=3)
@@ -209,7 +209,7 @@ def responses(
 
 
 class Worth(NamedTuple):
-    """What a template's response is worth under noise with a given spectrum."""
+    """The worth of a template's response under noise with a given spectrum."""
 
     energy: float
     """Whitened energy t' C^-1 t of the template."""
@@ -256,11 +256,12 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     return tuple(template_worths)
 
 
-class _Sums(NamedTuple):
-    """What `worths` sums over half of the spectra of t templates on `GRID`, at f frequencies."""
+class _SpectrumSums(NamedTuple):
+    """The parts that `worths` sums over half of the spectra of t templates on `GRID`, at f
+    frequencies."""
 
     frequencies: tuple[np.ndarray, ...]
-    """Where these frequencies lie in the spectra."""
+    """Indices of these frequencies in the spectra."""
     squares: np.ndarray
     """Squares (t, f) of the magnitudes."""
     above: np.ndarray
@@ -273,7 +274,7 @@ class _Sums(NamedTuple):
 
 
 @lru_cache(maxsize=6)
-def _sums_of(window_px: int, coarse: bool) -> _Sums:
+def _sums_of(window_px: int, coarse: bool) -> _SpectrumSums:
     """Return the sums of the fine templates, or of the coarse ones, which have half the
     frequencies."""
     grid = (GRID, GRID)
@@ -303,7 +304,7 @@ def _sums_of(window_px: int, coarse: bool) -> _Sums:
         ]
     )
     count = len(sizes)
-    return _Sums(
+    return _SpectrumSums(
         frequencies,
         squares=np.asarray((sizes**2).reshape(count, -1), np.float32),
         above=np.asarray(above.reshape(count, -1), np.float32),

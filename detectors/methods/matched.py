@@ -297,7 +297,7 @@ class _Noise(NamedTuple):
     window_px: int
     """Side of the camera's window that the noise indicates."""
     worths: tuple[templates.Worth, ...]
-    """Of each template."""
+    """Worth of each template."""
 
 
 class _Scores(NamedTuple):

@@ -48,7 +48,7 @@ TAIL_SIGMAS = 3.29  # where a Gaussian has that share
 
 
 class Zones(NamedTuple):
-    """Which scores count for the scatter, and where they lie."""
+    """The pixels whose scores count for the scatter, by their zone."""
 
     loud: np.ndarray
     """(r, c) bool: scores that do not count."""
@@ -124,7 +124,7 @@ def _multiply(
 
 
 class Scatter(NamedTuple):
-    """How scores scatter that are neither 0 nor loud."""
+    """The scatter of scores that are neither 0 nor loud."""
 
     deviations: np.ndarray
     """(z,): by zone, at least that of the last one, which is the whole picture's inside."""
