@@ -324,10 +324,10 @@ def drilled_board_before_a_wall(
     z = np.where(target, 0.7, 0.9)
     hole = np.zeros(z.shape, dtype=int)
     for number, centre_x, diameter in ((1, 0.1, 0.014), (2, 0.19, 0.025)):
-        distance_px = np.stack([x - centre_x, y - 0.02], axis=-1)
+        from_axis_m = np.stack([x - centre_x, y - 0.02], axis=-1)
         a = (slopes**2).sum(-1)
-        b = (distance_px * slopes).sum(-1)
-        c = (distance_px**2).sum(-1) - diameter**2 / 4
+        b = (from_axis_m * slopes).sum(-1)
+        c = (from_axis_m**2).sum(-1) - diameter**2 / 4
         inside = c < 0
         wall = (np.sqrt(np.where(inside, b * b - a * c, 0.0)) - b) / a
         hole[inside] = number
@@ -373,12 +373,12 @@ def test_without_a_grid_holes_with_a_backing_are_found_and_the_wall_past_the_rim
     # of 85 x 86 pixels at most 6 on each side go: 3 of rim, 3 for the raster's cells
     assert not kept[~target].any()
     assert kept[target].mean() > 0.73
-    taken_choice = np.zeros(len(points), dtype=bool)
+    in_findings = np.zeros(len(points), dtype=bool)
     for detection in detector.find(flat, evidence, 5.0):
-        taken_choice[detection.pixels] = True
-    assert not taken_choice[hole == 0].any()
-    assert taken_choice[hole == 1].mean() > 0.8
-    assert taken_choice[hole == 2].mean() > 0.8
+        in_findings[detection.pixels] = True
+    assert not in_findings[hole == 0].any()
+    assert in_findings[hole == 1].mean() > 0.8
+    assert in_findings[hole == 2].mean() > 0.8
 
 
 def test_without_a_grid_the_crop_is_the_grids_but_for_the_rim() -> None:

@@ -40,19 +40,20 @@ def by_graph(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarr
 def test_links_are_steps_within_tilt_and_noise(seed: int, central: bool) -> None:
     points = rough_points(seed)
     right, down = links(points, 6.0, 3e-3, central)
-    for result, true_pixels, inside in (
+    for result, neighbours, pixels in (
         (right[:, :-1], points[:, 1:], points[:, :-1]),
         (down[:-1], points[1:], points[:-1]),
     ):
+        x, y, z = np.moveaxis(pixels, -1, 0)
+        next_x, next_y, next_z = np.moveaxis(neighbours, -1, 0)
         with np.errstate(invalid="ignore"):
-            across = true_pixels[..., :2] - inside[..., :2]
+            across = np.hypot(next_x - x, next_y - y)
             if central:
-                between_rays = (
-                    true_pixels[..., :2] / true_pixels[..., 2:] - inside[..., :2] / inside[..., 2:]
-                )
-                across = np.minimum(true_pixels[..., 2:], inside[..., 2:]) * between_rays
-            step = np.abs(true_pixels[..., 2] - inside[..., 2])
-            expected = step <= 6.0 * np.hypot(across[..., 0], across[..., 1]) + 3e-3
+                nearer_z = np.minimum(next_z, z)
+                between_rays_x = next_x / next_z - x / z
+                between_rays_y = next_y / next_z - y / z
+                across = np.hypot(nearer_z * between_rays_x, nearer_z * between_rays_y)
+            expected = np.abs(next_z - z) <= 6.0 * across + 3e-3
         np.testing.assert_array_equal(result, expected)
         assert expected.any()
         assert not expected.all()
@@ -80,9 +81,8 @@ def test_the_components_are_those_of_a_graph(seed: int, share: float) -> None:
     assert not result[~nodes].any()
     firsts = [int(np.flatnonzero(result == number)[0]) for number in range(1, len(sizes) + 1)]
     # of equal sizes the first in the order of the pixels is the first
-    assert sorted(zip((-sizes).tolist(), firsts, strict=True)) == list(
-        zip((-sizes).tolist(), firsts, strict=True)
-    )
+    order = list(zip((-sizes).tolist(), firsts, strict=True))
+    assert order == sorted(order)
     for number, size in enumerate(sizes, start=1):
         assert (result == number).sum() == size
         assert len(set(expected[result == number].tolist())) == 1

@@ -361,7 +361,8 @@ def test_mistakes_are_named() -> None:
 
 def test_frames_of_different_size_are_refused() -> None:
     stack = noisy(2, (4, 5))
-    stack.slopes, stack.z_m = None, [stack.z_m[0], np.ones((4, 6), np.float32)]  # type: ignore[assignment]
+    stack.slopes = None
+    stack.z_m = [stack.z_m[0], np.ones((4, 6), np.float32)]  # type: ignore[assignment]
     with pytest.raises(UserError, match=r"frame 1: 6 x 4 pixels, but 5 x 4 pixels expected"):
         average(stack, AverageConfig())
 

@@ -246,15 +246,15 @@ def test_few_frames_cannot_tell_their_noise():
 def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
     field = found(wall(0.0), poses=False).field
     cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
-    exit_code = corrected(cloud, field)
-    residual_m = flattened(exit_code, exit_code.valid, "corrected").residual_m
-    assert exit_code.mean_variance_m2 is not None
+    cleaned = corrected(cloud, field)
+    residual_m = flattened(cleaned, cleaned.valid, "corrected").residual_m
+    assert cleaned.mean_variance_m2 is not None
     axial_m = residual_m * cloud.points_m[..., 2] / np.linalg.norm(cloud.points_m, axis=-1)
     assert np.nanstd(axial_m) == pytest.approx(
-        float(np.sqrt(exit_code.mean_variance_m2.mean())), rel=0.03
+        float(np.sqrt(cleaned.mean_variance_m2.mean())), rel=0.03
     )
     np.testing.assert_allclose(
-        np.cross(exit_code.points_m, cloud.points_m),
+        np.cross(cleaned.points_m, cloud.points_m),
         0.0,
         atol=1e-15,
     )  # along the rays
@@ -266,7 +266,7 @@ def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
     }
     np.testing.assert_array_equal(
         corrected(replace(cloud, region=part, **cut), field).points_m,
-        exit_code.points_m[rows, columns],
+        cleaned.points_m[rows, columns],
     )
     single = corrected(replace(cloud, n_frames=1), field)
     assert single.mean_variance_m2 is None
@@ -278,12 +278,10 @@ def test_pixels_without_a_pattern_stay_and_are_told():
     error_m = field.error_m.copy()
     error_m[:, :40] = np.nan
     holed = replace(field, error_m=error_m, warnings=("it drifts",))
-    exit_code = corrected(cloud, holed)
-    np.testing.assert_array_equal(exit_code.points_m[:, :40], cloud.points_m[:, :40])
-    assert exit_code.mean_variance_m2 is not None
-    assert (
-        exit_code.mean_variance_m2[:, :40].mean() > 10 * exit_code.mean_variance_m2[:, 40:].mean()
-    )
+    cleaned = corrected(cloud, holed)
+    np.testing.assert_array_equal(cleaned.points_m[:, :40], cloud.points_m[:, :40])
+    assert cleaned.mean_variance_m2 is not None
+    assert cleaned.mean_variance_m2[:, :40].mean() > 10 * cleaned.mean_variance_m2[:, 40:].mean()
     assert doubts(cloud, holed, "unit.npz") == (
         "the flat field unit.npz: it drifts",
         "the flat field unit.npz covers 75 % of the valid pixels; others are not corrected",
@@ -374,13 +372,13 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
     first, *remainder = capsys.readouterr().out.splitlines()
     assert first.startswith("warning: nothing shows that the camera moved")
     assert remainder[0].startswith("fixed pattern 0.4")
-    printed = json.loads(unit.with_suffix(".json").read_text())
-    assert printed["warnings"] == list(load_flat_field(unit).warnings)
-    figures = {row["figure"]: row["value"] for row in printed["figures"]}
+    facts = json.loads(unit.with_suffix(".json").read_text())
+    assert facts["warnings"] == list(load_flat_field(unit).warnings)
+    figures = {row["figure"]: row["value"] for row in facts["figures"]}
     assert figures["noise of the map"] == pytest.approx(NOISE_M / MM / np.sqrt(24), rel=0.05)
     assert figures["pattern"] == pytest.approx(float(np.nanstd(truth_m)) / MM, rel=0.03)
     assert figures["change, near and far captures"] is None
-    assert len(printed["captures"]) == 3
+    assert len(facts["captures"]) == 3
     assert unit.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 
     judged = [walls[0], *options, "--threshold", "5"]
@@ -418,12 +416,12 @@ def test_a_lone_capture_is_judged_by_its_halves(recorded, tmp_path, capsys):
         flatfield.main([str(recorded / "wall0.npy"), *lens, "--out", str(tmp_path / "unit.npz")])
         == 0
     )
-    printed = json.loads((tmp_path / "unit.json").read_text())
-    assert [row["capture"] for row in printed["captures"]] == [
+    facts = json.loads((tmp_path / "unit.json").read_text())
+    assert [row["capture"] for row in facts["captures"]] == [
         "wall0.npy, first half",
         "wall0.npy, second half",
     ]
-    figures = {row["figure"]: row["value"] for row in printed["figures"]}
+    figures = {row["figure"]: row["value"] for row in facts["figures"]}
     # 4 frames in each half
     signal = figures["pattern"] ** 2
     noise = (NOISE_M / MM) ** 2 / 4
@@ -444,11 +442,11 @@ def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path,
         flatfield.main([str(walls), "--intrinsics", "azure_kinect_nfov", "--out", str(unit)]) == 0
     )
     assert "is assumed to be flat" in capsys.readouterr().out.splitlines()[0]
-    printed = json.loads(unit.with_suffix(".json").read_text())
-    figures = {row["figure"]: row["value"] for row in printed["figures"]}
+    facts = json.loads(unit.with_suffix(".json").read_text())
+    figures = {row["figure"]: row["value"] for row in facts["figures"]}
     assert figures["pattern"] > 2 * figures["noise of the map"]
     assert figures["change, first and last captures"] < 0.1
-    noise_mm = printed["captures"][0]["noise_mm"]
+    noise_mm = facts["captures"][0]["noise_mm"]
     expected = figures["pattern"] ** 2 / (figures["pattern"] ** 2 + noise_mm**2)
     assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.05)
 

@@ -381,17 +381,16 @@ def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
     )
     cloud, evidence = board.seen(0.05, 3)
     lag = np.abs(np.arange(-28, 29))
-    short, long = (
-        np.outer(row, row)
-        for row in (np.clip(1 - lag / 4, 0, None), np.exp(-(lag**2) / (2 * 6.3**2)))
-    )
+    triangle = np.clip(1 - lag / 4, 0, None)
+    wave = np.exp(-(lag**2) / (2 * 6.3**2))
+    by_lag = 0.3 * np.outer(triangle, triangle) + 0.7 * np.outer(wave, wave)
     core = detection_of(cloud, 9.0, np.flatnonzero(board.image > 6.3e-3))
     m = measure_detection(
         cloud,
         evidence,
         core,
         HoleModelConfig(),
-        0.3 * short + 0.7 * long,
+        by_lag,
     )
     assert m.model_depth_m == pytest.approx(7e-3, abs=1.5e-3)
     assert m.model_diameter_m == pytest.approx(34e-3, abs=5e-3)

@@ -233,8 +233,8 @@ def test_evidence_is_the_likelihood_ratio_of_the_number_in_a_disc() -> None:
     ratios = []
     for pixels, number in ((9, 3), (21, 5), (37, 5)):
         expected = pixels * rate
-        by_both = number - 0.5
-        ratios.append(by_both * np.log(by_both / expected) - (by_both - expected))
+        counted = number - 0.5
+        ratios.append(counted * np.log(counted / expected) - (counted - expected))
     assert detection[100, 100] == pytest.approx(2.0 * max(ratios) / 9.0, rel=1e-3)
     assert detection[100, 110] == 0.0
     assert (detection >= 0.0).all()
@@ -289,18 +289,18 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
     # a ring of valid deep pixels around a core that returned nothing: the larger ring stands for
     # the hole
     kept = one_damage_once(SHAPE, (depth_finding(ring), far), (nothing,))
-    assert [found_once.kind for found_once in kept] == ["depth", "depth"]
+    assert [finding.kind for finding in kept] == ["depth", "depth"]
     # a ring without return around a small valid floor: what it encloses counts as its own
     hollow = Detection(12.0, np.flatnonzero(ring), np.zeros(3), "no return")
     kept = one_damage_once(SHAPE, (depth_finding(core), far), (hollow,))
-    assert [(found_once.kind, found_once.score) for found_once in kept] == [
+    assert [(finding.kind, finding.score) for finding in kept] == [
         ("no return", 12.0),
         ("depth", 6.0),
     ]
     # specks on the rim of a hole that returned nothing
     specks = (depth_finding(disc(55, 45, 2), 8.0), depth_finding(disc(65, 45, 2), 7.0))
     kept = one_damage_once(SHAPE, (*specks, far), (nothing,))
-    assert [(found_once.kind, found_once.score) for found_once in kept] == [
+    assert [(finding.kind, finding.score) for finding in kept] == [
         ("no return", 12.0),
         ("depth", 6.0),
     ]
@@ -308,11 +308,9 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
     # the rim did
     hole = disc(60, 45, 12)
     gap = Detection(12.0, np.flatnonzero(hole & (U >= 62)), np.zeros(3), "no return")
-    detection = (depth_finding(hole & (U < 62)), depth_finding(disc(67, 45, 4), 8.0), far)
-    assert [found_once.score for found_once in one_damage_once(SHAPE, detection, (gap,))] == [
-        9.0,
-        6.0,
-    ]
+    findings = (depth_finding(hole & (U < 62)), depth_finding(disc(67, 45, 4), 8.0), far)
+    kept = one_damage_once(SHAPE, findings, (gap,))
+    assert [finding.score for finding in kept] == [9.0, 6.0]
 
 
 def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
@@ -321,7 +319,7 @@ def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
     hole = disc(60, 62, 10)
     nothing = Detection(12.0, np.flatnonzero(gone), np.zeros(3), "no return")
     kept = one_damage_once(SHAPE, (depth_finding(hole),), (nothing,))
-    assert [found_once.kind for found_once in kept] == ["no return", "depth"]
+    assert [finding.kind for finding in kept] == ["no return", "depth"]
     # one hole, half of which returned nothing
     half = Detection(
         12.0,
@@ -344,7 +342,7 @@ def test_findings_without_return_stand_in_the_table_and_a_map_of_blind_pixels_be
 
     kinds = [finding.kind for finding in judged.findings]
     assert sorted(kinds) == ["bump", "hole", "hole", "no return"]
-    row = next(found_once for found_once in judged.findings if found_once.kind == "no return")
+    row = next(finding for finding in judged.findings if finding.kind == "no return")
     assert np.isnan(row.depth_mm)
     assert np.isnan(row.volume_mm3)
     assert (row.size_from, row.depth_from) == ("area", "none")
@@ -372,10 +370,11 @@ def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
 
     limits = [limit_of(replace(record, inspected=by_both), draws=50), limit_of(record, draws=50)]
     grid = LIMITS.grid(limits)
-    row_of_both, row_of_depth = (row[grid.heads.index("found")].text for row in grid.rows)
+    column = grid.heads.index("found")
+    row_of_both, row_of_depth = grid.rows
 
     n = len(by_depth)
     hits = int(by_depth.sum())
-    assert row_of_both == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
+    assert row_of_both[column].text == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
     assert f"5 of {hits + 5} hits by missing returns alone" in "; ".join(notes_of(limits[0]))
-    assert row_of_depth == f"{hits} of {n}"
+    assert row_of_depth[column].text == f"{hits} of {n}"

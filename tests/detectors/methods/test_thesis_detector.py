@@ -46,7 +46,7 @@ def board(
         flat,
         flat + n_frames,
         variance,
-        Region(0, *SHAPE[:1], 0, SHAPE[1]),
+        Region(0, SHAPE[0], 0, SHAPE[1]),
         z_step_m,
         n_frames,
         lens=LENS,
