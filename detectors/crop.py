@@ -571,7 +571,11 @@ def _taken(candidates: tuple[Candidate, ...], target: int | None) -> int:
     )
 
 
-def _inside(candidates: tuple[Candidate, ...], taken: int, grid: Cloud) -> np.ndarray:
+def _inside(
+    candidates: tuple[Candidate, ...],
+    taken: int,
+    grid: Cloud,
+) -> np.ndarray:
     """Return (h, w) bool: the valid pixels inside the outline of the candidate that is taken."""
     if not candidates:
         return np.zeros(grid.valid.shape, bool)

@@ -52,7 +52,11 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
     return mask | parts_with(gaps, deep_in(gaps), connectivity=4)
 
 
-def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndarray:
+def grown(
+    mask: np.ndarray,
+    pixels: int,
+    shape: int = cv2.MORPH_RECT,
+) -> np.ndarray:
     """Return the mask grown by all pixels within this distance: in a square, or in OpenCV's
     ``shape``."""
     kernel = cv2.getStructuringElement(shape, (2 * pixels + 1, 2 * pixels + 1))

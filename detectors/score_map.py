@@ -198,7 +198,11 @@ def above(evidence: Evidence, threshold: float) -> np.ndarray:
         return np.flatnonzero(evidence.score.reshape(-1) > threshold)
 
 
-def _scored_pixels(cloud: Cloud, evidence: Evidence, threshold: float) -> np.ndarray:
+def _scored_pixels(
+    cloud: Cloud,
+    evidence: Evidence,
+    threshold: float,
+) -> np.ndarray:
     """Return the flat indices, ascending, of the valid pixels whose score exceeds the
     threshold."""
     pixels = above(evidence, threshold)

@@ -301,7 +301,12 @@ class FrameSums:
             self.rgb_total += frame.rgb
             self.rgb_frames += 1
 
-    def _take_channel(self, name: str, values: np.ndarray, used: np.ndarray) -> None:
+    def _take_channel(
+        self,
+        name: str,
+        values: np.ndarray,
+        used: np.ndarray,
+    ) -> None:
         """Add a frame's further values where they are used (n,) bool."""
         if name not in self.channels:
             self.channels[name] = (np.zeros(used.size), np.zeros(used.size, dtype=np.int32))

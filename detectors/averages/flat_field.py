@@ -80,7 +80,11 @@ def corrected(cloud: Cloud, field: FlatField) -> Cloud:
     return replace(cloud, points_m=moved, mean_variance_m2=noise_m2)
 
 
-def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
+def doubts(
+    cloud: Cloud,
+    field: FlatField,
+    name: str | Path,
+) -> tuple[str, ...]:
     """Return full sentences on doubts about the correction of a cloud. ``name``: of the field."""
     notes = [f"the flat field {name}: {warning}" for warning in field.warnings]
     is_known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])

@@ -194,7 +194,11 @@ def _noise_of_one(picture: np.ndarray, z_step_m: float) -> tuple[np.ndarray, np.
     return noise * known, known
 
 
-def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
+def _levelled(
+    values: np.ndarray,
+    known: np.ndarray,
+    side: int,
+) -> np.ndarray:
     """Return the values (h, w) minus their mean over a square of known ones; 0 where unknown."""
     size = (side, side)
     border = cv2.BORDER_CONSTANT

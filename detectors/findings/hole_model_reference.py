@@ -65,7 +65,11 @@ def _fine(length: int, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
     return positions, inside / (FINER * blur_px)
 
 
-def fitted(patch: HolePatch, start: Start, draw: Draw = picture) -> tuple[np.ndarray, float, bool]:
+def fitted(
+    patch: HolePatch,
+    start: Start,
+    draw: Draw = picture,
+) -> tuple[np.ndarray, float, bool]:
     """Return the hole (5,), the offset, and whether SciPy's descent has converged, with the least
     sum of squares of the used pixels' residuals and of the prior's misfit, weight * (wall - 0.5).
     ``draw``: the picture of a hole; a fast one saves minutes."""
@@ -105,7 +109,11 @@ def hole_of(q: np.ndarray) -> np.ndarray:
     return np.array([q[0], q[1], radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
 
 
-def sandwich(patch: HolePatch, derivatives: np.ndarray, square_m2: float) -> np.ndarray:
+def sandwich(
+    patch: HolePatch,
+    derivatives: np.ndarray,
+    square_m2: float,
+) -> np.ndarray:
     """Return the covariance (6, 6) A^-1 (s^2 J' C J + p^2 W) A^-1 with A = J' J + W and s^2 =
     square / (n - trace(A^-1 J' C J)), where C (n, n) is the correlation of pixels that share
     samples of a square filter. ``derivatives``: J' (6, n)."""

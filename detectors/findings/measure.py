@@ -121,14 +121,22 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
     return diameter, (west + east + north + south) / 4.0
 
 
-def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+def centres_of(
+    points_m: np.ndarray,
+    labels: np.ndarray,
+    count: int,
+) -> np.ndarray:
     """Return the centres (count, 3) by `extents` of clusters of points (n, 3). ``labels`` (n,): -1
     for no cluster."""
     return points_m[_extremes(points_m, labels, count)].mean(axis=1)
 
 
 @numba.njit(**PLAIN)
-def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+def _extremes(
+    points: np.ndarray,
+    labels: np.ndarray,
+    count: int,
+) -> np.ndarray:
     """Return the indices (count, 4) of each cluster's points with the least and greatest x, and
     with the least and greatest y."""
     extremes = np.full((count, 4), -1)
@@ -144,7 +152,11 @@ def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
     return extremes
 
 
-def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:
+def measure_extents(
+    cloud: Cloud,
+    detection: Detection,
+    note: str,
+) -> Measurement:
     """Measure the thesis' extents and the position on the sensor, if any. ``note`` says why
     nothing else is measured."""
     points_m = cloud.points_m.reshape(-1, 3)[detection.pixels]
@@ -245,7 +257,12 @@ class _Surroundings:
         """Area of one pixel on the surface."""
         return math.hypot(*normal_of(self.per_px_m))
 
-    def positioned(self, measured: Measurement, u: float, v: float) -> Measurement:
+    def positioned(
+        self,
+        measured: Measurement,
+        u: float,
+        v: float,
+    ) -> Measurement:
         """Return the measurement with the position (u, v) of the patch as its centre."""
         du = u - self.u0
         dv = v - self.v0
@@ -506,7 +523,11 @@ def _start(around: _Surroundings) -> tuple[float, float, float, float, float]:
     return u, v, radius_m, around.sign * around.peak_m, around.offset_m
 
 
-def _explains(around: _Surroundings, fit: HoleFit, patch: HolePatch) -> bool:
+def _explains(
+    around: _Surroundings,
+    fit: HoleFit,
+    patch: HolePatch,
+) -> bool:
     """Return whether a fit has converged near the detection and explains its residual."""
     h, w = around.own.shape
     row = round(fit.v_px)
@@ -522,7 +543,11 @@ def _explains(around: _Surroundings, fit: HoleFit, patch: HolePatch) -> bool:
 # --- the contour at half depth, elsewhere ---
 
 
-def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Measurement:
+def _by_contour(
+    measured: Measurement,
+    around: _Surroundings,
+    doubt: str,
+) -> Measurement:
     """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels
     without a range that touch the detection count as inside."""
     residual_m = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))

@@ -168,7 +168,11 @@ def _counted(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     return cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_CONSTANT)
 
 
-def _local_rate(missing: np.ndarray, known: np.ndarray, rate: float) -> np.ndarray:
+def _local_rate(
+    missing: np.ndarray,
+    known: np.ndarray,
+    rate: float,
+) -> np.ndarray:
     """Return the rate of dropouts around each pixel, from the numbers of missing and known pixels
     in a window and the target's own rate."""
     return (missing + RATE_PRIOR_PX * rate) / (known + RATE_PRIOR_PX)
@@ -367,7 +371,11 @@ def _settled(gaps: _Gaps) -> _Chance:
         least = chance.least_points
 
 
-def _chance_of(scattered: np.ndarray, known: np.ndarray, outline: np.ndarray) -> _Chance:
+def _chance_of(
+    scattered: np.ndarray,
+    known: np.ndarray,
+    outline: np.ndarray,
+) -> _Chance:
     """Return the chance by ``scattered`` dropouts (h, w) among the ``known`` pixels (h, w) of an
     outline, from simulated fields with the same local rate and correlation."""
     rate = float(scattered.sum() / max(known.sum(), 1))
@@ -391,7 +399,11 @@ def _in_window(image: np.ndarray) -> np.ndarray:
     return cv2.boxFilter(image, -1, window, normalize=False, borderType=border)
 
 
-def _fields(shape: tuple[int, ...], side: int, count: int) -> Iterator[np.ndarray]:
+def _fields(
+    shape: tuple[int, ...],
+    side: int,
+    count: int,
+) -> Iterator[np.ndarray]:
     """Draw fields (h, w) of unit variance, averaged over a square of this side."""
     height, width = shape
     margin = side - 1

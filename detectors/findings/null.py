@@ -290,7 +290,11 @@ class Tail:
         return float(low), float(high)
 
 
-def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
+def _excess(
+    ratios: np.ndarray,
+    exponent: float,
+    floor: float,
+) -> np.ndarray:
     """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which
     peaks become fewer.
 

@@ -224,7 +224,11 @@ def inverse_times(
     return solution
 
 
-def _filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
+def _filtered(
+    image: np.ndarray,
+    factors: np.ndarray,
+    out: np.ndarray,
+) -> np.ndarray:
     """Return ``out``, which gets the image with its frequencies multiplied by factors."""
     np.multiply(cv2.dft(image, dst=out), factors, out=out)
     return cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE)
@@ -351,7 +355,11 @@ def _lower_covariance(  # type: ignore[no-untyped-def]
     return covariance
 
 
-def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
+def correlated_products(
+    columns: np.ndarray,
+    across: int,
+    down: int,
+) -> np.ndarray:
     """Return S' S (p, p), where S is the columns (h, w, p), zero outside, summed over windows of
     ``down`` x ``across`` pixels."""
     height, width, count = columns.shape

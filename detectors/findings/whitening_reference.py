@@ -6,7 +6,12 @@ import numpy as np
 from detectors.findings.whitening import LONGEST_LAG_PX, TAPS
 
 
-def autocovariance(noise: np.ndarray, quiet: np.ndarray, down: int, across: int) -> float:
+def autocovariance(
+    noise: np.ndarray,
+    quiet: np.ndarray,
+    down: int,
+    across: int,
+) -> float:
     """Return the mean product of pairs of quiet pixels at one lag (down, across >= 0), faded out by
     Parzen's window: 1 - 6 x^2 (1 - x) up to x = 1/2, then 2 (1 - x)^3, of the lag x over the
     longest one."""
@@ -30,13 +35,22 @@ def dense_covariance(known: np.ndarray, by_lag: np.ndarray) -> np.ndarray:
     return np.where(inside, by_lag[tuple(np.where(inside[..., None], lags, 0).T)].T, 0.0)
 
 
-def score(template: np.ndarray, values: np.ndarray, covariance: np.ndarray) -> float:
+def score(
+    template: np.ndarray,
+    values: np.ndarray,
+    covariance: np.ndarray,
+) -> float:
     """Return t' C^-1 r / sqrt(t' C^-1 t) of a template t (n,) and values r (n,)."""
     whitened = np.linalg.solve(covariance, template)
     return float(whitened @ values / np.sqrt(whitened @ template))
 
 
-def spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool) -> np.ndarray:
+def spread(
+    image: np.ndarray,
+    inner: np.ndarray,
+    outer: np.ndarray,
+    back: bool,
+) -> np.ndarray:
     """Return s + outer x blur(s) on the grid of ``outer``, where s is image x inner, 0 beyond the
     image, and the blur has the weights `TAPS` on both axes; if ``back``, the transpose, (image +
     blur(image x inner)) x outer on the grid of ``outer``."""

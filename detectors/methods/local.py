@@ -264,7 +264,11 @@ class LocalDetector:
         return None
 
 
-def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray:
+def _shares(
+    cloud: Cloud,
+    judged: np.ndarray,
+    residual_m: np.ndarray,
+) -> np.ndarray:
     """Return the weight (n,) of each judged point: the median variance over its own, at most 4; 1
     if variances are unknown. They come from the cloud's maker, or from the scatter of frames
     nearby plus what is fixed in all frames."""
@@ -395,7 +399,11 @@ def _tent(image: np.ndarray, half: int) -> np.ndarray:
     return cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT)
 
 
-def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
+def _worth(
+    weights: np.ndarray,
+    covered: np.ndarray,
+    half: int,
+) -> np.ndarray:
     """Return the variance (r, c) of a tent's mean of white noise with all weights 1, over that of
     its mean with ``weights``, whose own mean is ``covered``."""
     side = np.convolve(np.ones(2 * half + 1), np.ones(2 * half + 1)) ** 2

@@ -58,7 +58,11 @@ class Zones(NamedTuple):
     """(z,): where each of these zones ends among them."""
 
 
-def zones_of(seen: np.ndarray, depth_px: np.ndarray, loud: np.ndarray) -> Zones:
+def zones_of(
+    seen: np.ndarray,
+    depth_px: np.ndarray,
+    loud: np.ndarray,
+) -> Zones:
     """Return the zones of the ``seen`` pixels (r, c) by their distance ``depth_px`` (r, c) from
     the outline."""
     zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.uint8)]

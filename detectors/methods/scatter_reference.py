@@ -21,7 +21,11 @@ def deviation_of(sizes: np.ndarray) -> float:
     return float(brentq(excess, 0.2, 50.0))
 
 
-def deviations(scores: np.ndarray, depth_px: np.ndarray, loud: np.ndarray) -> np.ndarray:
+def deviations(
+    scores: np.ndarray,
+    depth_px: np.ndarray,
+    loud: np.ndarray,
+) -> np.ndarray:
     """Return the deviation (z,) of the scores (r, c) in each zone of distances from the outline
     (r, c): up to each of `RIM_ENDS_PX`, and beyond, which sets the least of all. Scores that are 0
     or loud do not count; a zone with fewer than `FEWEST` has the deviation of the last one."""
@@ -38,7 +42,11 @@ def deviations(scores: np.ndarray, depth_px: np.ndarray, loud: np.ndarray) -> np
     return np.array([*by_zone, last])
 
 
-def raised(scores: np.ndarray, deviation: float, more: float) -> np.ndarray:
+def raised(
+    scores: np.ndarray,
+    deviation: float,
+    more: float,
+) -> np.ndarray:
     """Return scores over their deviation, whose squares grow by ``more``; those below `FAINT` grow
     in proportion to what the square of `FAINT` grows by."""
     scaled = scores / deviation
