@@ -24,7 +24,7 @@ from scipy import optimize, special
 
 from harness.evaluation.intervals import percentiles
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
-from harness.evaluation.study.limit import design_effect, refitted_sizes, targets_of
+from harness.evaluation.study.boards import design_effect, refitted_sizes, targets_of
 from harness.vocabulary.errors import UserError
 
 A50_MM = 6.0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness.evaluation.intervals import FalseCallRate, Interval, clopper_pearson, percentiles
-from harness.evaluation.study.limit import DRAWS, weights_in_blocks
+from harness.evaluation.study.boards import DRAWS, weights_in_blocks
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,16 +16,11 @@ import numpy as np
 from harness.evaluation.intervals import SITES_PER_TARGET, Interval, percentiles
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE
 from harness.evaluation.study import curves
+from harness.evaluation.study.boards import DRAWS
 from harness.evaluation.study.curves import ChanceHits
-from harness.evaluation.study.limit import (
-    ALL_FOUND,
-    DRAWS,
-    PodSurface,
-    SetUpLimit,
-    limit_of,
-    surface_of,
-)
+from harness.evaluation.study.limit import ALL_FOUND, SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
+from harness.evaluation.study.surface import PodSurface, surface_of
 from harness.records.trials import ResultTables
 from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.seeds import canonical_json

@@ -13,9 +13,10 @@ from scipy import special, stats
 
 from harness.evaluation.intervals import false_call_rate
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curve
-from harness.evaluation.study.limit import SetUpLimit, limit_of, surface_of
+from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.result import FRAMES, axis_lines, difference
+from harness.evaluation.study.surface import surface_of
 from harness.records.trials import ResultTables
 from tests.support.synthetic_study import (
     PIXEL_GRID,

@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 from harness.evaluation.intervals import percentiles
 from harness.evaluation.pod.curve import CELLS, LINKS, PodCurve
 from harness.evaluation.pod.hit_miss import bound, choose_model, fit_hit_miss
-from harness.evaluation.study.limit import (
-    ALL_FOUND,
+from harness.evaluation.study.boards import (
     design_effect,
-    limit_of,
     refitted_sizes,
     targets_of,
     weights_in_blocks,
 )
+from harness.evaluation.study.limit import ALL_FOUND, limit_of
 from harness.evaluation.study.record import Inspected, SetUpRecord
 from harness.tables.limits import limit_sentence
 from tests.support.synthetic_study import SetUp, Study, study_record
