@@ -290,8 +290,8 @@ def test_of_several_penalised_maxima_the_highest_is_taken(link: str, seed: int, 
     found = fit.data.hits > 0
     below = fit.data.z[~found].max()
     above = fit.data.z[found].min()
-    slopes = np.geomspace(0.2, 3000, 240)[:, None]
-    places = np.linspace(below - 1, above + 1, 800)
+    slopes = np.geomspace(0.2, 3000, 120)[:, None]
+    places = np.linspace(below - 1, above + 1, 200)
     values = fit.data.value(np.stack([-slopes * places, slopes + 0 * places], axis=-1))
     assert float(fit.data.value(np.array([b0, b1]))) >= values.max()
 
