@@ -9,17 +9,24 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from harness.evaluation.intervals import UNKNOWN, Interval
 from harness.evaluation.maps import (
+    Change,
     against_one,
     by_views,
     change_of,
+    change_text,
     compare_maps,
+    frames_text,
+    label_of,
     map_cases,
     maps_of,
     of_map,
     paired_ratio,
+    ratio_text,
     run_ratio,
     size_errors,
+    span,
     summarise_registrations,
 )
 from harness.evaluation.summary import summarise_holes
@@ -250,3 +257,139 @@ def test_other_axes_make_places_of_their_own(small):
     (case,) = map_cases(placed, summarise_holes(placed.holes, [row["path"] for row in more]))
     assert case.conditions == "0.7 m"
     assert against_one(case, "cpd", "grid") is not None
+
+
+def test_two_views_against_one_by_hand() -> None:
+    """Two views find one hole more and lose none, have half the bias and noise, and a threshold
+    of 4 instead of 5."""
+    world = MapWorld(
+        first=lambda views, method, merge, frames: 5 if views == 1 else 4,
+        size_bias_mm=lambda diameter, views, method, merge: (2.0 if diameter > 9 else 1.0) / views,
+        size_std_mm=0.0,
+        surface_mm=lambda views, method, merge, frames: 0.9 / views,
+        threshold=lambda views, merge: 6.0 - views,
+    )
+    made = perspectives(world, counts=(1, 2), methods=("cpd",), merges=("grid",))
+    (case,) = map_cases(made, summarise_holes(made.holes, [VIEWS, REGISTRATION, MERGE]))
+    against = against_one(case, "cpd", "grid")
+    assert against is not None
+    assert (against.frames, against.lost, against.gained) == (50, (), ("4",))
+    # holes from 9.525 mm = 3/8 in are large
+    assert against.sizes.holes == tuple(str(number) for number in range(5, 12))
+    assert against.large.mean == pytest.approx(-1.0)
+    assert against.small.mean == pytest.approx(-0.5)
+    assert np.exp(against.noise.mean) == pytest.approx(0.5, rel=0.02)
+    scale_mm = made.runs.groupby(["variant", "role", "frames"])["scale_mm"].mean()
+    before = 5.0 * scale_mm[name_of(1, "cpd", "grid"), "damaged", 50]
+    after = 4.0 * scale_mm[name_of(2, "cpd", "grid"), "damaged", 50]
+    assert against.threshold.mean == pytest.approx(after - before)
+    assert against_one(case, "cpd", "volume") is None
+    turned = replace(world, first=lambda views, method, merge, frames: 4 if views == 1 else 5)
+    made = perspectives(turned, counts=(1, 2), methods=("cpd",), merges=("grid",))
+    (case,) = map_cases(made, summarise_holes(made.holes, [VIEWS, REGISTRATION, MERGE]))
+    against = against_one(case, "cpd", "grid")
+    assert (against.lost, against.gained) == (("4",), ())
+
+
+def test_a_hole_of_three_eighths_of_an_inch_is_large(small) -> None:
+    (case,) = map_cases(small, summarise_holes(small.holes, [VIEWS, REGISTRATION, MERGE]))
+    against = against_one(case, "cpd", "grid")
+    sizes = against.sizes
+    assert 9.525 in np.round(sizes.diameters_mm, 6)
+    assert against.large == sizes.change(sizes.diameters_mm > 9.0)
+    assert against.small == sizes.change(sizes.diameters_mm < 9.0)
+
+
+def test_maps_are_compared_with_fifty_frames_or_the_most_that_all_have(small) -> None:
+    (case,) = map_cases(small, summarise_holes(small.holes, [VIEWS, REGISTRATION, MERGE]))
+    single = name_of(1, "cpd", "grid")
+    assert case.frames(single) == [1, 50]
+    assert case.common_frames(single) == 50
+    assert case.common_frames(single, None) is None
+    chosen = case.named(1, "cpd", "grid")
+    assert (chosen.variant, chosen.frames, chosen.views) == (single, 50, 1)
+    assert case.named(1, "cpd", "grid", 7) is None
+    assert case.named(2, "cpd", "grid", 1).frames == 1
+    assert case.single(1).frames == 1
+    assert set(case.runs(chosen)["variant"]) == {single}
+    assert set(case.runs(chosen)["frames"]) == {50}
+    assert set(case.holes(chosen)["frames"]) == {50}
+    assert set(case.registrations(1)["frames"]) == {1}
+    without = replace(case, summary=case.summary[case.summary["frames"] == 1])
+    assert without.common_frames(single) == 1
+
+
+def test_a_ratio_over_pairs_of_views_by_hand() -> None:
+    """Root mean squares 1 and 2 against 2 and 2: ratios 2 and 1, geometric mean sqrt(2)."""
+    first = pd.concat([registrations(view=1), registrations(view=2)], ignore_index=True)
+    first["tre_mm"] = [0.6, np.sqrt(2 - 0.36), 2.0, 2.0]
+    second = first.assign(tre_mm=2.0)
+    ratio, low, high, pairs = paired_ratio(first, second, "tre_mm")
+    # t(0.975, 1) = 12.7062 times ln(2) / sqrt(2) / sqrt(2)
+    half = 12.7062 * np.log(2) / 2
+    assert (ratio, pairs) == (pytest.approx(np.sqrt(2)), 2)
+    assert low == pytest.approx(np.sqrt(2) * np.exp(-half), rel=1e-4)
+    assert high == pytest.approx(np.sqrt(2) * np.exp(half), rel=1e-4)
+    nothing = first.assign(tre_mm=0.0)
+    assert paired_ratio(first, nothing, "tre_mm")[3] == 0
+
+
+def test_registrations_of_any_number_of_views_count_as_the_most() -> None:
+    rows = pd.concat(
+        [
+            registrations(seconds=0.1).assign(**{VIEWS: 2.0}),
+            registrations(seconds=0.2).assign(**{VIEWS: 5.0}),
+            registrations(seconds=0.3).assign(**{VIEWS: "all"}),
+        ],
+        ignore_index=True,
+    )
+    assert of_map(rows, "marks", 2)["seconds"].tolist() == [0.1, 0.1]
+    assert of_map(rows, "marks", 4)["seconds"].tolist() == [0.2, 0.2]
+    assert of_map(rows[rows["seconds"] > 0.2], "marks", 9)["seconds"].tolist() == [0.3, 0.3]
+    assert of_map(rows, "marks", 1).empty
+
+
+def test_failures_are_counted_by_reason_most_frequent_first() -> None:
+    rows = pd.concat([registrations()] * 5, ignore_index=True)
+    rows["failure"] = ["", "b", "c", "b", "a", "d", "d", "d", "a", ""]
+    rows["guess_tre_mm"] = np.arange(10.0)
+    rows["seconds"] = np.arange(10.0)
+    (row,) = summarise_registrations(rows).to_dict("records")
+    assert (row["n"], row["failed"]) == (10, 8)
+    assert row["reasons"] == ["d (3)", "a (2)", "b (2)"]
+    assert (row["guess_mm"], row["seconds"]) == (4.5, 4.5)
+
+
+def test_changes_in_words() -> None:
+    change = Change(0.123, Interval(0.05, 0.187), 4)
+    assert change_text(change) == "+0.12 mm (0.05 to 0.19)"
+    assert change_text(Change(-0.001, UNKNOWN, 4)) == "+0.00 mm (interval unknown)"
+    assert change_text(Change(np.nan, UNKNOWN, 0)) == "not compared"
+    ratio = Change(np.log(0.6), Interval(np.log(0.5), np.log(0.7)), 4)
+    assert ratio_text(ratio) == "× 0.60 (0.50 to 0.70)"
+    assert ratio_text(Change(np.nan, UNKNOWN, 0)) == "not compared"
+    assert span(Interval(-0.001, 1.25), 1) == "0.0 to 1.2"
+    assert label_of("cpd", "grid", "0.7 m") == "cpd, grid, 0.7 m"
+    assert label_of("", "") == "as declared"
+    assert (frames_text(1), frames_text(2)) == ("1 frame a view", "2 frames a view")
+
+
+def test_a_mean_change_by_hand() -> None:
+    """Differences 1, 2 and 6: mean 3, standard deviation 2.645751, t(0.975, 2) = 4.302653."""
+    change = change_of(np.array([1.0, np.nan, 2.0, 6.0, np.inf]))
+    half = 4.302653 * np.sqrt(7.0) / np.sqrt(3)
+    assert (change.mean, change.n) == (3.0, 3)
+    assert change.interval.low == pytest.approx(3 - half, abs=1e-5)
+    assert change.interval.high == pytest.approx(3 + half, abs=1e-5)
+    assert change_of(np.array([1.0, np.nan])).n == 0
+
+
+def test_size_errors_of_some_holes() -> None:
+    one = holes([[11.0, 12.0], [5.5, 5.0]], repeats=2)
+    two = holes([[10.5, 8.0], [4.0, 6.0]], repeats=2)
+    errors = size_errors(one, two)
+    assert errors.differences_mm.tolist() == [[0.5, -0.5], [1.0, 0.0]]
+    assert errors.change(np.array([True, False])).mean == 0.75
+    assert errors.change(np.array([False, True])).mean == -0.25
+    assert errors.change().mean == 0.25
+    assert errors.change(np.array([False, False])).n == 0
