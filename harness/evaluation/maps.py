@@ -81,8 +81,8 @@ def _most_views(runs: pd.DataFrame) -> dict[str, int]:
     if runs.empty or "views_used" not in runs:
         return {}
     views = runs["views_used"] + runs["views_left_out"]
-    most = views.groupby(runs["variant"]).max().dropna()
-    return {str(variant): int(number) for variant, number in most.items()}
+    largest = views.groupby(runs["variant"]).max().dropna()
+    return {str(variant): int(number) for variant, number in largest.items()}
 
 
 def _whole(value: Any) -> int | None:

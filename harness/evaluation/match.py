@@ -11,13 +11,13 @@ def match(truth_m: np.ndarray, finding_m: np.ndarray, radius_m: float) -> dict[i
     return closest_pairs(np.linalg.norm(offset_m, axis=-1), radius_m)
 
 
-def closest_pairs(distance: np.ndarray, most: float) -> dict[int, int]:
+def closest_pairs(distance: np.ndarray, limit: float) -> dict[int, int]:
     """Return pairs {index of truth: index of finding} from the distances (n, m) between damages
-    and findings: closest pairs first, each used once, none farther apart than ``most``; NaN
+    and findings: closest pairs first, each used once, none farther apart than ``limit``; NaN
     matches nothing. Ties: lower index first."""
     pairs: dict[int, int] = {}
     matched_findings: set[int] = set()
-    candidates = np.flatnonzero(distance <= most)
+    candidates = np.flatnonzero(distance <= limit)
     order = np.argsort(distance.reshape(-1)[candidates], kind="stable")
     for flat_index in candidates[order]:
         truth, finding = divmod(int(flat_index), distance.shape[1])

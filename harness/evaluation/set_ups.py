@@ -197,15 +197,15 @@ def _errors(name: str, errors: pd.Series) -> dict[str, float]:
 
 
 class _Cost(NamedTuple):
-    """A cost that is wanted: of turning on effects of ``on`` that are not in ``off``."""
+    """A cost that is wanted: of turning on one effect, or all."""
 
     effect: str
     """Words for the effect, or ``all``."""
     against: str
     """Words for what else is on: ``nothing`` or ``all others``."""
-    off: frozenset[str]
+    effects_before: frozenset[str]
     """Effects of the set-up without it."""
-    on: frozenset[str]
+    effects_after: frozenset[str]
     """Effects of the set-up with it."""
 
 
@@ -225,7 +225,7 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
     rows = list[dict[str, Any]]()
     for values, part in groups:
         named_values = zip(axes, values, strict=True)
-        place = ", ".join(f"{names[path]}={value}" for path, value in named_values)
+        conditions = ", ".join(f"{names[path]}={value}" for path, value in named_values)
         variant_of = {}
         for _, row in part.iterrows():
             variant_of[_switched_on(str(row["switches"]))] = str(row["variant"])
@@ -237,15 +237,15 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
                 str(variant): ladder_of(trials) for variant, trials in of_frames.groupby("variant")
             }
             ladders = {
-                on: by_variant[variant]
-                for on, variant in variant_of.items()
+                effects: by_variant[variant]
+                for effects, variant in variant_of.items()
                 if variant in by_variant
             }
             for wanted in _wanted_costs(order, most_on):
-                if cost := _cost(ladders, wanted.off, wanted.on):
+                if cost := _cost(ladders, wanted.effects_before, wanted.effects_after):
                     rows.append(
                         {
-                            "place": place,
+                            "place": conditions,
                             "frames": frames,
                             "effect": wanted.effect,
                             "against": wanted.against,
@@ -278,15 +278,17 @@ def _wanted_costs(effects: list[str], most_on: frozenset[str]) -> list[_Cost]:
 
 
 def _cost(
-    ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]
+    ladders: Mapping[frozenset[str], Ladder],
+    effects_before: frozenset[str],
+    effects_after: frozenset[str],
 ) -> dict[str, Any]:
     """Return the paired difference of two set-ups with its interval, and whether both sizes lie on
     the ladder (else it is only a bound); empty if either was not finished, or not with the same
     repeats."""
-    if off not in ladders or on not in ladders:
+    if effects_before not in ladders or effects_after not in ladders:
         return {}
-    before = ladders[off]
-    after = ladders[on]
+    before = ladders[effects_before]
+    after = ladders[effects_after]
     if before.detected.shape != after.detected.shape:
         return {}
     # both off the ladder: a difference of infinities is unknown

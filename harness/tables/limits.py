@@ -27,7 +27,7 @@ its own."""
 
 
 def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
-    """Return whether a bound (a90/95 unless stated) is demonstrated by sizes that were inspected."""
+    """Return whether a bound (a90/95 if None) is demonstrated by sizes that were inspected."""
     bound = bound or limit.a90_95
     return bound.demonstrated and not limit.beyond(bound.value)
 
@@ -49,18 +49,18 @@ def bound_text(bound: Estimate) -> str:
     return text.size(bound.value, bound.most)
 
 
-def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown
+def size_estimate(limit: SetUpLimit, name: str) -> Estimate:
+    """Return a50 or a90 (``name``) with its interval; an upper bound if nothing was missed; unknown
     if not above 0."""
-    size_mm = getattr(limit, f"{of}_mm")
-    ends = getattr(limit, f"{of}_interval_mm")
+    size_mm = getattr(limit, f"{name}_mm")
+    ends = getattr(limit, f"{name}_interval_mm")
     if size_mm <= 0:
         return Estimate(np.nan)
     return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
-a50_of = partial(size_estimate, of="a50")
-a90_of = partial(size_estimate, of="a90")
+a50_of = partial(size_estimate, name="a50")
+a90_of = partial(size_estimate, name="a90")
 FOUND_50 = f"size found {50} % of the time"
 FOUND_90 = f"size found {90} % of the time"
 BRIEF: dict[str, Any] = {
@@ -128,26 +128,26 @@ def _verdict(limit: SetUpLimit, bound: Bound) -> str:
 
 def _by_depth(limit: SetUpLimit) -> int | None:
     """Return the number of hits by depth; None if kinds of hits were not counted separately."""
-    seen = limit.record.inspected
-    if seen.by_depth is None or seen.by_no_return is None:
+    inspected = limit.record.inspected
+    if inspected.by_depth is None or inspected.by_no_return is None:
         return None
-    return int(seen.by_depth.sum())
+    return int(inspected.by_depth.sum())
 
 
 def _by_no_return(limit: SetUpLimit) -> int | None:
     """Return the number of hits by missing returns; None if they were not counted separately."""
-    seen = limit.record.inspected
-    if seen.by_depth is None or seen.by_no_return is None:
+    inspected = limit.record.inspected
+    if inspected.by_depth is None or inspected.by_no_return is None:
         return None
-    return int(seen.by_no_return.sum())
+    return int(inspected.by_no_return.sum())
 
 
 def _found(limit: SetUpLimit) -> str:
     by_no_return = _by_no_return(limit)
-    found = f"{limit.hits} of {limit.inspections}"
+    text_of_hits = f"{limit.hits} of {limit.inspections}"
     if not by_no_return:
-        return found
-    return f"{found} ({_by_depth(limit)} by depth, {by_no_return} by missing returns)"
+        return text_of_hits
+    return f"{text_of_hits} ({_by_depth(limit)} by depth, {by_no_return} by missing returns)"
 
 
 LIMITS = Table(
@@ -467,10 +467,10 @@ def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each
     set-up."""
     notes = {limit.record.label: notes_of(limit) for limit in limits}
-    first, *further = notes.values()
+    first, *remaining = notes.values()
     shared = []
-    if further:
-        shared = [note for note in first if all(note in others for others in further)]
+    if remaining:
+        shared = [note for note in first if all(note in other_notes for other_notes in remaining)]
     lines = [("every set-up", shared)]
     for label, of_set_up in notes.items():
         lines.append((label, [note for note in of_set_up if note not in shared]))

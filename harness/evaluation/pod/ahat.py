@@ -312,12 +312,12 @@ def fit_censored(
     exact = ~(below | above)
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
-        what = (
+        message = (
             f"{exact.sum()} of {len(y)} signals lie between the limits: "
             "too few, or at too few sizes, for a line"
         )
         raise UserError(
-            what, legal=f"more than {p} signals that are not censored, at different sizes"
+            message, legal=f"more than {p} signals that are not censored, at different sizes"
         )
     start = np.linalg.lstsq(design[exact], y[exact], rcond=None)[0]
     residual = y - design @ start

@@ -509,11 +509,11 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     inside = np.zeros(DIRECTIONS)
     outside = np.minimum(farthest, 2.0)
     for _ in range(REACH):
-        further = (excess(outside, ray_index) > 0) & (outside < farthest)
-        if not further.any():
+        extended = (excess(outside, ray_index) > 0) & (outside < farthest)
+        if not extended.any():
             break
-        inside = np.where(further, outside, inside)
-        outside = np.where(further, np.minimum(2.0 * outside, farthest), outside)
+        inside = np.where(extended, outside, inside)
+        outside = np.where(extended, np.minimum(2.0 * outside, farthest), outside)
     crossed = excess(outside, ray_index) < 0
     roots = elementwise.find_root(
         excess,

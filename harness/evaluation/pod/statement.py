@@ -141,8 +141,8 @@ class PodStatement:
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
         least = min(row.deviance for row in self.models)
         rows_per_target = len(self.read.size) / self.read.targets
-        near = least + NEAR_DEVIANCE * rows_per_target
-        limits = [row.bound.value for row in self.models if row.deviance <= near]
+        near_deviance = least + NEAR_DEVIANCE * rows_per_target
+        limits = [row.bound.value for row in self.models if row.deviance <= near_deviance]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
         span = f"{_limit_text(min(limits))} to {_limit_text(max(limits))}"
@@ -176,7 +176,9 @@ class PodStatement:
             "a90_95": _bound_data(self.bound),
             "models": [_model_data(row) for row in self.models],
             "numbers": self.numbers,
-            "tests": [{"test": what, "p": p, "reads": reads} for what, p, reads in self.tests],
+            "tests": [
+                {"test": subject, "p": p, "reads": reads} for subject, p, reads in self.tests
+            ],
             "notes": self.notes,
             "warnings": self.doubts,
         }
@@ -233,10 +235,10 @@ def state_hits(
             if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)
         ]
         fit = allowed[0]
-        near = hit_miss.near_models(allowed)
+        close_fits = hit_miss.near_models(allowed)
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
         bounds = [hit_miss.bound(fit, POD, CONFIDENCE) for fit in tried]
-    of_near = [limit for fit, limit in zip(tried, bounds, strict=True) if fit in near]
+    of_near = [limit for fit, limit in zip(tried, bounds, strict=True) if fit in close_fits]
     limit = max(of_near, key=lambda limit: limit.value)
 
     notes = [*read.notes, *fit.notes]
@@ -273,9 +275,9 @@ def state_hits(
         read=read,
         kind="hit/miss",
         unit=unit,
-        fits=near,
+        fits=close_fits,
         signal=None,
-        models=_models(tried, bounds, near),
+        models=_models(tried, bounds, close_fits),
         bound=limit,
         numbers=numbers,
         notes=tuple(notes),
@@ -356,7 +358,7 @@ Fit = TypeVar("Fit", HitMissFit, AhatFit)
 
 
 def _models(
-    tried: Sequence[Fit], bounds: Sequence[Bound], near: Sequence[Fit]
+    tried: Sequence[Fit], bounds: Sequence[Bound], close_fits: Sequence[Fit]
 ) -> tuple[ModelRow, ...]:
     """Return rows of fits with their ``bounds``; the first of the ``near`` fits is that of the
     curve."""
@@ -368,8 +370,8 @@ def _models(
             a50=fit.curve.size_at(0.5),
             a90=fit.curve.size_at(POD),
             bound=limit,
-            chosen=fit is near[0],
-            in_bound=any(fit is other for other in near),
+            chosen=fit is close_fits[0],
+            in_bound=any(fit is close_fit for close_fit in close_fits),
         )
         rows.append(row)
     return tuple(rows)

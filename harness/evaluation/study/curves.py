@@ -57,18 +57,18 @@ def chance_hits(
     per_m2 = np.nan if rate is None else rate.rate_per_m2
     calls_within_radius = per_m2 * np.pi * (radius_mm / 1000) ** 2
     count = 0
-    found = 0.0
+    found_sites = 0.0
     if not sites.empty:
         share = sites.groupby(["board", "hole"])["detected"].mean()
         count = len(share)
-        found = float(share.sum())
-    low, high = clopper_pearson(found, count)
+        found_sites = float(share.sum())
+    low, high = clopper_pearson(found_sites, count)
     return ChanceHits(
         probability=probability,
         laid=laid,
         expected=float(-np.expm1(-calls_within_radius)),
         sites=count,
-        of_sites=found / count if count else np.nan,
+        of_sites=found_sites / count if count else np.nan,
         sites_interval=Interval(float(low), float(high)),
     )
 

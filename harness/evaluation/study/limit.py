@@ -135,12 +135,12 @@ class _Sizes:
 def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -> SetUpLimit:
     """Return the limit of ``record``. ``tested``: whether to test for a floor and a ceiling, with
     a note. Deterministic. Data without a curve are not an error: ``why`` gives the reason."""
-    seen = record.inspected
-    targets = targets_of(seen.board, seen.hole, seen.size_mm, seen.hit)
+    inspected = record.inspected
+    targets = targets_of(inspected.board, inspected.hole, inspected.size_mm, inspected.hit)
     statement, why = _statement(record, tested)
     if statement is not None:
         sizes = _sizes_of_curve(record, targets, statement, draws)
-    elif len(seen.hit) and seen.hit.all():
+    elif len(inspected.hit) and inspected.hit.all():
         sizes = _sizes_if_all_found(targets, draws)
     else:
         sizes = _no_sizes(why, draws)
@@ -160,11 +160,11 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
         design_effect=sizes.design_effect,
         boards=len(np.unique(targets.board)),
         targets=len(targets.board),
-        hits=int(seen.hit.sum()),
-        inspections=len(seen.hit),
+        hits=int(inspected.hit.sum()),
+        inspections=len(inspected.hit),
         false_calls=false_calls,
         false_calls_interval_per_m2=false_calls_interval,
-        largest_mm=float(seen.size_mm.max()) if len(seen.hit) else np.nan,
+        largest_mm=float(inspected.size_mm.max()) if len(inspected.hit) else np.nan,
         over_units=sizes.over_units,
         beside=beside,
     )
@@ -172,39 +172,39 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
 
 def _statement(record: SetUpRecord, tested: bool) -> tuple[PodStatement | None, str]:
     """State the curve of all hits; None, and the reason, if there is none."""
-    seen = record.inspected
-    if not len(seen.hit):
+    inspected = record.inspected
+    if not len(inspected.hit):
         return None, "no damage was inspected"
     try:
         statement = state_hits(_rows(record), unit="mm", tested=tested)
     except UserError as error:
         return None, error.message
-    if seen.limit_of == "depth" or not depth_varies(seen.depth_mm):
+    if inspected.limit_of == "depth" or not depth_varies(inspected.depth_mm):
         return statement, ""
-    depths = f"{seen.depth_mm.min():.3g} to {seen.depth_mm.max():.3g} mm"
+    depths = f"{inspected.depth_mm.min():.3g} to {inspected.depth_mm.max():.3g} mm"
     note = f"depths from {depths}: one curve over all depths"
     return replace(statement, notes=(*statement.notes, note)), ""
 
 
 def _rows(record: SetUpRecord) -> Inspections:
     """Return the inspections as a table of the library; repeats are rows of one target."""
-    seen = record.inspected
-    names = target_names(seen)
+    inspected = record.inspected
+    names = target_names(inspected)
     repeated = len(np.unique(names)) < len(names)
     return Inspections(
         path=Path(record.label),
-        size_column=seen.limit_of,
+        size_column=inspected.limit_of,
         response_column="hit",
-        size=seen.size_mm,
-        response=seen.hit.astype(float),
+        size=inspected.size_mm,
+        response=inspected.hit.astype(float),
         target=names if repeated else None,
         line=np.arange(1, len(names) + 1),
     )
 
 
-def target_names(seen: Inspected) -> np.ndarray:
+def target_names(inspected: Inspected) -> np.ndarray:
     """Return a name (n,) of what each row inspects; repeats of one damage share it."""
-    pairs = zip(seen.board, seen.hole, strict=True)
+    pairs = zip(inspected.board, inspected.hole, strict=True)
     return np.array([f"{board}:{hole}" for board, hole in pairs], dtype=str)
 
 
@@ -212,15 +212,15 @@ def _sizes_of_curve(
     record: SetUpRecord, targets: Targets, statement: PodStatement, draws: int
 ) -> _Sizes:
     """Return the sizes of a curve, with percentiles over resampled boards (and units)."""
-    seen = record.inspected
-    unit = seen.repeat % record.units
+    inspected = record.inspected
+    unit = inspected.repeat % record.units
     rows = targets
     if record.units > 1:
         rows = Targets(
-            board=seen.board,
-            size_mm=seen.size_mm,
-            hits=seen.hit.astype(float),
-            inspections=np.ones(len(seen.hit)),
+            board=inspected.board,
+            size_mm=inspected.size_mm,
+            hits=inspected.hit.astype(float),
+            inspections=np.ones(len(inspected.hit)),
             unit=unit,
         )
     redrawn = refitted_sizes(rows, statement.curve, (0.5, POD), draws)
@@ -229,9 +229,9 @@ def _sizes_of_curve(
     units: OverUnits | None = None
     if record.units > 1:
         units = over_units(
-            size_mm=seen.size_mm,
-            hit=seen.hit,
-            target=target_names(seen),
+            size_mm=inspected.size_mm,
+            hit=inspected.hit,
+            target=target_names(inspected),
             unit=unit,
             curve=statement.curve,
             limit=over_boards,
@@ -283,12 +283,12 @@ def _sizes_if_all_found(targets: Targets, draws: int) -> _Sizes:
     )
 
 
-def _all_found(size_mm: np.ndarray, what: str) -> Bound:
-    method = f"all found: binomial on the {ALL_FOUND} smallest {what}"
+def _all_found(size_mm: np.ndarray, noun: str) -> Bound:
+    method = f"all found: binomial on the {ALL_FOUND} smallest {noun}"
     if len(size_mm) >= ALL_FOUND:
         return Bound(POD, CONFIDENCE, method, float(np.sort(size_mm)[ALL_FOUND - 1]))
-    found = f"all of {len(size_mm)} {what} were found"
-    why = f"not demonstrated: {found}, but {ALL_FOUND} are needed"
+    outcome = f"all of {len(size_mm)} {noun} were found"
+    why = f"not demonstrated: {outcome}, but {ALL_FOUND} are needed"
     return Bound(POD, CONFIDENCE, method, np.inf, why)
 
 

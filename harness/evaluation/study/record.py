@@ -339,7 +339,7 @@ def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
 def _mistake(error: ValidationError, data: Any) -> str:
     """Describe the first mistake in a study's data in one sentence, with its place, and count the
     rest."""
-    first, *further = error.errors(include_url=False)
+    first, *remaining = error.errors(include_url=False)
     path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
     where = ".".join(map(str, path))
     if path[:1] == ["set_ups"] and len(path) > 1:
@@ -351,6 +351,6 @@ def _mistake(error: ValidationError, data: Any) -> str:
     value = first.get("input")
     if value is None or isinstance(value, str | int | float):
         sentence += f", not {shown(value)}"
-    if further:
-        sentence += f"; and {len(further)} more"
+    if remaining:
+        sentence += f"; and {len(remaining)} more"
     return sentence

@@ -213,14 +213,14 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
     axes."""
     labels_of: dict[str, list[str]] = {}
     for limit in limits:
-        seen = limit.record.inspected
-        if not len(seen.hit):
+        inspected = limit.record.inspected
+        if not len(inspected.hit):
             continue
-        wide = _span(seen.diameter_mm.min(), seen.diameter_mm.max())
-        deep = _span(seen.depth_mm.min(), seen.depth_mm.max())
+        wide = _span(inspected.diameter_mm.min(), inspected.diameter_mm.max())
+        deep = _span(inspected.depth_mm.min(), inspected.depth_mm.max())
         text = (
             f"{limit.targets} damages on {limit.boards} boards, "
-            f"{wide} in {seen.size_of} and {deep} deep"
+            f"{wide} in {inspected.size_of} and {deep} deep"
         )
         times = limit.inspections / limit.targets
         if times != 1:
@@ -228,8 +228,8 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
         labels_of.setdefault(text, []).append(limit.record.label)
     sentences = []
     for text, labels in labels_of.items():
-        named = f"{', '.join(labels)}: " if len(labels_of) > 1 else ""
-        sentences.append(f"{named}{text}.")
+        prefix = f"{', '.join(labels)}: " if len(labels_of) > 1 else ""
+        sentences.append(f"{prefix}{text}.")
     for path, values in sweep.items():
         words = [in_words(f"{path}={canonical_json(value)}") for value in values]
         sentences.append(f"Varied: {'; '.join(words)}.")

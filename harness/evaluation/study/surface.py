@@ -72,41 +72,41 @@ def depth_varies(depth_mm: np.ndarray) -> bool:
 
 def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | None, str]:
     """Fit the surface; None, and the reason, if there is none."""
-    seen = record.inspected
-    if why := _no_surface(seen):
+    inspected = record.inspected
+    if why := _no_surface(inspected):
         return None, why
-    a = np.log(seen.diameter_mm)
-    d = np.log(seen.depth_mm)
+    a = np.log(inspected.diameter_mm)
+    d = np.log(inspected.depth_mm)
     crossed = np.stack([np.ones_like(a), a, d, a * d], axis=1)
-    if _separated(crossed[:, :3], seen.hit):
-        overlap = f"hits and misses do not overlap over {seen.size_of} and depth (separation)"
+    if _separated(crossed[:, :3], inspected.hit):
+        overlap = f"hits and misses do not overlap over {inspected.size_of} and depth (separation)"
         return None, f"{overlap}: no surface fits"
 
-    fits = [_fit(link, crossed[:, :3], seen.hit) for link in LINKS]
+    fits = [_fit(link, crossed[:, :3], inspected.hit) for link in LINKS]
     fit = min(fits, key=lambda fit: fit.deviance)
     if fit.b[1] <= 0:
-        return None, f"the probability of detection does not grow with {seen.size_of}"
+        return None, f"the probability of detection does not grow with {inspected.size_of}"
     note = "POD falls with depth" if fit.b[2] < 0 else ""
     interaction_p = np.nan
     terms = 3
-    if not _separated(crossed, seen.hit):
-        bent = _fit(fit.link, crossed, seen.hit)
-        ratio = max(fit.deviance - bent.deviance, 0.0) / _repeats(seen)
+    if not _separated(crossed, inspected.hit):
+        bent = _fit(fit.link, crossed, inspected.hit)
+        ratio = max(fit.deviance - bent.deviance, 0.0) / _repeats(inspected)
         interaction_p = float(chi2.sf(ratio, 1))
         if interaction_p < LEVEL and _rises(bent.b, d):
             fit = bent
             terms = 4
         elif interaction_p < LEVEL:
             interaction = (
-                f"{seen.size_of} and depth interact (p = {interaction_p:.2g}), "
+                f"{inspected.size_of} and depth interact (p = {interaction_p:.2g}), "
                 "which the surface leaves out"
             )
             note = f"{note}; {interaction}" if note else interaction
 
-    diameter_mm = np.geomspace(seen.diameter_mm.min(), seen.diameter_mm.max(), STEPS)
+    diameter_mm = np.geomspace(inspected.diameter_mm.min(), inspected.diameter_mm.max(), STEPS)
     d90_mm = _depth_at_pod(fit.b[None], fit.link, diameter_mm)[0]
-    redrawn = _refitted(crossed[:, :terms], seen, fit, draws)
-    low, high = _percentiles(_depth_at_pod(redrawn, fit.link, diameter_mm), seen)
+    redrawn = _refitted(crossed[:, :terms], inspected, fit, draws)
+    low, high = _percentiles(_depth_at_pod(redrawn, fit.link, diameter_mm), inspected)
     surface = PodSurface(
         link=fit.link,
         b=fit.b,
@@ -116,29 +116,29 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
         d90_mm=d90_mm,
         d90_low_mm=low,
         d90_high_mm=high,
-        depth_range_mm=(float(seen.depth_mm.min()), float(seen.depth_mm.max())),
+        depth_range_mm=(float(inspected.depth_mm.min()), float(inspected.depth_mm.max())),
         note=note,
     )
     return surface, ""
 
 
-def _no_surface(seen: Inspected) -> str:
+def _no_surface(inspected: Inspected) -> str:
     """Return why the rows allow no surface, before any fit; empty if they may."""
-    if not len(seen.hit) or seen.hit.all() or not seen.hit.any():
+    if not len(inspected.hit) or inspected.hit.all() or not inspected.hit.any():
         return "all damages had the same outcome: there is no surface to fit"
-    shallowest = seen.depth_mm.min()
-    if shallowest <= 0 or not depth_varies(seen.depth_mm):
-        return f"depth does not vary: {shallowest:g} to {seen.depth_mm.max():g} mm"
-    smallest = seen.diameter_mm.min()
-    if smallest == seen.diameter_mm.max():
-        return f"{seen.size_of} does not vary: {smallest:g} mm"
+    shallowest = inspected.depth_mm.min()
+    if shallowest <= 0 or not depth_varies(inspected.depth_mm):
+        return f"depth does not vary: {shallowest:g} to {inspected.depth_mm.max():g} mm"
+    smallest = inspected.diameter_mm.min()
+    if smallest == inspected.diameter_mm.max():
+        return f"{inspected.size_of} does not vary: {smallest:g} mm"
     return ""
 
 
-def _repeats(seen: Inspected) -> float:
+def _repeats(inspected: Inspected) -> float:
     """Return the mean number of inspections of a damage."""
-    damages = set(zip(seen.board.tolist(), seen.hole.tolist(), strict=True))
-    return len(seen.hit) / len(damages)
+    damages = set(zip(inspected.board.tolist(), inspected.hole.tolist(), strict=True))
+    return len(inspected.hit) / len(damages)
 
 
 def _rises(b: np.ndarray, log_depth: np.ndarray) -> bool:
@@ -154,13 +154,13 @@ def _fit(link: str, design: np.ndarray, hit: np.ndarray) -> _Fit:
     return _Fit(deviance, np.pad(b, (0, COEFFICIENTS - len(b))), link)
 
 
-def _refitted(design: np.ndarray, seen: Inspected, fit: _Fit, draws: int) -> np.ndarray:
+def _refitted(design: np.ndarray, inspected: Inspected, fit: _Fit, draws: int) -> np.ndarray:
     """Return the coefficients (draws, 4) of resampled boards."""
     terms = design.shape[1]
     parts = []
-    for (weights,) in weights_in_blocks(draws, (seen.board, "damaged")):
-        hits = weights * seen.hit
-        misses = weights * ~seen.hit
+    for (weights,) in weights_in_blocks(draws, (inspected.board, "damaged")):
+        hits = weights * inspected.hit
+        misses = weights * ~inspected.hit
         parts.append(_coefficients(design, hits, misses, fit.link, fit.b[:terms]))
     return np.pad(np.concatenate(parts), ((0, 0), (0, COEFFICIENTS - terms)))
 
@@ -176,9 +176,9 @@ def _depth_at_pod(b: np.ndarray, link: str, diameter_mm: np.ndarray) -> np.ndarr
     return np.where(slope > 0, depth_mm, np.inf)
 
 
-def _percentiles(draws_mm: np.ndarray, seen: Inspected) -> tuple[np.ndarray, np.ndarray]:
+def _percentiles(draws_mm: np.ndarray, inspected: Inspected) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends (k,) of the intervals of depths (draws, k); NaN below two boards."""
-    several = len(np.unique(seen.board)) > 1
+    several = len(np.unique(inspected.board)) > 1
     ends = [percentiles(column) if several else UNKNOWN for column in draws_mm.T]
     low = np.array([end.low for end in ends])
     high = np.array([end.high for end in ends])
