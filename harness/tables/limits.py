@@ -466,14 +466,13 @@ def notes_of(limit: SetUpLimit) -> list[str]:
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each
     set-up."""
-    notes = {limit.record.label: notes_of(limit) for limit in limits}
-    first, *remaining = notes.values()
-    shared = []
-    if remaining:
-        shared = [note for note in first if all(note in other_notes for other_notes in remaining)]
+    notes = [notes_of(limit) for limit in limits]
+    shared: list[str] = []
+    if len(notes) > 1:
+        shared = [note for note in notes[0] if all(note in of_set_up for of_set_up in notes)]
     lines = [("every set-up", shared)]
-    for label, of_set_up in notes.items():
-        lines.append((label, [note for note in of_set_up if note not in shared]))
+    for limit, of_set_up in zip(limits, notes, strict=True):
+        lines.append((limit.record.label, [note for note in of_set_up if note not in shared]))
     return [f"{label}: {'; '.join(of_line)}" for label, of_line in lines if of_line]
 
 

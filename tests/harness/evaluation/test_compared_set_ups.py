@@ -26,18 +26,18 @@ def summary_of(parts: Tables) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def both() -> Tables:
+def two_variants() -> Tables:
     """The set-up "main" and a variation with a shifted threshold."""
-    other = WORLD.changed(threshold={50: 7.0})
-    return joined(tables(WORLD, (1, 50)), tables(other, (50,), "varied"))
+    other_world = WORLD.changed(threshold={50: 7.0})
+    return joined(tables(WORLD, (1, 50)), tables(other_world, (50,), "varied"))
 
 
-def test_set_ups_are_those_that_vary_nothing(both: Tables) -> None:
-    assert set_ups_of(both) == ["main"]
+def test_set_ups_are_those_that_vary_nothing(two_variants: Tables) -> None:
+    assert set_ups_of(two_variants) == ["main"]
 
 
-def test_a_row_holds_what_its_trials_say(both: Tables) -> None:
-    compared = compare_set_ups(both, summary_of(both), ["varied", "main"])
+def test_a_row_holds_what_its_trials_say(two_variants: Tables) -> None:
+    compared = compare_set_ups(two_variants, summary_of(two_variants), ["varied", "main"])
     assert compared["variant"].tolist() == ["varied", "main", "main"]
     assert compared["frames"].tolist() == [50, 1, 50]
     row = compared.iloc[2]
@@ -50,17 +50,21 @@ def test_a_row_holds_what_its_trials_say(both: Tables) -> None:
     assert np.isnan(compared.iloc[0]["half_mm"])
     assert (row["runs"], row["false_calls"], row["threshold"]) == (6, 1, 5.0)
     assert compared.iloc[0]["threshold"] == 7.0
-    damaged = both.runs[(both.runs["role"] == "damaged") & (both.runs["frames"] == 50)]
+    damaged = two_variants.runs[
+        (two_variants.runs["role"] == "damaged") & (two_variants.runs["frames"] == 50)
+    ]
     scale_mm = damaged["scale_mm"][damaged["variant"] == "main"].mean()
     assert row["threshold_mm"] == pytest.approx(5.0 * scale_mm)
     assert row["surface_mm"] == pytest.approx(0.9 / np.sqrt(50))
     assert row["pitch_u_mm"] == pytest.approx(1.5)
-    assert "half_mm" not in compare_set_ups(both, summary_of(both), ["main"], half_sizes=False)
+    assert "half_mm" not in compare_set_ups(
+        two_variants, summary_of(two_variants), ["main"], half_sizes=False
+    )
 
 
-def test_errors_of_measures_are_over_trials_of_found_holes(both: Tables) -> None:
-    row = compare_set_ups(both, summary_of(both), ["main"]).iloc[1]
-    holes = both.holes
+def test_errors_of_measures_are_over_trials_of_found_holes(two_variants: Tables) -> None:
+    row = compare_set_ups(two_variants, summary_of(two_variants), ["main"]).iloc[1]
+    holes = two_variants.holes
     trials = holes[(holes["variant"] == "main") & (holes["frames"] == 50)]
     of_found = trials[trials["hole"].astype(int) >= 5]
     size_error = of_found["extent_diameter_mm"] - of_found["true_diameter_mm"]
@@ -76,17 +80,17 @@ def test_errors_of_measures_are_over_trials_of_found_holes(both: Tables) -> None
     assert row["extent_place_std_mm"] == pytest.approx(place_error.std(ddof=1))
 
 
-def test_two_largest_holes_leave_no_distances(both: Tables) -> None:
-    holes = both.holes.copy()
+def test_two_largest_holes_leave_no_distances(two_variants: Tables) -> None:
+    holes = two_variants.holes.copy()
     holes.loc[holes["hole"] == "10", "true_diameter_mm"] = DIAMETERS_MM[10]
-    level = replace(both, holes=holes)
+    level = replace(two_variants, holes=holes)
     row = compare_set_ups(level, summary_of(level), ["main"]).iloc[0]
     assert row["extent_place_n"] == 0
     assert np.isnan(row["extent_place_bias_mm"])
 
 
-def test_nothing_finished_gives_an_empty_table(both: Tables) -> None:
-    assert compare_set_ups(both, summary_of(both), ["unknown"]).empty
+def test_nothing_finished_gives_an_empty_table(two_variants: Tables) -> None:
+    assert compare_set_ups(two_variants, summary_of(two_variants), ["unknown"]).empty
 
 
 def test_a_limit_is_nan_if_the_largest_hole_is_missed() -> None:

@@ -112,14 +112,14 @@ def test_a_ratio_is_paired_by_view():
 
 def test_the_registrations_of_a_map_are_found_under_whichever_number_of_views_they_stand():
     shared = pd.concat([registrations(view=v).assign(**{VIEWS: v + 1.0}) for v in (1, 2)])
-    own = pd.concat(
+    joint_rows = pd.concat(
         [
             registrations(view=v, method="joint").assign(**{VIEWS: n})
             for n, last in ((2.0, 2), (3.0, 3))
             for v in range(1, last)
         ]
     )
-    table = pd.concat([shared, own], ignore_index=True)
+    table = pd.concat([shared, joint_rows], ignore_index=True)
     assert sorted(of_map(table, "marks", 3)["view"]) == [1, 1, 2, 2]
     assert sorted(of_map(table, "marks", 2)["view"]) == [1, 1]
     joint = of_map(table, "joint", 3)
@@ -146,11 +146,11 @@ def holes(diameters, repeats=4, true=(10.0, 5.0)):
 
 
 def test_size_errors_are_paired_and_need_both_maps():
-    one = holes([[11.0, 12.0, 11.0, 12.0], [5.5, 5.5, np.nan, np.nan]])
-    two = holes([[10.5, 11.5, 10.5, 11.5], [np.nan, np.nan, 6.0, 6.0]])
-    found = size_errors(one, two)
-    assert found.holes == ("0",)
-    change = found.change()
+    first = holes([[11.0, 12.0, 11.0, 12.0], [5.5, 5.5, np.nan, np.nan]])
+    second = holes([[10.5, 11.5, 10.5, 11.5], [np.nan, np.nan, 6.0, 6.0]])
+    errors = size_errors(first, second)
+    assert errors.holes == ("0",)
+    change = errors.change()
     assert (change.mean, change.n) == (pytest.approx(-0.5), 4)
     assert change.is_below is True
     # differences do not vary though sizes do: a point
@@ -158,9 +158,9 @@ def test_size_errors_are_paired_and_need_both_maps():
 
 
 def test_holes_are_in_the_order_of_their_size():
-    both = holes([[11.0] * 4, [5.5] * 4])
-    assert size_errors(both, both).holes == ("1", "0")
-    assert size_errors(both, both).diameters_mm.tolist() == [5.0, 10.0]
+    rows = holes([[11.0] * 4, [5.5] * 4])
+    assert size_errors(rows, rows).holes == ("1", "0")
+    assert size_errors(rows, rows).diameters_mm.tolist() == [5.0, 10.0]
 
 
 @pytest.mark.parametrize(
@@ -194,22 +194,28 @@ def small():
 
 
 def test_maps_are_known_by_their_axes(small):
-    found = with_variation(small, MapWorld(), "hand-held", (24, "odometry", "volume"), (1,))
-    maps = {one.variant: one for one in maps_of(found)}
+    varied = with_variation(small, MapWorld(), "hand-held", (24, "odometry", "volume"), (1,))
+    maps = {set_up.variant: set_up for set_up in maps_of(varied)}
     assert (maps["hand-held"].views, maps["hand-held"].merge, maps["hand-held"].is_variation) == (
         24,
         "volume",
         True,
     )
-    one = maps[name_of(2, "cpd", "grid")]
-    assert (one.views, one.registration, one.merge, one.conditions, one.is_variation) == (
+    set_up = maps[name_of(2, "cpd", "grid")]
+    assert (
+        set_up.views,
+        set_up.registration,
+        set_up.merge,
+        set_up.conditions,
+        set_up.is_variation,
+    ) == (
         2,
         "cpd",
         "grid",
         "",
         False,
     )
-    (case,) = map_cases(found, summarise_holes(found.holes, [VIEWS, REGISTRATION, MERGE]))
+    (case,) = map_cases(varied, summarise_holes(varied.holes, [VIEWS, REGISTRATION, MERGE]))
     assert case.variant(1, "joint", "grid") == name_of(
         1, "cpd", "grid"
     )  # of one view any registration will do
@@ -219,14 +225,14 @@ def test_maps_are_known_by_their_axes(small):
 
 
 def test_all_views_are_counted_by_the_runs(small):
-    every = small.variants[VIEWS].where(small.variants[VIEWS] != 2.0)
+    views = small.variants[VIEWS].where(small.variants[VIEWS] != 2.0)
     table = replace(
         small,
         variants=small.variants.assign(
-            **{VIEWS: every.astype(object).map(lambda v: "null" if v != v else str(v))}
+            **{VIEWS: views.astype(object).map(lambda v: "null" if v != v else str(v))}
         ),
     )
-    assert {one.views for one in maps_of(table)} == {1, 2}
+    assert {set_up.views for set_up in maps_of(table)} == {1, 2}
 
 
 def test_maps_side_by_side(small):
@@ -242,19 +248,19 @@ def test_maps_side_by_side(small):
 
 
 def test_other_axes_make_places_of_their_own(small):
-    more = [
+    axes = [
         *small.axes.to_dict("records"),
         {"path": "source.target.distance_m", "name": "distance", "unit": "m"},
     ]
     names = ("holes", "runs", "probes", "variants", "registrations")
     placed = replace(
         small,
-        axes=pd.DataFrame(more),
+        axes=pd.DataFrame(axes),
         **{
             name: getattr(small, name).assign(**{"source.target.distance_m": 0.7}) for name in names
         },
     )
-    (case,) = map_cases(placed, summarise_holes(placed.holes, [row["path"] for row in more]))
+    (case,) = map_cases(placed, summarise_holes(placed.holes, [row["path"] for row in axes]))
     assert case.conditions == "0.7 m"
     assert against_one(case, "cpd", "grid") is not None
 
@@ -269,8 +275,8 @@ def test_two_views_against_one_by_hand() -> None:
         surface_mm=lambda views, method, merge, frames: 0.9 / views,
         threshold=lambda views, merge: 6.0 - views,
     )
-    made = perspectives(world, counts=(1, 2), methods=("cpd",), merges=("grid",))
-    (case,) = map_cases(made, summarise_holes(made.holes, [VIEWS, REGISTRATION, MERGE]))
+    experiment = perspectives(world, counts=(1, 2), methods=("cpd",), merges=("grid",))
+    (case,) = map_cases(experiment, summarise_holes(experiment.holes, [VIEWS, REGISTRATION, MERGE]))
     against = against_one(case, "cpd", "grid")
     assert against is not None
     assert (against.frames, against.lost, against.gained) == (50, (), ("4",))
@@ -279,14 +285,14 @@ def test_two_views_against_one_by_hand() -> None:
     assert against.large.mean == pytest.approx(-1.0)
     assert against.small.mean == pytest.approx(-0.5)
     assert np.exp(against.noise.mean) == pytest.approx(0.5, rel=0.02)
-    scale_mm = made.runs.groupby(["variant", "role", "frames"])["scale_mm"].mean()
+    scale_mm = experiment.runs.groupby(["variant", "role", "frames"])["scale_mm"].mean()
     before = 5.0 * scale_mm[name_of(1, "cpd", "grid"), "damaged", 50]
     after = 4.0 * scale_mm[name_of(2, "cpd", "grid"), "damaged", 50]
     assert against.threshold.mean == pytest.approx(after - before)
     assert against_one(case, "cpd", "volume") is None
     turned = replace(world, first=lambda views, method, merge, frames: 4 if views == 1 else 5)
-    made = perspectives(turned, counts=(1, 2), methods=("cpd",), merges=("grid",))
-    (case,) = map_cases(made, summarise_holes(made.holes, [VIEWS, REGISTRATION, MERGE]))
+    experiment = perspectives(turned, counts=(1, 2), methods=("cpd",), merges=("grid",))
+    (case,) = map_cases(experiment, summarise_holes(experiment.holes, [VIEWS, REGISTRATION, MERGE]))
     against = against_one(case, "cpd", "grid")
     assert (against.lost, against.gained) == (("4",), ())
 
@@ -385,11 +391,36 @@ def test_a_mean_change_by_hand() -> None:
 
 
 def test_size_errors_of_some_holes() -> None:
-    one = holes([[11.0, 12.0], [5.5, 5.0]], repeats=2)
-    two = holes([[10.5, 8.0], [4.0, 6.0]], repeats=2)
-    errors = size_errors(one, two)
+    first = holes([[11.0, 12.0], [5.5, 5.0]], repeats=2)
+    second = holes([[10.5, 8.0], [4.0, 6.0]], repeats=2)
+    errors = size_errors(first, second)
     assert errors.differences_mm.tolist() == [[0.5, -0.5], [1.0, 0.0]]
     assert errors.change(np.array([True, False])).mean == 0.75
     assert errors.change(np.array([False, True])).mean == -0.25
     assert errors.change().mean == 0.25
     assert errors.change(np.array([False, False])).n == 0
+
+
+def test_a_ratio_needs_the_actual_and_the_predicted_error() -> None:
+    rows = registrations(predicted_in_plane_mm=[0.25, np.nan])
+    (row,) = summarise_registrations(rows).to_dict("records")
+    assert row["in_plane_ratio"] == pytest.approx(0.3 / 0.25)
+    assert row["in_plane_rms_mm"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
+    infinite = registrations(predicted_in_plane_mm=[0.25, np.inf])
+    (row,) = summarise_registrations(infinite).to_dict("records")
+    assert row["in_plane_predicted_mm"] == 0.25
+
+
+def test_views_that_were_left_out_count_among_all_views(small) -> None:
+    views = small.variants[VIEWS].astype(object)
+    variants = small.variants.assign(**{VIEWS: views.where(small.variants[VIEWS] != 2.0, "all")})
+    runs = small.runs.assign(views_left_out=0)
+    of_two = runs["variant"] == name_of(2, "cpd", "grid")
+    runs.loc[of_two & (runs["repeat"] == 0), ["views_used", "views_left_out"]] = [1, 4]
+    set_ups = {
+        set_up.variant: set_up for set_up in maps_of(replace(small, variants=variants, runs=runs))
+    }
+    assert set_ups[name_of(2, "cpd", "grid")].views == 5
+    assert set_ups[name_of(2, "marks", "grid")].views == 2
+    unfinished = replace(small, variants=variants, runs=runs.iloc[:0])
+    assert {set_up.views for set_up in maps_of(unfinished)} == {0, 1}

@@ -22,8 +22,8 @@ def test_parts_are_recovered() -> None:
         noise["guide_mm"], noise["temporal_rms_mm"].iloc[0] / np.sqrt(frames)
     )
     assert (np.abs(noise["offset_mm"] - 0.2) < 5 * temporal / np.sqrt(50 * 800)).all()
-    left = temporal**2 / 50
-    spread = np.sqrt((4 * 0.09 * left + 2 * left**2) / 800)
+    remaining_noise = temporal**2 / 50
+    spread = np.sqrt((4 * 0.09 * remaining_noise + 2 * remaining_noise**2) / 800)
     assert (np.abs(noise["pattern_mm"] ** 2 - 0.09) < 5 * spread).all()
     np.testing.assert_allclose(
         noise["total_rms_mm"] ** 2, noise["temporal_rms_mm"] ** 2 + noise["systematic_mm"] ** 2
@@ -86,7 +86,7 @@ def test_law_uses_only_pixels_seen_at_every_count_and_needs_two_counts() -> None
 
 def test_a_law_by_hand() -> None:
     """Four pixels, each a block of its own: temporal noise falls from 2 to 1 over 16 frames."""
-    few = pd.DataFrame(
+    shortest = pd.DataFrame(
         {
             "variant": "main",
             "frames": 1,
@@ -97,24 +97,27 @@ def test_a_law_by_hand() -> None:
             "repeats": 8,
         }
     )
-    many = few.assign(frames=16, mean_error_mm=[0.5, 1.0, 1.5, 3.0], temporal_std_mm=1.0)
-    probes = pd.concat([many, few])
+    longest = shortest.assign(frames=16, mean_error_mm=[1.5, 2.0, 2.5, 4.0], temporal_std_mm=1.0)
+    probes = pd.concat([longest, shortest])
     law = noise_law(probes, "main")
     assert law is not None
     assert law.slope == pytest.approx(-0.25)
     assert (law.slope_interval.low, law.slope_interval.high) == pytest.approx((-0.25, -0.25))
-    # offset 3 and variance 14 / 3 - 4 / 8; offset 1.5 and variance 14 / 12 - 1 / 8
+    # offset 3 and variance 14 / 3 - 4 / 8; offset 2.5 and variance 14 / 12 - 1 / 8
     first = 9 + 14 / 3 - 0.5
-    last = 2.25 + 14 / 12 - 0.125
+    last = 6.25 + 14 / 12 - 0.125
     assert law.systematic_ratio == pytest.approx(np.sqrt(last / first))
     assert (law.few_frames, law.many_frames, law.pixels) == (1, 16, 4)
 
     def ratio(indices: np.ndarray) -> np.ndarray:
         squares = []
-        for errors, left in ((np.array([0.5, 1, 1.5, 3]), 0.125), (np.array([1.0, 2, 3, 6]), 0.5)):
+        for errors, remaining_noise in (
+            (np.array([1.5, 2, 2.5, 4]), 0.125),
+            (np.array([1.0, 2, 3, 6]), 0.5),
+        ):
             drawn = errors[indices]
             offset = drawn.mean(axis=1)
-            pattern = ((drawn**2).mean(axis=1) - offset**2) * 4 / 3 - left
+            pattern = ((drawn**2).mean(axis=1) - offset**2) * 4 / 3 - remaining_noise
             squares.append(offset**2 + np.maximum(pattern, 0.0))
         return np.sqrt(squares[0] / squares[1])
 
@@ -174,3 +177,10 @@ def test_a_floor_is_weighted_for_equal_relative_error() -> None:
     unknown = fit_floor([1, 4, 100, 7], [2.0, 1.2, 0.5, np.nan])
     assert unknown == pytest.approx(np.sqrt(squares[1]))
     assert fit_floor([1, 4, 100, 7], [2.0, 1.2, 0.5, 0.0]) == pytest.approx(np.sqrt(squares[1]))
+
+
+def test_pixels_without_noise_or_without_a_mean_are_out() -> None:
+    probes = tables(frames=(1,)).probes
+    probes.loc[probes["pixel"] < 50, "temporal_std_mm"] = np.nan
+    probes.loc[probes["pixel"] >= 790, "mean_error_mm"] = np.nan
+    assert noise_against_frames(probes)["pixels"].tolist() == [740]

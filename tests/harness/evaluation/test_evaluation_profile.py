@@ -40,8 +40,8 @@ def cloud(measured: str, *holes: HoleInView) -> ExampleCloud:
         shape = np.sqrt(np.clip(1 - rho_of(hole) ** 2, 0, None)) if measured == "bowl" else inside
         residual += 0.5 * DEPTH_MM * shape
         z_truth[inside] += DEPTH_MM
-    every = np.ones((HEIGHT, WIDTH), bool)
-    return ExampleCloud(50, "main", residual, ~every, every, holes, z_truth)
+    all_pixels = np.ones((HEIGHT, WIDTH), bool)
+    return ExampleCloud(50, "main", residual, ~all_pixels, all_pixels, holes, z_truth)
 
 
 def rms_about(values: np.ndarray, shape: np.ndarray) -> float:
@@ -134,9 +134,9 @@ def test_only_pixels_of_the_crop_within_three_radii_make_the_face() -> None:
     inside = rho_of(LARGE) < 1
     assert true_residual_mm(spoiled, LARGE)[inside] == pytest.approx(DEPTH_MM, abs=1e-6)
     outer = (rho_of(LARGE) > 2.7) & (rho_of(LARGE) < 3.0)
-    near = replace(scene, z_truth_mm=np.where(outer, 0.0, scene.z_truth_mm))
-    assert abs(true_residual_mm(near, LARGE)[inside] - DEPTH_MM).max() > 1.0
-    cropped = replace(near, inside=~outer)
+    spoiled_inside = replace(scene, z_truth_mm=np.where(outer, 0.0, scene.z_truth_mm))
+    assert abs(true_residual_mm(spoiled_inside, LARGE)[inside] - DEPTH_MM).max() > 1.0
+    cropped = replace(spoiled_inside, inside=~outer)
     assert true_residual_mm(cropped, LARGE)[inside] == pytest.approx(DEPTH_MM, abs=1e-6)
 
 
@@ -156,10 +156,10 @@ def test_a_small_hole_has_a_face_four_pixels_wide() -> None:
 def test_without_a_face_nothing_is_known() -> None:
     scene = cloud("bowl", LARGE)
     ring = np.argwhere(rho_of(LARGE) > 1.3)
-    few = np.zeros((HEIGHT, WIDTH), bool)
+    eleven_pixels = np.zeros((HEIGHT, WIDTH), bool)
     for v, u in ring[:11]:
-        few[v, u] = True
-    assert np.isnan(true_residual_mm(replace(scene, inside=few), LARGE)).all()
+        eleven_pixels[v, u] = True
+    assert np.isnan(true_residual_mm(replace(scene, inside=eleven_pixels), LARGE)).all()
 
 
 def test_holes_come_smallest_first() -> None:

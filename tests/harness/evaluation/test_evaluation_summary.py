@@ -40,8 +40,8 @@ def test_a_hole_by_hand() -> None:
 
 
 def test_rows_are_in_order() -> None:
-    both = joined(tables(frames=(1, 50), variant="far"), tables(frames=(1, 50)))
-    summary = summarise_holes(both.holes)
+    two_variants = joined(tables(frames=(1, 50), variant="far"), tables(frames=(1, 50)))
+    summary = summarise_holes(two_variants.holes)
     assert list(summary["variant"].unique()) == ["main", "far"]
     main = summary[(summary["variant"] == "main") & (summary["frames"] == 1)]
     assert list(main["hole"]) == [str(n) for n in range(1, 12)]
@@ -91,10 +91,10 @@ def test_a_repeat_of_rows_changes_counts_not_means() -> None:
 
 def test_too_few_trials_to_find_anything_are_told():
     for repeats, status in ((3, "undecided"), (4, "found")):
-        found = summarise_holes(
+        summary = summarise_holes(
             tables(World(repeats=repeats), frames=(50,)).holes.assign(detected=True)
         )
-        assert set(found["status"]) == {status}
+        assert set(summary["status"]) == {status}
     assert found_rule(4) == FOUND_RULE
     assert "3 repeats are too few for either" in found_rule(3)
 

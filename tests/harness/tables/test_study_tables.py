@@ -120,8 +120,8 @@ def test_thresholds_set_by_one_place_or_too_high_are_warned_of(two: list[SetUpLi
 def test_how_thresholds_were_set_is_stated() -> None:
     record = study_record(Study(boards=3, hole_free_boards=2))
     assert "calibrated to 1 false call per m² on" in threshold_note(record)
-    more = replace(record, false_calls_per_m2=2.5)
-    assert "calibrated to 2.5 false calls per m² on" in threshold_note(more)
+    higher_rate = replace(record, false_calls_per_m2=2.5)
+    assert "calibrated to 2.5 false calls per m² on" in threshold_note(higher_rate)
     assert threshold_note(replace(record, false_calls_per_m2=None)).startswith(
         "Thresholds were given, not calibrated; the rates beside them are those"
     )
@@ -261,9 +261,11 @@ def test_the_limit_of_a_new_unit_is_quoted(units: SetUpLimit, two: list[SetUpLim
 
 
 def test_of_many_limits_depths_are_not_compared_with_diameters(two: list[SetUpLimit]) -> None:
-    seen = two[1].record.inspected
+    inspected = two[1].record.inspected
     turned = replace(
-        seen, diameter_mm=np.full(len(seen.hit), 10.0), depth_mm=seen.diameter_mm.copy()
+        inspected,
+        diameter_mm=np.full(len(inspected.hit), 10.0),
+        depth_mm=inspected.diameter_mm.copy(),
     )
     deep = limit_of(replace(two[1].record, inspected=turned), draws=20)
     answer = study_answer([two[0], two[0], deep, deep])
@@ -288,27 +290,28 @@ def test_estimates_and_bounds(two: list[SetUpLimit]) -> None:
 
 
 def test_hits_by_missing_returns_alone_are_noted(two: list[SetUpLimit]) -> None:
-    seen = two[0].record.inspected
-    index = np.flatnonzero(seen.hit)
-    by_depth = seen.hit.copy()
+    inspected = two[0].record.inspected
+    index = np.flatnonzero(inspected.hit)
+    by_depth = inspected.hit.copy()
     by_depth[index[:3]] = False
-    by_no_return = np.zeros_like(seen.hit)
+    by_no_return = np.zeros_like(inspected.hit)
     by_no_return[index[:5]] = True
-    split = replace(seen, by_depth=by_depth, by_no_return=by_no_return)
+    split = replace(inspected, by_depth=by_depth, by_no_return=by_no_return)
     limit = replace(two[0], record=replace(two[0].record, inspected=split))
     assert f"3 of {limit.hits} hits by missing returns alone" in "; ".join(notes_of(limit))
     row = LIMITS.frame([limit]).iloc[0]
     assert (row["hits_by_depth"], row["hits_by_no_return"]) == (limit.hits - 3, 5)
     cells = LIMITS.grid([limit])
-    found = cells.rows[0][cells.heads.index("found")].text
-    assert found == (
+    text = cells.rows[0][cells.heads.index("found")].text
+    assert text == (
         f"{limit.hits} of {limit.inspections} ({limit.hits - 3} by depth, 5 by missing returns)"
     )
     assert not any("missing returns" in note for note in notes_of(two[0]))
     assert "hits by missing returns" not in "; ".join(
         notes_of(
             replace(
-                limit, record=replace(limit.record, inspected=replace(split, by_depth=seen.hit))
+                limit,
+                record=replace(limit.record, inspected=replace(split, by_depth=inspected.hit)),
             )
         )
     )

@@ -144,9 +144,9 @@ def test_a_step_is_newtons(link: str) -> None:
 def test_a_step_of_a_single_coefficient_is_newtons(link: str) -> None:
     data = replace(data_of(link), design=SIZES[:, None] - 0.3)
     b = np.array([0.7])
-    one = replace(data, hits=data.hits[None], misses=data.misses[None])
+    study = replace(data, hits=data.hits[None], misses=data.misses[None])
     expected = numeric_gradient(data, b) / -numeric_hessian(data, b)[0]
-    assert one.step(b[None])[0] == pytest.approx(expected, rel=1e-4)
+    assert study.step(b[None])[0] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize("link", LINKS)
@@ -165,18 +165,18 @@ def test_a_penalised_step_is_scoring_of_the_penalised_likelihood(link: str, pena
 def test_maxima_have_no_slope_whatever_the_start(link: str) -> None:
     data = data_of(link)
     studies = studies_of(data)
-    found = maxima(studies, np.array([0.0, 0.0]))
-    assert numeric_gradient(data, found[0]) == pytest.approx([0.0, 0.0], abs=1e-6)
+    b = maxima(studies, np.array([0.0, 0.0]))
+    assert numeric_gradient(data, b[0]) == pytest.approx([0.0, 0.0], abs=1e-6)
     again = maxima(studies, np.array([6.0, 9.0]))
-    assert again == pytest.approx(found, rel=1e-5)
+    assert again == pytest.approx(b, rel=1e-5)
 
 
 @pytest.mark.parametrize("link", LINKS)
 def test_penalised_maxima_have_no_slope(link: str) -> None:
     data = separated(link)
     (b,) = penalised_maxima(data, 1e-9)
-    one = replace(data, hits=data.hits[0], misses=data.misses[0])
-    assert numeric_gradient(one, b) == pytest.approx([0.0, 0.0], abs=1e-5)
+    study = replace(data, hits=data.hits[0], misses=data.misses[0])
+    assert numeric_gradient(study, b) == pytest.approx([0.0, 0.0], abs=1e-5)
     assert b[1] > 0
 
 

@@ -26,7 +26,7 @@ from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import drawn_sizes, false_positives, state_hits, state_signals
 
 
-def inspections(size: np.ndarray, response: np.ndarray, **further: object) -> Inspections:
+def inspections(size: np.ndarray, response: np.ndarray, **columns: object) -> Inspections:
     return Inspections(
         path=Path("table.csv"),
         size_column="size",
@@ -35,7 +35,7 @@ def inspections(size: np.ndarray, response: np.ndarray, **further: object) -> In
         response=np.asarray(response, float),
         target=None,
         line=np.arange(len(size)),
-        **further,  # type: ignore[arg-type]
+        **columns,  # type: ignore[arg-type]
     )
 
 
@@ -46,11 +46,11 @@ def hits_of(targets: int, seed: int, floor: float = 0.0, ceiling: float = 1.0) -
     return inspections(size, np.random.default_rng(seed).random(targets) < chance)
 
 
-def signals_of(seed: int, **further: object) -> Inspections:
+def signals_of(seed: int, **columns: object) -> Inspections:
     """60 sizes and signals 0.5 + 1.2 size + 0.7 normal."""
     rng = np.random.default_rng(seed)
     size = rng.uniform(1.0, 9.0, 60)
-    return inspections(size, 0.5 + 1.2 * size + 0.7 * rng.normal(size=60), **further)
+    return inspections(size, 0.5 + 1.2 * size + 0.7 * rng.normal(size=60), **columns)
 
 
 NEAR_SEED = 7  # four of the eight models fit about equally well
@@ -68,7 +68,7 @@ def test_p_values_are_those_of_the_mixtures_at_the_boundary(repeats: int) -> Non
         np.repeat(read.response, repeats),
         inspections=np.repeat(np.arange(60), repeats),
     )
-    floor, ceiling, both = floor_ceiling_tests(fit)
+    floor, ceiling, floor_and_ceiling = floor_ceiling_tests(fit)
     plain = np.append(fit.maximum, [0.0, 1.0])
     low = (0.0, 0.5)
     high = (0.5, 1.0)
@@ -81,8 +81,12 @@ def test_p_values_are_those_of_the_mixtures_at_the_boundary(repeats: int) -> Non
     ratio = 2.0 * (value - fit.log_likelihood) / repeats
     mixture = 0.5 * stats.chi2.sf(ratio, 1) + 0.25 * stats.chi2.sf(ratio, 2)
     assert ratio > 0.5
-    assert both.p_value == pytest.approx(mixture, rel=1e-9)
-    assert [test.beyond for test in (floor, ceiling, both)] == ["floor", "ceiling", "both"]
+    assert floor_and_ceiling.p_value == pytest.approx(mixture, rel=1e-9)
+    assert [test.beyond for test in (floor, ceiling, floor_and_ceiling)] == [
+        "floor",
+        "ceiling",
+        "both",
+    ]
 
 
 def _columns(read: Inspections) -> tuple[np.ndarray, np.ndarray]:
@@ -114,17 +118,20 @@ def test_the_bound_is_the_largest_and_the_band_the_widest_of_near_models() -> No
     read = hits_of(60, NEAR_SEED)
     stated = state_hits(read, unit="mm")
     tried = choose_model(read.size, read.response)
-    near = near_models(tried)
-    assert 1 < len(near) < len(tried)
-    assert [fit.deviance for fit in stated.fits] == [fit.deviance for fit in near]
-    assert stated.bound == largest_bound(near)
-    assert stated.bound.value == max(bound(fit).value for fit in near)
-    assert (stated.a50, stated.a90) == (near[0].curve.size_at(0.5), near[0].curve.size_at(0.9))
-    bands = [band(fit, stated.sizes) for fit in near]
+    near_fits = near_models(tried)
+    assert 1 < len(near_fits) < len(tried)
+    assert [fit.deviance for fit in stated.fits] == [fit.deviance for fit in near_fits]
+    assert stated.bound == largest_bound(near_fits)
+    assert stated.bound.value == max(bound(fit).value for fit in near_fits)
+    assert (stated.a50, stated.a90) == (
+        near_fits[0].curve.size_at(0.5),
+        near_fits[0].curve.size_at(0.9),
+    )
+    bands = [band(fit, stated.sizes) for fit in near_fits]
     low, high = stated.band
     assert np.array_equal(low, np.min([edges[0] for edges in bands], axis=0))
     assert np.array_equal(high, np.max([edges[1] for edges in bands], axis=0))
-    deviances = [fit.deviance for fit in near]
+    deviances = [fit.deviance for fit in near_fits]
     assert [row.in_bound for row in stated.models] == [fit.deviance in deviances for fit in tried]
     assert [row.chosen for row in stated.models] == [True] + 7 * [False]
     assert stated.counts == f"60 inspections of 60 targets, {int(read.response.sum())} hits"
@@ -132,9 +139,9 @@ def test_the_bound_is_the_largest_and_the_band_the_widest_of_near_models() -> No
 
 def test_near_models_are_within_two_of_the_least_deviance_per_inspection() -> None:
     fit = fit_hit_miss(*_columns(hits_of(60, 5)))
-    others = [replace(fit, deviance=fit.deviance + more) for more in (1.999, 2.001)]
-    assert near_models([fit, *others]) == (fit, others[0])
-    thrice = [replace(one, repeats=3.0) for one in (fit, *others)]
+    worse = [replace(fit, deviance=fit.deviance + excess) for excess in (1.999, 2.001)]
+    assert near_models([fit, *worse]) == (fit, worse[0])
+    thrice = [replace(worse_fit, repeats=3.0) for worse_fit in (fit, *worse)]
     assert len(near_models(thrice)) == 3
 
 
@@ -178,10 +185,10 @@ def test_models_that_differ_are_warned_of() -> None:
     first = stated.models[0]
 
     def doubts(value: float, deviance: float) -> list[str]:
-        other = replace(
+        second = replace(
             first, deviance=first.deviance + deviance, bound=replace(first.bound, value=value)
         )
-        return replace(stated, models=(first, other)).doubts
+        return replace(stated, models=(first, second)).doubts
 
     limit = first.bound.value
     assert doubts(1.049 * limit, 1.9) == []
@@ -195,8 +202,8 @@ def test_models_that_differ_are_warned_of() -> None:
 
 
 def test_small_studies_and_extrapolated_bounds_are_noted() -> None:
-    few = state_hits(hits_of(59, 5), tested=False)
-    assert few.notes[0] == "59 independent targets; MIL-HDBK-1823A asks for at least 60"
+    small_study = state_hits(hits_of(59, 5), tested=False)
+    assert small_study.notes[0] == "59 independent targets; MIL-HDBK-1823A asks for at least 60"
     assert state_hits(hits_of(60, 5), tested=False).notes == ()
     read = hits_of(60, 5)
     small = read.size < 5.0
@@ -245,8 +252,8 @@ def test_false_positives_of_hits_by_clopper_and_pearson() -> None:
         "PFP": 0.2,
         "PFP's 95 % upper bound": pytest.approx(stats.beta.ppf(0.95, 3, 8)),
     }
-    every = false_positives(inspections(np.ones(3), np.ones(3), unflawed=np.ones(4)))
-    assert every["PFP's 95 % upper bound"] == 1.0
+    all_called = false_positives(inspections(np.ones(3), np.ones(3), unflawed=np.ones(4)))
+    assert all_called["PFP's 95 % upper bound"] == 1.0
     assert false_positives(inspections(np.ones(3), np.ones(3))) == {}
 
 
@@ -274,8 +281,8 @@ def test_noise_at_the_floor_is_censored_and_little_noise_is_not_fitted() -> None
     assert law == pytest.approx(stats.norm.sf(4.0, mean, std), rel=1e-6)
     assert mean == pytest.approx(1.0, abs=0.3)
     for count, is_fitted in ((4, False), (5, True)):
-        few = replace(read, unflawed=np.arange(1.0, 1.0 + count))
-        numbers = false_positives(few, stated.signal)
+        few_sites = replace(read, unflawed=np.arange(1.0, 1.0 + count))
+        numbers = false_positives(few_sites, stated.signal)
         assert ("PFP by the noise's normal law" in numbers) is is_fitted
     negative = replace(read, unflawed=np.linspace(-1.0, 3.0, 20))
     logarithmic = state_signals(read, decision=4.0, log_size=False, log_signal=True).signal

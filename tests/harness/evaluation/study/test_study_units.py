@@ -73,18 +73,21 @@ def test_without_a_limit_over_boards_there_is_none_of_a_new_unit() -> None:
 def test_a_study_of_several_units_is_judged_by_unit() -> None:
     """Repeat r shows unit r modulo 3; percentiles resample units as well as boards."""
     record = study_record(Study(boards=15, hole_free_boards=0, repeats=3)).set_ups[0]
-    one = limit_of(record, draws=60)
+    single_unit = limit_of(record, draws=60)
     limit = limit_of(replace(record, units=3), draws=60)
-    seen = record.inspected
-    assert one.over_units is None
+    inspected = record.inspected
+    assert single_unit.over_units is None
     assert limit.over_units is not None
     for unit in range(3):
-        rows = seen.repeat == unit
+        rows = inspected.repeat == unit
         curve = limit.statement.curve
         fit = fit_hit_miss(
-            seen.diameter_mm[rows], seen.hit[rows], link=curve.link, log_size=curve.log_size
+            inspected.diameter_mm[rows],
+            inspected.hit[rows],
+            link=curve.link,
+            log_size=curve.log_size,
         )
         assert limit.over_units.a90_mm[unit] == pytest.approx(fit.curve.size_at(0.9), rel=1e-9)
-    assert limit.a90_95 == one.a90_95
+    assert limit.a90_95 == single_unit.a90_95
     assert limit.over_units.new_unit.value > limit.over_boards.value
-    assert not np.array_equal(limit.a90_draws_mm, one.a90_draws_mm)
+    assert not np.array_equal(limit.a90_draws_mm, single_unit.a90_draws_mm)
