@@ -19,10 +19,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import numpy as np
 
@@ -94,7 +94,7 @@ class Column:
     are `Estimate`. ``spread``: they are mappings, and each key becomes a column. ``brief``: text
     at a terminal, False to hide it."""
 
-    name: str
+    name: str = ""
     label: str = ""
     value: str | tuple[str, str] | Callable[[Any], Any] | None = None
     note: str = ""
@@ -140,6 +140,21 @@ class Column:
         return Cell(how(value), self.tone(row) if self.tone else "")
 
 
+def declared_columns(row_type: type) -> tuple[Column, ...]:
+    """Return the columns that the fields of a class of rows declare, in order. A field is annotated
+    with its note or its `Column`; a field that is itself a dataclass adds the columns of that
+    class."""
+    columns: list[Column] = []
+    for name, hint in get_type_hints(row_type, include_extras=True).items():
+        if is_dataclass(hint):
+            columns += declared_columns(hint)
+            continue
+        _, declared = get_args(hint)
+        column = Column(note=declared) if isinstance(declared, str) else declared
+        columns.append(replace(column, name=name))
+    return tuple(columns)
+
+
 @dataclass(frozen=True)
 class Table:
     """A result table. ``note`` says what a row is, ``order`` names the columns that sort rows,
@@ -158,6 +173,10 @@ class Table:
     left: int = 1
     digits: str = "%.6g"
     kind: str = "limits"
+
+    def column(self, name: str) -> Column:
+        """Return a column by its name in files. Raises KeyError."""
+        return {column.name: column for column in self.columns}[name]
 
     @property
     def stored(self) -> tuple[Column, ...]:

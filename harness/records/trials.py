@@ -1,8 +1,7 @@
-"""Tables of trials: the measurements of each trial, and summaries of experiments that are not
-studies.
+"""Tables of trials: the measurements of each trial, whose columns are the fields of the classes in
+`harness.records.rows`, and summaries of experiments that are not studies.
 
-Columns declare only a name and a note; their values come from `harness.trials.trial` and
-`harness.evaluation`."""
+The columns of summaries declare a name and a note; their values come from `harness.evaluation`."""
 
 from __future__ import annotations
 
@@ -12,7 +11,18 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from harness.records import outputs
-from harness.records.schema import Column, Table
+from harness.records.rows import (
+    DamageRow,
+    FindingRow,
+    NoiseRow,
+    OperatingRow,
+    PixelsRow,
+    ProbeRow,
+    RegistrationRow,
+    RunRow,
+    SiteRow,
+)
+from harness.records.schema import Column, Table, declared_columns
 from harness.vocabulary import text
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -38,44 +48,6 @@ def _word(name: str | None) -> str:
     return name or "as declared"
 
 
-COMMON = _columns(
-    variant="name of the set-up",
-    frames="number of averaged frames",
-    repeat="draw of the noise and unit",
-)
-BOARD = _columns(board="number of the board in a study")
-POINT = _columns(point="digest of the set-up with its number of frames")
-ROLE = _columns(role="role of the board: damaged, hole_free or calibration")
-TRUTH = _columns(
-    kind="kind of damage",
-    true_diameter_mm="true diameter",
-    true_depth_mm="true depth of removed material",
-    seen_depth_mm="depth of the surface that is visible in the damage; for a through-hole, of the backing",
-    true_x_mm="x of its centre on the board",
-    true_y_mm="y of its centre on the board",
-    true_offset_mm="distance of its centre from the centre of the largest hole",
-)
-SHAPE = _columns(
-    size_of="what true_diameter_mm is: the diameter or, for long damage, the width or length",
-    true_length_mm="true length; empty for holes and ball dents",
-    true_width_mm="true width; empty for holes and ball dents",
-    true_angle_deg="angle from the board's x axis to its length",
-)
-SIZES = _columns(
-    extent_diameter_mm="measured diameter (the thesis' measure)",
-    extent_offset_mm="distance of its centre from the largest cluster's (the thesis' measure)",
-    extent_error_mm="distance of its centre from the true centre (the thesis' measure)",
-    model_diameter_mm="measured diameter (the fitted model of a blurred hole)",
-    model_diameter_se_mm="standard error of that diameter, as the fit estimates it",
-    model_depth_mm="measured depth (the model)",
-    model_depth_se_mm="standard error of that depth, as the fit estimates it",
-    model_offset_mm="distance of its centre from the largest cluster's (the model)",
-    model_error_mm="distance of its centre from the true centre (the model)",
-    length_mm="length of the rectangle with the second moments of the residual, corrected for blur",
-    width_mm="width of that rectangle",
-    angle_deg="angle from the board's x axis to that rectangle's length, -90 to 90",
-    model_note="remark of the fit about its result",
-)
 STATISTICS = {
     "measured": "number of trials with a finite diameter",
     "diameter_mean_mm": "mean diameter",
@@ -98,175 +70,87 @@ MARKS: dict[str, tuple[str, Tone]] = {
     "undecided": ("?", "open"),
 }
 PITCH = ("pitch_u_mm", "pitch_v_mm")
-LAGS = tuple(f"correlation_{way}{lag}" for way in "uv" for lag in (1, 2, 3))
 
 TRIALS = Table(
     "trials",
     "one row per trial on a damaged board and damage",
-    (
-        *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the damage"), *TRUTH, *SHAPE),
-        *_columns(
-            detected="whether it was hit, which means that a finding matches it",
-            threshold="threshold in use, in the detector's units",
-            invalid_fraction="share of its pixels without a range",
-            median_residual_mm="median distance of its pixels behind the surface",
-            state="state of its pixels, independent of the detector: found, wrong depth, invalid or invisible",
-            score="score of the finding that matches it",
-            points="number of points of that finding",
-            signal="in a study: highest score within the hit radius",
-            no_return="in a study: whether a finding of pixels without a return matches it",
-        ),
-        *SIZES,
-    ),
-    ("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
-    ("parquet",),
+    declared_columns(DamageRow),
+    order=("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
+    formats=("parquet",),
     always=True,
 )
 RUNS = Table(
     "runs",
     "one row per trial",
-    (
-        *(*POINT, *COMMON, *BOARD, *ROLE),
-        *_columns(
-            threshold="threshold in use; empty in calibration runs",
-            quiet_threshold="hole-free boards: score above which nothing is found",
-            scale_mm="residual per unit of score",
-            surface_noise_mm="robust deviation from the fitted surface on the undamaged face",
-            frames_used="number of frames in the average",
-            left_out="number of frames left out as disturbed",
-            detections="number of findings",
-            false_calls="number of findings that match no damage",
-            inspected_m2="in a study: judged area of the face",
-            no_return_calls="in a study: false calls that consist of pixels without a return",
-            loudest_x_mm="calibration: x of the highest score on the board",
-            loudest_y_mm="calibration: y of the highest score on the board",
-            loudest_u_px="calibration: column of the highest score on the sensor",
-            loudest_v_px="calibration: row of the highest score on the sensor",
-            views_used="maps: number of merged views",
-            views_left_out="maps: number of views left out because their registration failed",
-            seconds_map="maps: time to make the map",
-            seconds_frames="time to simulate and average the frames",
-            seconds_detect="time to detect and measure",
-        ),
-    ),
-    ("variant", "role", "frames", "board", "repeat"),
-    ("parquet",),
+    declared_columns(RunRow),
+    order=("variant", "role", "frames", "board", "repeat"),
+    formats=("parquet",),
     always=True,
 )
 PROBES = Table(
     "probes",
     "one row per set-up, number of frames and sample pixel, over the hole-free repeats",
-    (
-        *COMMON[:2],
-        *_columns(
-            pixel="number of the pixel, in sensor order",
-            mean_error_mm="mean error of z",
-            temporal_std_mm="standard deviation of z over repeats",
-            displacement_std_mm="standard deviation of whole clouds' displacement, which the other columns exclude",
-            repeats="number of repeats",
-        ),
-    ),
-    ("variant", "frames", "pixel"),
-    ("parquet",),
+    declared_columns(ProbeRow),
+    order=("variant", "frames", "pixel"),
+    formats=("parquet",),
 )
 NOISE = Table(
     "noise",
     "one row per hole-free trial of a single view: noise and pixels on an undamaged board",
-    (
-        *COMMON,
-        *_columns(
-            valid_share="share of the board's pixels with a range",
-            pitch_u_mm="median distance on the board between neighbouring pixels of a row",
-            pitch_v_mm="median distance on the board between neighbouring pixels of a column",
-            single_frame_mm="standard deviation of one frame's temporal noise of z",
-            **{
-                name: "correlation of that noise between pixels n columns (u) or rows (v) apart"
-                for name in LAGS
-            },
-        ),
-    ),
-    ("variant", "frames", "repeat"),
+    declared_columns(NoiseRow),
+    order=("variant", "frames", "repeat"),
 )
 REGISTRATIONS = Table(
     "registrations",
-    "one row per registration of a view; registrations that set-ups share are under the first of them",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            view="number of the view; the reference is 0",
-            method="method of registration",
-            tre_mm="target registration error, root mean square over the board",
-            tre_in_plane_mm="part of that error in the board's plane",
-            tre_across_mm="part of that error perpendicular to the plane",
-            predicted_in_plane_mm="predicted error in the plane; empty if the method predicts none",
-            predicted_across_mm="predicted error perpendicular to the plane",
-            guess_tre_mm="error of the nominal pose from which it started",
-            residual_mm="root mean square residual",
-            overlap="share of points with a partner",
-            pairs="number of pairs of points",
-            marks="number of marks that were used",
-            iterations="number of iterations",
-            converged="whether it converged",
-            seconds="time in seconds",
-            failure="reason for a failure; empty if it succeeded",
-        ),
-    ),
-    ("variant", "role", "frames", "repeat", "view"),
+    "one row per registration of a view; registrations that set-ups share are under the first "
+    "of them",
+    declared_columns(RegistrationRow),
+    order=("variant", "role", "frames", "repeat", "view"),
 )
 SITES = Table(
     "sites",
     "one row per repeat and place on a hole-free board from which the damage was left out",
-    (
-        *(*COMMON, *BOARD, *ROLE, *_columns(hole="number of the place"), *TRUTH[1:3], *TRUTH[4:6]),
-        *_columns(
-            detected="whether a finding lies there by chance",
-            signal="highest score within the hit radius",
-        ),
-    ),
-    ("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
-    ("parquet",),
+    declared_columns(SiteRow),
+    order=("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
+    formats=("parquet",),
 )
 FINDINGS = Table(
     "findings",
     "one row per finding on a study's boards",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            x_mm="x on the board",
-            y_mm="y on the board",
-            score="score",
-            hole="damage that it hits; empty: none",
-        ),
-    ),
-    ("variant", "frames", "role", "board", "repeat"),
-    ("parquet",),
+    declared_columns(FindingRow),
+    order=("variant", "frames", "role", "board", "repeat"),
+    formats=("parquet",),
 )
 OPERATING = Table(
     "operating",
     "one row per trial of a study and threshold of a grid, besides the threshold in use",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(threshold="threshold", findings="findings above it", hits="hits among them"),
-    ),
-    ("variant", "frames", "role", "board", "repeat"),
-    ("parquet",),
+    declared_columns(OperatingRow),
+    order=("variant", "frames", "role", "board", "repeat"),
+    formats=("parquet",),
     lists=("threshold", "findings", "hits"),
 )
 PIXELS = Table(
     "pixels",
     "one row per trial on a study's damaged boards, damage, and threshold on a finer grid",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            hole="damage; empty: intact face",
-            pixels="judged pixels",
-            threshold="threshold",
-            above="above it",
-        ),
-    ),
-    ("variant", "frames", "board", "repeat"),
-    ("parquet",),
+    declared_columns(PixelsRow),
+    order=("variant", "frames", "board", "repeat"),
+    formats=("parquet",),
     lists=("threshold", "above"),
+)
+STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
+STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
+SET_UP = (TRIALS.column("variant"), TRIALS.column("frames"))
+TRUTH = tuple(
+    TRIALS.column(name)
+    for name in (
+        "kind",
+        "true_diameter_mm",
+        "true_depth_mm",
+        "seen_depth_mm",
+        "true_x_mm",
+        "true_y_mm",
+        "true_offset_mm",
+    )
 )
 
 
@@ -319,10 +203,10 @@ SUMMARY = Table(
     "summary",
     "one row per set-up, number of frames and damage, with 95 % intervals; means are over the trials that detected it",
     (
-        *COMMON[:2],
+        *SET_UP,
         Column("hole", "hole", note="number of the damage"),
         *(
-            replace(column, label={"true_diameter_mm": "true (mm)"}.get(column.name, ""))
+            replace(column, label="true (mm)") if column.name == "true_diameter_mm" else column
             for column in TRUTH
         ),
         *_columns(n="number of trials", detected="number of trials that detected it"),
@@ -372,7 +256,7 @@ NOISE_BY_FRAMES = Table(
     "noise_by_frames",
     "one row per set-up and number of frames: components of the error of z over the sample pixels",
     (
-        COMMON[0],
+        TRIALS.column("variant"),
         Column("frames", "frames", note="number of averaged frames"),
         *_columns(pixels="number of sample pixels", repeats="number of repeats"),
         Column(
@@ -414,7 +298,9 @@ FALSE_CALLS = Table(
     (
         Column("variant", "set-up", None, "name of the set-up", in_words),
         Column("frames", "frames", note="number of averaged frames"),
-        Column("role", "board", note=ROLE[0].note, text=lambda role: role.replace("_", "-")),
+        Column(
+            "role", "board", note=RUNS.column("role").note, text=lambda role: role.replace("_", "-")
+        ),
         CALLS_OF,
         *_columns(
             runs="number of runs with a threshold", false_calls="number of false calls in them"
@@ -478,9 +364,9 @@ SET_UPS = Table(
             "mm per pixel",
             lambda row: " × ".join(text.mm(row.get(name, math.nan)) for name in PITCH),
         ),
-        Column("valid_share", "valid", note=NOISE.columns[3].note, text=_percent),
-        *NOISE.columns[4:6],
-        Column("single_frame_mm", "one frame (mm)", note=NOISE.columns[6].note),
+        Column("valid_share", "valid", note=NOISE.column("valid_share").note, text=_percent),
+        *(NOISE.column(name) for name in PITCH),
+        replace(NOISE.column("single_frame_mm"), label="one frame (mm)"),
         Column("temporal_mm", "average (mm)", None, "temporal noise of the averaged z", _fine),
         Column("offset_mm", "offset (mm)", None, "mean error of z", _fine),
         Column(
@@ -490,7 +376,7 @@ SET_UPS = Table(
             "standard deviation over pixels of the mean error",
             _fine,
         ),
-        *NOISE.columns[7:],
+        *(column for column in NOISE.columns if column.name.startswith("correlation_")),
         Column(
             "surface_mm",
             "surface noise (mm)",
@@ -615,8 +501,6 @@ EFFECTS = Table(
         ),
     ),
 )
-STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
-STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
 SUMMARISED = (
     SUMMARY,
     NOISE_BY_FRAMES,
