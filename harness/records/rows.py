@@ -24,6 +24,7 @@ Frames = Annotated[int, "number of averaged frames"]
 Repeat = Annotated[int, "draw of the noise and unit"]
 BoardNumber = Annotated[int | None, "number of the board in a study"]
 BoardRole = Annotated[Role, "role of the board: damaged, hole_free or calibration"]
+NAN = float("nan")
 TrueDiameter = Annotated[float, "true diameter"]
 TrueDepth = Annotated[float, "true depth of removed material"]
 TrueX = Annotated[float, "x of its centre on the board"]
@@ -82,7 +83,7 @@ class RunRow:
 
 @dataclass(frozen=True, kw_only=True)
 class DamageRow:
-    """One damage of a damaged board in one trial of one point. Measured values are NaN if it was
+    """One damage of a damaged board in one trial of one point. What is measured is NaN if it was
     not found."""
 
     point: PointDigest
@@ -114,41 +115,47 @@ class DamageRow:
         "state of its pixels, independent of the detector: found, wrong depth, invalid or "
         "invisible",
     ]
-    score: Annotated[float, "score of the finding that matches it"]
-    points: Annotated[int, "number of points of that finding"]
+    score: Annotated[float, "score of the finding that matches it"] = NAN
+    points: Annotated[int, "number of points of that finding"] = 0
     signal: Annotated[float | None, "in a study: highest score within the hit radius"] = None
     no_return: Annotated[
         bool | None,
         "in a study: whether a finding of pixels without a return matches it",
     ] = None
-    extent_diameter_mm: Annotated[float, "measured diameter (the thesis' measure)"]
+    extent_diameter_mm: Annotated[float, "measured diameter (the thesis' measure)"] = NAN
     extent_offset_mm: Annotated[
         float,
         "distance of its centre from the largest cluster's (the thesis' measure)",
-    ]
+    ] = NAN
     extent_error_mm: Annotated[
         float,
         "distance of its centre from the true centre (the thesis' measure)",
-    ]
-    model_diameter_mm: Annotated[float, "measured diameter (the fitted model of a blurred hole)"]
+    ] = NAN
+    model_diameter_mm: Annotated[
+        float, "measured diameter (the fitted model of a blurred hole)"
+    ] = NAN
     model_diameter_se_mm: Annotated[
         float, "standard error of that diameter, as the fit estimates it"
-    ]
-    model_depth_mm: Annotated[float, "measured depth (the model)"]
-    model_depth_se_mm: Annotated[float, "standard error of that depth, as the fit estimates it"]
+    ] = NAN
+    model_depth_mm: Annotated[float, "measured depth (the model)"] = NAN
+    model_depth_se_mm: Annotated[float, "standard error of that depth, as the fit estimates it"] = (
+        NAN
+    )
     model_offset_mm: Annotated[
         float, "distance of its centre from the largest cluster's (the model)"
-    ]
-    model_error_mm: Annotated[float, "distance of its centre from the true centre (the model)"]
+    ] = NAN
+    model_error_mm: Annotated[float, "distance of its centre from the true centre (the model)"] = (
+        NAN
+    )
     length_mm: Annotated[
         float,
         "length of the rectangle with the second moments of the residual, corrected for blur",
-    ]
-    width_mm: Annotated[float, "width of that rectangle"]
+    ] = NAN
+    width_mm: Annotated[float, "width of that rectangle"] = NAN
     angle_deg: Annotated[
         float, "angle from the board's x axis to that rectangle's length, -90 to 90"
-    ]
-    model_note: Annotated[str, "remark of the fit about its result"]
+    ] = NAN
+    model_note: Annotated[str, "remark of the fit about its result"] = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -146,7 +146,7 @@ def declared_columns(row_type: type) -> tuple[Column, ...]:
     class."""
     columns: list[Column] = []
     for name, hint in get_type_hints(row_type, include_extras=True).items():
-        if is_dataclass(hint):
+        if isinstance(hint, type) and is_dataclass(hint):
             columns += declared_columns(hint)
             continue
         _, declared = get_args(hint)

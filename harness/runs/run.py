@@ -25,7 +25,7 @@ from harness.runs.processes import render_into_cache
 from harness.runs.shards import WHOLE, Shard
 from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, grid
 from harness.trials.learning import learn, learned_file
-from harness.trials.trial import TrialTask, run_trial
+from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.errors import DiskFull, UserError
 from harness.vocabulary.files import write_bytes
 from harness.vocabulary.geometry import MM
@@ -111,11 +111,11 @@ class Calibration:
         return f"{THRESHOLDS}{digest(keys)}-" if keys else ""
 
 
-def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
+def refiled(entry: Ended, judged: Trial, task: Trial) -> Ended:
     """Return a trial's entry with the thresholds of ``task``, which agree with those at which it
     was judged."""
-    new = {(point.variant, point.frames): point.threshold for point in task.points}
-    old = {(point.variant, point.frames): point.threshold for point in judged.points}
+    new = {(point.variant, point.frames): point.judging.threshold for point in task.points}
+    old = {(point.variant, point.frames): point.judging.threshold for point in judged.points}
     octaves = {"operating": FINDING_OCTAVES, "pixels": PIXEL_OCTAVES}
     record = entry.record or {}
     for table, rows in record.items():
@@ -314,7 +314,7 @@ def _failure(what: str, ended: Ended) -> Failure:
 class _Trial(NamedTuple):
     part: PlanPart
     key: str
-    task: TrialTask
+    task: Trial
 
 
 class _Run:
@@ -551,7 +551,9 @@ class _Run:
             self._count(trial, entry)
 
 
-def trial_as_text(task: TrialTask) -> str:
+def trial_as_text(task: Trial) -> str:
     """Return a trial's record as JSON for the journal. The worker makes this text, because it
     takes a millisecond."""
-    return record_text(learn(task) if task.role == "learning" else run_trial(task))
+    if task.role == "learning":
+        return record_text(learn(task))
+    return record_text(run_trial(task).to_data())

@@ -360,7 +360,7 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
     if holes.empty:
         return None
     calibrating = runs[runs["role"] == "calibration"]
-    boards = [batch.set_ups[0].target for batch in group.then if batch.role == "damaged"]
+    boards = [batch.views[0].target for batch in group.then if batch.role == "damaged"]
     targets = [
         [board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards
     ]

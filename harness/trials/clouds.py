@@ -1,0 +1,273 @@
+"""The clouds that the points of a trial share: averages of one view, or maps of several.
+
+`ViewClouds` and `MapClouds` answer the same questions for a number of frames and a mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from detectors.views.mapping.merge import Merged, merge, prepare
+from detectors.views.mapping.settings import MappingConfig
+from detectors.views.registration.register import register
+from detectors.views.registration.registered import Registration, predicted_error_m
+from detectors.views.registration.settings import PAIRWISE
+from detectors.views.view import PreparedView, View
+from harness.records.rows import Origin, RegistrationRow, Role
+from harness.trials.board import Board, LabelledCloud, face_errors_m
+from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
+from harness.vocabulary.seeds import canonical_json
+
+BOARD_STEPS = 9  # points along each side of the board where a registration's error is evaluated
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """How a map was made."""
+
+    views_used: int | None = None
+    """Number of merged views; None for a single view."""
+    views_left_out: int | None = None
+    """Number of views whose registration failed."""
+    seconds_map: float | None = None
+    """Time of registration and merging, even if another point shares them."""
+
+
+@dataclass(frozen=True)
+class ViewClouds:
+    """Averages of one view of a board."""
+
+    board: Board
+    """The board in this view."""
+    averages: Mapping[int, Cloud]
+    """By number of frames."""
+
+    def key(self, frames: int, mapping: MappingConfig | None) -> str:
+        """Return a text that is equal for points that see the same cloud."""
+        return str(frames)
+
+    def cloud(self, frames: int, mapping: MappingConfig | None) -> Cloud:
+        """Return what a detector sees."""
+        return self.averages[frames]
+
+    def labelled(self, frames: int, mapping: MappingConfig | None) -> LabelledCloud:
+        """Return the cloud with the truth."""
+        return self.board.labelled(self.averages[frames])
+
+    def probe_errors_m(self, frames: int, mapping: MappingConfig | None) -> np.ndarray:
+        """Return the errors (p,) of z at the board's probes."""
+        z_m = self.averages[frames].points_m[..., 2].ravel()
+        seen_z_m = self.board.seen_z_m.ravel()
+        return np.asarray(z_m[self.board.probes] - seen_z_m[self.board.probes])
+
+    def map_facts(self, frames: int, mapping: MappingConfig | None) -> MapFacts:
+        """Return no facts: a single view is not mapped."""
+        return MapFacts()
+
+    def registration_rows(
+        self, frames: int, mapping: MappingConfig | None, origin: Origin, role: Role
+    ) -> list[RegistrationRow]:
+        """Return no rows: a single view is not registered."""
+        return []
+
+
+@dataclass
+class MapClouds:
+    """Maps of several views of a board. What several points share is made once."""
+
+    boards: Sequence[Board]
+    """The board in each view; the first view is the reference."""
+    averages: Sequence[Mapping[int, Cloud]]
+    """By view, then by number of frames."""
+    truth: Sequence[np.ndarray]
+    """True T_reference_view (4, 4) of each view."""
+    guesses: Sequence[np.ndarray]
+    """Nominal T_reference_view (4, 4) of each view, from which registration starts."""
+    _prepared: dict[str, PreparedView] = field(default_factory=dict)
+    _registered: dict[str, tuple[Registration, ...]] = field(default_factory=dict)
+    _merged: dict[str, Merged] = field(default_factory=dict)
+    _labelled: dict[str, LabelledCloud] = field(default_factory=dict)
+    _reported: set[str] = field(default_factory=set)
+    """Keys of the registrations whose rows have been returned."""
+
+    def count(self, mapping: MappingConfig) -> int:
+        """Return the number of views that a mapping uses."""
+        return mapping.views or len(self.boards)
+
+    def key(self, frames: int, mapping: MappingConfig | None) -> str:
+        """Return a text that is equal for points that see the same map."""
+        mapping = _stated(mapping)
+        return canonical_json([self._registration_key(frames, mapping), mapping.merge.to_data()])
+
+    def cloud(self, frames: int, mapping: MappingConfig | None) -> Cloud:
+        """Return what a detector sees."""
+        return self.merged(frames, _stated(mapping)).cloud
+
+    def labelled(self, frames: int, mapping: MappingConfig | None) -> LabelledCloud:
+        """Return the map with the truth."""
+        key = self.key(frames, mapping)
+        if key not in self._labelled:
+            merged = self.merged(frames, _stated(mapping))
+            self._labelled[key] = self.boards[0].labelled_map(
+                merged.cloud, merged.T_reference_cloud
+            )
+        return self._labelled[key]
+
+    def probe_errors_m(self, frames: int, mapping: MappingConfig | None) -> np.ndarray:
+        """Return the errors (p,) of the map at the probes of the first view, across the face."""
+        first = self.boards[0]
+        places_m = first.board_xy_m.reshape(-1, 2)[first.probes]
+        return face_errors_m(self.labelled(frames, mapping), places_m)
+
+    def map_facts(self, frames: int, mapping: MappingConfig | None) -> MapFacts:
+        """Return how the map was made."""
+        mapping = _stated(mapping)
+        merged = self.merged(frames, mapping)
+        views_used = len(merged.views_used)
+        spent_s = sum(each.seconds for each in self.registrations(frames, mapping))
+        return MapFacts(
+            views_used=views_used,
+            views_left_out=self.count(mapping) - views_used,
+            seconds_map=float(spent_s + merged.seconds),
+        )
+
+    def registration_rows(
+        self, frames: int, mapping: MappingConfig | None, origin: Origin, role: Role
+    ) -> list[RegistrationRow]:
+        """Return a row for each view but the first, once for each registration."""
+        mapping = _stated(mapping)
+        key = self._registration_key(frames, mapping)
+        if key in self._reported or self.count(mapping) == 1:
+            return []
+        self._reported.add(key)
+        views = self.prepared(frames, mapping)
+        registrations = self.registrations(frames, mapping)
+        rows = []
+        for number in range(1, len(views)):
+            row = self._registration_row(number, views[number], registrations[number], origin, role)
+            rows.append(row)
+        return rows
+
+    def merged(self, frames: int, mapping: MappingConfig) -> Merged:
+        """Return the map."""
+        key = self.key(frames, mapping)
+        if key not in self._merged:
+            views = self.prepared(frames, mapping)
+            registrations = self.registrations(frames, mapping)
+            self._merged[key] = merge(views, registrations, mapping.merge)
+        return self._merged[key]
+
+    def prepared(
+        self, frames: int, mapping: MappingConfig, count: int | None = None
+    ) -> tuple[PreparedView, ...]:
+        """Return the views that the mapping uses, or the first ``count``, with their target cut
+        out and their marks found."""
+        if count is None:
+            count = self.count(mapping)
+        views = []
+        for number in range(count):
+            key = canonical_json([number, frames, mapping.crop.to_data(), mapping.marks.to_data()])
+            if key not in self._prepared:
+                cloud = self.averages[number][frames]
+                view = View(f"view {number}", cloud, self.guesses[number])
+                self._prepared[key] = prepare(view, mapping)
+            views.append(self._prepared[key])
+        return tuple(views)
+
+    def registrations(self, frames: int, mapping: MappingConfig) -> tuple[Registration, ...]:
+        """Return the registration of each view that the mapping uses."""
+        count = self.count(mapping)
+        key = self._registration_key(frames, mapping)
+        registered = count
+        if mapping.registration.method in PAIRWISE:
+            # each view is registered to the first alone: all mappings share the longest sequence
+            key = canonical_json([frames, *_registration_settings(mapping)])
+            registered = max(sum(frames in averages for averages in self.averages), count)
+        if key not in self._registered:
+            views = self.prepared(frames, mapping, registered)
+            self._registered[key] = tuple(register(views, mapping.registration))
+        return self._registered[key][:count]
+
+    def _registration_key(self, frames: int, mapping: MappingConfig) -> str:
+        count = self.count(mapping)
+        crop, marks, registration = _registration_settings(mapping)
+        if count == 1:
+            registration = None
+        return canonical_json([count, frames, crop, marks, registration])
+
+    def _registration_row(
+        self,
+        number: int,
+        view: PreparedView,
+        registration: Registration,
+        origin: Origin,
+        role: Role,
+    ) -> RegistrationRow:
+        """Return the row of one view: errors over a grid of points of the board."""
+        T_camera_board = self.boards[0].T_camera_board
+        points_m = transform_points(T_camera_board, board_grid_m(self.boards[0]))
+        normal = T_camera_board[:3, 2]
+        in_plane_m, across_m = registration_error_m(
+            registration.T_reference_view, self.truth[number], points_m, normal
+        )
+        guessed_m = registration_error_m(self.guesses[number], self.truth[number], points_m, normal)
+        predicted_in_plane_m, predicted_across_m = predicted_error_m(registration, points_m, normal)
+        return RegistrationRow(
+            origin=origin,
+            role=role,
+            view=number,
+            method=registration.method,
+            tre_mm=float(np.hypot(in_plane_m, across_m)) / MM,
+            tre_in_plane_mm=in_plane_m / MM,
+            tre_across_mm=across_m / MM,
+            predicted_in_plane_mm=predicted_in_plane_m / MM,
+            predicted_across_mm=predicted_across_m / MM,
+            guess_tre_mm=float(np.hypot(*guessed_m)) / MM,
+            residual_mm=registration.residual_m / MM,
+            overlap=registration.overlap,
+            pairs=registration.pairs,
+            marks=len(view.marks.trusted),
+            iterations=registration.iterations,
+            converged=registration.converged,
+            seconds=registration.seconds,
+            failure=registration.failure,
+        )
+
+
+def _stated(mapping: MappingConfig | None) -> MappingConfig:
+    """Return the mapping, which every point of several views has."""
+    if mapping is None:
+        raise ValueError("several views need a mapping into one cloud")
+    return mapping
+
+
+def _registration_settings(mapping: MappingConfig) -> list[object]:
+    """Return the settings that a registration depends on: crop, marks and the method's own."""
+    return [mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
+
+
+def board_grid_m(board: Board) -> np.ndarray:
+    """Return `BOARD_STEPS` squared points (n, 3) over a board's rectangle at z = 0, board frame."""
+    sides = board.target.board
+    x_m = np.linspace(-0.5, 0.5, BOARD_STEPS) * sides.width_mm * MM
+    y_m = np.linspace(-0.5, 0.5, BOARD_STEPS) * sides.height_mm * MM
+    grid_x_m, grid_y_m = np.meshgrid(x_m, y_m)
+    return np.stack([grid_x_m, grid_y_m, np.zeros(grid_x_m.shape)], axis=-1).reshape(-1, 3)
+
+
+def registration_error_m(
+    T_reference_view: np.ndarray,
+    true_T_reference_view: np.ndarray,
+    points_m: np.ndarray,
+    normal: np.ndarray,
+) -> tuple[float, float]:
+    """Return the root mean square target registration error over points (n, 3) of the reference
+    frame, in metres: in the plane perpendicular to ``normal`` (3,), and along ``normal``
+    (Fitzpatrick, West and Maurer 1998). An error that a whole view shares counts too: a camera
+    that ranges d too far at an angle a adds d sin(a) in the plane."""
+    moved = transform_points(T_reference_view @ invert(true_T_reference_view), points_m) - points_m
+    across = moved @ normal
+    in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
+    return float(np.sqrt((in_plane**2).mean())), float(np.sqrt((across**2).mean()))
