@@ -297,7 +297,7 @@ class PixelsRow:
 
 @dataclass
 class TrialRecord:
-    """What a trial recorded: the rows of all its points, by table."""
+    """The rows that a trial recorded for all its points, by table."""
 
     runs: list[RunRow] = field(default_factory=list)
     """One row for each point."""
@@ -310,13 +310,13 @@ class TrialRecord:
     registrations: list[RegistrationRow] = field(default_factory=list)
     """One row for each registered view of each map."""
     sites: list[SiteRow] = field(default_factory=list)
-    """In a study, one row for each point and place of a hole-free board."""
+    """One row for each point and place of a hole-free board, in a study."""
     findings: list[FindingRow] = field(default_factory=list)
-    """In a study, one row for each finding of each point."""
+    """One row for each finding of each point, in a study."""
     operating: list[OperatingRow] = field(default_factory=list)
-    """In a study, one row for each point that has a threshold."""
+    """One row for each point that has a threshold, in a study."""
     pixels: list[PixelsRow] = field(default_factory=list)
-    """In a study, one row for each point and damage, and one for the intact face."""
+    """One row for each point and damage, and one for the intact face, in a study."""
 
     def to_data(self) -> dict[str, list[dict[str, Any]]]:
         """Return the rows as mappings, by table: the record's form in the journal."""

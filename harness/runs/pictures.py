@@ -47,7 +47,7 @@ def _judged_again(trial: Trial, point: TrialPoint, most: int) -> Judgement:
     clouds = averages_of(
         capture, [point.frames], averaging.config, averaging.exact, averaging.flat_field
     )
-    return judge(board.labelled(clouds[point.frames]), point.judging)
+    return judge(board.labelled(clouds[point.frames]), point.criteria)
 
 
 def _detected(judgement: Judgement) -> np.ndarray:
@@ -190,7 +190,7 @@ def _map_example(
     """Return the picture of one map."""
     labelled = maps.labelled(point.frames, mapping)
     cloud = labelled.cloud
-    judgement = judge(labelled, replace(point.judging, overlap=None))
+    judgement = judge(labelled, replace(point.criteria, overlap=None))
     shown = np.flatnonzero(cloud.valid.ravel())
     shown = shown[:: max(1, -(-len(shown) // MOST_POINTS))]
     points_m = transform_points(labelled.T_board_cloud, cloud.points_m.reshape(-1, 3)[shown])
@@ -272,7 +272,7 @@ class ShownDamage:
     limit: SetUpLimit
     """The limit of the point's set-up."""
     where: Where
-    """How its size compares with the limit."""
+    """Its size compared with the limit."""
     row: int
     """Its row of the limit's inspections."""
     half_m: float
@@ -363,7 +363,7 @@ def _study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> Study
         score=float(inspected.signal[row]),
         diameter_mm=damage.diameter_m / MM,
         depth_mm=damage.depth_m / MM,
-        threshold=float("nan") if point.judging.threshold is None else point.judging.threshold,
+        threshold=float("nan") if point.criteria.threshold is None else point.criteria.threshold,
         residual_mm=_window(judgement.evidence.residual_m / MM, middle, half, np.nan),
         detected=_window(_detected(judgement), middle, half, False),
         outline_px=rim_px - (middle - half),

@@ -23,7 +23,7 @@ from harness.runs.journal import JOURNAL_VERSION
 from harness.runs.shards import Shard
 from harness.trials.averages import Averaging
 from harness.trials.board import BoardRef
-from harness.trials.judge import Judging, detector_of
+from harness.trials.judge import Criteria, detector_of
 from harness.trials.learning import LEARNING_BOARDS
 from harness.trials.trial import Trial, TrialPoint
 from harness.vocabulary.errors import UserError
@@ -249,7 +249,7 @@ class Group:
     def _key(self, batch: Batch, trial: Trial) -> str:
         """Return a trial's key in the journal: its role and number, and a digest of everything
         that determines its record."""
-        detectors = sorted({point.judging.detector for point in trial.points})
+        detectors = sorted({point.criteria.detector for point in trial.points})
         content: list[Any] = [JOURNAL_VERSION]
         content += [source_digest(trial_code(name), PACKAGES) for name in detectors]
         content += [path.stem for path in batch.paths]
@@ -267,10 +267,10 @@ class Group:
 
 def _point_key(point: TrialPoint) -> list[Any]:
     """Return what distinguishes a point's part of a trial in its journal key."""
-    learned = point.judging.learned
+    learned = point.criteria.learned
     if learned is not None:
         learned = Path(learned).name
-    return [point.digest, point.variant, point.judging.threshold, learned]
+    return [point.digest, point.variant, point.criteria.threshold, learned]
 
 
 def trial_point(point: Point, threshold: float | None, learned: str | None) -> TrialPoint:
@@ -284,7 +284,7 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
         averaging=Averaging(
             config.capture.average, config.capture.exact, config.capture.flat_field
         ),
-        judging=Judging(
+        criteria=Criteria(
             detector=config.detector.name,
             settings_json=canonical_json(config.detector.settings),
             threshold=threshold,
@@ -473,7 +473,7 @@ class PlanPart:
     batch: Batch
     """The batch."""
     sets_threshold: bool
-    """Whether these trials set the group's thresholds."""
+    """True if these trials set the group's thresholds."""
     repeats: range
     """The repeats."""
 

@@ -114,8 +114,8 @@ class Calibration:
 def refiled(entry: Ended, judged: Trial, task: Trial) -> Ended:
     """Return a trial's entry with the thresholds of ``task``, which agree with those at which it
     was judged."""
-    new = {(point.variant, point.frames): point.judging.threshold for point in task.points}
-    old = {(point.variant, point.frames): point.judging.threshold for point in judged.points}
+    new = {(point.variant, point.frames): point.criteria.threshold for point in task.points}
+    old = {(point.variant, point.frames): point.criteria.threshold for point in judged.points}
     octaves = {"operating": FINDING_OCTAVES, "pixels": PIXEL_OCTAVES}
     record = entry.record or {}
     for table, rows in record.items():

@@ -42,12 +42,12 @@ MEDIAN_TO_MEAN = 1.2533
 
 @dataclass(frozen=True)
 class Averaging:
-    """How frames become a cloud."""
+    """The way in which frames become a cloud."""
 
     config: AverageConfig
     """The average, and which frames it leaves out."""
     exact: bool = False
-    """Whether every frame is drawn, even where averages could be drawn at once."""
+    """True if every frame is drawn, even where averages could be drawn at once."""
     flat_field: FlatFieldConfig | None = None
     """The flat field to subtract."""
 

@@ -46,7 +46,7 @@ class BoardRef:
     target: TargetConfig
     """The target with its pose in this view and all its damage."""
     damaged: bool
-    """Whether the view shows the damage."""
+    """True if the view shows the damage."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Board:
     unit: SimulatedUnit
     """The unit of the camera with the rendered view."""
     damaged: bool
-    """Whether the view shows the damage; if not, there are no holes at the places of ``truth``."""
+    """True if the view shows the damage; if not, there are no holes at the places of ``truth``."""
     truth: tuple[Damage, ...]
     """The target's damage with its centre in view."""
     target: TargetConfig
@@ -283,9 +283,9 @@ class LabelledCloud:
     """A cloud of a board with the truth on its pixels (for a map, cells or points)."""
 
     cloud: Cloud
-    """What the detector gets."""
+    """The cloud that the detector gets."""
     damaged: bool
-    """Whether the board has its damage; if not, ``truth`` tells where it was left out."""
+    """True if the board has its damage; if not, ``truth`` tells where it was left out."""
     T_board_cloud: np.ndarray
     """True pose (4, 4), cloud's frame to board's."""
     target: TargetConfig

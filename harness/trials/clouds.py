@@ -25,7 +25,7 @@ BOARD_STEPS = 9  # points along each side of the board where a registration's er
 
 @dataclass(frozen=True)
 class MapFacts:
-    """How a map was made."""
+    """Facts on the making of a map."""
 
     views_used: int | None = None
     """Number of merged views; None for a single view."""
@@ -42,7 +42,7 @@ class ViewClouds:
     board: Board
     """The board in this view."""
     averages: Mapping[int, Cloud]
-    """By number of frames."""
+    """Clouds by number of frames."""
 
     def key(self, frames: int, mapping: MappingConfig | None) -> str:
         """Return a text that is equal for points that see the same cloud."""
@@ -80,7 +80,7 @@ class MapClouds:
     boards: Sequence[Board]
     """The board in each view; the first view is the reference."""
     averages: Sequence[Mapping[int, Cloud]]
-    """By view, then by number of frames."""
+    """Clouds by view, then by number of frames."""
     truth: Sequence[np.ndarray]
     """True T_reference_view (4, 4) of each view."""
     guesses: Sequence[np.ndarray]

@@ -38,8 +38,8 @@ PIXEL_OCTAVES = (-6, 4)
 
 
 @dataclass(frozen=True)
-class Judging:
-    """How a cloud is judged: by which detector, at which threshold, and what counts as a hit."""
+class Criteria:
+    """The detector that judges a cloud, its threshold, and what counts as a hit."""
 
     detector: str
     """Name of the detector."""
@@ -61,8 +61,8 @@ class Judgement:
 
     labelled: LabelledCloud
     """The cloud with the truth."""
-    judging: Judging
-    """How it was judged."""
+    criteria: Criteria
+    """The detector, its threshold, and the rule of hits."""
     detector: Detector
     """The detector, with what it has learned."""
     evidence: Evidence
@@ -72,7 +72,7 @@ class Judgement:
     surface_noise_m: float = np.nan
     """Robust deviation from the fitted surface on the undamaged face; NaN if it has no pixels."""
     detections: tuple[Detection, ...] = ()
-    """What was found at the threshold, strongest first."""
+    """The findings at the threshold, strongest first."""
     places_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     """Place (m, 2) of each detection on the face."""
     hits: Mapping[int, int] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class Judgement:
         """Highest score within the hit radius of each damage; NaN if none is judged there."""
         lines_m = [damage.line_m for damage in self.labelled.truth]
         signals: list[float] = highest_within(
-            self.labelled.places_m, self.evidence.score, lines_m, self.judging.radius_m
+            self.labelled.places_m, self.evidence.score, lines_m, self.criteria.radius_m
         ).tolist()
         return signals
 
@@ -125,7 +125,7 @@ class Judgement:
         hits: dict[int, int] = {}
         if self.labelled.damaged:
             hits, _ = matched(
-                self.labelled, missing.detections, self.judging.radius_m, self.judging.overlap
+                self.labelled, missing.detections, self.criteria.radius_m, self.criteria.overlap
             )
         hitting = {id(missing.detections[index]) for index in hits.values()}
         grid_shape = self.labelled.cloud.valid.shape
@@ -142,7 +142,7 @@ class Judgement:
         levels = findings_at(self.detector, self.labelled.cloud, self.evidence, thresholds)
         hits = [0] * len(levels)
         if self.labelled.damaged:
-            rule = (self.judging.radius_m, self.judging.overlap)
+            rule = (self.criteria.radius_m, self.criteria.overlap)
             hits = [len(pairs) for pairs, _ in _matched(self.labelled, levels, *rule)]
         return thresholds, [len(level.scores) for level in levels], hits
 
@@ -153,8 +153,8 @@ class Judgement:
 
     @cached_property
     def pixels_above(self) -> dict[str, tuple[int, list[int]]]:
-        """By damage (text of its id; "" for the undamaged face): the number of judged pixels, and
-        how many exceed each of `pixel_thresholds`."""
+        """Numbers of judged pixels, and of those that exceed each of `pixel_thresholds`, by damage
+        (text of its id; "" for the undamaged face)."""
         regions = {
             str(damage.id): self.labelled.outlines[damage.id] for damage in self.labelled.truth
         }
@@ -169,24 +169,24 @@ class Judgement:
 
     @property
     def _threshold(self) -> float:
-        if self.judging.threshold is None:
+        if self.criteria.threshold is None:
             raise ValueError("nothing is found without a threshold")
-        return self.judging.threshold
+        return self.criteria.threshold
 
 
-def judge(labelled: LabelledCloud, judging: Judging) -> Judgement:
+def judge(labelled: LabelledCloud, criteria: Criteria) -> Judgement:
     """Judge a detector on a cloud; without a threshold, only find the quiet threshold. Raises
     UserError if the detector cannot judge the cloud."""
     began = time.perf_counter()
-    judgement = analysed(labelled, judging)
-    if judging.threshold is not None:
-        judgement = with_detections(judgement, judging.threshold)
+    judgement = analysed(labelled, criteria)
+    if criteria.threshold is not None:
+        judgement = with_detections(judgement, criteria.threshold)
     return replace(judgement, seconds=time.perf_counter() - began)
 
 
-def analysed(labelled: LabelledCloud, judging: Judging) -> Judgement:
+def analysed(labelled: LabelledCloud, criteria: Criteria) -> Judgement:
     """Score every pixel of a cloud, without a threshold."""
-    detector = detector_for(labelled, judging)
+    detector = detector_for(labelled, criteria)
     evidence = detector.analyse(labelled.cloud)
     quiet_threshold = np.nan
     if not labelled.damaged:
@@ -198,7 +198,7 @@ def analysed(labelled: LabelledCloud, judging: Judging) -> Judgement:
         surface_noise_m = sigma_of(residual_m - median_of(residual_m))
     return Judgement(
         labelled=labelled,
-        judging=judging,
+        criteria=criteria,
         detector=detector,
         evidence=evidence,
         quiet_threshold=quiet_threshold,
@@ -213,7 +213,7 @@ def with_detections(judgement: Judgement, threshold: float) -> Judgement:
     detections = detector.find(labelled.cloud, judgement.evidence, threshold)
     centres_m = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
     hits, parts = matched(
-        labelled, detections, judgement.judging.radius_m, judgement.judging.overlap
+        labelled, detections, judgement.criteria.radius_m, judgement.criteria.overlap
     )
     measurements = {}
     if labelled.damaged:
@@ -332,11 +332,11 @@ def detector_of(name: str, settings_json: str, learned: str | None = None) -> De
         return detector.calibrated(dict(arrays))
 
 
-def detector_for(labelled: LabelledCloud, judging: Judging) -> Detector:
+def detector_for(labelled: LabelledCloud, criteria: Criteria) -> Detector:
     """Return the detector for a cloud. A built-in detector that needs the truth gets it; no
     plug-in does."""
-    detector = detector_of(judging.detector, judging.settings_json, judging.learned)
-    if not isinstance(detector, NeedsTruth) or not DETECTORS.offer(judging.detector).built_in:
+    detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
+    if not isinstance(detector, NeedsTruth) or not DETECTORS.offer(criteria.detector).built_in:
         return detector
     damages: tuple[Damage, ...] = labelled.truth if labelled.damaged else ()
     truth = []

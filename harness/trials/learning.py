@@ -29,9 +29,9 @@ def learn(trial: Trial) -> dict[str, list[dict[str, Any]]]:
     for number in range(LEARNING_BOARDS):
         own_views = trial.views[number * views : (number + 1) * views]
         clouds.append(cloud_of(replace(trial, views=own_views, repeat=number), point))
-    detector = detector_of(point.judging.detector, point.judging.settings_json)
+    detector = detector_of(point.criteria.detector, point.criteria.settings_json)
     if not isinstance(detector, Calibratable):
-        raise TypeError(f"the detector {point.judging.detector!r} does not learn")
+        raise TypeError(f"the detector {point.criteria.detector!r} does not learn")
     file = io.BytesIO()
     np.savez_compressed(file, **dict(detector.calibrate(clouds)))  # type: ignore[arg-type]
     arrays = base64.b64encode(file.getvalue()).decode()

@@ -47,10 +47,10 @@ def add_judgement(
     record.runs.append(
         run_row(judgement, point, origin, role, seconds_frames=seconds_frames, map_facts=map_facts)
     )
-    if judgement.judging.threshold is None:
+    if judgement.criteria.threshold is None:
         return
     if judgement.labelled.damaged:
-        record.holes += damage_rows(judgement, judgement.judging.threshold, point, origin)
+        record.holes += damage_rows(judgement, judgement.criteria.threshold, point, origin)
     if not in_study:
         return
     record.findings += finding_rows(judgement, origin, role)
@@ -71,7 +71,7 @@ def run_row(
     map_facts: MapFacts,
 ) -> RunRow:
     """Return the row of a judgement as a whole."""
-    threshold = judgement.judging.threshold
+    threshold = judgement.criteria.threshold
     cloud = judgement.labelled.cloud
     row = RunRow(
         point=point,

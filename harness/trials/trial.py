@@ -17,7 +17,7 @@ from harness.records.rows import Origin, Role, TrialRecord
 from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, BoardRef, load_board
 from harness.trials.clouds import MapClouds, ViewClouds
-from harness.trials.judge import Judgement, Judging, judge
+from harness.trials.judge import Judgement, Criteria, judge
 from harness.trials.record import add_judgement, noise_row, pair_noise, probes_row
 from harness.vocabulary.geometry import Cloud
 from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
@@ -35,11 +35,11 @@ class TrialPoint:
     frames: int
     """Number of frames to average."""
     averaging: Averaging
-    """How frames become a cloud."""
-    judging: Judging
-    """How the cloud is judged."""
+    """The average of the frames."""
+    criteria: Criteria
+    """The detector that judges the cloud, its threshold, and what counts as a hit."""
     mapping: MappingConfig | None = None
-    """How the clouds of several views become one; None for a single view."""
+    """Registration and merge of the clouds of several views; None for a single view."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ def run_trial(trial: Trial) -> TrialRecord:
         began = time.perf_counter()
         clouds = captured(trial, boards, points)
         seconds_frames = (time.perf_counter() - began) / len(points)
-        judgements: dict[tuple[str, Judging], Judgement] = {}
+        judgements: dict[tuple[str, Criteria], Judgement] = {}
         for point in points:
-            judged_as = (clouds.key(point.frames, point.mapping), point.judging)
+            judged_as = (clouds.key(point.frames, point.mapping), point.criteria)
             if judged_as not in judgements:
                 labelled = clouds.labelled(point.frames, point.mapping)
-                judgements[judged_as] = judge(labelled, point.judging)
+                judgements[judged_as] = judge(labelled, point.criteria)
             origin = origin_of(trial, point)
             add_judgement(
                 record,

@@ -240,8 +240,8 @@ def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
             points=(point,),
             board=batch.board,
         )
-        judging = point.judging
-        detector = detector_of(judging.detector, judging.settings_json, judging.learned)
+        criteria = point.criteria
+        detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
         evidence = detector.analyse(cloud_of(task, point))
         known = np.isfinite(evidence.score)
         fields.append(

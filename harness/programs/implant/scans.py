@@ -371,7 +371,7 @@ def _add(
     """Judge one cloud and add its rows."""
     judgement = judge.judge(
         known,
-        judge.Judging(
+        judge.Criteria(
             detector=judging.detector,
             settings_json=judging.settings_json,
             threshold=threshold,

@@ -77,9 +77,9 @@ def made_up(task: Trial, factor: float = 1.0) -> str:
             "point": one.digest,
             "variant": one.variant,
             "frames": one.frames,
-            "quiet_threshold": quiet if one.judging.threshold is None else None,
+            "quiet_threshold": quiet if one.criteria.threshold is None else None,
             "inspected_m2": 0.06,
-            "threshold": one.judging.threshold,
+            "threshold": one.criteria.threshold,
         }
         for one in task.points
     ]
@@ -87,10 +87,10 @@ def made_up(task: Trial, factor: float = 1.0) -> str:
         {
             "variant": one.variant,
             "frames": one.frames,
-            "threshold": grid(one.judging.threshold, FINDING_OCTAVES).tolist(),
+            "threshold": grid(one.criteria.threshold, FINDING_OCTAVES).tolist(),
         }
         for one in task.points
-        if one.judging.threshold is not None
+        if one.criteria.threshold is not None
     ]
     return record_text({"runs": runs, "operating": operating})
 

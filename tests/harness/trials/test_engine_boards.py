@@ -22,7 +22,7 @@ from harness.trials.board import (
     met_on_face,
     pixel_areas,
 )
-from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, Judgement, Judging, grid
+from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, Judgement, Criteria, grid
 from harness.trials.record import add_judgement
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.custom import BoardConfig, SphereConfig, TargetConfig
@@ -82,7 +82,7 @@ def judgement_of(*, damaged: bool = True, threshold: float = 4.0) -> Judgement:
 
     return Judgement(
         labelled=labelled,
-        judging=Judging("finder", "{}", threshold, 0.01),
+        criteria=Criteria("finder", "{}", threshold, 0.01),
         detector=Finder(),  # type: ignore[arg-type]
         evidence=Evidence(score, score, score, 1.0),
         detections=(hit, call),
