@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -15,11 +16,17 @@ from detectors.views.registration.register import register
 from detectors.views.registration.registered import Registration, predicted_error_m
 from detectors.views.registration.settings import PAIRWISE
 from detectors.views.view import PreparedView, View
-from harness.records.rows import Origin, RegistrationRow, Role
+from harness.records.rows import NoiseRow, Origin, ProbesRow, RegistrationRow, Role
 from harness.trials.board import Board, LabelledCloud, face_errors_m
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 from harness.vocabulary.seeds import canonical_json
+from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
+from scenes.sensor.source import SimulatedCapture
 
+NOISE_FRAMES = 2  # frames whose difference shows the noise of one
+LAGS = (1, 2, 3)  # distances in pixels for the correlation of noise
+# fewest pairs of pixels for a correlation; with fewer, its standard error would exceed 0.14
+FEWEST_PAIRS = 50
 BOARD_STEPS = 9  # points along each side of the board where a registration's error is evaluated
 
 
@@ -43,6 +50,8 @@ class ViewClouds:
     """The board in this view."""
     averages: Mapping[int, Cloud]
     """Clouds by number of frames."""
+    first_frames: SimulatedCapture
+    """The first `NOISE_FRAMES` frames, whose difference is noise."""
 
     def key(self, frames: int, mapping: MappingConfig | None) -> str:
         """Return a text that is equal for points that see the same cloud."""
@@ -56,11 +65,33 @@ class ViewClouds:
         """Return the cloud with the truth."""
         return self.board.labelled(self.averages[frames])
 
-    def probe_errors_m(self, frames: int, mapping: MappingConfig | None) -> np.ndarray:
-        """Return the errors (p,) of z at the board's probes."""
+    def probes_row(self, frames: int, mapping: MappingConfig | None, origin: Origin) -> ProbesRow:
+        """Return the errors of z at the board's probes."""
         z_m = self.averages[frames].points_m[..., 2].ravel()
         seen_z_m = self.board.seen_z_m.ravel()
-        return np.asarray(z_m[self.board.probes] - seen_z_m[self.board.probes])
+        return _probes_row(origin, z_m[self.board.probes] - seen_z_m[self.board.probes])
+
+    def noise_rows(
+        self, frames: int, mapping: MappingConfig | None, origin: Origin
+    ) -> list[NoiseRow]:
+        """Return the row of an average's pixels and of the noise of single frames."""
+        pitch_u_mm, pitch_v_mm = self.board.pitch_mm
+        row = NoiseRow(
+            variant=origin.variant,
+            frames=origin.frames,
+            repeat=origin.repeat,
+            valid_share=float(self.averages[frames].valid[self.board.on_board].mean()),
+            pitch_u_mm=pitch_u_mm,
+            pitch_v_mm=pitch_v_mm,
+            **self.frame_noise,
+        )
+        return [row]
+
+    @cached_property
+    def frame_noise(self) -> dict[str, float]:
+        """Noise of single frames on the undamaged face, as `pair_noise` returns it."""
+        first, second = self.first_frames.frames()
+        return pair_noise(first.z_m, second.z_m, self.board.bare)
 
     def map_facts(self, frames: int, mapping: MappingConfig | None) -> MapFacts:
         """Return no facts: a single view is not mapped."""
@@ -81,16 +112,31 @@ class MapClouds:
     """The board in each view; the first view is the reference."""
     averages: Sequence[Mapping[int, Cloud]]
     """Clouds by view, then by number of frames."""
-    truth: Sequence[np.ndarray]
-    """True T_reference_view (4, 4) of each view."""
-    guesses: Sequence[np.ndarray]
-    """Nominal T_reference_view (4, 4) of each view, from which registration starts."""
+    poses: AnyViews
+    """Declaration of the views, with the errors of their nominal poses."""
+    labels: tuple[str | int, ...]
+    """Labels of the random stream of these errors."""
     _prepared: dict[str, PreparedView] = field(default_factory=dict)
     _registered: dict[str, tuple[Registration, ...]] = field(default_factory=dict)
     _merged: dict[str, Merged] = field(default_factory=dict)
     _labelled: dict[str, LabelledCloud] = field(default_factory=dict)
     _reported: set[str] = field(default_factory=set)
     """Keys of the registrations whose rows have been returned."""
+
+    @cached_property
+    def truth(self) -> list[np.ndarray]:
+        """True T_reference_view (4, 4) of each view."""
+        stands = tuple(board.target.pose for board in self.boards)
+        return [T_reference_view_of(stands, number) for number in range(len(stands))]
+
+    @cached_property
+    def guesses(self) -> list[np.ndarray]:
+        """Nominal T_reference_view (4, 4) of each view, from which registration starts."""
+        stands = tuple(board.target.pose for board in self.boards)
+        return [
+            guessed_T_reference_view(self.poses, stands, number, *self.labels)
+            for number in range(len(stands))
+        ]
 
     def count(self, mapping: MappingConfig) -> int:
         """Return the number of views that a mapping uses."""
@@ -115,11 +161,17 @@ class MapClouds:
             )
         return self._labelled[key]
 
-    def probe_errors_m(self, frames: int, mapping: MappingConfig | None) -> np.ndarray:
-        """Return the errors (p,) of the map at the probes of the first view, across the face."""
+    def probes_row(self, frames: int, mapping: MappingConfig | None, origin: Origin) -> ProbesRow:
+        """Return the errors of the map at the probes of the first view, across the face."""
         first = self.boards[0]
         places_m = first.board_xy_m.reshape(-1, 2)[first.probes]
-        return face_errors_m(self.labelled(frames, mapping), places_m)
+        return _probes_row(origin, face_errors_m(self.labelled(frames, mapping), places_m))
+
+    def noise_rows(
+        self, frames: int, mapping: MappingConfig | None, origin: Origin
+    ) -> list[NoiseRow]:
+        """Return no rows: the noise of single frames belongs to a single view."""
+        return []
 
     def map_facts(self, frames: int, mapping: MappingConfig | None) -> MapFacts:
         """Return how the map was made."""
@@ -236,6 +288,20 @@ class MapClouds:
         )
 
 
+def _probes_row(origin: Origin, errors_m: np.ndarray) -> ProbesRow:
+    """Return the errors (p,) of probes in whole tenths of a micrometre, which keep records
+    small."""
+    tenths: list[int | None] = []
+    for error_m in errors_m:
+        tenths.append(round(float(error_m) * 1e7) if np.isfinite(error_m) else None)
+    return ProbesRow(
+        variant=origin.variant,
+        frames=origin.frames,
+        repeat=origin.repeat,
+        error_tenth_um=tenths,
+    )
+
+
 def _stated(mapping: MappingConfig | None) -> MappingConfig:
     """Return the mapping, which every point of several views has."""
     if mapping is None:
@@ -271,3 +337,34 @@ def registration_error_m(
     across = moved @ normal
     in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
     return float(np.sqrt((in_plane**2).mean())), float(np.sqrt((across**2).mean()))
+
+
+def pair_noise(
+    first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray
+) -> dict[str, float]:
+    """Return the standard deviation of one frame's temporal noise and its correlations (columns of
+    `NoiseRow`), from two frames' z (h, w) in metres without their median difference. Only valid
+    pixels in ``where`` (h, w) count; NaN if there are too few."""
+    difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
+    valid = where & np.isfinite(difference)
+    if valid.sum() < FEWEST_PAIRS:
+        columns = ["single_frame_mm"]
+        columns += [f"correlation_{way}{lag}" for way in "uv" for lag in LAGS]
+        return dict.fromkeys(columns, np.nan)
+    noise = np.where(valid, difference - np.median(difference[valid]), 0.0)
+    measured = {"single_frame_mm": float(np.sqrt((noise[valid] ** 2).mean())) / MM}
+    for lag in LAGS:
+        measured[f"correlation_u{lag}"] = _correlation(noise, valid, lag)
+        measured[f"correlation_v{lag}"] = _correlation(noise.T, valid.T, lag)
+    return measured
+
+
+def _correlation(noise: np.ndarray, valid: np.ndarray, lag: int) -> float:
+    """Return the correlation of valid noise (h, w) between pixels a lag of columns apart."""
+    both_valid = valid[:, :-lag] & valid[:, lag:]
+    first = noise[:, :-lag][both_valid]
+    second = noise[:, lag:][both_valid]
+    power = np.sqrt((first @ first) * (second @ second))
+    if len(first) < FEWEST_PAIRS or not power > 0:
+        return float("nan")
+    return float(first @ second / power)

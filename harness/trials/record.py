@@ -9,26 +9,20 @@ from detectors.interface import Measurement
 from harness.records.rows import (
     DamageRow,
     FindingRow,
-    NoiseRow,
     OperatingRow,
     Origin,
     PixelsRow,
-    ProbesRow,
     Role,
     RunRow,
     SiteRow,
     TrialRecord,
 )
-from harness.trials.board import Board
 from harness.trials.clouds import MapFacts
 from harness.trials.judge import Judgement
-from harness.vocabulary.geometry import MM, Cloud
+from harness.vocabulary.geometry import MM
 from scenes.target.truth import Damage
 
 NO_MAP = MapFacts()
-LAGS = (1, 2, 3)  # distances in pixels for the correlation of noise
-# fewest pairs of pixels for a correlation; with fewer, its standard error would exceed 0.14
-FEWEST_PAIRS = 50
 
 
 def add_judgement(
@@ -297,62 +291,3 @@ def site_rows(judgement: Judgement, origin: Origin, role: Role) -> list[SiteRow]
         )
         rows.append(row)
     return rows
-
-
-def probes_row(origin: Origin, errors_m: np.ndarray) -> ProbesRow:
-    """Return the errors (p,) of probes in whole tenths of a micrometre, which keep records
-    small."""
-    tenths: list[int | None] = []
-    for error_m in errors_m:
-        tenths.append(round(float(error_m) * 1e7) if np.isfinite(error_m) else None)
-    return ProbesRow(
-        variant=origin.variant,
-        frames=origin.frames,
-        repeat=origin.repeat,
-        error_tenth_um=tenths,
-    )
-
-
-def noise_row(origin: Origin, board: Board, cloud: Cloud, pair_noise: dict[str, float]) -> NoiseRow:
-    """Return the pixels of an average of an undamaged board, and the noise of single frames."""
-    pitch_u_mm, pitch_v_mm = board.pitch_mm
-    return NoiseRow(
-        variant=origin.variant,
-        frames=origin.frames,
-        repeat=origin.repeat,
-        valid_share=float(cloud.valid[board.on_board].mean()),
-        pitch_u_mm=pitch_u_mm,
-        pitch_v_mm=pitch_v_mm,
-        **pair_noise,
-    )
-
-
-def pair_noise(
-    first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray
-) -> dict[str, float]:
-    """Return the standard deviation of one frame's temporal noise and its correlations (columns of
-    `NoiseRow`), from two frames' z (h, w) in metres without their median difference. Only valid
-    pixels in ``where`` (h, w) count; NaN if there are too few."""
-    difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
-    valid = where & np.isfinite(difference)
-    if valid.sum() < FEWEST_PAIRS:
-        columns = ["single_frame_mm"]
-        columns += [f"correlation_{way}{lag}" for way in "uv" for lag in LAGS]
-        return dict.fromkeys(columns, np.nan)
-    noise = np.where(valid, difference - np.median(difference[valid]), 0.0)
-    measured = {"single_frame_mm": float(np.sqrt((noise[valid] ** 2).mean())) / MM}
-    for lag in LAGS:
-        measured[f"correlation_u{lag}"] = _correlation(noise, valid, lag)
-        measured[f"correlation_v{lag}"] = _correlation(noise.T, valid.T, lag)
-    return measured
-
-
-def _correlation(noise: np.ndarray, valid: np.ndarray, lag: int) -> float:
-    """Return the correlation of valid noise (h, w) between pixels a lag of columns apart."""
-    both_valid = valid[:, :-lag] & valid[:, lag:]
-    first = noise[:, :-lag][both_valid]
-    second = noise[:, lag:][both_valid]
-    power = np.sqrt((first @ first) * (second @ second))
-    if len(first) < FEWEST_PAIRS or not power > 0:
-        return float("nan")
-    return float(first @ second / power)

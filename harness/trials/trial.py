@@ -10,17 +10,16 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from detectors.views.mapping.settings import MappingConfig
 from harness.records.rows import Origin, Role, TrialRecord
 from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, BoardRef, load_board
-from harness.trials.clouds import MapClouds, ViewClouds
-from harness.trials.judge import Judgement, Criteria, judge
-from harness.trials.record import add_judgement, noise_row, pair_noise, probes_row
+from harness.trials.clouds import NOISE_FRAMES, MapClouds, ViewClouds
+from harness.trials.judge import Criteria, Judgement, judge
+from harness.trials.record import add_judgement
 from harness.vocabulary.geometry import Cloud
-from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
+from scenes.perspectives import AnyViews
 from scenes.sensor.source import SimulatedCapture
 
 
@@ -84,11 +83,13 @@ def run_trial(trial: Trial) -> TrialRecord:
         seconds_frames = (time.perf_counter() - began) / len(points)
         judgements: dict[tuple[str, Criteria], Judgement] = {}
         for point in points:
+            origin = Origin(
+                variant=point.variant, frames=point.frames, repeat=trial.repeat, board=trial.board
+            )
             judged_as = (clouds.key(point.frames, point.mapping), point.criteria)
             if judged_as not in judgements:
                 labelled = clouds.labelled(point.frames, point.mapping)
                 judgements[judged_as] = judge(labelled, point.criteria)
-            origin = origin_of(trial, point)
             add_judgement(
                 record,
                 judgements[judged_as],
@@ -101,8 +102,9 @@ def run_trial(trial: Trial) -> TrialRecord:
             record.registrations += clouds.registration_rows(
                 point.frames, point.mapping, origin, trial.role
             )
-        if trial.hole_free and trial.board is None:
-            add_noise(record, trial, clouds, points)
+            if trial.hole_free and trial.board is None:
+                record.probes.append(clouds.probes_row(point.frames, point.mapping, origin))
+                record.noise += clouds.noise_rows(point.frames, point.mapping, origin)
     return record
 
 
@@ -112,13 +114,6 @@ def sharing_averages(points: Sequence[TrialPoint]) -> list[list[TrialPoint]]:
     for point in points:
         groups.setdefault(point.averaging, []).append(point)
     return list(groups.values())
-
-
-def origin_of(trial: Trial, point: TrialPoint) -> Origin:
-    """Return the origin that the rows of a point state."""
-    return Origin(
-        variant=point.variant, frames=point.frames, repeat=trial.repeat, board=trial.board
-    )
 
 
 def captured(
@@ -144,19 +139,9 @@ def clouds_of(
     trial: Trial, boards: Sequence[Board], averages: Sequence[Mapping[int, Cloud]]
 ) -> ViewClouds | MapClouds:
     """Return what points see of averages by view and number of frames."""
-    if trial.poses is None:
-        return ViewClouds(boards[0], averages[0])
-    stands = tuple(board.target.pose for board in boards)
-    numbers = range(len(boards))
-    return MapClouds(
-        boards=boards,
-        averages=averages,
-        truth=[T_reference_view_of(stands, number) for number in numbers],
-        guesses=[
-            guessed_T_reference_view(trial.poses, stands, number, *trial.labels)
-            for number in numbers
-        ],
-    )
+    if trial.poses is not None:
+        return MapClouds(boards, averages, trial.poses, trial.labels)
+    return ViewClouds(boards[0], averages[0], capture_of(trial, 0, boards[0], NOISE_FRAMES))
 
 
 def uses_view(point: TrialPoint, number: int) -> bool:
@@ -173,26 +158,6 @@ def capture_of(trial: Trial, number: int, board: Board, frames: int) -> Simulate
     if number:
         labels = (*labels, "view", number)
     return board.unit.capture(frames, trial.seed, *labels)
-
-
-def add_noise(
-    record: TrialRecord,
-    trial: Trial,
-    clouds: ViewClouds | MapClouds,
-    points: Sequence[TrialPoint],
-) -> None:
-    """Add the errors of z of a hole-free board; of a single view also the noise of its frames."""
-    for point in points:
-        errors_m = clouds.probe_errors_m(point.frames, point.mapping)
-        record.probes.append(probes_row(origin_of(trial, point), errors_m))
-    if isinstance(clouds, MapClouds):
-        return
-    board = clouds.board
-    first, second = islice(capture_of(trial, 0, board, 2).frames(), 2)
-    noise = pair_noise(first.z_m, second.z_m, board.bare)
-    for point in points:
-        cloud = clouds.averages[point.frames]
-        record.noise.append(noise_row(origin_of(trial, point), board, cloud, noise))
 
 
 def cloud_of(trial: Trial, point: TrialPoint) -> Cloud:
