@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import compare_results
 import numpy as np
 import pandas as pd
 import pytest
+
+from tests import compare_results
 
 DIGEST = "0123456789abcdef"
 OTHER_DIGEST = "fedcba9876543210"

@@ -19,6 +19,7 @@ FILES = {
     "scenes/__init__.py": "",
     "scenes/board.py": "class Board: ...\n",
     "detectors/__init__.py": "",
+    "detectors/methods/__init__.py": "",
     "detectors/methods/thesis.py": "",
     "detectors/blind.py": "",
 }
@@ -107,6 +108,6 @@ def test_a_source_that_is_edited_stays_what_this_process_has_loaded(project: Pat
     asked later."""
     forget()
     before = source_digest(("harness.trial",), ("numpy",))
-    (project / "harness" / "engine" / "judge.py").write_text("K = 5\n")
+    (project / "harness" / "trials" / "judge.py").write_text("K = 5\n")
     source_digest.cache_clear()
     assert source_digest(("harness.trial",), ("numpy",)) == before != fresh("harness.trial")
