@@ -150,7 +150,7 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
             counts.append(
                 f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}"
             )
-        where = f"{case.place}: " if len(cases) > 1 else ""
+        where = f"{case.conditions}: " if len(cases) > 1 else ""
         sentences.append(f"{where}With {maps.frames_text(alone.frames)} {', '.join(counts)}.")
     if not sentences:
         return "No trial of any set-up finished, so there is no answer."

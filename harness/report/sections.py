@@ -281,10 +281,10 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
     rows = [row for row in records(compared) if not row["is_variation"]]
     frames = shown_frames(compared)
     views = sorted({row["views"] for row in rows})
-    several = len({row["place"] for row in rows}) > 1
+    several = len({row["conditions"] for row in rows}) > 1
     by_way: dict[str, dict[tuple[int, int], Row]] = {}
     for row in rows:
-        way = label_of(row["registration"], row["merge"], row["place"] if several else "")
+        way = label_of(row["registration"], row["merge"], row["conditions"] if several else "")
         by_way.setdefault(way, {})[row["views"], row["frames"]] = row
 
     def count(row: Row | None) -> str:

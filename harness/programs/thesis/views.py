@@ -318,7 +318,7 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
         if len(cases) > 1:
             judged = [
-                (case, replace(result, evidence=f"{case.place}: {result.evidence}"))
+                (case, replace(result, evidence=f"{case.conditions}: {result.evidence}"))
                 for case, result in judged
             ]
         if claim in OVER_UNITS:
