@@ -8,11 +8,18 @@ import numpy as np
 
 from detectors.views.mapping.merge import SEVERAL, Mapped
 from detectors.views.mapping.settings import MappingConfig
-from harness.evaluation.profile import HoleInView
 from harness.evaluation.study.limit import SetUpLimit
 from harness.experiment.schema import Point
-from harness.report.clouds import ExampleCloud, MappedExample, StudyExample, Where
-from harness.report.view3d import Circle3d, Kind, Scene3d
+from harness.records.examples import (
+    Circle3d,
+    CircleKind,
+    ExampleCloud,
+    HoleInView,
+    MappedExample,
+    Scene3d,
+    StudyExample,
+    Where,
+)
 from harness.runs.plan import Batch, Group, SweepPlan
 from harness.trials.judge import JudgedCloud, judge
 from harness.trials.setup import SetUp, known_view, load_set_up
@@ -171,12 +178,12 @@ def _map_example(
     points_m = transform_points(known.T_board_cloud, cloud.points_m.reshape(-1, 3)[shown])
     circles = []
 
-    def add(centre_m: np.ndarray, diameter_m: float, label: str, kind: Kind) -> None:
+    def add(centre_m: np.ndarray, diameter_m: float, label: str, kind: CircleKind) -> None:
         centre_mm = np.array([*centre_m[:2], 0.0]) / MM
         circles.append(Circle3d(centre_mm, np.array([0.0, 0.0, 1.0]), diameter_m / MM, label, kind))
 
     for n, damage in enumerate(known.truth):
-        kind: Kind = "found" if n in judged.pairs else "missed"
+        kind: CircleKind = "found" if n in judged.pairs else "missed"
         add(damage.centre_board_m, damage.diameter_m, str(damage.id), kind)
     for n, (place_m, detection) in enumerate(zip(judged.places_m, judged.detections, strict=True)):
         diameter_m = judged.detector.measure(cloud, judged.evidence, detection).extent_diameter_m

@@ -17,11 +17,10 @@ from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     FEWEST_PAIRS,
     FEWEST_UNITS,
-    Answer,
-    Verdict,
     decide,
     verdict_of,
 )
+from harness.report.claims import Answer, Verdict
 from harness.vocabulary.text import many
 
 Standing = Literal["ahead", "behind", "level", "open"]
