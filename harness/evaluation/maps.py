@@ -37,14 +37,14 @@ FEWEST_BOTH = 2  # fewest repeats in which both maps must measure a hole to comp
 @dataclass(frozen=True)
 class MapSetUp:
     """One set-up or variation. ``views``: 0 for "all" without a finished run. ``registration``,
-    ``merge``: empty if no axis states them. ``place``: the other axes' values as text.
+    ``merge``: empty if no axis states them. ``conditions``: the other axes' values as text.
     ``reference``: the set-up of a variation, or ""."""
 
     variant: str
     views: int
     registration: str
     merge: str
-    place: str
+    conditions: str
     is_variation: bool
     reference: str
 
@@ -193,7 +193,7 @@ class MapCase:
     tables: ResultTables
     summary: pd.DataFrame
     maps: Sequence[MapSetUp]
-    place: str
+    conditions: str
     without_unit: str = ""
 
     @property
@@ -273,14 +273,14 @@ def _rows(table: pd.DataFrame, chosen: Map) -> pd.DataFrame:
 def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
     """Make one case for each place, in the order of the set-ups."""
     maps = maps_of(tables)
-    places = dict.fromkeys(each.place for each in maps if not each.is_variation)
+    places = dict.fromkeys(each.conditions for each in maps if not each.is_variation)
     alike = (
         tables.variants.assign(**{CAMERA_UNIT: ""})
         if CAMERA_UNIT in tables.variants
         else tables.variants
     )
-    without = {each.variant: each.place for each in maps_of(replace(tables, variants=alike))}
-    groups = ((place, [each for each in maps if each.place == place]) for place in places)
+    without = {each.variant: each.conditions for each in maps_of(replace(tables, variants=alike))}
+    groups = ((place, [each for each in maps if each.conditions == place]) for place in places)
     return [
         MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups
     ]

@@ -5,6 +5,8 @@ from typing import Literal
 
 import numpy as np
 
+from harness.records.examples import ExampleCloud, HoleInView
+
 # valid pixels inside the outline to distinguish two shapes; with fewer, one ring is the whole hole
 FEWEST_PIXELS = 12
 FEWEST_VALID = (
@@ -13,36 +15,6 @@ FEWEST_VALID = (
 # a shape fits clearly better if its rms misfit is at most this share of the other's (fixed
 # beforehand)
 CLEARLY = 0.8
-
-
-@dataclass(frozen=True)
-class HoleInView:
-    """The true place of one round damage on the cloud's pixel grid. ``u_px``, ``v_px``: centre
-    (column, row; 0, 0 is the centre of the first pixel). ``radius_px``: of its outline.
-    ``depth_mm``: NaN or infinite without a floor."""
-
-    hole: str
-    u_px: float
-    v_px: float
-    radius_px: float
-    diameter_mm: float
-    depth_mm: float
-
-
-@dataclass(frozen=True)
-class ExampleCloud:
-    """One averaged cloud of one variant, on its pixel grid (h, w). ``residual_mm``: distance
-    behind (+) or before (-) the fitted surface, NaN if unknown. ``detected`` bool: pixels of the
-    detector's clusters. ``inside`` bool: of the crop. ``truth``: its holes. ``z_truth_mm``: true z
-    on each pixel's central ray, NaN where it meets nothing."""
-
-    frames: int
-    variant: str
-    residual_mm: np.ndarray
-    detected: np.ndarray
-    inside: np.ndarray
-    truth: tuple[HoleInView, ...]
-    z_truth_mm: np.ndarray
 
 
 @dataclass(frozen=True)

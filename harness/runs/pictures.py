@@ -8,11 +8,18 @@ import numpy as np
 
 from detectors.views.mapping.merge import SEVERAL, Mapped
 from detectors.views.mapping.settings import MappingConfig
-from harness.evaluation.profile import ExampleCloud, HoleInView
 from harness.evaluation.study.limit import SetUpLimit
 from harness.experiment.schema import Point
-from harness.report.clouds import MappedExample, StudyExample, Where
-from harness.report.view3d import Circle3d, Kind, Scene3d
+from harness.records.examples import (
+    Circle3d,
+    CircleKind,
+    ExampleCloud,
+    HoleInView,
+    MappedExample,
+    Scene3d,
+    StudyExample,
+    Where,
+)
 from harness.runs.plan import Batch, Group, SweepPlan
 from harness.trials.averages import averages_of
 from harness.trials.board import Board, load_board
@@ -237,7 +244,7 @@ def _circles(judgement: Judgement) -> Iterator[Circle3d]:
     """Yield a circle for each damage, hit or missed, and one for each detection."""
     labelled = judgement.labelled
     for index, damage in enumerate(labelled.truth):
-        kind: Kind = "found" if index in judgement.hits else "missed"
+        kind: CircleKind = "found" if index in judgement.hits else "missed"
         yield _circle(damage.centre_board_m, damage.diameter_m, str(damage.id), kind)
     hitting = set(judgement.hits.values())
     for index, detection in enumerate(judgement.detections):
@@ -248,7 +255,7 @@ def _circles(judgement: Judgement) -> Iterator[Circle3d]:
         yield _circle(judgement.places_m[index], diameter_m, label, kind)
 
 
-def _circle(centre_m: np.ndarray, diameter_m: float, label: str, kind: Kind) -> Circle3d:
+def _circle(centre_m: np.ndarray, diameter_m: float, label: str, kind: CircleKind) -> Circle3d:
     """Return a circle in the board's plane."""
     return Circle3d(
         centre_mm=np.array([*centre_m[:2], 0.0]) / MM,

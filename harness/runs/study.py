@@ -24,10 +24,11 @@ from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import Experiment, Point, detector_version
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.records.trials import ResultTables
+from harness.report.claims import claim_set_of
 from harness.report.page import write_report
 from harness.report.sections import final_tables
 from harness.report.study_page import study_html, study_parts
-from harness.report.summaries import as_files, is_thesis, summaries
+from harness.report.summaries import as_files, summaries
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
 from harness.runs.jobs import STATES, Failure, Job, JobEngine, Outcome
@@ -212,7 +213,7 @@ def _write_report(
     """Write the summaries and the report of an experiment that is not a study. Return what the
     terminal shows."""
     facts = experiment.data
-    found = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
+    found = summaries(tables, outcome.examples, claim_set_of(facts))
     write_tables(folder, as_files(found), provenance)
     about = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
     write_report(folder, tables, outcome.examples, *about, found=found)

@@ -248,26 +248,26 @@ class AxisGroup:
 def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
     """Return the lines of each axis. A line's label gives its values on those other axes on which
     the lines differ."""
-    names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
+    names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.fixed)))
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
         of_axis = [line for line in lines if line.axis == path]
-        axes = dict.fromkeys(axis for line in of_axis for axis in line.held)
-        taken = {axis: [line.held.get(axis) for line in of_axis] for axis in axes}
+        axes = dict.fromkeys(axis for line in of_axis for axis in line.fixed)
+        taken = {axis: [line.fixed.get(axis) for line in of_axis] for axis in axes}
         varied = [axis for axis, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
         def held(line: AxisLine, axis: str, values: Sequence[Any]) -> str:
             """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key
             (``albedo=0.2``)."""
-            words = axis_value(axis, differing(line.held[axis], values))
+            words = axis_value(axis, differing(line.fixed[axis], values))
             return (
                 words
-                if axis == FRAMES or isinstance(line.held[axis], str)
+                if axis == FRAMES or isinstance(line.fixed[axis], str)
                 else f"{names[axis]}={words}"
             )
 
         labels = [
-            ", ".join(held(line, axis, taken[axis]) for axis in varied if axis in line.held)
+            ", ".join(held(line, axis, taken[axis]) for axis in varied if axis in line.fixed)
             for line in of_axis
         ]
         every = [value for line in of_axis for value in line.values]

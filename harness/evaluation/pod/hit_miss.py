@@ -61,7 +61,7 @@ STARTS = (
 class HitMissFit:
     """A fitted curve, POD = F(b0 + b1 x) with x = size or ln size, and its basis. ``covariance``
     (2, 2): of b0 and b1, multiplied by ``repeats`` = n / targets. Deviances count every row,
-    without the penalty of ``method`` "Firth". ``place`` (2,): intercept and slope in z = (x -
+    without the penalty of ``method`` "Firth". ``maximum`` (2,): intercept and slope in z = (x -
     centre) / spread. ``data``: defines the likelihood."""
 
     curve: PodCurve
@@ -79,7 +79,7 @@ class HitMissFit:
     notes: tuple[str, ...]
     centre: float
     spread: float
-    place: np.ndarray
+    maximum: np.ndarray
     data: HitsAndMisses
 
 
@@ -212,7 +212,7 @@ def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     sides = (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
     cases: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
     for beyond, floor, ceiling in cases if fit.method == "ML" else ():
-        place, value = _search(fit.data, np.append(fit.place, [0.0, 1.0]), floor, ceiling)
+        place, value = _search(fit.data, np.append(fit.maximum, [0.0, 1.0]), floor, ceiling)
         statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
         p_one, p_two = stats.chi2.sf(statistic, [1, 2])
         tail = 0.5 * p_one if beyond != "both" else 0.5 * p_one + 0.25 * p_two
@@ -385,7 +385,7 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     """Return the largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and
     the reason."""
     data = fit.data
-    place = fit.place
+    place = fit.maximum
     level = float(link_ppf(fit.curve.link, np.array(pod)))
     z_best = (fit.curve.mu + fit.curve.sigma * level - fit.centre) / fit.spread
     top = float(data.value(place))
@@ -419,7 +419,7 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     """Return (b0, b1) (n, 2), in standardised sizes, on the outline of 2 (llmax - ll) <=
     ``allowed`` with b1 >= 0."""
     data = fit.data
-    best = fit.place
+    best = fit.maximum
     scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
     metric = scale @ (fit.covariance / fit.repeats) @ scale.T
     try:

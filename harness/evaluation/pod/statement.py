@@ -39,7 +39,7 @@ TESTED: dict[Beyond, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """A model that was tried. ``deviance``: a smaller one fits better. ``near``: whether its bound
+    """A model that was tried. ``deviance``: a smaller one fits better. ``in_bound``: whether its bound
     is among those of which the statement's bound is the largest."""
 
     name: str
@@ -48,7 +48,7 @@ class ModelRow:
     a90: float
     bound: Bound
     chosen: bool
-    near: bool
+    in_bound: bool
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class PodStatement:
         of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
         models = [
             {"model": row.name, **{name: getattr(row, name) for name in ("deviance", "a50", "a90")}}
-            | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.near}
+            | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.in_bound}
             for row in self.models
         ]
         data = {

@@ -89,11 +89,11 @@ PRO_LIMIT = 0.3  # false-positive rate up to which per-region overlap is integra
 @dataclass(frozen=True, eq=False)
 class Roc:
     """``false``, ``true`` (k,): shares of ``unflawed`` sites and of ``damages`` (inspections) with
-    at least a given signal, from (0, 0) to (1, 1). ``at``: both at the threshold in use."""
+    at least a given signal, from (0, 0) to (1, 1). ``in_use``: both at the threshold in use."""
 
     false: np.ndarray
     true: np.ndarray
-    at: tuple[float, float]
+    in_use: tuple[float, float]
     area: float
     damages: int
     unflawed: int
@@ -101,16 +101,16 @@ class Roc:
 
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
-    """Shares and rates at descending values of ``threshold`` (k,). ``found`` (k,): share of all
-    damages, with ``found_low`` and ``found_high`` (k,) over boards. ``at``: (false calls per m2,
+    """Shares and rates at descending values of ``threshold`` (k,). ``found_share`` (k,): share of all
+    damages, with ``found_low`` and ``found_high`` (k,) over boards. ``in_use``: (false calls per m2,
     found) at the threshold in use. ``area_m2``: inspected area of hole-free boards."""
 
     threshold: np.ndarray
     false_calls_per_m2: np.ndarray
-    found: np.ndarray
+    found_share: np.ndarray
     found_low: np.ndarray
     found_high: np.ndarray
-    at: tuple[float, float]
+    in_use: tuple[float, float]
     area_m2: float
 
 

@@ -49,12 +49,12 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class AxisLine:
-    """Set-ups that differ only in ``axis`` (a dotted path). ``held``: the other axes. ``values``
+    """Set-ups that differ only in ``axis`` (a dotted path). ``fixed``: the other axes. ``values``
     and ``limits``: ascending, text in the declared order. ``steps``: from each to the next.
     ``numeric``: can be drawn to scale."""
 
     axis: str
-    held: Mapping[str, Any]
+    fixed: Mapping[str, Any]
     values: tuple[Any, ...]
     limits: tuple[SetUpLimit, ...]
     steps: tuple[Difference, ...]

@@ -17,11 +17,10 @@ from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     FEWEST_PAIRS,
     FEWEST_UNITS,
-    Answer,
-    Verdict,
     decide,
     verdict_of,
 )
+from harness.report.claims import Answer, Verdict
 from harness.vocabulary.text import many
 
 Standing = Literal["ahead", "behind", "level", "open"]
@@ -318,7 +317,7 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
         if len(cases) > 1:
             judged = [
-                (case, replace(result, evidence=f"{case.place}: {result.evidence}"))
+                (case, replace(result, evidence=f"{case.conditions}: {result.evidence}"))
                 for case, result in judged
             ]
         if claim in OVER_UNITS:

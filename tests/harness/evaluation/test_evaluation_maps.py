@@ -195,7 +195,7 @@ def test_maps_are_known_by_their_axes(small):
         True,
     )
     one = maps[name_of(2, "cpd", "grid")]
-    assert (one.views, one.registration, one.merge, one.place, one.is_variation) == (
+    assert (one.views, one.registration, one.merge, one.conditions, one.is_variation) == (
         2,
         "cpd",
         "grid",
@@ -248,5 +248,5 @@ def test_other_axes_make_places_of_their_own(small):
         },
     )
     (case,) = map_cases(placed, summarise_holes(placed.holes, [row["path"] for row in more]))
-    assert case.place == "0.7 m"
+    assert case.conditions == "0.7 m"
     assert against_one(case, "cpd", "grid") is not None

@@ -329,7 +329,7 @@ def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
         for start in starts
     ]
     both = _search(
-        data, np.append(fit_hit_miss(sizes, hits).place, [0.0, 1.0]), (0.0, 0.5), (0.5, 1.0)
+        data, np.append(fit_hit_miss(sizes, hits).maximum, [0.0, 1.0]), (0.0, 0.5), (0.5, 1.0)
     )[1]
     assert -both <= min(losses) + 5e-5
 
@@ -428,7 +428,7 @@ def test_a_bound_far_beyond_all_sizes_is_where_the_ratio_says():
     for log_size in (True, False):
         fit = fit_hit_miss(size, hit, link="cloglog", log_size=log_size)
         found = bound(fit)
-        top = float(fit.data.value(fit.place))
+        top = float(fit.data.value(fit.maximum))
         level = float(link_ppf("cloglog", np.array(0.9)))
         slopes = np.geomspace(1e-4, 10.0, 4000)
         for far in (4.0, 32.0, 64.0, 200.0):

@@ -111,7 +111,7 @@ class TestRoc:
         ranks = stats.mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
         assert curve.area == pytest.approx(ranks, rel=1e-12)
         assert np.trapezoid(curve.true, curve.false) == pytest.approx(ranks, rel=1e-9)
-        assert curve.at == ((negative > THRESHOLD).mean(), (positive > THRESHOLD).mean())
+        assert curve.in_use == ((negative > THRESHOLD).mean(), (positive > THRESHOLD).mean())
 
     def test_ties_and_unjudged_places_by_hand(self):
         """Signals 2, 1, none against 1, none: won 2 + 1.5 + 0.5 of 6."""
@@ -121,7 +121,7 @@ class TestRoc:
         sites = pd.DataFrame({"board": [8, 9], "signal": [1.0, np.nan]})
         curve = roc_curve(holes, sites, 0.5)
         assert curve.area == pytest.approx(4 / 6)
-        assert curve.at == (0.5, pytest.approx(2 / 3))
+        assert curve.in_use == (0.5, pytest.approx(2 / 3))
         assert (curve.false[0], curve.true[0], curve.false[-1], curve.true[-1]) == (0, 0, 1, 1)
 
     def test_none_without_sites(self, loud):
@@ -132,16 +132,16 @@ class TestFreeResponse:
     def test_the_threshold_in_use_lies_on_the_curve(self, loud):
         curve = free_response(loud.operating, loud.runs, loud.holes)
         here = np.flatnonzero(curve.threshold == THRESHOLD)[0]
-        assert curve.at == (curve.false_calls_per_m2[here], curve.found[here])
-        assert curve.at[1] == loud.holes["detected"].mean()
-        assert curve.found_low[here] < curve.at[1] < curve.found_high[here]
+        assert curve.in_use == (curve.false_calls_per_m2[here], curve.found_share[here])
+        assert curve.in_use[1] == loud.holes["detected"].mean()
+        assert curve.found_low[here] < curve.in_use[1] < curve.found_high[here]
         assert curve.area_m2 == pytest.approx(30 * 0.25)
 
     def test_the_rate_is_that_of_hole_free_boards_alone(self, loud):
         """So it is the table's, though damaged boards have false calls of their own."""
         curve = free_response(loud.operating, loud.runs, loud.holes)
         runs = loud.runs[loud.runs["role"] == "hole_free"]
-        assert curve.at[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
+        assert curve.in_use[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
         more = loud.operating.copy()
         more.loc[more["role"] == "damaged", "findings"] = more["findings"] + 7
         again = free_response(more, loud.runs, loud.holes)
@@ -172,7 +172,7 @@ class TestFreeResponse:
         curve = free_response(pd.concat([free, hits]), runs, holes, draws=10)
         assert curve.threshold.tolist() == [6.0, 5.0, 3.0, 2.0]
         assert curve.false_calls_per_m2.tolist() == [0.0, 4.0, 4.0, 6.0]
-        assert curve.found.tolist() == [0.0, 0.5, 0.5, 1.0] and curve.at == (4.0, 0.5)
+        assert curve.found_share.tolist() == [0.0, 0.5, 0.5, 1.0] and curve.in_use == (4.0, 0.5)
 
     def test_none_without_hole_free_boards(self, loud):
         runs = loud.runs[loud.runs["role"] == "damaged"]
@@ -184,7 +184,7 @@ class TestFreeResponse:
         expected = LOUD * np.exp(THRESHOLD - curve.threshold)
         scatter = np.sqrt(expected / curve.area_m2)
         assert np.all(np.abs(curve.false_calls_per_m2 - expected) < 4 * scatter)
-        assert np.all(np.diff(curve.found) >= 0) and np.all(np.diff(curve.threshold) < 0)
+        assert np.all(np.diff(curve.found_share) >= 0) and np.all(np.diff(curve.threshold) < 0)
 
 
 class TestPixels:
@@ -343,7 +343,7 @@ class TestAxes:
             (FRAMES, (1, 20)),
         ]
         assert (
-            lines[0].held == {"camera": "b", FRAMES: 1}
+            lines[0].fixed == {"camera": "b", FRAMES: 1}
             and lines[0].numeric
             and not lines[1].numeric
         )
