@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detectors.views.mapping.merge import SEVERAL, Mapped
-from detectors.views.mapping.settings import MappingConfig
 from harness.evaluation.study.limit import SetUpLimit
 from harness.experiment.schema import Point
 from harness.records.examples import (
@@ -23,9 +22,9 @@ from harness.records.examples import (
 from harness.runs.plan import Batch, Group, SweepPlan
 from harness.trials.averages import averages_of
 from harness.trials.board import Board, load_board
-from harness.trials.clouds import MapClouds
+from harness.trials.clouds import MapClouds, TrialPoint, mapping_of
 from harness.trials.judge import Judgement, judge
-from harness.trials.trial import Trial, TrialPoint, capture_of, clouds_of
+from harness.trials.trial import Trial, capture_of, clouds_of
 from harness.vocabulary.geometry import MM, transform_points
 from scenes.target.truth import Damage, face_of
 
@@ -162,10 +161,9 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
     assert isinstance(maps, MapClouds)  # the group has several views
     examples = []
     for (count, _), point in shown.items():
-        mapping = point.config.mapping
-        if mapping is not None and count in (min(counts), max(counts)):
+        if count in (min(counts), max(counts)):
             in_trial = trial_points[point.digest]
-            examples.append(_map_example(maps, in_trial, mapping, point.is_variation))
+            examples.append(_map_example(maps, in_trial, is_variation=point.is_variation))
     return examples
 
 
@@ -191,11 +189,10 @@ def _shown_maps(
     return last
 
 
-def _map_example(
-    maps: MapClouds, point: TrialPoint, mapping: MappingConfig, is_variation: bool
-) -> MappedExample:
+def _map_example(maps: MapClouds, point: TrialPoint, *, is_variation: bool) -> MappedExample:
     """Return the picture of one map."""
-    labelled = maps.labelled(point.frames, mapping)
+    mapping = mapping_of(point)
+    labelled = maps.labelled(point)
     cloud = labelled.cloud
     judgement = judge(labelled, replace(point.criteria, overlap=None))
     shown = np.flatnonzero(cloud.valid.ravel())
@@ -204,14 +201,12 @@ def _map_example(
     rgb = np.full((len(shown), 3), GREY, np.uint8)
     if cloud.rgb is not None:
         rgb = cloud.rgb.reshape(-1, 3)[shown]
-    merged = maps.merged(point.frames, mapping)
-    mapped = Mapped(
-        maps.prepared(point.frames, mapping), maps.registrations(point.frames, mapping), merged
-    )
+    merged = maps.merged(point)
+    mapped = Mapped(maps.prepared(point), maps.registrations(point), merged)
     view_names = tuple(view.view.name for view in mapped.views)
     # a view that failed keeps its number
     number_of = np.array([*map(view_names.index, merged.views_used), SEVERAL])
-    count = maps.count(mapping)
+    count = maps.count(point)
     registration = mapping.registration.method
     merge_kind = mapping.merge.kind
     scene = Scene3d(

@@ -23,9 +23,10 @@ from harness.runs.journal import JOURNAL_VERSION
 from harness.runs.shards import Shard
 from harness.trials.averages import Averaging
 from harness.trials.board import BoardRef
+from harness.trials.clouds import TrialPoint
 from harness.trials.judge import Criteria, detector_of
 from harness.trials.learning import LEARNING_BOARDS
-from harness.trials.trial import Trial, TrialPoint
+from harness.trials.trial import Trial
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import source_digest

@@ -130,7 +130,7 @@ class Board:
     @cached_property
     def on_board(self) -> np.ndarray:
         """Pixels (h, w) bool whose central ray meets the face or a hole in it."""
-        return np.isfinite(self.board_xy_m[..., 0])
+        return np.asarray(np.isfinite(self.board_xy_m[..., 0]))
 
     @cached_property
     def bare(self) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The clouds that the points of a trial share: averages of one view, or maps of several.
 
-`ViewClouds` and `MapClouds` answer the same questions for a number of frames and a mapping."""
+`ViewClouds` and `MapClouds` answer the same questions about a point's cloud."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from detectors.views.registration.registered import Registration, predicted_erro
 from detectors.views.registration.settings import PAIRWISE
 from detectors.views.view import PreparedView, View
 from harness.records.rows import NoiseRow, Origin, ProbesRow, RegistrationRow, Role
+from harness.trials.averages import Averaging
 from harness.trials.board import Board, LabelledCloud, face_errors_m
+from harness.trials.judge import Criteria
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 from harness.vocabulary.seeds import canonical_json
 from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
@@ -28,6 +30,24 @@ LAGS = (1, 2, 3)  # distances in pixels for the correlation of noise
 # fewest pairs of pixels for a correlation; with fewer, its standard error would exceed 0.14
 FEWEST_PAIRS = 50
 BOARD_STEPS = 9  # points along each side of the board where a registration's error is evaluated
+
+
+@dataclass(frozen=True)
+class TrialPoint:
+    """A point's part of a trial: what it makes of the frames."""
+
+    digest: str
+    """Digest of the point, which names its results."""
+    variant: str
+    """Name of its set-up."""
+    frames: int
+    """Number of frames to average."""
+    averaging: Averaging
+    """The average of the frames."""
+    criteria: Criteria
+    """The detector that judges the cloud, its threshold, and what counts as a hit."""
+    mapping: MappingConfig | None = None
+    """Registration and merge of the clouds of several views; None for a single view."""
 
 
 @dataclass(frozen=True)
@@ -53,34 +73,32 @@ class ViewClouds:
     first_frames: SimulatedCapture
     """The first `NOISE_FRAMES` frames, whose difference is noise."""
 
-    def key(self, frames: int, mapping: MappingConfig | None) -> str:
+    def key(self, point: TrialPoint) -> str:
         """Return a text that is equal for points that see the same cloud."""
-        return str(frames)
+        return str(point.frames)
 
-    def cloud(self, frames: int, mapping: MappingConfig | None) -> Cloud:
+    def cloud(self, point: TrialPoint) -> Cloud:
         """Return what a detector sees."""
-        return self.averages[frames]
+        return self.averages[point.frames]
 
-    def labelled(self, frames: int, mapping: MappingConfig | None) -> LabelledCloud:
+    def labelled(self, point: TrialPoint) -> LabelledCloud:
         """Return the cloud with the truth."""
-        return self.board.labelled(self.averages[frames])
+        return self.board.labelled(self.averages[point.frames])
 
-    def probes_row(self, frames: int, mapping: MappingConfig | None, origin: Origin) -> ProbesRow:
+    def probes_row(self, point: TrialPoint, origin: Origin) -> ProbesRow:
         """Return the errors of z at the board's probes."""
-        z_m = self.averages[frames].points_m[..., 2].ravel()
+        z_m = self.averages[point.frames].points_m[..., 2].ravel()
         seen_z_m = self.board.seen_z_m.ravel()
         return _probes_row(origin, z_m[self.board.probes] - seen_z_m[self.board.probes])
 
-    def noise_rows(
-        self, frames: int, mapping: MappingConfig | None, origin: Origin
-    ) -> list[NoiseRow]:
+    def noise_rows(self, point: TrialPoint, origin: Origin) -> list[NoiseRow]:
         """Return the row of an average's pixels and of the noise of single frames."""
         pitch_u_mm, pitch_v_mm = self.board.pitch_mm
         row = NoiseRow(
             variant=origin.variant,
             frames=origin.frames,
             repeat=origin.repeat,
-            valid_share=float(self.averages[frames].valid[self.board.on_board].mean()),
+            valid_share=float(self.averages[point.frames].valid[self.board.on_board].mean()),
             pitch_u_mm=pitch_u_mm,
             pitch_v_mm=pitch_v_mm,
             **self.frame_noise,
@@ -93,12 +111,12 @@ class ViewClouds:
         first, second = self.first_frames.frames()
         return pair_noise(first.z_m, second.z_m, self.board.bare)
 
-    def map_facts(self, frames: int, mapping: MappingConfig | None) -> MapFacts:
+    def map_facts(self, point: TrialPoint) -> MapFacts:
         """Return no facts: a single view is not mapped."""
         return MapFacts()
 
     def registration_rows(
-        self, frames: int, mapping: MappingConfig | None, origin: Origin, role: Role
+        self, point: TrialPoint, origin: Origin, role: Role
     ) -> list[RegistrationRow]:
         """Return no rows: a single view is not registered."""
         return []
@@ -138,116 +156,113 @@ class MapClouds:
             for number in range(len(stands))
         ]
 
-    def count(self, mapping: MappingConfig) -> int:
-        """Return the number of views that a mapping uses."""
-        return mapping.views or len(self.boards)
+    def count(self, point: TrialPoint) -> int:
+        """Return the number of views that a point maps."""
+        return mapping_of(point).views or len(self.boards)
 
-    def key(self, frames: int, mapping: MappingConfig | None) -> str:
+    def key(self, point: TrialPoint) -> str:
         """Return a text that is equal for points that see the same map."""
-        mapping = _stated(mapping)
-        return canonical_json([self._registration_key(frames, mapping), mapping.merge.to_data()])
+        mapping = mapping_of(point)
+        return canonical_json([self._registration_key(point), mapping.merge.to_data()])
 
-    def cloud(self, frames: int, mapping: MappingConfig | None) -> Cloud:
+    def cloud(self, point: TrialPoint) -> Cloud:
         """Return what a detector sees."""
-        return self.merged(frames, _stated(mapping)).cloud
+        return self.merged(point).cloud
 
-    def labelled(self, frames: int, mapping: MappingConfig | None) -> LabelledCloud:
+    def labelled(self, point: TrialPoint) -> LabelledCloud:
         """Return the map with the truth."""
-        key = self.key(frames, mapping)
+        key = self.key(point)
         if key not in self._labelled:
-            merged = self.merged(frames, _stated(mapping))
+            merged = self.merged(point)
             self._labelled[key] = self.boards[0].labelled_map(
                 merged.cloud, merged.T_reference_cloud
             )
         return self._labelled[key]
 
-    def probes_row(self, frames: int, mapping: MappingConfig | None, origin: Origin) -> ProbesRow:
+    def probes_row(self, point: TrialPoint, origin: Origin) -> ProbesRow:
         """Return the errors of the map at the probes of the first view, across the face."""
         first = self.boards[0]
         places_m = first.board_xy_m.reshape(-1, 2)[first.probes]
-        return _probes_row(origin, face_errors_m(self.labelled(frames, mapping), places_m))
+        return _probes_row(origin, face_errors_m(self.labelled(point), places_m))
 
-    def noise_rows(
-        self, frames: int, mapping: MappingConfig | None, origin: Origin
-    ) -> list[NoiseRow]:
+    def noise_rows(self, point: TrialPoint, origin: Origin) -> list[NoiseRow]:
         """Return no rows: the noise of single frames belongs to a single view."""
         return []
 
-    def map_facts(self, frames: int, mapping: MappingConfig | None) -> MapFacts:
+    def map_facts(self, point: TrialPoint) -> MapFacts:
         """Return how the map was made."""
-        mapping = _stated(mapping)
-        merged = self.merged(frames, mapping)
+        merged = self.merged(point)
         views_used = len(merged.views_used)
-        spent_s = sum(each.seconds for each in self.registrations(frames, mapping))
+        spent_s = sum(registration.seconds for registration in self.registrations(point))
         return MapFacts(
             views_used=views_used,
-            views_left_out=self.count(mapping) - views_used,
+            views_left_out=self.count(point) - views_used,
             seconds_map=float(spent_s + merged.seconds),
         )
 
     def registration_rows(
-        self, frames: int, mapping: MappingConfig | None, origin: Origin, role: Role
+        self, point: TrialPoint, origin: Origin, role: Role
     ) -> list[RegistrationRow]:
         """Return a row for each view but the first, once for each registration."""
-        mapping = _stated(mapping)
-        key = self._registration_key(frames, mapping)
-        if key in self._reported or self.count(mapping) == 1:
+        key = self._registration_key(point)
+        if key in self._reported or self.count(point) == 1:
             return []
         self._reported.add(key)
-        views = self.prepared(frames, mapping)
-        registrations = self.registrations(frames, mapping)
+        views = self.prepared(point)
+        registrations = self.registrations(point)
         rows = []
         for number in range(1, len(views)):
             row = self._registration_row(number, views[number], registrations[number], origin, role)
             rows.append(row)
         return rows
 
-    def merged(self, frames: int, mapping: MappingConfig) -> Merged:
+    def merged(self, point: TrialPoint) -> Merged:
         """Return the map."""
-        key = self.key(frames, mapping)
+        key = self.key(point)
         if key not in self._merged:
-            views = self.prepared(frames, mapping)
-            registrations = self.registrations(frames, mapping)
-            self._merged[key] = merge(views, registrations, mapping.merge)
+            views = self.prepared(point)
+            registrations = self.registrations(point)
+            self._merged[key] = merge(views, registrations, mapping_of(point).merge)
         return self._merged[key]
 
-    def prepared(
-        self, frames: int, mapping: MappingConfig, count: int | None = None
-    ) -> tuple[PreparedView, ...]:
+    def prepared(self, point: TrialPoint, count: int | None = None) -> tuple[PreparedView, ...]:
         """Return the views that the mapping uses, or the first ``count``, with their target cut
         out and their marks found."""
         if count is None:
-            count = self.count(mapping)
+            count = self.count(point)
+        mapping = mapping_of(point)
+        settings = [mapping.crop.to_data(), mapping.marks.to_data()]
         views = []
         for number in range(count):
-            key = canonical_json([number, frames, mapping.crop.to_data(), mapping.marks.to_data()])
+            key = canonical_json([number, point.frames, *settings])
             if key not in self._prepared:
-                cloud = self.averages[number][frames]
+                cloud = self.averages[number][point.frames]
                 view = View(f"view {number}", cloud, self.guesses[number])
                 self._prepared[key] = prepare(view, mapping)
             views.append(self._prepared[key])
         return tuple(views)
 
-    def registrations(self, frames: int, mapping: MappingConfig) -> tuple[Registration, ...]:
+    def registrations(self, point: TrialPoint) -> tuple[Registration, ...]:
         """Return the registration of each view that the mapping uses."""
-        count = self.count(mapping)
-        key = self._registration_key(frames, mapping)
+        mapping = mapping_of(point)
+        count = self.count(point)
         registered = count
+        key = self._registration_key(point)
         if mapping.registration.method in PAIRWISE:
             # each view is registered to the first alone: all mappings share the longest sequence
-            key = canonical_json([frames, *_registration_settings(mapping)])
-            registered = max(sum(frames in averages for averages in self.averages), count)
+            key = canonical_json([point.frames, *_registration_settings(mapping)])
+            registered = max(sum(point.frames in averages for averages in self.averages), count)
         if key not in self._registered:
-            views = self.prepared(frames, mapping, registered)
+            views = self.prepared(point, registered)
             self._registered[key] = tuple(register(views, mapping.registration))
         return self._registered[key][:count]
 
-    def _registration_key(self, frames: int, mapping: MappingConfig) -> str:
-        count = self.count(mapping)
-        crop, marks, registration = _registration_settings(mapping)
+    def _registration_key(self, point: TrialPoint) -> str:
+        count = self.count(point)
+        crop, marks, registration = _registration_settings(mapping_of(point))
         if count == 1:
             registration = None
-        return canonical_json([count, frames, crop, marks, registration])
+        return canonical_json([count, point.frames, crop, marks, registration])
 
     def _registration_row(
         self,
@@ -302,11 +317,11 @@ def _probes_row(origin: Origin, errors_m: np.ndarray) -> ProbesRow:
     )
 
 
-def _stated(mapping: MappingConfig | None) -> MappingConfig:
-    """Return the mapping, which every point of several views has."""
-    if mapping is None:
-        raise ValueError("several views need a mapping into one cloud")
-    return mapping
+def mapping_of(point: TrialPoint) -> MappingConfig:
+    """Return a point's mapping, which every point of several views has."""
+    if point.mapping is None:
+        raise ValueError(f"{point.variant}: several views need a mapping into one cloud")
+    return point.mapping
 
 
 def _registration_settings(mapping: MappingConfig) -> list[object]:

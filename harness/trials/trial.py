@@ -11,34 +11,15 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from detectors.views.mapping.settings import MappingConfig
 from harness.records.rows import Origin, Role, TrialRecord
 from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, BoardRef, load_board
-from harness.trials.clouds import NOISE_FRAMES, MapClouds, ViewClouds
+from harness.trials.clouds import NOISE_FRAMES, MapClouds, TrialPoint, ViewClouds
 from harness.trials.judge import Criteria, Judgement, judge
 from harness.trials.record import add_judgement
 from harness.vocabulary.geometry import Cloud
 from scenes.perspectives import AnyViews
 from scenes.sensor.source import SimulatedCapture
-
-
-@dataclass(frozen=True)
-class TrialPoint:
-    """A point's part of a trial: what it makes of the frames."""
-
-    digest: str
-    """Digest of the point, which names its results."""
-    variant: str
-    """Name of its set-up."""
-    frames: int
-    """Number of frames to average."""
-    averaging: Averaging
-    """The average of the frames."""
-    criteria: Criteria
-    """The detector that judges the cloud, its threshold, and what counts as a hit."""
-    mapping: MappingConfig | None = None
-    """Registration and merge of the clouds of several views; None for a single view."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +67,9 @@ def run_trial(trial: Trial) -> TrialRecord:
             origin = Origin(
                 variant=point.variant, frames=point.frames, repeat=trial.repeat, board=trial.board
             )
-            judged_as = (clouds.key(point.frames, point.mapping), point.criteria)
+            judged_as = (clouds.key(point), point.criteria)
             if judged_as not in judgements:
-                labelled = clouds.labelled(point.frames, point.mapping)
+                labelled = clouds.labelled(point)
                 judgements[judged_as] = judge(labelled, point.criteria)
             add_judgement(
                 record,
@@ -97,14 +78,12 @@ def run_trial(trial: Trial) -> TrialRecord:
                 origin=origin,
                 role=trial.role,
                 seconds_frames=seconds_frames,
-                map_facts=clouds.map_facts(point.frames, point.mapping),
+                map_facts=clouds.map_facts(point),
             )
-            record.registrations += clouds.registration_rows(
-                point.frames, point.mapping, origin, trial.role
-            )
+            record.registrations += clouds.registration_rows(point, origin, trial.role)
             if trial.hole_free and trial.board is None:
-                record.probes.append(clouds.probes_row(point.frames, point.mapping, origin))
-                record.noise += clouds.noise_rows(point.frames, point.mapping, origin)
+                record.probes.append(clouds.probes_row(point, origin))
+                record.noise += clouds.noise_rows(point, origin)
     return record
 
 
@@ -163,4 +142,4 @@ def capture_of(trial: Trial, number: int, board: Board, frames: int) -> Simulate
 def cloud_of(trial: Trial, point: TrialPoint) -> Cloud:
     """Return the cloud, or the map, that a point's detector sees in a trial."""
     boards = [load_board(view) for view in trial.views]
-    return captured(trial, boards, [point]).cloud(point.frames, point.mapping)
+    return captured(trial, boards, [point]).cloud(point)

@@ -23,8 +23,9 @@ from harness.runs.journal import Journal
 from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, trial_point
 from harness.runs.run import render_missing, run_plan, values_of
 from harness.trials.board import load_board
+from harness.trials.clouds import TrialPoint
 from harness.trials.judge import detector_of
-from harness.trials.trial import Trial, TrialPoint, cloud_of
+from harness.trials.trial import Trial, cloud_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
 from scenes.target.custom import BoardConfig, PoseConfig
