@@ -73,7 +73,7 @@ class Scan:
         self.frames = list(recording.frames())
         self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES], recording.z_step_m)
         self.whole = self.averaged(self.frames)
-        evidence = detector_of(judging.detector, judging.settings_json).analyse(self.whole)
+        evidence = judge.detector_of(judging.detector, judging.settings_json).analyse(self.whole)
         self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
         self.surface_z_m = np.where(self.judged, evidence.surface_z_m, np.nan)
         points_m = self.rays[self.judged] * self.surface_z_m[self.judged][:, None]
@@ -91,7 +91,7 @@ class Scan:
         self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
         self.size_m: np.ndarray = np.ptp(places, axis=0)
         # no damage is placed where the undamaged recording has findings, which would count as hits
-        detector = detector_of(judging.detector, judging.settings_json)
+        detector = judge.detector_of(judging.detector, judging.settings_json)
         threshold = judging.threshold
         found = detector.find(
             self.whole, evidence, threshold or judging.threshold_of(self.whole)[0]
