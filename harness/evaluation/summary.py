@@ -1,9 +1,8 @@
 """Rates, means and intervals of rows per trial, and the error of an averaged range against the
 number of frames."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
@@ -151,18 +150,6 @@ def _order(column: pd.Series) -> pd.Series:
         first_seen = {name: place for place, name in enumerate(dict.fromkeys(column))}
         return column.map(lambda name: -1 if name == MAIN else first_seen[name])
     return column
-
-
-def hole_list(names: Iterable[str]) -> str:
-    """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
-    all_names = [str(name) for name in names]
-    numbered = sorted(int(name) for name in all_names if name.isdecimal())
-    runs = [
-        [number for _, number in run]
-        for _, run in groupby(enumerate(numbered), lambda at: at[1] - at[0])
-    ]
-    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
-    return ", ".join([*parts, *(name for name in all_names if not name.isdecimal())]) or "none"
 
 
 BLOCKS = 40

@@ -6,7 +6,7 @@ The columns of summaries declare a name and a note; their values come from `harn
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,9 @@ def _fine(value: float | None) -> str:
 
 
 def _percent(share: float | None) -> str:
-    return text.UNKNOWN_TEXT if share is None or math.isnan(share) else f"{100 * share:.0f} %"
+    if share is None or math.isnan(share):
+        return text.UNKNOWN_TEXT
+    return f"{100 * share:.0f} %"
 
 
 def _word(name: str | None) -> str:
@@ -156,9 +158,11 @@ TRUTH = tuple(
 
 def _mean(kind: str, label: str) -> Column:
     """Return a column for pages with a mean and its standard deviation."""
-    return Column(
-        "", label, lambda row: text.plus_minus(row[f"{kind}_mean_mm"], row[f"{kind}_std_mm"])
-    )
+
+    def mean(row: Mapping[str, Any]) -> str:
+        return text.plus_minus(row[f"{kind}_mean_mm"], row[f"{kind}_std_mm"])
+
+    return Column("", label, mean)
 
 
 def _error(kind: str, label: str) -> Column:
@@ -167,41 +171,56 @@ def _error(kind: str, label: str) -> Column:
 
     def error(row: Mapping[str, Any]) -> str:
         count = int(row[f"{kind}_n"])
-        return (
-            f"{text.plus_minus(row[f'{kind}_bias_mm'], row[f'{kind}_std_mm'], '+')} ({count})"
-            if count
-            else "–"
-        )
+        if not count:
+            return "–"
+        mean = text.plus_minus(row[f"{kind}_bias_mm"], row[f"{kind}_std_mm"], "+")
+        return f"{mean} ({count})"
 
     return Column("", label, error)
 
 
-def _found(row: Mapping[str, Any]) -> Cell:
+def _holes_found(row: Mapping[str, Any]) -> Cell:
     """Return the number of holes found, and their names if there are few enough to read."""
-    from harness.evaluation.summary import hole_list
+    lists_names = row["holes"] <= MOST_NAMES
+    words = []
+    if lists_names:
+        words.append(hole_list(row["found"]))
+    if row["undecided"]:
+        undecided = hole_list(row["undecided"]) if lists_names else str(len(row["undecided"]))
+        words.append(f"undecided {undecided}")
+    count = len(row["found"])
+    share = f"{count} of {row['holes']}"
+    return Cell(f"{share}\n{'; '.join(words)}".strip(), share=count / row["holes"])
 
-    names = hole_list(row["found"]) if row["holes"] <= MOST_NAMES else ""
-    undecided = (
-        hole_list(row["undecided"]) if row["holes"] <= MOST_NAMES else str(len(row["undecided"]))
-    )
-    words = "; ".join(
-        part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part
-    )
-    return Cell(
-        f"{len(row['found'])} of {row['holes']}\n{words}".strip(),
-        share=len(row["found"]) / row["holes"],
-    )
+
+def hole_list(names: Iterable[str]) -> str:
+    """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
+    all_names = [str(name) for name in names]
+    numbered = sorted(int(name) for name in all_names if name.isdecimal())
+    runs: list[list[int]] = []
+    for number in numbered:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
+    parts += [name for name in all_names if not name.isdecimal()]
+    return ", ".join(parts) or "none"
+
+
+def _false_calls(row: Mapping[str, Any]) -> str:
+    """Return the number of false calls in a number of runs."""
+    if not row["runs"] > 0:
+        return "–"
+    return f"{row['false_calls']:.0f} in {row['runs']:.0f}"
 
 
 MOST_NAMES = 15  # most holes that a cell lists by name; for more holes it gives only the number
-CALLS_OF = Column(
-    "",
-    "false calls",
-    lambda row: f"{row['false_calls']:.0f} in {row['runs']:.0f}" if row["runs"] > 0 else "–",
-)
+CALLS_OF = Column("", "false calls", _false_calls)
 SUMMARY = Table(
     "summary",
-    "one row per set-up, number of frames and damage, with 95 % intervals; means are over the trials that detected it",
+    "one row per set-up, number of frames and damage, with 95 % intervals; means are over the "
+    "trials that detected it",
     (
         *SET_UP,
         Column("hole", "hole", note="number of the damage"),
@@ -326,7 +345,8 @@ FALSE_CALLS = Table(
 )
 SET_UPS = Table(
     "set_ups",
-    "one row per set-up and number of frames: holes found, errors of size and place, noise, threshold",
+    "one row per set-up and number of frames: holes found, errors of size and place, noise, "
+    "threshold",
     (
         Column("variant", "set-up", None, "name of the set-up", in_words),
         Column("registration", "registration", note="maps: method of registration", text=_word),
@@ -335,7 +355,7 @@ SET_UPS = Table(
         Column("frames", "frames", note="number of averaged frames"),
         *_columns(holes="number of holes", repeats="number of repeats"),
         *_columns(found="numbers of the holes found", undecided="numbers of the undecided holes"),
-        Column("", "found", _found),
+        Column("", "found", _holes_found),
         Column(
             "limit_mm", "from (mm)", note="smallest diameter at and above which all holes are found"
         ),
@@ -460,7 +480,8 @@ CLAIMS = Table(
 )
 POSTERIOR = Table(
     "posterior",
-    "one row per set-up and per value of an axis: how well it agrees with the thesis' result (from 20 set-ups on)",
+    "one row per set-up and per value of an axis: how well it agrees with the thesis' result "
+    "(from 20 set-ups on)",
     (
         Column(
             "axis",
@@ -480,7 +501,8 @@ POSTERIOR = Table(
 )
 EFFECTS = Table(
     "effects",
-    "one row per effect, condition and number of frames of an experiment with `switches`: the effect's loss",
+    "one row per effect, condition and number of frames of an experiment with `switches`: the "
+    "effect's loss",
     (
         Column("place", "place", note="values of the other axes"),
         Column("frames", "frames", note="number of averaged frames"),
@@ -521,39 +543,47 @@ def _empty() -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class ResultTables:
-    """Tables of trials as declared above; ``holes`` is `TRIALS`. A table that an experiment lacks
-    is empty. ``variants`` has a row per set-up and then per variation: variant, reason, settings,
-    is_variation, reference, switches, and the axes. ``axes`` has the path, name and unit of every
-    axis on which set-ups differ, in order."""
+    """Tables of trials as declared above. A table that an experiment lacks is empty."""
 
     holes: pd.DataFrame
+    """`TRIALS`: one row for each trial on a damaged board and damage."""
     runs: pd.DataFrame
+    """`RUNS`: one row for each trial."""
     probes: pd.DataFrame
+    """`PROBES`: one row for each set-up, number of frames and sample pixel."""
     variants: pd.DataFrame
+    """One row for each set-up and then for each variation: variant, reason, settings,
+    is_variation, reference, switches, and the axes."""
     noise: pd.DataFrame
+    """`NOISE`: one row for each hole-free trial of a single view."""
     axes: pd.DataFrame
+    """Path, name and unit of every axis on which set-ups differ, in order."""
     registrations: pd.DataFrame = field(default_factory=_empty)
+    """`REGISTRATIONS`: one row for each registration of a view."""
     sites: pd.DataFrame = field(default_factory=_empty)
+    """`SITES`: one row for each repeat and place on a hole-free board."""
     findings: pd.DataFrame = field(default_factory=_empty)
+    """`FINDINGS`: one row for each finding of a study."""
     operating: pd.DataFrame = field(default_factory=_empty)
+    """`OPERATING`: one row for each trial of a study."""
     pixels: pd.DataFrame = field(default_factory=_empty)
+    """`PIXELS`: one row for each trial of a study and damage, and for the intact face."""
 
     def of(self, variant: str, frames: int) -> ResultTables:
         """Return the rows of one set-up."""
-        found = vars(self).items()
-        by_set_up = {
-            name: table for name, table in found if {"variant", "frames"} <= set(table.columns)
-        }
-        own = {
-            n: t[(t["variant"] == variant) & (t["frames"] == frames)] for n, t in by_set_up.items()
-        }
-        return replace(self, **own)
+        selected = {}
+        for name, table in vars(self).items():
+            if {"variant", "frames"} <= set(table.columns):
+                is_own = (table["variant"] == variant) & (table["frames"] == frames)
+                selected[name] = table[is_own]
+        return replace(self, **selected)
 
     def stored(self) -> dict[Table, pd.DataFrame]:
         """Return the tables that are written to files, in order."""
-        return {
-            table: getattr(self, "holes" if table is TRIALS else table.name) for table in STORED
-        }
+        tables = {}
+        for table in STORED:
+            tables[table] = getattr(self, "holes" if table is TRIALS else table.name)
+        return tables
 
 
 # ---------------------------------------------------------------- real captures

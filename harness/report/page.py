@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from harness.evaluation.set_ups import LIMIT_RULE, set_ups_of
-from harness.evaluation.summary import MAIN, fit_floor, found_holes, hole_list
+from harness.evaluation.summary import MAIN, fit_floor, found_holes
 from harness.records import trials
 from harness.records.examples import ExampleCloud, MappedExample
 from harness.records.outputs import REPORT
@@ -23,6 +23,7 @@ from harness.records.trials import (
     SET_UPS,
     SUMMARY,
     ResultTables,
+    hole_list,
 )
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
