@@ -194,10 +194,10 @@ def sweep(
     """
     from harness.runs.study import run_study  # imports pandas
 
-    found = load_experiment(Path(experiment), changes)
+    loaded = load_experiment(Path(experiment), changes)
     out = Path(out)
     code = run_study(
-        found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
+        loaded, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
     )
     if code == 130:
         raise KeyboardInterrupt
@@ -206,7 +206,7 @@ def sweep(
             f"{experiment}: trials failed, as printed above",
             fix="correct the cause and run it again",
         )
-    return found.folder(out)
+    return loaded.folder(out)
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:

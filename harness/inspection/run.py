@@ -63,7 +63,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
-    found = one_damage_once(cloud.valid.shape, each_object_once(cloud, evidence, searched), unseen)
+    detections = one_damage_once(cloud.valid.shape, each_object_once(cloud, evidence, searched), unseen)
 
     def measure(detection: Detection) -> Measurement:
         if detection.kind == "object":
@@ -74,7 +74,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
             cloud, evidence, detection
         )
 
-    return Judged(cloud, evidence, found, tuple(map(measure, found)), missing)
+    return Judged(cloud, evidence, detections, tuple(map(measure, detections)), missing)
 
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
@@ -97,11 +97,11 @@ rim."""
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
     """Raise UserError if several arguments set the threshold, or its value is not legal."""
-    given = [
+    given_options = [
         f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None
     ]
-    if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
+    if len(given_options) > 1:
+        raise UserError(f"{' and '.join(given_options)} set the threshold", fix="give one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")
@@ -126,23 +126,23 @@ def threshold_of(
     if default is not None and arguments.false_calls is None:
         return float(default), "the detector's own", evidence
 
-    own = own_threshold(detector, cloud, evidence, arguments.false_calls or cli.DEFAULT_FALSE_CALLS)
+    own_noise = own_threshold(detector, cloud, evidence, arguments.false_calls or cli.DEFAULT_FALSE_CALLS)
     names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
-    notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
-    peaks = f"{own.peaks} peaks towards the camera"
-    if own.objects:
+    notes = {**evidence.notes, "own_null": {name: getattr(own_noise, name) for name in names}}
+    peaks = f"{own_noise.peaks} peaks towards the camera"
+    if own_noise.objects:
         peaks += (
-            f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
+            f"; expect more beside objects, tags and edges in the picture ({own_noise.objects} places)"
         )
     if not cloud.organised:
         peaks += "; objects on the target were not sought"
-    if own.rim_pixels:
-        peaks += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
-    if own.doubts:
-        k = max(DEFAULT_K, own.threshold) if math.isfinite(own.threshold) else DEFAULT_K
+    if own_noise.rim_pixels:
+        peaks += f"; {own_noise.rim_pixels} pixels along the rim are mixed with the background and are not judged"
+    if own_noise.doubts:
+        k = max(DEFAULT_K, own_noise.threshold) if math.isfinite(own_noise.threshold) else DEFAULT_K
         warnings = tuple(
             f"the capture cannot set its own threshold, {k:.3g} is used: {why}"
-            for why in own.doubts
+            for why in own_noise.doubts
         )
         origin = (
             f"a fallback, {k:.3g} units of score: the number of false calls is unknown; {peaks}"
@@ -150,14 +150,14 @@ def threshold_of(
         return (
             k,
             origin,
-            replace(own.evidence, notes=notes, warnings=(*evidence.warnings, *warnings)),
+            replace(own_noise.evidence, notes=notes, warnings=(*evidence.warnings, *warnings)),
         )
-    expected, low, high = map(_calls, (own.expected, own.low, own.high))
+    expected, low, high = map(_calls, (own_noise.expected, own_noise.low, own_noise.high))
     calls = f"{expected} false calls expected, 95 % interval {low} to {high}, from {peaks}"
     return (
-        own.threshold,
+        own_noise.threshold,
         f"from this capture's own null: {calls}",
-        replace(own.evidence, notes=notes),
+        replace(own_noise.evidence, notes=notes),
     )
 
 
@@ -172,15 +172,15 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
     rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
     sure = math.sqrt(threshold**2 + math.log(null["high"] / FAINT_CALLS) / rate)
     faint = [
-        str(each.id) for each in judged.findings if each.kind != "no return" and each.score < sure
+        str(finding.id) for finding in judged.findings if finding.kind != "no return" and finding.score < sure
     ]
     if len(faint) <= max(null["expected"], 1.0) + 1e-6:
         return judged
-    which = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
+    faint_findings = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
     calls = (
         f"{_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
     )
-    warning = f"{which} are so faint that noise explains them: {calls}"
+    warning = f"{faint_findings} are so faint that noise explains them: {calls}"
     return replace(
         judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
     )
@@ -198,15 +198,15 @@ def with_size_warnings(judged: Judged) -> Judged:
     )
     rim = grown(outside, 1)[1:-1, 1:-1].ravel()
     doubts = []
-    both = zip(judged.findings, judged.detections, strict=True)
-    if cut := [str(finding.id) for finding, detection in both if rim[detection.pixels].any()]:
+    pairs = zip(judged.findings, judged.detections, strict=True)
+    if cut := [str(finding.id) for finding, detection in pairs if rim[detection.pixels].any()]:
         doubts.append(
             f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than stated"
         )
     open_ = [
-        str(each.id)
-        for each in judged.findings
-        if each.kind == "no return" or each.depth_mm > OPEN_MM
+        str(finding.id)
+        for finding in judged.findings
+        if finding.kind == "no return" or finding.depth_mm > OPEN_MM
     ]
     if open_ and cloud.noise_reach_px >= FILTER_PX:
         most_mm = (
@@ -264,7 +264,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
     own_settings = [
-        each for each in arguments.set if config is None or not each.startswith(cli.PREFIX)
+        assignment for assignment in arguments.set if config is None or not assignment.startswith(cli.PREFIX)
     ]
     detector, settings = cli.detector_of(
         arguments, "none" if config else arguments.crop, own_settings
@@ -285,7 +285,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     names = [path.resolve().name for path in paths] if config else [recordings[0].name]
     names = names if len(set(names)) == len(names) else list(map(str, paths))
     clouds = (_averaged(arguments, recording, field) for recording in recordings)
-    views = [View(*each) for each in zip(names, clouds, guesses, strict=False)]
+    views = [View(*view_parts) for view_parts in zip(names, clouds, guesses, strict=False)]
     choices: list[Choice | None] = []
     for view in views:
         with _mistakes_named(view if config else None):
@@ -311,7 +311,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     doubted = dict.fromkeys(doubt for view in views if (doubt := unsteadiness(view.cloud)))
     if field is not None:
         doubted |= dict.fromkeys(
-            each for view in views for each in doubts(view.cloud, field, arguments.flat_field)
+            doubt for view in views for doubt in doubts(view.cloud, field, arguments.flat_field)
         )
     evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(
@@ -319,11 +319,11 @@ def inspect(arguments: argparse.Namespace) -> int:
     )
     result = judged(detector, cloud, evidence, threshold)
     result = with_size_warnings(result if mapped else with_faint_warning(result, threshold))
-    seen = (
+    gauge_seen = (
         seen_on(gauge, result, f"{detector.name} {detector.version}", threshold) if gauge else None
     )
-    found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
-    run = Inspection(arguments, recordings, choices, config, *found)
+    parts = (mapped, registrations, detector, settings, result, threshold, origin, gauge_seen)
+    run = Inspection(arguments, recordings, choices, config, *parts)
     _print(run)
     if arguments.out is not None:
         _write(run, _facts(run, [*recordings, *quiet]))
@@ -351,9 +351,9 @@ def _mistakes_named(view: View | None) -> Iterator[None]:
     try:
         yield
     except UserError as mistake:
-        named = "" if view is None else f"view {view.name}: "
+        prefix = "" if view is None else f"view {view.name}: "
         raise UserError(
-            f"{named}{mistake.message}", legal=mistake.legal, fix=mistake.fix
+            f"{prefix}{mistake.message}", legal=mistake.legal, fix=mistake.fix
         ) from mistake
 
 
@@ -400,16 +400,16 @@ def _merged(
                 ready, view=replace(ready.view, T_reference_view_guess=guess)
             )
     registrations = register(tuple(prepared), config.registration)
-    failed = [each for each in registrations if each.failure]
+    failed = [registration for registration in registrations if registration.failure]
     if failed:
         reasons = "\n  ".join(
-            f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed
+            f"{registration.view}: {registration.failure.removeprefix(f'{registration.view}: ')}" for registration in failed
         )
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
-        what = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
+        message = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
         pose = "correct --poses" if has_poses else "state their poses (--poses)"
         raise UserError(
-            what, fix=f"leave such views out, {pose}, or choose another --register or --marks"
+            message, fix=f"leave such views out, {pose}, or choose another --register or --marks"
         )
     mapped = Mapped(
         tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge)
@@ -523,10 +523,10 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
         facts["captures"] = [
             {
                 "view": view.view.name,
-                **output.capture_facts(each, view.view.cloud),
-                "target": output.choice_facts(own),
+                **output.capture_facts(recording, view.view.cloud),
+                "target": output.choice_facts(view_choice),
             }
-            for each, view, own in zip(run.recordings, run.mapped.views, run.choices, strict=True)
+            for recording, view, view_choice in zip(run.recordings, run.mapped.views, run.choices, strict=True)
         ]
         facts["merged"] = {"views": merged.views_used, "cell_mm": cell_mm, "notes": merged.notes}
         settings["mapping"] = run.config.to_data()

@@ -41,15 +41,15 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         cloud = prefix_averages(recording, [frames], config.capture.average)[frames]
         detector = load_detector(config.detector.name, dict(config.detector.settings))
         choice = choice_by(getattr(detector, "settings", None), cloud)
-        found = judged(detector, cloud, detector.analyse(cloud), k)
-        about = {
+        result = judged(detector, cloud, detector.analyse(cloud), k)
+        facts = {
             "target": choice_facts(choice),
             "capture": capture_facts(recording, cloud),
             "threshold": {"k": k, "from": "given"},
             "settings": config.to_data(),
             "provenance": record(command),
         }
-        write_findings(folder / name, found, about, point.label or name, beside=pictures(choice))
+        write_findings(folder / name, result, facts, point.label or name, beside=pictures(choice))
         row = {
             "point": name,
             "variant": point.variant,
@@ -58,21 +58,21 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         }
         row |= {
             "frames_left_out": len(cloud.left_out),
-            "findings": len(found.findings),
+            "findings": len(result.findings),
             "threshold_k": k,
         }
-        rows.append(row | {"threshold_mm": round(k * found.evidence.scale_m / MM, 4)})
+        rows.append(row | {"threshold_mm": round(k * result.evidence.scale_m / MM, 4)})
         warnings = (
             *recording.warnings,
             *(choice.warnings if choice else ()),
-            *found.evidence.warnings,
+            *result.evidence.warnings,
         )
         print_warnings(f"{name}: {text}" for text in warnings)
         print(
-            f"{name} {point.label}: {len(found.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm"
+            f"{name} {point.label}: {len(result.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm"
         )
-        for left in cloud.left_out:
-            print(f"  left out: {left.name}: {left.why}")
+        for left_out in cloud.left_out:
+            print(f"  left out: {left_out.name}: {left_out.why}")
     write_json(folder / PROVENANCE.name, {"results_version": RESULTS_VERSION, **record(command)})
     write_table(folder, POINTS_OF_CAPTURES, POINTS_OF_CAPTURES.frame(rows))
     point_to(folder)

@@ -62,7 +62,7 @@ class Calibration:
 
     def thresholds(self) -> tuple[dict[str, float], list[Failure]]:
         """Return thresholds by point digest; and a failure for each point that has none."""
-        found: dict[str, float] = {}
+        stored: dict[str, float] = {}
         failures: list[Failure] = []
         for point in self._group.points:
             quiet = self._quiet.get(point.digest, {})
@@ -77,10 +77,10 @@ class Calibration:
             if threshold is None:
                 failures.append(Failure(f"threshold of {point.label}", why))
             else:
-                found[point.digest] = threshold
-        return found, failures
+                stored[point.digest] = threshold
+        return stored, failures
 
-    def sets(self, own: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
+    def sets(self, own_thresholds: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
         """Return sets of thresholds that agree with ``own``, the set to use first: ``own``, or one
         from the journal."""
         prefix = self._prefix()
@@ -88,12 +88,12 @@ class Calibration:
         for key in journal.thresholds():
             entry = journal.read(key) if prefix and key.startswith(prefix) else None
             thresholds = entry.record if entry is not None else None
-            if thresholds is None or thresholds.keys() != own.keys():
+            if thresholds is None or thresholds.keys() != own_thresholds.keys():
                 continue
-            if all(isclose(thresholds[name], own[name], rel_tol=AGREES) for name in own):
+            if all(isclose(thresholds[name], own_thresholds[name], rel_tol=AGREES) for name in own_thresholds):
                 stored.append({name: float(value) for name, value in thresholds.items()})
-        mine = [dict(own)] if dict(own) in stored or not stored else []
-        return mine + [known for known in stored if known not in mine]
+        variants = [dict(own_thresholds)] if dict(own_thresholds) in stored or not stored else []
+        return variants + [thresholds for thresholds in stored if thresholds not in variants]
 
     def store(self, thresholds: Mapping[str, float], journal: Journal) -> None:
         """Store the thresholds at which this process judges, if trials set them."""
@@ -120,9 +120,9 @@ def refiled(entry: Ended, judged: Trial, task: Trial) -> Ended:
     record = entry.record or {}
     for table, rows in record.items():
         for row in rows:
-            place = row.get("variant"), row.get("frames")
-            now = new.get(place)
-            if now is None or old.get(place) is None or row.get("threshold") is None:
+            point_key = row.get("variant"), row.get("frames")
+            now = new.get(point_key)
+            if now is None or old.get(point_key) is None or row.get("threshold") is None:
                 continue
             if table in octaves:
                 row["threshold"] = (
@@ -137,11 +137,11 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
     """Return a point's threshold: given, or from its hole-free runs (quiet threshold, judged area
     in m2): the highest or, in a study, the one for the wanted rate of false calls. None without
     runs. Raises UserError."""
-    given = point.config.threshold.k
+    given_k = point.config.threshold.k
     calibrate = point.config.threshold.calibrate
     quiet = list(quiet)
-    if given is not None or not quiet:
-        return given
+    if given_k is not None or not quiet:
+        return given_k
     thresholds, areas_m2 = np.array(quiet).T
     if calibrate is None or calibrate.false_calls_per_m2 is None:
         return float(thresholds.max())
@@ -154,10 +154,10 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
         ).value
     except UserError as error:
         board = point.config.simulated.target.declare().board
-        seen = float(areas_m2.mean()) / (board.width_mm * board.height_mm * MM**2)
-        if seen > NOTHING:
+        inspected_share = float(areas_m2.mean()) / (board.width_mm * board.height_mm * MM**2)
+        if inspected_share > NOTHING:
             raise
-        message = f"the camera sees nothing of the board here but {100 * seen:.2g} % of its face"
+        message = f"the camera sees nothing of the board here but {100 * inspected_share:.2g} % of its face"
         raise UserError(f"{message}, too little for a threshold") from error
 
 
@@ -295,7 +295,7 @@ def values_of(
 ) -> list[Any]:
     """Return the values of a function of each of several arguments, None for a user's mistake. A
     bug is raised."""
-    jobs = [Job(str(number), "trials", function, each) for number, each in enumerate(arguments)]
+    jobs = [Job(str(number), "trials", function, job_arguments) for number, job_arguments in enumerate(arguments)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     if bug := next((end.why for end in ends.values() if end.is_bug), None):
         raise RuntimeError(bug)
@@ -307,8 +307,8 @@ def _render_job(job: RenderJob) -> Job:
     return Job(job.path.name, "renders", render_into_cache, arguments)
 
 
-def _failure(what: str, ended: Ended) -> Failure:
-    return Failure(what, ended.why, ended.is_bug, ended.state)
+def _failure(label: str, ended: Ended) -> Failure:
+    return Failure(label, ended.why, ended.is_bug, ended.state)
 
 
 class _Trial(NamedTuple):
@@ -429,9 +429,9 @@ class _Run:
         self.outcome.thresholds |= thresholds
         self.outcome.failures += failures
         for part in () if thresholds else judged:
-            made = self._groups[number].trials(part.batch, None, part.repeats)
+            keyed_tasks = self._groups[number].trials(part.batch, None, part.repeats)
             self._skip(
-                [_Trial(part, *keyed) for keyed in made], f"no threshold: {failures[0].in_short}"
+                [_Trial(part, *keyed) for keyed in keyed_tasks], f"no threshold: {failures[0].in_short}"
             )
         return judged if thresholds else []
 
@@ -477,26 +477,26 @@ class _Run:
         """Return a part's trials. Those that others judged at agreeing thresholds are filed under
         this run's keys."""
         group = self._groups[part.group]
-        made = group.trials(
+        keyed_tasks = group.trials(
             part.batch,
             self.outcome.thresholds,
             part.repeats,
             self._calibrations[part.group].unlearned,
         )
-        found = [_Trial(part, key, task) for key, task in made]
-        self.outcome.trials.total += len(found) - len(part.repeats)
+        trials = [_Trial(part, key, task) for key, task in keyed_tasks]
+        self.outcome.trials.total += len(trials) - len(part.repeats)
         if part.sets_threshold:
-            return self._shard.rotated(found)
+            return self._shard.rotated(trials)
         for thresholds in self._others[part.group]:
             for trial, (key, judged) in zip(
-                found, group.trials(part.batch, thresholds, part.repeats), strict=True
+                trials, group.trials(part.batch, thresholds, part.repeats), strict=True
             ):
                 is_new = (
                     self._journal.state(trial.key) != "done" and self._journal.state(key) == "done"
                 )
                 if is_new and (entry := self._journal.read(key)) is not None:
                     self._journal.write(trial.key, refiled(entry, judged, trial.task))
-        return found
+        return trials
 
     def _found(self, trial: _Trial) -> bool:
         """Return whether the journal has a trial's final end, so that it is not run again."""
@@ -519,8 +519,8 @@ class _Run:
             return
         self.outcome.trials.failed += 1
         failure = _failure(trial.key, entry)
-        whole = len(self.outcome.failures) < MOST_TRACEBACKS
-        self.outcome.failures.append(failure if whole else replace(failure, why=failure.in_short))
+        with_traceback = len(self.outcome.failures) < MOST_TRACEBACKS
+        self.outcome.failures.append(failure if with_traceback else replace(failure, why=failure.in_short))
 
     def _render_over(self, path: Path, ended: Ended) -> None:
         counts = self.outcome.renders

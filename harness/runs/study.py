@@ -182,8 +182,8 @@ def _write_study(
     # other processes draw the damages again while this process draws the figures
     arguments = [] if lost else [(damages, outcome.thresholds) for damages in shown]
     jobs = [
-        Job(f"pictures of set-up {n}", "trials", study_examples, each)
-        for n, each in enumerate(arguments)
+        Job(f"pictures of set-up {n}", "trials", study_examples, job_arguments)
+        for n, job_arguments in enumerate(arguments)
     ]
     examples = pictures_from(jobs, engine, outcome)
     write_tables(
@@ -199,8 +199,8 @@ def _write_study(
 def title_of(experiment: Experiment) -> str:
     """Return the title of an experiment's page: its own title, and the axes."""
     axes = list(names_of(experiment.data.get("sweep") or {}).values())
-    by = ", by " + " and ".join(filter(None, (", ".join(axes[:-1]), axes[-1]))) if axes else ""
-    return (experiment.config.title or in_words(experiment.config.name)) + by
+    axes_text = ", by " + " and ".join(filter(None, (", ".join(axes[:-1]), axes[-1]))) if axes else ""
+    return (experiment.config.title or in_words(experiment.config.name)) + axes_text
 
 
 def _write_report(
@@ -213,11 +213,11 @@ def _write_report(
     """Write the summaries and the report of an experiment that is not a study. Return what the
     terminal shows."""
     facts = experiment.data
-    found = summaries(tables, outcome.examples, claim_set_of(facts))
-    write_tables(folder, as_files(found), provenance)
-    about = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
-    write_report(folder, tables, outcome.examples, *about, found=found)
-    return final_tables(tables, found)
+    summary_tables = summaries(tables, outcome.examples, claim_set_of(facts))
+    write_tables(folder, as_files(summary_tables), provenance)
+    page_facts = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
+    write_report(folder, tables, outcome.examples, *page_facts, found=summary_tables)
+    return final_tables(tables, summary_tables)
 
 
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
@@ -230,18 +230,18 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
         summary = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
         print(f"{bug.why}\n{summary}", file=sys.stderr)
         return 1
-    own = [failure for failure in outcome.failures if failure.state != "skipped"]
-    why = own[0].why if len({failure.in_short for failure in own}) == 1 else _reasons(outcome)
-    what = "trial was judged" if outcome.finished else "trial succeeded"
+    failures = [failure for failure in outcome.failures if failure.state != "skipped"]
+    why = failures[0].why if len({failure.in_short for failure in failures}) == 1 else _reasons(outcome)
+    outcome_text = "trial was judged" if outcome.finished else "trial succeeded"
     again = "once the cause is corrected, run the same command with --retry-failed: it runs these trials again"
-    is_old = own and not outcome.trials.done and "to do:" not in why
-    raise UserError(f"no {what} of {name}: {why}", fix=again if is_old else None)
+    is_old = failures and not outcome.trials.done and "to do:" not in why
+    raise UserError(f"no {outcome_text} of {name}: {why}", fix=again if is_old else None)
 
 
 def _reasons(outcome: Outcome) -> str:
     """Return the causes of failures, without trials that were skipped because of them."""
-    own = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
-    return "; ".join(sorted(own)[:3]) or "nothing was planned"
+    reasons = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
+    return "; ".join(sorted(reasons)[:3]) or "nothing was planned"
 
 
 def _counts(outcome: Outcome) -> dict[str, int]:
@@ -301,8 +301,8 @@ def _provenance(
         "peak_mb": outcome.peak_mb,
         "warnings": [text for text in guesses if text],
         "failures": [
-            {name: getattr(each, name) for name in FAILURE}
-            for each in outcome.failures[:MOST_FAILURES]
+            {name: getattr(failure, name) for name in FAILURE}
+            for failure in outcome.failures[:MOST_FAILURES]
         ],
         "failures_in_all": _counts(outcome),
     }
@@ -326,10 +326,10 @@ def record_of(
     """Return a study's record, without set-ups that have no judged damaged board. ``failed``: by
     point digest."""
     calibrate = experiment.config.threshold.calibrate
-    found = {point.digest: group for group in plan.groups for point in group.points}
+    groups = {point.digest: group for group in plan.groups for point in group.points}
     counts = {digest: len(failures) for digest, failures in failed.items()}
     set_ups = (
-        _set_up(point, found[point.digest], tables, counts.get(point.digest, 0))
+        _set_up(point, groups[point.digest], tables, counts.get(point.digest, 0))
         for point in experiment.points
     )
     return StudyRecord(
@@ -404,7 +404,7 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
     )
 
 
-def set_up_of(holes: pd.DataFrame, runs: pd.DataFrame, **named: Any) -> SetUpRecord:
+def set_up_of(holes: pd.DataFrame, runs: pd.DataFrame, **columns: Any) -> SetUpRecord:
     """Return a set-up's record: threshold, hits and false calls from tables of its judged boards,
     and ``named``."""
     judged = runs[runs["threshold"].notna()]
@@ -438,7 +438,7 @@ def set_up_of(holes: pd.DataFrame, runs: pd.DataFrame, **named: Any) -> SetUpRec
         ),
         unflawed=false_calls("hole_free"),
         beside=false_calls("damaged"),
-        **{"axes": {}, "detector_version": 0, "failed": 0, **named},
+        **{"axes": {}, "detector_version": 0, "failed": 0, **columns},
     )
 
 
@@ -448,8 +448,8 @@ def failures_by_point(
     """Return the failed trials of each point, by its digest."""
     by_key = {failure.what: failure for failure in failures}
     found = dict[str, list[Failure]]()
-    every = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
-    for group, batch in every:
+    keyed_batches = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
+    for group, batch in keyed_batches:
         for key, task in group.trials(batch, thresholds if batch in group.then else {}):
             for point in task.points if key in by_key else ():
                 found.setdefault(point.digest, []).append(by_key[key])
@@ -464,18 +464,18 @@ def without_limit(
 ) -> list[str]:
     """Return sentences on the points that are not among the ``judged`` set-ups, each with its most
     common failure."""
-    known = {(set_up.variant, set_up.frames) for set_up in judged}
+    judged_set_ups = {(set_up.variant, set_up.frames) for set_up in judged}
     by_cause = dict[str, list[str]]()
     for point in (
-        each for each in points if (each.variant, each.config.capture.frames) not in known
+        point for point in points if (point.variant, point.config.capture.frames) not in judged_set_ups
     ):
-        own = [each for each in failed.get(point.digest, ()) if each.state != "skipped"]
-        causes = [each.in_short for each in own]
+        point_failures = [failure for failure in failed.get(point.digest, ()) if failure.state != "skipped"]
+        causes = [failure.in_short for failure in point_failures]
         causes = causes or [
-            each.in_short for each in outcome.failures if each.what == f"threshold of {point.label}"
+            failure.in_short for failure in outcome.failures if failure.what == f"threshold of {point.label}"
         ]
         why = Counter([*causes, "its trials did not finish"]).most_common(1)[0][0]
-        if own and all(each.state == "failed" and not each.is_bug for each in own):
+        if point_failures and all(failure.state == "failed" and not failure.is_bug for failure in point_failures):
             why = f"the camera sees no part of the board that can be judged ({why})"
         by_cause.setdefault(why, []).append(in_words(point.label))
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in by_cause.items()]

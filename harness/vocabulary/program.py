@@ -45,14 +45,14 @@ class Program:
     def __call__(self, arguments: list[str] | None = None) -> int:
         """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after
         Ctrl-C."""
-        given = sys.argv[1:] if arguments is None else arguments
-        parsed = self.parser().parse_args(given)
+        words = sys.argv[1:] if arguments is None else arguments
+        parsed = self.parser().parse_args(words)
         if arguments is None:
             # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C
             # does
             signal.signal(signal.SIGTERM, signal.default_int_handler)
         return exit_code_of(
-            lambda: self.run(parsed, f"{self.command} {shlex.join(given)}".rstrip())
+            lambda: self.run(parsed, f"{self.command} {shlex.join(words)}".rstrip())
         )
 
 
@@ -66,12 +66,12 @@ def program(
     )
 
 
-def whole_number(most: int) -> Callable[[str], int]:
+def whole_number(largest: int) -> Callable[[str], int]:
     """Return a parser of whole numbers from 1 to ``most``."""
 
     def parsed(text: str) -> int:
-        if not (text.isascii() and text.isdigit()) or not 1 <= int(text) <= most:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {most}")
+        if not (text.isascii() and text.isdigit()) or not 1 <= int(text) <= largest:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {largest}")
         return int(text)
 
     return parsed
