@@ -22,7 +22,7 @@ from harness.trials.board import (
     met_on_face,
     pixel_areas,
 )
-from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, Judgement, Criteria, grid
+from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, Criteria, Judgement, grid
 from harness.trials.record import add_judgement
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.custom import BoardConfig, SphereConfig, TargetConfig
