@@ -60,7 +60,9 @@ def progress_display(
                 total = counts.total - counts.found - counts.failed
                 bars.update(task, completed=counts.done, total=total)
                 speed = state.speed if state.speed and total > counts.done else None
-                time_left = str(timedelta(seconds=round((total - counts.done) / speed))) if speed else ""
+                time_left = (
+                    str(timedelta(seconds=round((total - counts.done) / speed))) if speed else ""
+                )
                 bars.update(
                     task,
                     counts=f"{counts.over}/{counts.total}"

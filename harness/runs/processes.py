@@ -258,7 +258,8 @@ class _Worker(threading.Thread):
         if digest != engine.digests.get(self.stage):
             message = f"the code of {self.stage} was edited while this sweep ran: a new process has loaded other sources"
             raise UserError(
-                message, fix="run the same command again: the trials that are left run by the new code"
+                message,
+                fix="run the same command again: the trials that are left run by the new code",
             )
 
     def _answer(self, limit_s: float | None) -> Any:
@@ -305,7 +306,9 @@ class _Worker(threading.Thread):
             name = (
                 signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
             )
-            cause = ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
+            cause = (
+                ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
+            )
             why = f"its process was ended by {name}{cause}"
         trace = self._trace.read_text()[-TRACEBACK_CHARACTERS:] if self._trace.exists() else ""
         return why + (f"\n{trace}" if trace else "")
@@ -453,7 +456,9 @@ def render_into_cache(
 
     target = TargetConfig.from_data(target_data)
     optics = camera_of(CameraConfig.from_data(camera_data)).optics
-    view, was_stored = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
+    view, was_stored = cached_view(
+        target, optics, RenderConfig.from_data(render_data), Path(folder)
+    )
     if (
         "drjit" in sys.modules
     ):  # threads wait busily: from the second render on, a process gets its share

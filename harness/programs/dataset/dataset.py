@@ -152,7 +152,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     to stderr."""
     from harness.programs.dataset.boards import TRUTH, seen_region, write_board
     from harness.runs.estimate import progress_display
-    from harness.runs.run import carried_out
+    from harness.runs.job_batches import carried_out
     from harness.vocabulary.geometry import Region
 
     outcome = Outcome()

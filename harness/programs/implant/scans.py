@@ -22,7 +22,7 @@ from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
 from harness.records.rows import Origin, TrialRecord
 from harness.records.trials import ResultTables
-from harness.runs.study import set_up_of
+from harness.runs.study_record import set_up_of
 from harness.runs.tables import columns_of
 from harness.trials import judge
 from harness.trials.board import INTACT_MARGIN_PX, LabelledCloud, far_from, outlined, pixel_areas
