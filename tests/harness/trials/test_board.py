@@ -169,7 +169,7 @@ def test_errors_of_a_face_count_where_the_cloud_has_points(board: Board) -> None
     cloud.points_m[..., 2] += 1e-3  # the map looks down on the face
     cloud.points_m[0, 0, 2] = -1.0  # far behind the face
     labelled = board.labelled_map(cloud, T_reference_cloud)
-    places_m = np.array([[0.0, 0.0], [0.0649, 0.0], [0.068, 0.0]])
+    places_m = np.array([[0.0, 0.0], [0.0649, 0.0], [0.067, 0.0]])
     errors_m = face_errors_m(labelled, places_m)
     np.testing.assert_allclose(errors_m[:2], 1e-3, atol=1e-12)
     assert np.isnan(errors_m[2])

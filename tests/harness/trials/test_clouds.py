@@ -19,6 +19,7 @@ from harness.trials.clouds import (
     mapping_of,
     pair_noise,
 )
+from harness.vocabulary.geometry import Cloud, Region
 from scenes.perspectives import ArcViews
 from tests.support.board_in_closed_form import TARGET, board_of, point_of
 
@@ -125,3 +126,45 @@ def test_the_reference_view_is_nominal_and_others_are_off() -> None:
     for truth in maps.truth:  # all views stand at one pose here
         np.testing.assert_allclose(truth, np.eye(4), atol=1e-12)
     assert not np.allclose(maps.guesses[1], maps.guesses[2])
+
+
+def test_registrations_are_reported_once_and_not_of_one_view(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps = maps_of(board_of())
+    views = [type("View", (), {"marks": type("Marks", (), {"trusted": ()})})] * 2
+    registered = tuple(Registration(f"view {n}", "icp", np.eye(4)) for n in range(2))
+    monkeypatch.setattr(maps, "prepared", lambda point: views)
+    monkeypatch.setattr(maps, "registrations", lambda point: registered)
+    (row,) = maps.registration_rows(MAPPED, ORIGIN, "damaged")
+    assert (row.view, row.tre_mm) == (1, 0.0)
+    assert maps.registration_rows(MAPPED, ORIGIN, "damaged") == []
+    single = replace(MAPPED, mapping=MappingConfig(views=1))
+    assert maps.registration_rows(single, ORIGIN, "damaged") == []
+
+
+def test_probes_of_a_map_are_those_of_the_first_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    board = board_of(damaged=False)
+    maps = maps_of(board)
+    ticks = np.arange(-80, 81) * 1e-3
+    x, y = np.meshgrid(ticks, ticks)
+    points = np.stack([x, y, np.full(x.shape, 0.7 + 2e-3)], axis=-1)
+    cloud = replace(cloud_of_points(points), projection="parallel")
+    monkeypatch.setattr(maps, "labelled", lambda point: board.labelled_map(cloud, np.eye(4)))
+    errors = maps.probes_row(MAPPED, ORIGIN).error_tenth_um
+    assert len(errors) == len(board.probes)
+    assert set(errors) == {20_000}
+
+
+def cloud_of_points(points_m: np.ndarray) -> Cloud:
+    """A cloud of points (h, w, 3) without frames."""
+    shape = points_m.shape[:2]
+    return Cloud(
+        points_m=points_m,
+        reason=np.zeros(shape, np.uint8),
+        count=np.ones(shape, int),
+        variance_m2=np.full(shape, np.nan),
+        region=Region(0, shape[0], 0, shape[1]),
+        z_step_m=0.0,
+        n_frames=1,
+    )
