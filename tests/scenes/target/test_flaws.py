@@ -14,8 +14,8 @@ from scipy.ndimage import uniform_filter
 
 from detectors.findings.measure import HoleModelConfig, measure_detection
 from detectors.interface import Detection, Evidence, Measurement
+from harness.trials.board import LabelledCloud
 from harness.trials.judge import matched
-from harness.trials.setup import KnownCloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.checks import check_target
@@ -306,7 +306,7 @@ def test_every_drawn_board_can_be_built_and_is_drawn_again_alike(damage: dict[st
     assert outline_board_m(config.board).shape[1] == 3
 
 
-def known_slot() -> KnownCloud:
+def known_slot() -> LabelledCloud:
     """A flat board seen straight on, a pixel each millimetre, with a slot along x about (20, 10)
     mm."""
     config = target({**SLOT, "angle_deg": 0.0})
@@ -326,20 +326,21 @@ def known_slot() -> KnownCloud:
     )
     truth = truth_of(config, np.eye(4))
     outlines = {1: np.flatnonzero(truth[0].within(x, y))}
-    return KnownCloud(
-        cloud,
-        np.eye(4),
-        config,
-        truth,
-        outlines,
-        points[..., :2],
-        zeros == 0,
-        {1: 0.008},
+    return LabelledCloud(
+        cloud=cloud,
+        damaged=True,
+        T_board_cloud=np.eye(4),
+        target=config,
+        truth=truth,
+        outlines=outlines,
+        places_m=points[..., :2],
+        undamaged=zeros == 0,
+        seen_depth_m={1: 0.008},
     )
 
 
 def finding(
-    known_cloud: KnownCloud,
+    known_cloud: LabelledCloud,
     x_mm: tuple[float, float],
     y_mm: tuple[float, float],
 ) -> Detection:

@@ -19,8 +19,8 @@ from scipy import ndimage, stats
 from detectors.averages.average import AverageConfig, prefix_averages
 from detectors.crop import NoCrop
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
-from harness.trials import trial as averages
-from harness.trials.trial import averages_of
+from harness.trials import averages
+from harness.trials.averages import averages_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
