@@ -28,7 +28,8 @@ from harness.programs.inspections.gauge_page import (
 from harness.vocabulary.geometry import MM, Lens, invert, rotation_xyz_deg, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
