@@ -383,10 +383,10 @@ def trials(runs: int) -> None:
             "thesis (the default)": (),
             "local": ("detector={name: local, settings: {crop: {kind: auto, inset_px: 4}}}",),
         }
-        for name, said in detectors.items():
+        for name, detector in detectors.items():
             for way, exact in WAYS.items():
                 spent = seconds(
-                    partial(run_all, trials_of(Path(folder), 1, *said, f"capture.exact={exact}")),
+                    partial(run_all, trials_of(Path(folder), 1, *detector, f"capture.exact={exact}")),
                     runs,
                 )
                 print(

@@ -140,7 +140,7 @@ def pair_marks(
     odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
     first, *rest = np.argsort(-odds, kind="stable").tolist()
     pairs = np.array(
-        [(mark, other) for mark, other in enumerate(solutions[first][0]) if other >= 0],
+        [(mark, solution) for mark, solution in enumerate(solutions[first][0]) if solution >= 0],
         dtype=np.int64,
     )
     pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs

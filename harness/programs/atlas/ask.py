@@ -204,8 +204,8 @@ def _answer(
     ]
     rows = []
     whose = dict[str, set[str]]()
-    for place in places:
-        found, why = rows_at(chosen, titles, place, size_mm)
+    for position in places:
+        found, why = rows_at(chosen, titles, position, size_mm)
         rows += found
         for reason, title in why:
             whose.setdefault(reason, set()).add(title)

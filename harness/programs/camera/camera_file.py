@@ -61,7 +61,7 @@ def camera_of_size(lens: Lens) -> str:
     raise UserError."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [
-        name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)
+        name for name, size in sizes.items() if (size.width, size.height) == (lens.width, lens.height)
     ]
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:
@@ -72,7 +72,7 @@ def camera_of_size(lens: Lens) -> str:
         f"several cameras have {wrong}: {', '.join(fitting)}"
         if fitting
         else f"no simulated camera has {wrong}",
-        legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
+        legal=", ".join(f"{name} {size.width} x {size.height}" for name, size in sizes.items()),
         fix="name the capture's camera with --camera"
         if fitting
         else f"{size} colour camera or of another mode",

@@ -81,7 +81,7 @@ def _list_offers(options: argparse.Namespace) -> int:
         names = (
             []
             if name is not None
-            else [each for kind in SETTABLE for each in plug_ins(kind).names()]
+            else [name for kind in SETTABLE for name in plug_ins(kind).names()]
         )
         legal = [*SETTABLE, "results", "cache", "keys", *names]
         near = nearest(word, legal)

@@ -72,7 +72,7 @@ def analyse() -> None:
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     wanted = [
         {"crop": {"kind": "auto"}},
-        *({"crop": {"kind": "none"}, "surface": each} for each in surfaces),
+        *({"crop": {"kind": "none"}, "surface": surface} for surface in surfaces),
     ]
     for name, settings in (("matched", wanted[1]), *(("thesis", each) for each in wanted)):
         detector = load_detector(name, settings)

@@ -160,7 +160,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         if what == "surface noise" or values[0].size:
             gaps = [gap(values[0], value) for value in values[1:]]
             parts += [interval.over(0) for interval in gaps]
-            sizes = [size(each) for each in values]
+            sizes = [size(value) for value in values]
             more = " and ".join(map(maps.span, gaps))
             texts.append(
                 f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})"
@@ -323,8 +323,8 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
         if claim in OVER_UNITS:
             places = dict.fromkeys(case.without_unit for case in cases)
             verdicts += [
-                _over_units([result for case, result in judged if case.without_unit == at])
-                for at in places
+                _over_units([result for case, result in judged if case.without_unit == position])
+                for position in places
             ]
         else:
             verdicts += [result for _, result in judged]
