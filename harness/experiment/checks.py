@@ -102,7 +102,9 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     if calibrate is not None and calibrate.boards is None:
         position = source.place_of(("threshold", "calibrate"))
         yield Problem(
-            "a study calibrates its threshold on separate boards", position, fix="write `boards: 60`"
+            "a study calibrates its threshold on separate boards",
+            position,
+            fix="write `boards: 60`",
         )
     elif calibrate is not None and calibrate.boards is not None:
         # the number of boards bounds the rate that they can show, even if their whole face is
@@ -168,7 +170,9 @@ def _unseen(
         return _unseen_pose(optics, views, target)
     for pose in declared.extreme_poses():
         posed = target.model_copy(update={"pose": pose})
-        message = _unseen_pose(optics, None, posed) or (views and _unseen_pose(optics, views, posed))
+        message = _unseen_pose(optics, None, posed) or (
+            views and _unseen_pose(optics, views, posed)
+        )
         if message:
             path, first = message
             aside = f"{pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off the axis"

@@ -131,7 +131,8 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     named_paths: list[KeyPath] = [checks.CAMERA_NAME]
     named_paths += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
     files = [
-        (*checks.TARGET, *part, "file") for part in ((), ("board", "shape"), ("material", "texture"))
+        (*checks.TARGET, *part, "file")
+        for part in ((), ("board", "shape"), ("material", "texture"))
     ]
     if shape.get(data, ("source", "kind")) == "capture":
         files += [

@@ -87,7 +87,9 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
     position = source.place_of((key,))
     if name is None:
         problems = [
-            Problem(f"the file lacks the key `{key}`", position, legal="one of " + ", ".join(models))
+            Problem(
+                f"the file lacks the key `{key}`", position, legal="one of " + ", ".join(models)
+            )
         ]
     elif not isinstance(name, str) or name not in models:
         problems = [wrong_choice((key,), name, list(models), position)]
@@ -109,7 +111,9 @@ def settings_of(model: type[C], data: Mapping[str, Any], noun: str, within: str 
         base: KeyPath = () if within is None else (within,)
         document = data if within is None else {within: data}
         source = Source(noun, "", document, {(): Place(noun, 0, 1, "")}, {})
-        declared = shape.Declared(Config if base else model, document, {base: model} if base else {})
+        declared = shape.Declared(
+            Config if base else model, document, {base: model} if base else {}
+        )
         problems = [
             replace(problem, place=None) for problem in problems_of(error, declared, source, base)
         ]
@@ -237,7 +241,8 @@ def nearest(word: object, words: Iterable[object]) -> str | None:
     matches = difflib.get_close_matches(sought, folded, n=1)
     if not matches and len(sought) >= LEAST_HELD:
         matches = sorted(
-            (candidate for candidate in folded if sought in candidate), key=lambda candidate: (len(candidate), candidate)
+            (candidate for candidate in folded if sought in candidate),
+            key=lambda candidate: (len(candidate), candidate),
         )
     return folded[matches[0]] if matches else None
 
@@ -273,7 +278,11 @@ def wrong_choice(
 
 
 def unknown_key(
-    name: str, where: KeyPath, legal: Sequence[str], position: Place | None, taken: Iterable[str] = ()
+    name: str,
+    where: KeyPath,
+    legal: Sequence[str],
+    position: Place | None,
+    taken: Iterable[str] = (),
 ) -> Problem:
     """Return the problem for an illegal key in the mapping at ``where``, which already has the
     keys ``taken``."""

@@ -22,7 +22,7 @@ from detectors.findings.missing import (
 )
 from detectors.interface import Detection, Evidence
 from harness.evaluation.study.limit import limit_of
-from harness.inspection.run import judged as judged_cloud
+from harness.inspection.judging import judged as judged_cloud
 from harness.report.findings import write_findings
 from harness.tables.limits import LIMITS, notes_of
 from harness.testing.synthetic_clouds import LENS, SHAPE, plane, without
