@@ -57,11 +57,23 @@ class Interval:
 UNKNOWN = Interval(np.nan, np.nan)
 
 
+def _floats(*values: ArrayLike) -> tuple[np.ndarray, ...]:
+    """Return values as arrays of numbers of one shape."""
+    return np.broadcast_arrays(*(np.asarray(value, float) for value in values))
+
+
+def _ends_where(
+    is_defined: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of intervals, NaN where they are not defined."""
+    return np.where(is_defined, low, np.nan), np.where(is_defined, high, np.nan)
+
+
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where
     ``trials`` is 0. Its average coverage over the proportion is near nominal; `clopper_pearson` is
     never below nominal and wider."""
-    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    k, n = _floats(successes, trials)
     z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
@@ -69,34 +81,32 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndar
     # rounding would give 1e-17 instead of exactly 0 or 1
     low = np.where(k == 0, 0.0, centre - half)
     high = np.where(k == n, 1.0, centre + half)
-    return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
+    return _ends_where(n > 0, low, high)
 
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Clopper and Pearson's exact interval of a proportion, element by element; NaN where
     ``trials`` is 0."""
-    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    k, n = _floats(successes, trials)
     low = np.where(k == 0, 0.0, special.betaincinv(k, n - k + 1, 1 - UPPER))
     high = np.where(k == n, 1.0, special.betaincinv(k + 1, n - k, UPPER))
-    return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
+    return _ends_where(n > 0, low, high)
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that
     is 0."""
-    k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
+    k, time = _floats(count, exposure)
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
+        return _ends_where(time > 0, low / time, high / time)
 
 
 def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN
     below two values."""
-    centre, deviation, count = np.broadcast_arrays(
-        np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float)
-    )
+    centre, deviation, count = _floats(mean, std, n)
     size = np.where(count >= 2, count, np.nan)
     half = special.stdtrit(size - 1, UPPER) * deviation / np.sqrt(size)
     return centre - half, centre + half

@@ -141,7 +141,9 @@ def test_a_size_off_the_ladder_gives_a_bound():
     assert noise_alone == np.inf
     assert np.isnan(pattern_last) or pattern_last == np.inf
     # nothing on finds the smallest hole already
-    assert not rows["on_ladder"][0] and not rows["on_ladder"][1] and np.isfinite(pattern_alone)
+    assert not rows["on_ladder"][0]
+    assert not rows["on_ladder"][1]
+    assert np.isfinite(pattern_alone)
 
 
 def test_without_switches_there_are_no_costs():

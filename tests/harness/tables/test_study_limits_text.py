@@ -204,15 +204,11 @@ def test_every_number_of_a_limit_stands_in_its_file(
     )
     assert numbers == (limit.a90_95.value, limit.a90_mm, ends.low, ends.high, limit.a50_mm)
     rate = limit.false_calls.interval_per_m2
-    assert (first["false_calls_low_per_m2"], first["false_calls_high_per_m2"]) == (
-        rate.low,
-        rate.high,
-    )
-    assert (first["targets"], first["boards"], first["hits"]) == (
-        limit.targets,
-        limit.boards,
-        limit.hits,
-    )
+    assert first["false_calls_low_per_m2"] == rate.low
+    assert first["false_calls_high_per_m2"] == rate.high
+    assert first["targets"] == limit.targets
+    assert first["boards"] == limit.boards
+    assert first["hits"] == limit.hits
     assert first["a90_95_method"] == "likelihood ratio"
     assert list(frame["a90_95_verdict"]) == ["demonstrated", "demonstrated", "not demonstrated"]
     assert np.isnan(frame["a90_95_mm"].iloc[2])
@@ -305,8 +301,11 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
         "source.target.distance_m",
         FRAMES,
     ]
-    assert (distance.title, distance.values, distance.numeric) == ("distance (m)", (0.5, 1.0), True)
-    assert (camera.values, camera.numeric) == (("a", "b"), False)
+    assert distance.title == "distance (m)"
+    assert distance.values == (0.5, 1.0)
+    assert distance.numeric is True
+    assert camera.values == ("a", "b")
+    assert camera.numeric is False
     assert list(camera.lines) == [
         f"distance={metres} m, {n}" for metres in ("0.5", "1") for n in ("1 frame", "50 frames")
     ]

@@ -123,10 +123,8 @@ def test_the_bound_is_the_largest_and_the_band_the_widest_of_near_models() -> No
     assert [fit.deviance for fit in stated.fits] == [fit.deviance for fit in near_fits]
     assert stated.bound == largest_bound(near_fits)
     assert stated.bound.value == max(bound(fit).value for fit in near_fits)
-    assert (stated.a50, stated.a90) == (
-        near_fits[0].curve.size_at(0.5),
-        near_fits[0].curve.size_at(0.9),
-    )
+    assert stated.a50 == near_fits[0].curve.size_at(0.5)
+    assert stated.a90 == near_fits[0].curve.size_at(0.9)
     bands = [band(fit, stated.sizes) for fit in near_fits]
     low, high = stated.band
     assert np.array_equal(low, np.min([edges[0] for edges in bands], axis=0))
@@ -327,9 +325,11 @@ def test_a_statement_as_plain_data() -> None:
         "why": "",
         "size": stated.bound.value,
     }
-    assert (data["a50"], data["a90"]) == (stated.a50, stated.a90)
+    assert data["a50"] == stated.a50
+    assert data["a90"] == stated.a90
     assert data["curve"]["mu"] == stated.curve.mu
     assert data["curve"]["covariance_mu_sigma"] == stated.curve.covariance.tolist()
     assert [row["in_a90_95"] for row in data["models"]] == [row.in_bound for row in stated.models]
-    assert (data["hits"], data["inspections"]) == (int(stated.read.response.sum()), 60)
+    assert data["hits"] == int(stated.read.response.sum())
+    assert data["inspections"] == 60
     assert [test["p"] for test in data["tests"]] == [p for _, p, _ in stated.tests]
