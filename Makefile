@@ -22,7 +22,7 @@ lint: .venv/.installed
 	$(BIN)/mypy
 
 smoke: .venv/.ready
-	$(BIN)/python -m harness.sweep experiments/smoke.yaml
+	$(BIN)/tofpod sweep experiments/smoke.yaml
 
 validate: .venv/.ready
 	$(BIN)/python -m harness validate

@@ -39,7 +39,7 @@ from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import DEFAULT_DETECTOR
-from harness.inspection.run import analysed, judged, threshold_of
+from harness.inspection.judging import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_page import draw_overlay
 from harness.runs.options import EngineOptions
@@ -119,7 +119,7 @@ def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
 
 
 def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
-    """Open a real capture (files or a folder) of any format that ``python -m harness.detect``
+    """Open a real capture (files or a folder) of any format that ``tofpod detect``
     reads. ``unit`` is that of the stored depth, such as ``mm`` or ``4000/m``, if the files do not
     state it. Raises UserError."""
     return open_capture([Path(path) for path in paths], unit=unit)
@@ -140,7 +140,7 @@ def detect(
     cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any
 ) -> Judged:
     """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's
-    own noise sets it, as in ``python -m harness.detect``; ``evidence.warnings`` of the result say
+    own noise sets it, as in ``tofpod detect``; ``evidence.warnings`` of the result say
     if that is not reliable. ``settings`` are those of the detector; the default detector chooses
     the shape of its surface by evidence unless they state it. Raises UserError if the cloud cannot
     be judged.
@@ -194,10 +194,13 @@ def sweep(
     """
     from harness.runs.study import run_study  # imports pandas
 
-    found = load_experiment(Path(experiment), changes)
+    loaded = load_experiment(Path(experiment), changes)
     out = Path(out)
     code = run_study(
-        found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
+        loaded,
+        out,
+        EngineOptions(jobs=jobs, serial=jobs == 1),
+        f"tofpod.sweep({str(experiment)!r})",
     )
     if code == 130:
         raise KeyboardInterrupt
@@ -206,7 +209,7 @@ def sweep(
             f"{experiment}: trials failed, as printed above",
             fix="correct the cause and run it again",
         )
-    return found.folder(out)
+    return loaded.folder(out)
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:

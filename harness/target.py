@@ -1,4 +1,4 @@
-"""``python -m harness.target``: builds a target, prints its truth, and writes its mesh and truth."""
+"""``tofpod target``: builds a target, prints its truth, and writes its mesh and truth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 @program(
     _options,
     "Build a target with damage from its declaration, print its truth, and write its mesh.",
-    epilog="example: python -m harness.target thesis --out board.glb --truth truth.json",
+    epilog="example: tofpod target thesis --out board.glb --truth truth.json",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake."""

@@ -98,7 +98,7 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
 
 class M3c2Config(ScoreMapConfig):
     """``reference``: a capture of the same target without damage, in any format that
-    ``harness.detect`` reads and in the frame of the clouds; without it, distances are to
+    ``tofpod detect`` reads and in the frame of the clouds; without it, distances are to
     ``surface``, fitted to the cloud itself. ``registration_error_mm``: the error between both;
     null: estimated from the scatter of the distances. ``cylinder_radius_mm``: half of the scale
     over which points are averaged; 4 mm holds some 20 pixels of an Azure Kinect at 0.7 m, as Lague

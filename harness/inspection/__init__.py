@@ -1,2 +1,2 @@
-"""The work of `harness.detect`: it turns captures and arguments into findings, which it prints and
+"""The work of `tofpod detect`: it turns captures and arguments into findings, which it prints and
 writes."""

@@ -1,4 +1,4 @@
-"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with
+"""Findings of `tofpod detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with
 coloured damage.
 
 All files of a run are first written under temporary names and renamed together at the end."""

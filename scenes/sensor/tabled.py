@@ -6,7 +6,7 @@ and frame, the noise's deviation and the probability of no return depend on the 
 back, intensity / range^2. A separable filter correlates neighbours; each unit has a fixed pattern,
 the same in all frames. Not modelled: errors at steps of depth (mixing of neighbours, flying
 pixels), light over several surfaces, ambient light, warm-up and displacements of whole frames.
-`harness.sweep` simulates all of them."""
+`tofpod sweep` simulates all of them."""
 
 import numpy as np
 

@@ -25,7 +25,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT)]
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 VARIANTS = {
     "cuda": ("cuda_ad_mono", None),

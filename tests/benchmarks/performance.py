@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 Work = Callable[[], Any]
 STUDY = ROOT / "experiments" / "detection_limit.yaml"

@@ -1,4 +1,4 @@
-"""``python -m harness.detect`` from files to findings: numbers, files, messages, exit codes."""
+"""``tofpod detect`` from files to findings: numbers, files, messages, exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m harness.detect A B C --register ..``: from several captures to one cloud, its
+"""``tofpod detect A B C --register ..``: from several captures to one cloud, its
 findings, and refusals."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The program `python -m harness.target` and the files that it writes."""
+"""The program `tofpod target` and the files that it writes."""
 
 from __future__ import annotations
 

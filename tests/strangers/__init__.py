@@ -1,2 +1,2 @@
 """Recordings that a stranger could bring, made by ray casting with known truth, and the score of
-`harness.detect`."""
+`tofpod detect`."""

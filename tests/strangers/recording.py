@@ -292,7 +292,7 @@ def _truth(
 
 
 def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
-    """Write the frames as the stranger keeps them; returns the path that `harness.detect` is
+    """Write the frames as the stranger keeps them; returns the path that `tofpod detect` is
     given."""
     folder.mkdir(parents=True, exist_ok=True)
     camera = stranger.camera

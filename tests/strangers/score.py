@@ -1,4 +1,4 @@
-"""Score one answer of `harness.detect`: right, warned or wrong, and why."""
+"""Score one answer of `tofpod detect`: right, warned or wrong, and why."""
 
 from __future__ import annotations
 

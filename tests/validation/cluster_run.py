@@ -118,9 +118,9 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
         outcome.failures[:2],
     )
     first, last = steady
-    wall = getattr(last, "at_s") - getattr(first, "at_s")
-    count = getattr(last, "trials") - getattr(first, "trials")
-    work = getattr(last, "work_s") - getattr(first, "work_s")
+    wall = last.at_s - first.at_s
+    count = last.trials - first.trials
+    work = last.work_s - first.work_s
     return {
         "trials": trials,
         "workers": workers,

@@ -32,7 +32,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "--poses",
         type=Path,
         metavar="FILE",
-        help="camera pose for each PATH, as for harness.detect",
+        help="camera pose for each PATH, as for tofpod detect",
     )
     add("--albedo", type=float, default=0.6, help="assumed albedo of the surfaces (default: 0.6)")
     add(
@@ -51,7 +51,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write also a certificate of two pages, certificate.html and .json",
     )
-    study = "results folder of a study (harness.sweep or tofpod implant), whose limits the certificate quotes"
+    study = "results folder of a study (tofpod sweep or tofpod implant), whose limits the certificate quotes"
     add("--study", type=Path, metavar="DIR", help=study)
     about = "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
     add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
@@ -62,7 +62,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Measure a depth camera on static captures, preferably of a matte wall that fills the view: noise "
     "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
     "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
-    "Each PATH is a capture of 50 frames or more, in any format that harness.detect reads, in order of time. Captures "
+    "Each PATH is a capture of 50 frames or more, in any format that tofpod detect reads, in order of time. Captures "
     "at several distances, with the camera moved sideways by 30 mm or more, show the most.",
     epilog="example: tofpod characterise near far --like azure_kinect_nfov --out my_camera",
 )

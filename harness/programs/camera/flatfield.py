@@ -38,7 +38,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="PATH",
-        help="captures, in any format that harness.detect reads",
+        help="captures, in any format that tofpod detect reads",
     )
     written = "the flat field; a .json of its figures and a .png of the map are written beside it"
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
@@ -47,9 +47,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "--crop",
         default="auto",
         metavar="KIND",
-        help="the part that shows the wall, as for harness.detect",
+        help="the part that shows the wall, as for tofpod detect",
     )
-    poses = "camera poses, as for harness.detect: the surface's shape is then not counted as noise"
+    poses = "camera poses, as for tofpod detect: the surface's shape is then not counted as noise"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 
@@ -60,7 +60,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "camera, several times at each of two distances, and move it by 30 mm or more between captures. Name the "
     "captures in the order of recording.",
     epilog="example: tofpod flatfield near1 near2 far1 far2 --out unit.npz, then "
-    "python -m harness.detect captures/board --flat-field unit.npz",
+    "tofpod detect captures/board --flat-field unit.npz",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if the pattern is not stable), 2 for a user's mistake, 130

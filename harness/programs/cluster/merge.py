@@ -25,7 +25,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Copy the trials of results folders (such as those of `harness.sweep --shard`) to another folder. "
+    "Copy the trials of results folders (such as those of `tofpod sweep --shard`) to another folder. "
     "Nothing is run; if several folders hold a trial, a finished record is used.",
     epilog="example: tofpod merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
     "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",

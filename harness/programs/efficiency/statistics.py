@@ -135,10 +135,10 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     half, most = (
         _level(*each, all_found) for each in zip(ideal_mm, ideal_index, needed, strict=True)
     )
-    board = getattr(ideal, "board")[kept]
-    hole = getattr(ideal, "hole")[kept]
-    exact = getattr(ideal, "index")[kept]
-    threshold = getattr(ideal, "threshold")[kept]
+    board = ideal.board[kept]
+    hole = ideal.hole[kept]
+    exact = ideal.index[kept]
+    threshold = ideal.threshold[kept]
     of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
     return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
 

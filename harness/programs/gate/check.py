@@ -100,7 +100,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not engine.shard.is_whole:
         raise UserError(
             "--shard: a check needs the whole study",
-            fix="run harness.sweep in shards, merge, then check",
+            fix="run tofpod sweep in shards, merge, then check",
         )
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
     baseline = _baseline(

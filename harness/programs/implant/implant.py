@@ -37,7 +37,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="PATH",
-        help="captures, in any format that harness.detect reads",
+        help="captures, in any format that tofpod detect reads",
     )
     add(
         "--camera",
@@ -108,7 +108,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="least distance of damages (default: 2 hit radii plus 10)",
     )
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
-    calls = f"expected number, which sets the threshold as in harness.detect (default: {cli.DEFAULT_FALSE_CALLS:g})"
+    calls = f"expected number, which sets the threshold as in tofpod detect (default: {cli.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add(
         "--threshold",
@@ -154,7 +154,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.evaluation.study.result import evaluate_study
     from harness.inspection.arguments import opened_as
-    from harness.inspection.run import analysed, refuse_thresholds, threshold_of
+    from harness.inspection.judging import analysed, refuse_thresholds, threshold_of
     from harness.programs.implant.scans import Judging, Scan, judge_scans, placements
     from harness.records.outputs import PROVENANCE, REPORT, STUDY
     from harness.report.study_page import study_html, study_parts
@@ -169,7 +169,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     load_mitsuba()  # must precede Open3D, after which LLVM cannot be loaded
     options.quiet_capture = options.target = (
-        None  # options of harness.detect that this program lacks
+        None  # options of tofpod detect that this program lacks
     )
     refuse_thresholds(options)
     numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
@@ -237,7 +237,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     title = f"Virtual damage in {recordings}"
     expected = options.false_calls or cli.DEFAULT_FALSE_CALLS
     calls = f"{expected:g} false calls a capture: the median over groups of frames."
-    own = f"Set by the undamaged frames, as in harness.detect, by noise towards the camera, for {calls}"
+    own = f"Set by the undamaged frames, as in tofpod detect, by noise towards the camera, for {calls}"
     thresholds = f"Given as {options.threshold:g}." if options.threshold else own
     known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
     study = StudyRecord(

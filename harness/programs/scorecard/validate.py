@@ -39,7 +39,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="PATH",
-        help="frames of a static scene, as read by harness.detect",
+        help="frames of a static scene, as read by tofpod detect",
     )
     add_reading(put)
     put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")

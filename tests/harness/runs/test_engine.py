@@ -93,7 +93,7 @@ def test_a_sweep_leaves_all_its_files(finished):
 def test_provenance_is_stored(finished):
     said = json.loads((results(finished) / "provenance.json").read_text())
     assert said["seed"] == 3
-    assert said["command"].startswith("python -m harness.sweep ")
+    assert said["command"].startswith("tofpod sweep ")
     assert said["versions"]["mitsuba"]
     assert set(said) >= {"commit", "dirty", "machine", "failures", "seconds"}
     import pyarrow.parquet as pq

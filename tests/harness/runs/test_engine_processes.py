@@ -130,13 +130,13 @@ with LocalEngine(1, Limits()) as engine:
 def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_in(tmp_path):
     """A second `harness`, as another checkout has it, would be found first in the folder where a
     sweep is started."""
-    other = tmp_path / "harness" / "engine"
+    other = tmp_path / "harness" / "trials"
     other.mkdir(parents=True)
     for path in (other.parent / "__init__.py", other / "__init__.py", other / "trial.py"):
         path.touch()
     given = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900}
     done = subprocess.run([sys.executable, "-c", OTHER_FOLDER, str(tmp_path)], **given)
-    assert str(ROOT / "harness" / "engine" / "trial.py") in done.stdout, done.stdout + done.stderr
+    assert str(ROOT / "harness" / "trials" / "trial.py") in done.stdout, done.stdout + done.stderr
 
 
 def test_serial_runs_here_and_in_order():

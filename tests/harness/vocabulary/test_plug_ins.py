@@ -12,6 +12,7 @@ import pytest
 import detectors
 from detectors import detector_names, detector_type, load_detector
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
+from harness import __version__
 from harness.programs.keeping.ls import main
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.plug_ins import PlugIns
@@ -110,10 +111,11 @@ def test_a_name_taken_twice_is_an_error_that_names_both_and_leaves_others_alone(
     offer(monkeypatch, tmp_path / "b", "bolt", detectors.GROUP, {"x": "q:B", "mine": MINE})
     told = str(mistake(load_detector, "thesis", {}))
     assert "2 detectors are called 'thesis'" in told
-    assert (
-        "detectors.methods.thesis:ThesisDetector (tofpod 0.1.0) and acme.found:Detector (acme 1.2)"
-        in told
+    offers = (
+        f"detectors.methods.thesis:ThesisDetector (tofpod {__version__}) "
+        "and acme.found:Detector (acme 1.2)"
     )
+    assert offers in told
     assert "p:A (acme 1.2) and q:B (bolt 1.2)" in str(mistake(detector_type, "x"))
     assert detector_type("mine") is Mine
 
@@ -264,7 +266,10 @@ def test_everything_is_listed_with_where_it_comes_from(acme_camera, capsys):
         if line and "(entry" not in line and not line.startswith("name ")
     }
     assert set(lines) == {*OWN_DETECTORS, *camera_names()}
-    assert "tofpod 0.1.0" in lines["thesis"] and f" {ThesisDetector.version} " in lines["thesis"]
+    assert (
+        f"tofpod {__version__}" in lines["thesis"]
+        and f" {ThesisDetector.version} " in lines["thesis"]
+    )
     assert "acme-cameras 1.2" in lines["acme_tof"] and "512 x 424" in lines["acme_tof"]
     assert "0.5 to 4.5 m" in lines["acme_tof"] and "860 nm" in lines["acme_tof"]
 

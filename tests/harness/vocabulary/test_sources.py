@@ -11,14 +11,15 @@ from harness.vocabulary.provenance import reached_sources, source_digest
 
 FILES = {
     "harness/__init__.py": "",
-    "harness/trial.py": "import numpy\nfrom harness.engine import (\n    judge,  # why\n)\n",
+    "harness/trial.py": "import numpy\nfrom harness.trials import (\n    judge,  # why\n)\n",
     "harness/page.py": "from harness.trial import run\n",
-    "harness/engine/__init__.py": "",
+    "harness/trials/__init__.py": "",
     "harness/trials/judge.py": "def run():\n    from scenes.board import Board\n    import detectors.methods.thesis as t\n",
-    "harness/engine/other.py": "",
+    "harness/trials/other.py": "",
     "scenes/__init__.py": "",
     "scenes/board.py": "class Board: ...\n",
     "detectors/__init__.py": "",
+    "detectors/methods/__init__.py": "",
     "detectors/methods/thesis.py": "",
     "detectors/blind.py": "",
 }
@@ -53,7 +54,7 @@ def test_what_a_module_reaches_counts_and_nothing_else(project: Path) -> None:
     forget()
     assert reached == set(FILES) - {
         "harness/page.py",
-        "harness/engine/other.py",
+        "harness/trials/other.py",
         "detectors/blind.py",
     }
     for name in FILES:
@@ -107,6 +108,6 @@ def test_a_source_that_is_edited_stays_what_this_process_has_loaded(project: Pat
     asked later."""
     forget()
     before = source_digest(("harness.trial",), ("numpy",))
-    (project / "harness" / "engine" / "judge.py").write_text("K = 5\n")
+    (project / "harness" / "trials" / "judge.py").write_text("K = 5\n")
     source_digest.cache_clear()
     assert source_digest(("harness.trial",), ("numpy",)) == before != fresh("harness.trial")

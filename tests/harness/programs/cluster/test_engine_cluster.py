@@ -217,7 +217,7 @@ def test_a_worker_with_other_code_is_refused(tmp_path):
     other = tmp_path / "other"
     for room in ("harness", "scenes", "detectors"):
         shutil.copytree(ROOT / room, other / room, ignore=shutil.ignore_patterns("__pycache__"))
-    with open(other / "detectors" / "average.py", "a") as changed:
+    with open(other / "detectors" / "averages" / "average.py", "a") as changed:
         changed.write("\n# another version\n")
     with processes(tmp_path / "cluster") as old:
         old.worker("--no-nanny", search=other)
