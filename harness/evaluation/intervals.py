@@ -63,7 +63,9 @@ def _floats(*values: ArrayLike) -> tuple[np.ndarray, ...]:
 
 
 def _ends_where(
-    is_defined: np.ndarray, low: np.ndarray, high: np.ndarray
+    is_defined: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends of intervals, NaN where they are not defined."""
     return np.where(is_defined, low, np.nan), np.where(is_defined, high, np.nan)
@@ -103,7 +105,11 @@ def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.
         return _ends_where(time > 0, low / time, high / time)
 
 
-def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def mean_t(
+    mean: ArrayLike,
+    std: ArrayLike,
+    n: ArrayLike,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN
     below two values."""
     centre, deviation, count = _floats(mean, std, n)
@@ -128,7 +134,11 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     return Interval(float(ends.low), float(ends.high))
 
 
-def standardised_bias(bias: float, std: float, n: int) -> Interval:
+def standardised_bias(
+    bias: float,
+    std: float,
+    n: int,
+) -> Interval:
     """Return the interval of bias / standard deviation (an effect size) from ``n`` normal values,
     by the large-sample variance 1/n + d^2/(2n) (Hedges and Olkin 1985). Exact if they do not vary;
     unknown below two values."""
@@ -143,7 +153,10 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
 
 
 def bootstrap(
-    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES
+    statistic: Callable[[np.ndarray], np.ndarray],
+    n: int,
+    *,
+    resamples: int = RESAMPLES,
 ) -> Interval:
     """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of
     pixels), with the same draws every time. ``statistic`` maps indices (resamples, n) to values
@@ -213,7 +226,10 @@ class Threshold:
 
 
 def threshold_for_rate(
-    highest_scores_per_run: ArrayLike, area_m2: float, rate_per_m2: float, confidence: float = 0.95
+    highest_scores_per_run: ArrayLike,
+    area_m2: float,
+    rate_per_m2: float,
+    confidence: float = 0.95,
 ) -> Threshold:
     """Return the lowest observed score whose rate of false calls is at most the wanted rate, from
     hole-free runs of ``area_m2`` each. ``highest_scores_per_run`` (runs,): -inf without a finding.

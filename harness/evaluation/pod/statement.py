@@ -358,7 +358,9 @@ Fit = TypeVar("Fit", HitMissFit, AhatFit)
 
 
 def _models(
-    tried: Sequence[Fit], bounds: Sequence[Bound], close_fits: Sequence[Fit]
+    tried: Sequence[Fit],
+    bounds: Sequence[Bound],
+    close_fits: Sequence[Fit],
 ) -> tuple[ModelRow, ...]:
     """Return rows of fits with their ``bounds``; the first of the ``near`` fits is that of the
     curve."""
@@ -426,7 +428,11 @@ def _false_positives_by_noise(sites: np.ndarray, fit: AhatFit) -> float | None:
     return float(stats.norm(mean, std).sf(on_axis(fit.decision)))
 
 
-def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> np.ndarray:
+def drawn_sizes(
+    size: np.ndarray,
+    log_size: bool,
+    marks: tuple[float, ...],
+) -> np.ndarray:
     """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond
     those ``marks`` that are at most twice the largest size; in equal steps, or in equal ratios if
     ``log_size``."""

@@ -74,7 +74,10 @@ def chance_hits(
 
 
 def _shuffled(
-    damages: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float
+    damages: pd.DataFrame,
+    runs: pd.DataFrame,
+    findings: pd.DataFrame,
+    radius_mm: float,
 ) -> tuple[float, int]:
     """Return the share of damages, moved to runs of other boards, that have an unmatched finding
     within the radius, and the number of these pairs."""
@@ -153,7 +156,11 @@ class PixelCurves:
     """Why ``pro`` is NaN; else empty."""
 
 
-def roc_curve(holes: pd.DataFrame, sites: pd.DataFrame, threshold: float) -> Roc | None:
+def roc_curve(
+    holes: pd.DataFrame,
+    sites: pd.DataFrame,
+    threshold: float,
+) -> Roc | None:
     """Return the ROC of all damages; None without damages or places. Damage without judged pixels
     cannot be found."""
     if holes.empty or sites.empty:
@@ -180,7 +187,10 @@ def _share_from(signals: np.ndarray, levels: np.ndarray) -> np.ndarray:
 
 
 def free_response(
-    operating: pd.DataFrame, runs: pd.DataFrame, holes: pd.DataFrame, draws: int = DRAWS
+    operating: pd.DataFrame,
+    runs: pd.DataFrame,
+    holes: pd.DataFrame,
+    draws: int = DRAWS,
 ) -> FreeResponse | None:
     """Return the free-response curve of one set-up; None if no damage or no hole-free board was
     inspected, or no other threshold was counted. Thresholds with fewer false calls than a higher

@@ -132,7 +132,12 @@ class _Sizes:
     over_units: OverUnits | None = None
 
 
-def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -> SetUpLimit:
+def limit_of(
+    record: SetUpRecord,
+    *,
+    draws: int = DRAWS,
+    tested: bool = False,
+) -> SetUpLimit:
     """Return the limit of ``record``. ``tested``: whether to test for a floor and a ceiling, with
     a note. Deterministic. Data without a curve are not an error: ``why`` gives the reason."""
     inspected = record.inspected
@@ -209,7 +214,10 @@ def target_names(inspected: Inspected) -> np.ndarray:
 
 
 def _sizes_of_curve(
-    record: SetUpRecord, targets: Targets, statement: PodStatement, draws: int
+    record: SetUpRecord,
+    targets: Targets,
+    statement: PodStatement,
+    draws: int,
 ) -> _Sizes:
     """Return the sizes of a curve, with percentiles over resampled boards (and units)."""
     inspected = record.inspected
@@ -306,7 +314,9 @@ def _no_sizes(why: str, draws: int) -> _Sizes:
 
 
 def _false_calls(
-    runs: Unflawed | None, draws: int, population: str
+    runs: Unflawed | None,
+    draws: int,
+    population: str,
 ) -> tuple[FalseCallRate | None, Interval]:
     """Return the rate of false calls in runs, and its interval over boards; unknown without runs
     or calls."""

@@ -97,7 +97,9 @@ def _without(setting: Mapping[str, Any], axis: str) -> dict[str, Any]:
 
 
 def _axis_line(
-    axis: str, settings: Sequence[Mapping[str, Any]], limits: Sequence[SetUpLimit]
+    axis: str,
+    settings: Sequence[Mapping[str, Any]],
+    limits: Sequence[SetUpLimit],
 ) -> AxisLine:
     """Return the line of these set-ups, with numbers in ascending order."""
     numeric = all(_is_number(setting[axis]) for setting in settings)
@@ -237,7 +239,9 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
 
 
 def _departures(
-    limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
+    limits: Sequence[SetUpLimit],
+    chances: Sequence[ChanceHits | None],
+    facts: Mapping[str, Any],
 ) -> tuple[str, ...]:
     per_board = max((limit.targets / limit.boards for limit in limits if limit.boards), default=1.0)
     # Unflawed sites are those of drawn damage on hole-free boards.
@@ -516,7 +520,12 @@ def evaluate_study(
     )
 
 
-def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: int) -> SetUpResult:
+def _set_up(
+    record: SetUpRecord,
+    tables: ResultTables,
+    radius_mm: float,
+    draws: int,
+) -> SetUpResult:
     """Evaluate a set-up from its own ``tables``."""
     holes = tables.holes
     sites = tables.sites
@@ -540,7 +549,11 @@ def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: 
     )
 
 
-def _with_measures(limit: SetUpLimit, holes: pd.DataFrame, runs: pd.DataFrame) -> SetUpLimit:
+def _with_measures(
+    limit: SetUpLimit,
+    holes: pd.DataFrame,
+    runs: pd.DataFrame,
+) -> SetUpLimit:
     """Add the typical error of measured sizes, and the time of a cloud."""
     size_of = limit.record.inspected.size_of
     column = "model_diameter_mm" if size_of == "diameter" else f"{size_of}_mm"
