@@ -95,7 +95,8 @@ def test_bootstrap_covers_a_mean() -> None:
 
 def test_bootstrap_is_repeatable_and_honest_about_nothing() -> None:
     values = np.random.default_rng(7).normal(size=20)
-    first, second = (intervals.bootstrap(lambda i: values[i].mean(axis=1), 20) for _ in range(2))
+    first = intervals.bootstrap(lambda i: values[i].mean(axis=1), 20)
+    second = intervals.bootstrap(lambda i: values[i].mean(axis=1), 20)
     assert first == second
     assert first.low < values.mean() < first.high
     assert not intervals.bootstrap(lambda i: values[i].mean(axis=1), 1).known
@@ -208,7 +209,7 @@ def test_a_rate_that_is_met_exactly_is_met() -> None:
 
 
 def test_thresholds_that_cannot_be_set_are_refused() -> None:
-    with pytest.raises(UserError, match="13 hole-free runs of 0.07 m² are too few") as caught:
+    with pytest.raises(UserError, match=r"13 hole-free runs of 0\.07 m² are too few") as caught:
         threshold_for_rate(np.arange(13.0), 0.07, 1.0)
     assert caught.value.legal == "at least 14 runs"
     for area, rate in ((0.0, 1.0), (0.07, 0.0)):

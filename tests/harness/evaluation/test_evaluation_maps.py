@@ -135,7 +135,11 @@ def test_the_registrations_of_a_map_are_found_under_whichever_number_of_views_th
     assert counts.to_dict() == {("marks", 2): 2, ("marks", 3): 4, ("joint", 2): 2, ("joint", 3): 4}
 
 
-def holes(diameters, repeats=4, true=(10.0, 5.0)):
+def holes(
+    diameters,
+    repeats=4,
+    true=(10.0, 5.0),
+):
     return pd.DataFrame(
         [
             {
@@ -179,7 +183,11 @@ def test_holes_are_in_the_order_of_their_size():
         ([0.0, 0.0], False, False),
     ],
 )
-def test_a_change_is_certain_or_open(values, above, below):
+def test_a_change_is_certain_or_open(
+    values,
+    above,
+    below,
+):
     change = change_of(np.array(values))
     assert change.interval.over(0) == above
     assert change.is_below == below

@@ -92,7 +92,9 @@ def test_misfits_are_those_of_least_squares(measured: str) -> None:
     ],
 )
 def test_a_shape_fits_clearly_better_from_four_fifths(
-    bowl_rms: float, cylinder_rms: float, looks: str
+    bowl_rms: float,
+    cylinder_rms: float,
+    looks: str,
 ) -> None:
     assert HoleShape("a", 40, cylinder_rms, bowl_rms, 0.0, 0.0).looks == looks
 

@@ -17,7 +17,11 @@ from harness.evaluation.summary import summarise_holes
 from tests.support.synthetic_tables import World, joined, tables
 
 
-def ladder(rates: list[float], copies: int = 1, repeats: int = 20) -> Ladder:
+def ladder(
+    rates: list[float],
+    copies: int = 1,
+    repeats: int = 20,
+) -> Ladder:
     """Holes of 1, 2, 3 ... mm, found in exactly these shares of the repeats."""
     sizes = np.repeat(np.arange(1.0, len(rates) + 1), copies)
     detected = np.arange(repeats)[:, None] < np.repeat(np.array(rates) * repeats, copies).round()

@@ -75,7 +75,8 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
     for limit in two:
         sentence = limit_sentence(limit)
         assert sentence.startswith(
-            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the time"
+            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the "
+            "time"
         )
         assert limit.false_calls is not None
         rate = f"{limit.false_calls.rate_per_m2:.2g}"
@@ -242,7 +243,11 @@ def test_few_targets_are_told() -> None:
 
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
-def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
+def test_intervals_as_text_hold_their_numbers(
+    value: float,
+    down: float,
+    up: float,
+) -> None:
     """To two decimals, or to two significant digits of the estimate (of the upper end where that
     is 0), where the interval is wider than a tenth of it."""
     text = with_interval(value, value - down, value + up)
@@ -277,7 +282,11 @@ def test_intervals_without_ends() -> None:
 
 
 def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
-    def one(camera: str, distance: float, frames: int) -> SetUp:
+    def one(
+        camera: str,
+        distance: float,
+        frames: int,
+    ) -> SetUp:
         axes = {
             "source.camera.name": camera,
             "source.target.distance_m": distance,

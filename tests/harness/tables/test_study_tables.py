@@ -51,7 +51,11 @@ def two() -> list[SetUpLimit]:
     return limits_of(SetUp(frames=1, a50_mm=6.0), SetUp(frames=50, a50_mm=4.0))
 
 
-def with_runs(limit: SetUpLimit, threshold: float, **columns: object) -> SetUpLimit:
+def with_runs(
+    limit: SetUpLimit,
+    threshold: float,
+    **columns: object,
+) -> SetUpLimit:
     """A limit whose threshold four runs set."""
     runs = Calibrated(
         board=np.array([3, 5, 7, 9]),
@@ -90,7 +94,10 @@ def test_the_run_that_set_a_threshold_has_the_nearest_score(two: list[SetUpLimit
     ],
 )
 def test_runs_within_five_pixels_are_on_the_same_pixels(
-    two: list[SetUpLimit], u_px: list[float], v_px: list[float], same: int
+    two: list[SetUpLimit],
+    u_px: list[float],
+    v_px: list[float],
+    same: int,
 ) -> None:
     limit = with_runs(two[0], 12.0, u_px=np.array(u_px), v_px=np.array(v_px))
     (row,) = set_by([limit])

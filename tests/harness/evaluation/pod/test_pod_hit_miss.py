@@ -1,4 +1,4 @@
-"""POD from hits and misses: the handbook's digits, a second oracle, theory, coverage and refusals."""
+"""POD from hits and misses: the handbook's digits, a second oracle, theory and coverage."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def example4(shared_data: Path) -> list[np.ndarray]:
 
 
 def simulated(
-    targets: int, seed: int, floor: float = 0.0, ceiling: float = 1.0
+    targets: int,
+    seed: int,
+    floor: float = 0.0,
+    ceiling: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sizes of 0.5 to 10 mm and hits of a logistic curve at 4 mm with sigma 0.8 mm."""
     sizes = np.linspace(0.5, 10.0, targets)
@@ -52,7 +55,11 @@ def simulated(
     return sizes, np.random.default_rng(seed).random(targets) < chance
 
 
-def standardised(sizes: np.ndarray, hits: np.ndarray, link: str) -> HitsAndMisses:
+def standardised(
+    sizes: np.ndarray,
+    hits: np.ndarray,
+    link: str,
+) -> HitsAndMisses:
     design = np.column_stack([np.ones_like(sizes), (sizes - sizes.mean()) / sizes.std()])
     return HitsAndMisses(design, hits.astype(float), 1.0 - hits, link)
 
@@ -203,9 +210,7 @@ def test_a_weak_study_demonstrates_nothing_and_says_why() -> None:
     assert limit.why.startswith("not demonstrated: ")
 
 
-def test_the_likelihood_ratio_bound_is_infinite_exactly_where_a_flat_curve_is_within_the_criterion() -> (
-    None
-):
+def test_the_bound_is_infinite_exactly_where_a_flat_curve_is_within_the_criterion() -> None:
     sizes = np.tile(np.arange(1.0, 7.0), 3)
     hits = np.array([0, 0, 0, 1, 1, 1, 0, 0, 1, 0, 1, 1, 0, 1, 0, 1, 0, 1])
     fit = fit_hit_miss(sizes, hits)
@@ -307,7 +312,11 @@ def test_separation_is_told_from_overlap(hits: list[int], separated: bool) -> No
     ("link", "seed", "n"),
     [("cloglog", 28, 55), ("cloglog", 29, 75), ("loglog", 49, 9), ("logit", 28, 55)],
 )
-def test_of_several_penalised_maxima_the_highest_is_taken(link: str, seed: int, n: int) -> None:
+def test_of_several_penalised_maxima_the_highest_is_taken(
+    link: str,
+    seed: int,
+    n: int,
+) -> None:
     """Compared with a fine grid of places and slopes, on data of which single starts end in lower
     maxima."""
     rng = np.random.default_rng(seed)
@@ -439,7 +448,10 @@ def test_a_chance_that_falls_with_size_is_refused() -> None:
     ],
 )
 def test_data_that_cannot_be_fitted_are_refused(
-    sizes: list[float], hits: list[float], more: dict[str, object], message: str
+    sizes: list[float],
+    hits: list[float],
+    more: dict[str, object],
+    message: str,
 ) -> None:
     with pytest.raises(UserError, match=message):
         fit_hit_miss(sizes, hits, **more)  # type: ignore[arg-type]

@@ -26,7 +26,11 @@ from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import drawn_sizes, false_positives, state_hits, state_signals
 
 
-def inspections(size: np.ndarray, response: np.ndarray, **columns: object) -> Inspections:
+def inspections(
+    size: np.ndarray,
+    response: np.ndarray,
+    **columns: object,
+) -> Inspections:
     return Inspections(
         path=Path("table.csv"),
         size_column="size",
@@ -39,7 +43,12 @@ def inspections(size: np.ndarray, response: np.ndarray, **columns: object) -> In
     )
 
 
-def hits_of(targets: int, seed: int, floor: float = 0.0, ceiling: float = 1.0) -> Inspections:
+def hits_of(
+    targets: int,
+    seed: int,
+    floor: float = 0.0,
+    ceiling: float = 1.0,
+) -> Inspections:
     """Sizes of 0.5 to 10 mm and hits of a logistic curve at 4 mm with sigma 0.8 mm."""
     size = np.linspace(0.5, 10.0, targets)
     chance = floor + (ceiling - floor) * link_cdf("logit", (size - 4.0) / 0.8)
@@ -302,7 +311,10 @@ def test_noise_at_the_floor_is_censored_and_little_noise_is_not_fitted() -> None
     ],
 )
 def test_sizes_are_drawn_a_little_beyond_those_inspected(
-    size: list[float], log_size: bool, marks: tuple[float, ...], ends: tuple[float, float]
+    size: list[float],
+    log_size: bool,
+    marks: tuple[float, ...],
+    ends: tuple[float, float],
 ) -> None:
     sizes = drawn_sizes(np.array(size), log_size, marks)
     assert (sizes[0], sizes[-1]) == pytest.approx(ends, abs=1e-12)

@@ -185,7 +185,7 @@ class TestFreeResponse:
         assert free_response(loud.operating, runs, loud.holes) is None
 
     def test_false_calls_fall_as_their_scores_do(self, loud):
-        """Scores are exponential, so the logarithm of the rate falls by 1 in a unit of threshold."""
+        """Scores are exponential: the logarithm of the rate falls by 1 in a unit of threshold."""
         curve = free_response(loud.operating, loud.runs, loud.holes)
         expected = LOUD * np.exp(THRESHOLD - curve.threshold)
         scatter = np.sqrt(expected / curve.area_m2)
@@ -387,7 +387,9 @@ class TestAxes:
             boards=30,
             hole_free_boards=0,
         )
-        first, second = (limit_of(record, draws=300) for record in study_record(study).set_ups)
+        records = study_record(study).set_ups
+        first = limit_of(records[0], draws=300)
+        second = limit_of(records[1], draws=300)
         paired = difference(first, second)
         elsewhere = dataclasses.replace(
             second.record.inspected, x_mm=second.record.inspected.x_mm + 1

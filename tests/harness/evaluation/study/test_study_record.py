@@ -139,7 +139,12 @@ def test_written_and_read_it_is_the_same(tmp_path):
         (("further",), 1, "further: "),
     ],
 )
-def test_a_damaged_one_is_told_with_its_place(tmp_path, path, value, told):
+def test_a_damaged_one_is_told_with_its_place(
+    tmp_path,
+    path,
+    value,
+    told,
+):
     file = tmp_path / "study.json"
     file.write_text(json.dumps(changed(path, value)))
     mistake = refusal(file)

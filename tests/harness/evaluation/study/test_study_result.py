@@ -68,6 +68,11 @@ def result(study) -> StudyResult:
     return evaluate_study(study_record(study), study_tables(study), FACTS, draws=200)
 
 
+def no_tables() -> ResultTables:
+    names = ("holes", "runs", "probes", "variants", "noise", "axes")
+    return ResultTables(**dict.fromkeys(names, pd.DataFrame()))
+
+
 def section(result: StudyResult, heading: str) -> str:
     return " ".join(dict(result.validity).get(heading, ()))
 
@@ -108,7 +113,12 @@ class TestStudy:
             ]
             assert set_up.limit.false_calls.calls == runs["false_calls"].sum()
 
-    def test_a_record_from_its_file_gives_the_same_limits(self, study, result, tmp_path):
+    def test_a_record_from_its_file_gives_the_same_limits(
+        self,
+        study,
+        result,
+        tmp_path,
+    ):
         file = tmp_path / "study.json"
         file.write_text(record_text(study_record(study)))
         again = evaluate_study(read_record(file), study_tables(study), FACTS, draws=200)
@@ -119,7 +129,7 @@ class TestStudy:
 
     def test_nothing_but_the_record_is_enough_for_limits(self, study):
         record = study_record(study)
-        bare = evaluate_study(record, ResultTables(*[pd.DataFrame()] * 6), {})
+        bare = evaluate_study(record, no_tables(), {})
         assert [set_up.limit.a90_95.demonstrated for set_up in bare.set_ups] == [True, True]
         first = bare.set_ups[0]
         assert (first.chance, first.free_response, first.pixels, first.roc) == (None,) * 4
@@ -168,9 +178,7 @@ class TestValidity:
 
     def test_a_limit_beyond_what_was_inspected_has_no_number(self):
         study = Study((SetUp(a50_mm=13.0),), boards=16, hole_free_boards=0)
-        result = evaluate_study(
-            study_record(study), ResultTables(*[pd.DataFrame()] * 6), {}, draws=50
-        )
+        result = evaluate_study(study_record(study), no_tables(), {}, draws=50)
         limit = result.limits[0]
         assert limit.beyond(limit.a90_95.value)
         assert limit.a90_95.demonstrated
