@@ -5,6 +5,8 @@ from typing import Literal
 
 import numpy as np
 
+from harness.records.examples import ExampleCloud, HoleInView
+
 # valid pixels inside the outline to distinguish two shapes; with fewer, one ring is the whole hole
 FEWEST_PIXELS = 12
 # least share of valid pixels inside the outline: fewer may show only one side of the hole
@@ -12,44 +14,6 @@ FEWEST_VALID = 0.5
 # a shape fits clearly better if its rms misfit is at most this share of the other's (fixed
 # beforehand)
 CLEARLY = 0.8
-
-
-@dataclass(frozen=True)
-class HoleInView:
-    """Where one round damage truly lies on the cloud's pixel grid."""
-
-    hole: str
-    """Name of the damage."""
-    u_px: float
-    """Column of its centre; 0 is the centre of the first pixel."""
-    v_px: float
-    """Row of its centre."""
-    radius_px: float
-    """Radius of its outline."""
-    diameter_mm: float
-    """True diameter."""
-    depth_mm: float
-    """True depth; NaN or infinite without a floor."""
-
-
-@dataclass(frozen=True)
-class ExampleCloud:
-    """One averaged cloud of one variant, on its pixel grid (h, w)."""
-
-    frames: int
-    """Number of averaged frames."""
-    variant: str
-    """Name of the variant."""
-    residual_mm: np.ndarray
-    """Distance (h, w) behind (+) or before (-) the fitted surface, NaN if unknown."""
-    detected: np.ndarray
-    """Pixels (h, w) bool of the detector's clusters."""
-    inside: np.ndarray
-    """Pixels (h, w) bool of the crop."""
-    truth: tuple[HoleInView, ...]
-    """Its holes."""
-    z_truth_mm: np.ndarray
-    """True z (h, w) on each pixel's central ray, NaN where it meets nothing."""
 
 
 @dataclass(frozen=True)

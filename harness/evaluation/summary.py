@@ -1,7 +1,7 @@
 """Rates, means and intervals of rows per trial, and the error of an averaged range against the
 number of frames."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -162,21 +162,6 @@ def _order(column: pd.Series) -> pd.Series:
         order[MAIN] = -1
         return column.map(order)
     return column
-
-
-def hole_list(names: Iterable[str]) -> str:
-    """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
-    all_names = [str(name) for name in names]
-    numbered = sorted(int(name) for name in all_names if name.isdecimal())
-    runs: list[list[int]] = []
-    for number in numbered:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
-    parts += [name for name in all_names if not name.isdecimal()]
-    return ", ".join(parts) or "none"
 
 
 BLOCKS = 40

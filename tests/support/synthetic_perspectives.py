@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation.maps import MERGE, REGISTRATION, VIEWS
-from harness.report.clouds import MappedExample
-from harness.report.view3d import Circle3d, Scene3d
+from harness.records.examples import Circle3d, MappedExample, Scene3d
 from tests.support.synthetic_tables import DIAMETERS_MM, OFFSETS_MM, Tables, World, joined, tables
 
 MAP_AXES = pd.DataFrame(

@@ -8,8 +8,9 @@ import numpy as np
 
 from harness.programs.coverage.statistics import Findable, Patches, Seen
 from harness.programs.coverage.tables import GOALS, POSES
+from harness.records.examples import Scene3d
 from harness.report.blocks import command_of, heading, note, page, tag
-from harness.report.view3d import Scene3d, view3d_html
+from harness.report.view3d import view3d_html
 from harness.vocabulary.text import many, percent
 
 COLOURS = (

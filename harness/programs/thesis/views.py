@@ -13,15 +13,14 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation import intervals, maps
-from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     FEWEST_PAIRS,
     FEWEST_UNITS,
-    Answer,
-    Verdict,
     decide,
     verdict_of,
 )
+from harness.records.trials import hole_list
+from harness.report.claims import Answer, Verdict
 from harness.vocabulary.text import many
 
 Standing = Literal["ahead", "behind", "level", "open"]

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from harness.evaluation.intervals import UNKNOWN, Interval
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, axis_lines
+from harness.records.examples import StudyExample
 from harness.records.schema import Estimate
-from harness.report.clouds import StudyExample, examples_figure
+from harness.report.clouds import examples_figure
 from harness.report.study_page import (
     MOST_CURVES,
     axis_figure,
