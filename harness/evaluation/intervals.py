@@ -218,7 +218,7 @@ class Threshold:
     upper_per_m2: float
     """Bound on the true rate at one-sided ``confidence``."""
     confidence: float
-    """Of that bound."""
+    """Confidence of that bound."""
     runs: int
     """Number of hole-free runs that set the threshold."""
     calling_runs: int

@@ -48,9 +48,9 @@ class MapSetUp:
     conditions: str
     """The other axes' values as text."""
     is_variation: bool
-    """Whether it varies a fact of another set-up."""
+    """True if it varies a fact of another set-up."""
     reference: str
-    """That set-up, or "" for a set-up."""
+    """Name of that set-up, or "" for a set-up."""
 
 
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
@@ -213,9 +213,9 @@ class MapCase:
     merging."""
 
     tables: ResultTables
-    """Of the whole experiment."""
+    """Tables of the whole experiment."""
     summary: pd.DataFrame
-    """Of `harness.evaluation.summary.summarise_holes`."""
+    """Rows of `harness.evaluation.summary.summarise_holes`."""
     maps: Sequence[MapSetUp]
     """The set-ups and variations of the case."""
     conditions: str

@@ -44,7 +44,7 @@ class AhatFit:
     """Covariance (3, 3) of (b0, b1, tau) for independent targets; divided by ``per_target`` it is
     that for independent rows."""
     log_likelihood: float
-    """Of signals in their own unit."""
+    """Log-likelihood of signals in their own unit."""
     deviance: float
     """-2 times the log-likelihood."""
     x: np.ndarray
@@ -62,9 +62,9 @@ class AhatFit:
     per_target: float
     """Mean number of signals of a target, over rows."""
     log_size: bool
-    """Whether x is ln size."""
+    """True if x is ln size."""
     log_signal: bool
-    """Whether y is ln signal."""
+    """True if y is ln signal."""
     decision: float
     """Threshold of signals, in their own unit."""
     left: float | None
@@ -317,7 +317,7 @@ class CensoredFit(NamedTuple):
     covariance: np.ndarray
     """Inverse observed information (p + 1, p + 1) of (coefficients, tau)."""
     log_likelihood: float
-    """Of the values and the censored rows."""
+    """Log-likelihood of the values and the censored rows."""
 
 
 def fit_censored(
@@ -421,7 +421,7 @@ class Diagnostic(NamedTuple):
     """A test of one assumption."""
 
     assumption: str
-    """What is assumed."""
+    """The assumption that is tested."""
     test: str
     """Name of the test."""
     statistic: float

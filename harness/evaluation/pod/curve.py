@@ -99,7 +99,7 @@ class PodCurve:
     link: str
     """Name of F, one of `LINKS`."""
     log_size: bool
-    """Whether x is the logarithm of the size."""
+    """True if x is the logarithm of the size."""
     mu: float
     """Middle of the curve, in the unit of x."""
     sigma: float
@@ -127,11 +127,11 @@ class Bound:
     confidence: float
     """One-sided confidence."""
     method: str
-    """How the bound was computed, in words."""
+    """Method by which the bound was computed, in words."""
     value: float
     """The bound, in the unit of sizes; infinite if there is none."""
     why: str = ""
-    """Why there is none; else empty."""
+    """Reason why there is none; else empty."""
 
     @property
     def demonstrated(self) -> bool:

@@ -100,9 +100,9 @@ class FloorCeilingTest:
     """A test whether POD = floor + (ceiling - floor) F fits better."""
 
     beyond: Beyond
-    """Which of both are free."""
+    """The free parameters: floor, ceiling or both."""
     p_value: float
-    """From the mixture of chi-squares for a parameter on its boundary."""
+    """P-value from the mixture of chi-squares for a parameter on its boundary."""
     floor: float
     """Maximum likelihood estimate: POD of the smallest damage."""
     ceiling: float
@@ -110,7 +110,7 @@ class FloorCeilingTest:
 
     @property
     def needed(self) -> bool:
-        """Whether the model with two parameters is rejected at the 5 % level."""
+        """True if the model with two parameters is rejected at the 5 % level."""
         return self.p_value < 0.05
 
 

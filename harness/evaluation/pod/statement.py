@@ -60,9 +60,9 @@ class ModelRow:
     bound: Bound
     """Its a90/95."""
     chosen: bool
-    """Whether it is the curve that is stated."""
+    """True if it is the curve that is stated."""
     in_bound: bool
-    """Whether its bound is among those of which the statement's bound is the largest."""
+    """True if its bound is among those of which the statement's bound is the largest."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class PodStatement:
     unit: str
     """Unit of sizes; may be empty."""
     fits: tuple[HitMissFit, ...]
-    """For hits, the models whose largest bound and widest band are stated, that of the curve
-    first."""
+    """Models of hits whose largest bound and widest band are stated, that of the curve first;
+    empty for signals."""
     signal: AhatFit | None
     """The regression of signals; None for hits."""
     models: tuple[ModelRow, ...]

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChanceHits:
-    """How often a damage would be hit by a finding that has nothing to do with it."""
+    """Probability that a finding which has nothing to do with a damage hits it."""
 
     probability: float
-    """By shuffling: share of ``laid`` pairs with an unmatched finding near the damage."""
+    """Share of ``laid`` pairs with an unmatched finding near the damage, by shuffling."""
     laid: int
     """Number of pairs of a damage and another board's run."""
     expected: float
@@ -153,7 +153,7 @@ class PixelCurves:
     """Area under the curve up to `PRO_LIMIT`, divided by that. NaN if the counted thresholds do
     not reach so far and pixels of damage remain below them."""
     why: str
-    """Why ``pro`` is NaN; else empty."""
+    """Reason why ``pro`` is NaN; else empty."""
 
 
 def roc_curve(

@@ -45,7 +45,7 @@ WIDER = 1.1  # boards matter if the limit over boards exceeds a90/95 by more tha
 
 @dataclass(frozen=True, eq=False)
 class SetUpLimit:
-    """What the inspections of one set-up say about sizes, and the counts behind it.
+    """The detection limit of one set-up, and the counts behind it.
 
     If everything is found, the estimates are upper bounds: the smallest size inspected. If nothing
     is, or POD does not grow with size, they are NaN and their draws infinite."""
@@ -55,7 +55,7 @@ class SetUpLimit:
     statement: PodStatement | None
     """Curve, band and bounds from hits; None if no curve can be fitted."""
     why: str
-    """Why there is no curve; empty if there is one."""
+    """Reason why there is no curve; empty if there is one."""
     a90_95: Bound
     """The limit to quote, of diameters or depths in mm (`Inspected.limit_of`); infinite if not
     demonstrated."""
@@ -101,7 +101,7 @@ class SetUpLimit:
 
     @property
     def is_at_most(self) -> bool:
-        """Whether everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
+        """True if everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
         return self.statement is None and bool(np.isfinite(self.a90_mm))
 
     def beyond(self, size_mm: float) -> bool:

@@ -45,9 +45,9 @@ class Difference:
     interval: Interval
     """95 % interval over boards, without draws that are infinite for both."""
     paired: bool
-    """Whether both were judged on the same boards."""
+    """True if both were judged on the same boards."""
     beyond_chance: bool
-    """Whether the interval excludes 1."""
+    """True if the interval excludes 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class AxisLine:
     steps: tuple[Difference, ...]
     """The change from each value to the next."""
     numeric: bool
-    """Whether the values can be drawn to scale."""
+    """True if the values can be drawn to scale."""
 
 
 def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
@@ -464,7 +464,7 @@ class SetUpResult:
     surface: PodSurface | None
     """POD over diameter and depth; None if there is none."""
     surface_why: str
-    """Why there is no surface; else empty."""
+    """Reason why there is no surface; else empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -480,7 +480,7 @@ class StudyResult:
     axes: tuple[AxisLine, ...]
     """Lines along swept axes."""
     validity: tuple[Section, ...]
-    """What the limits hold for, in words."""
+    """Headings and sentences on what the limits hold for."""
     facts: Mapping[str, Any]
     """The resolved experiment as plain data."""
 
