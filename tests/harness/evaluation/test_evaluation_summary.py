@@ -11,7 +11,6 @@ from harness.evaluation.summary import (
     false_calls,
     found_holes,
     found_rule,
-    hole_list,
     summarise_holes,
 )
 from tests.support.synthetic_tables import World, joined, tables
@@ -133,20 +132,6 @@ def test_fits_of_a_hole_are_compared_with_the_truth() -> None:
 def test_axes_are_kept_beside_the_holes() -> None:
     holes = tables(World(repeats=4), frames=(50,)).holes.assign(distance=0.7)
     assert set(summarise_holes(holes, ["distance"])["distance"]) == {0.7}
-
-
-@pytest.mark.parametrize(
-    ("names", "text"),
-    [
-        (["4", "5", "6", "9"], "4–6, 9"),
-        (["11", "2", "1", "rim"], "1–2, 11, rim"),
-        ([], "none"),
-        (["b", "a"], "b, a"),
-        (["7"], "7"),
-    ],
-)
-def test_names_of_holes_as_runs_of_numbers(names: list[str], text: str) -> None:
-    assert hole_list(names) == text
 
 
 def test_holes_with_names_follow_those_with_numbers() -> None:
