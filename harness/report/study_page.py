@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.study.curves import PRO_LIMIT
-from harness.evaluation.study.limit import SetUpLimit, depth_varies
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.evaluation.study.surface import depth_varies
 from harness.records.schema import Table
 from harness.report.blocks import COLOURS, GREY, MARKERS, PALE, closing, joined, svg, template
 from harness.report.clouds import StudyExample, examples_figure

@@ -183,7 +183,7 @@ def peers_of_clusters(runs: int) -> None:
     from scipy.spatial import cKDTree
     from sklearn.cluster import DBSCAN
 
-    from detectors.findings.clusters import euclidean_clusters
+    from detectors.pixels.clusters import euclidean_clusters
 
     points = noisy_board(120_000).reshape(-1, 3)
     points = np.ascontiguousarray(points[np.random.default_rng(1).random(len(points)) < 0.02])

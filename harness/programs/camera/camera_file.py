@@ -27,8 +27,6 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import with_number
 from scenes.sensor.camera import (
     AnyCamera,
-    CameraConfig,
-    EffectsConfig,
     camera_names,
     camera_of,
     guessed_precision,
@@ -37,9 +35,10 @@ from scenes.sensor.camera import (
     numbers_of_lens,
     read_camera,
 )
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
+from scenes.sensor.common.unit import taps_of
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.unit import taps_of
 
 SEED = 1
 UNIT = CameraConfig(

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage, optimize, stats
 
 from detectors.averages.flat_captures import SMOOTH, Separated, flattened, separated
-from detectors.averages.noise import LEAST_FRAMES, rounding_left_m2
+from detectors.pixels.noise import LEAST_FRAMES, rounding_left_m2
 from detectors.recordings import Recording
 from detectors.surfaces.surface import fit_surface
 from harness.stills import statistics

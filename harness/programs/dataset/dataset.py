@@ -209,7 +209,9 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")
     write_text(
         out / "README.md",
-        template("dataset_card.md", Path(__file__).parent).render(about=about, inset=INSET_PX, title=camera_title),
+        template("dataset_card.md", Path(__file__).parent).render(
+            about=about, inset=INSET_PX, title=camera_title
+        ),
     )
     write_text(out / INDEX, json.dumps({**about, "samples": [*truths]}, indent=1) + "\n")
 

@@ -17,7 +17,7 @@ import pandas as pd
 from scipy import ndimage
 
 from detectors.averages.average import RECORDED, average
-from detectors.averages.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
 from harness.records.rows import Origin, TrialRecord

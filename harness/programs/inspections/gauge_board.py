@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from detectors.rigid_motion import kabsch
 from detectors.views.marks.find import find_marks
 from detectors.views.marks.mark import CodedMarks
-from detectors.views.marks.pairing import kabsch
 from harness.evaluation.match import match
 from harness.records.outputs import GAUGE_ROWS
 from harness.records.schema import Column, Table

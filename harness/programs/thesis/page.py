@@ -1,4 +1,4 @@
-"""What pages say about the thesis: the section of the posterior, and the lead of several views."""
+"""Parts of pages about the thesis: the section of the posterior, and the lead of several views."""
 
 from __future__ import annotations
 

@@ -37,7 +37,8 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view
 from scenes.optics import NoiseFreeView
 from scenes.perspectives import ArcViews, guessed_T_reference_view, poses_of
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.thesis import ThesisTargetConfig
 
