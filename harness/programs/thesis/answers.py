@@ -1,4 +1,4 @@
-"""The thesis' claims as the report asks for them: `harness.report.claims.CLAIM_SETS` names this set."""
+"""The thesis' claims as the report asks for them; `harness.report.claims` names this set."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from harness.evaluation.maps import MapCase
 from harness.evaluation.summary import MAIN
-from harness.programs.thesis.claims import claim_c11, score_claims
+from harness.programs.thesis.cameras import claim_c11
+from harness.programs.thesis.claims import score_claims
 from harness.programs.thesis.inference import borne_out_if, posterior_of
 from harness.programs.thesis.page import lead_of_views, posterior_section
 from harness.programs.thesis.views import score_views

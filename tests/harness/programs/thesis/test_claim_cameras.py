@@ -7,7 +7,7 @@ import pytest
 
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
-from harness.programs.thesis.claims import claim_c11
+from harness.programs.thesis.cameras import claim_c11
 from tests.support.synthetic_tables import World, cameras, joined, placed, set_up_name, tables
 
 UNIT = "source.camera.unit_seed"

@@ -16,7 +16,6 @@ from harness.evaluation.profile import hole_shape, hole_shapes
 from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     RULES,
-    Verdict,
     decide,
     falling_rank,
     scatter_ratio,
@@ -24,6 +23,7 @@ from harness.programs.thesis.claims import (
 )
 from harness.records.examples import ExampleCloud, HoleInView
 from harness.records.trials import CLAIMS
+from harness.report.claims import Verdict
 from tests.support.synthetic_tables import World, example, joined, tables
 
 
