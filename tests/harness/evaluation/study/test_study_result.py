@@ -89,7 +89,9 @@ class TestStudy:
             frames = one.limit.record.frames
             holes = tables.holes[tables.holes["frames"] == frames]
             assert one.limit.hits == holes["detected"].sum()
-            assert one.free_response.in_use[1] == pytest.approx(one.limit.hits / one.limit.inspections)
+            assert one.free_response.in_use[1] == pytest.approx(
+                one.limit.hits / one.limit.inspections
+            )
             sized = holes[holes["detected"] & holes["model_diameter_mm"].notna()]
             assert one.limit.sized == len(sized) < one.limit.hits
             error_mm = one.limit.size_error_mm
