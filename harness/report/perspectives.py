@@ -245,7 +245,7 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
 
 
 def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
-    """Draw the error of each registration by method, in the plane and across it, with the median."""
+    """Draw the error of each registration by method, in the plane and across it, and the median."""
     methods = list(dict.fromkeys(registrations["method"]))
     frames_text = " and ".join(many(n, "frame") for n in frames)
 

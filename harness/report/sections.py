@@ -75,7 +75,7 @@ CALLS_NOTE = (
 
 
 def rule_note(repeats: int, *sentences: str) -> Markup:
-    """Return the note below the answer: what counts as found, and what the intervals do not cover."""
+    """Return the note below the answer: what counts as found, and what intervals do not cover."""
     draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
     scope = (
         f"{draws} of the noise for the same board in the same place with one unit of each camera:"
@@ -319,7 +319,7 @@ def _diameter(row: Row, measure: str) -> str:
 
 
 def set_ups_grid(compared: pd.DataFrame, *, terminal: bool = False) -> Grid:
-    """Return the table of what each set-up finds with the least and the greatest number of frames."""
+    """Return the table of what each set-up finds with the fewest and the most frames."""
     frames = shown_frames(compared)
     rows = [row for row in records(compared) if row["frames"] in frames]
     return SET_UPS.grid(rows, terminal=terminal, only=SHOWN)

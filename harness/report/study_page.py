@@ -32,7 +32,7 @@ from harness.vocabulary.text import Grid, unbroken
 
 
 def study_parts(result: StudyResult) -> list[str | Grid]:
-    """Return the parts of a study for a terminal: warnings, limits, notes on them, and the answer."""
+    """Return the parts of a study for a terminal: warnings, limits, notes on them, the answer."""
     parts: list[str | Grid] = []
     parts += [f"warning: {text}" for text in study.threshold_warnings(result.limits)]
     parts.append(limits_grid(result.limits, terminal=True))

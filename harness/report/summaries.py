@@ -1,4 +1,4 @@
-"""Summaries of an experiment that is not a study, computed once for files, pages and the terminal."""
+"""Summaries of an experiment that is not a study, computed once for files, pages and terminal."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
