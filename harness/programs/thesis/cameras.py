@@ -21,6 +21,12 @@ CountsByPlace = dict[str, dict[str, HoleCount]]
 """The count of each camera (by name) at each place (as text)."""
 
 
+def score_cameras(summary: pd.DataFrame, axes: Sequence[str]) -> list[Verdict]:
+    """Return the verdict of `claim_c11`, if there is one."""
+    verdict = claim_c11(summary, axes)
+    return [] if verdict is None else [verdict]
+
+
 def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     """Return the verdict from summary rows of all set-ups and variations; None if none of the
     ``axes`` holds the three cameras."""

@@ -107,21 +107,19 @@ def certain(holds: bool, fails: bool) -> bool | None:
 
 @dataclass(frozen=True)
 class Case:
-    """What the rules use of one variant."""
+    """What the rules use of the main set-up."""
 
-    variant: str
-    """Name of the variant."""
     summary: pd.DataFrame
     """Its rows of `summarise_holes`."""
     units: pd.DataFrame
-    """The same rows, and those of the variations that change only the camera's unit."""
+    """The same rows, and those of variations that change only the camera's unit."""
     holes: pd.DataFrame
     """Its rows per trial and hole."""
     runs: pd.DataFrame
     """Its rows per trial."""
     probes: pd.DataFrame
     """Its rows of sample pixels."""
-    examples: Sequence[ExampleCloud] = ()
+    examples: Sequence[ExampleCloud]
     """Its averaged clouds."""
 
     def found_with_many(self) -> pd.DataFrame:
@@ -170,7 +168,7 @@ def _found(
 ) -> tuple[Answer, str]:
     """Judge whether the expected holes are found and the unexpected holes missed; return also the
     counts."""
-    status = found_holes(case.summary, case.variant, frames)
+    status = found_holes(case.summary, MAIN, frames)
     if not status:
         return "undecided", f"Not judged: no trial has {frames} frames."
     if set(status) != set(THESIS_HOLES):
@@ -376,7 +374,7 @@ def _c6(case: Case) -> tuple[Answer, str]:
 
 
 def _c9(case: Case) -> tuple[Answer, str]:
-    law = noise_law(case.probes, case.variant)
+    law = noise_law(case.probes, MAIN)
     if law is None:
         return "undecided", "Not judged: too few sample pixels or numbers of frames."
     steepest = -0.5 - SLOPE_MARGIN
@@ -410,13 +408,14 @@ RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
 
 def score_claims(
     tables: ResultTables,
-    variant: str = MAIN,
     examples: Sequence[ExampleCloud] = (),
     summary: pd.DataFrame | None = None,
 ) -> list[Verdict]:
-    """Return a verdict for each of `RULES` on a variant. ``summary`` is the result of
+    """Return a verdict for each of `RULES` on the main set-up. ``summary`` is the result of
     `summarise_holes`, if it exists."""
-    case = _case_of(tables, variant, examples, summary)
+    if summary is None:
+        summary = summarise_holes(tables.holes)
+    case = _case_of(tables, examples, summary)
     verdicts = []
     for claim, rule in RULES.items():
         answer, evidence = rule(case)
@@ -424,24 +423,16 @@ def score_claims(
     return verdicts
 
 
-def _case_of(
-    tables: ResultTables,
-    variant: str,
-    examples: Sequence[ExampleCloud],
-    summary: pd.DataFrame | None,
-) -> Case:
-    if summary is None:
-        summary = summarise_holes(tables.holes)
+def _case_of(tables: ResultTables, examples: Sequence[ExampleCloud], summary: pd.DataFrame) -> Case:
     holes = with_columns(tables.holes)
     other_units = tables.variants["variant"][tables.variants["settings"].map(_changes_only_unit)]
     return Case(
-        variant=variant,
-        summary=summary[summary["variant"] == variant],
-        units=summary[summary["variant"].isin({variant, *other_units})],
-        holes=holes[holes["variant"] == variant],
-        runs=tables.runs[tables.runs["variant"] == variant],
-        probes=tables.probes[tables.probes["variant"] == variant],
-        examples=[example for example in examples if example.variant == variant],
+        summary=summary[summary["variant"] == MAIN],
+        units=summary[summary["variant"].isin({MAIN, *other_units})],
+        holes=holes[holes["variant"] == MAIN],
+        runs=tables.runs[tables.runs["variant"] == MAIN],
+        probes=tables.probes[tables.probes["variant"] == MAIN],
+        examples=[example for example in examples if example.variant == MAIN],
     )
 
 
