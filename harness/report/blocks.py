@@ -199,9 +199,9 @@ def _failures(failures: Iterable[Mapping[str, str]]) -> list[Markup]:
 
 def _origin(provenance: Mapping[str, Any]) -> Markup:
     """Return the table of all keys that have no section of their own."""
-    further = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
+    remaining_keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
     lines = []
-    for key in (*SHOWN_FIRST, *further):
+    for key in (*SHOWN_FIRST, *remaining_keys):
         name = key.replace("_mm", " (mm)").replace("_", " ")
         value = plain(provenance.get(key, "not recorded"))
         lines.append(tag("tr", tag("th", name, scope="row"), tag("td", value)))

@@ -193,11 +193,21 @@ def residual_norm(residual_mm: np.ndarray) -> SymLogNorm:
     limit_mm = LEAST_MM
     if finite_mm.size:
         limit_mm = max(LEAST_MM, float(np.quantile(finite_mm, 0.9995)))
-    return SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit_mm, vmax=limit_mm, base=10)
+    return SymLogNorm(
+        linthresh=1,
+        linscale=1.2,
+        vmin=-limit_mm,
+        vmax=limit_mm,
+        base=10,
+    )
 
 
 def _image(
-    axes: Axes, residual_mm: np.ndarray, detected: np.ndarray, norm: SymLogNorm, dot: float = 1.1
+    axes: Axes,
+    residual_mm: np.ndarray,
+    detected: np.ndarray,
+    norm: SymLogNorm,
+    dot: float = 1.1,
 ) -> AxesImage:
     """Draw residuals (h, w) with a dot of ``dot`` points on each pixel of a finding."""
     axes.set_facecolor(NOTHING)

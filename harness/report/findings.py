@@ -296,7 +296,14 @@ def _draw_residual(axes: Axes, cloud: Cloud, residual_mm: np.ndarray) -> ScalarM
     judged = np.isfinite(residual_mm)
     x_mm = cloud.points_m[..., 0][judged] / MM
     y_mm = cloud.points_m[..., 1][judged] / MM
-    return axes.scatter(x_mm, y_mm, c=residual_mm[judged], s=2, linewidths=0, **style)
+    return axes.scatter(
+        x_mm,
+        y_mm,
+        c=residual_mm[judged],
+        s=2,
+        linewidths=0,
+        **style,
+    )
 
 
 def save_blind_map(
@@ -331,7 +338,11 @@ def save_blind_map(
 
 
 def save_targets(
-    path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int
+    path: Path,
+    grid: Cloud,
+    outlines: Sequence[np.ndarray],
+    texts: Sequence[str],
+    taken: int,
 ) -> None:
     """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and
     numbers from 1."""
@@ -356,7 +367,11 @@ def save_targets(
 
 
 def _draw_outline(
-    axes: Axes, outline: np.ndarray, number: str, colour: str, line_width: float
+    axes: Axes,
+    outline: np.ndarray,
+    number: str,
+    colour: str,
+    line_width: float,
 ) -> None:
     """Draw the edge of an outline (h, w) bool, and its number at the pixel that is farthest from
     the edge."""
@@ -439,7 +454,12 @@ def _frame(axes: Axes, cloud: Cloud, box: Box) -> None:
         axes.set(xlabel=f"u, {unit}", ylabel=f"v, {unit}")
     else:
         axes.set(xlabel="x, mm", ylabel="y, mm")
-    axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", autoscale_on=False)
+    axes.set(
+        xlim=box[:2],
+        ylim=box[2:],
+        aspect="equal",
+        autoscale_on=False,
+    )
 
 
 def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None:
@@ -460,7 +480,12 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
     axes.add_patch(Circle((u_centre, v_centre), radius, fill=False, color=TAKEN, linewidth=0.9))
     style: dict[str, Any] = {
         "textcoords": "offset points",
-        "bbox": {"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.4},
+        "bbox": {
+            "facecolor": "white",
+            "edgecolor": "none",
+            "alpha": 0.6,
+            "pad": 0.4,
+        },
         "fontsize": 7,
         "annotation_clip": True,
     }

@@ -40,11 +40,11 @@ def write_report(
     experiment_yaml_text: str,
     title: str,
     facts: Mapping[str, Any] | None = None,
-    found: Summaries | None = None,
+    computed: Summaries | None = None,
 ) -> Path:
     """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups,
     or of maps, with a page for each map of ``examples`` beside it. `harness.report.blocks.closing`
-    describes ``provenance``; ``facts`` is the resolved experiment as plain data, ``found`` the
+    describes ``provenance``; ``facts`` is the resolved experiment as plain data, ``computed`` the
     result of `summaries`. Claims are judged for a target that has some. The same input gives the
     same bytes. Raises UserError if the folder cannot be written."""
     facts = facts or {}
@@ -58,11 +58,11 @@ def write_report(
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
     if len(tables.registrations):
-        text = perspectives_html(tables, maps, about, found)
+        text = perspectives_html(tables, maps, about, computed)
     elif len(set_ups_of(tables)) > 1:
-        text = set_ups_html(tables, clouds, about, found)
+        text = set_ups_html(tables, clouds, about, computed)
     else:
-        text = report_html(tables, clouds, about, found)
+        text = report_html(tables, clouds, about, computed)
     for name, example in map_files(maps).items():
         write_view3d(Path(folder) / name, example.scene, map_text(example))
     path = Path(folder) / REPORT.name
@@ -74,14 +74,14 @@ def report_html(
     tables: ResultTables,
     examples: Sequence[ExampleCloud],
     about: sections.About,
-    found: Summaries | None = None,
+    computed: Summaries | None = None,
 ) -> str:
     """Return the page of an experiment with one set-up as text; see `write_report`."""
-    found = found or summaries(tables, examples, about.claim_set)
-    main = _of_main(found[SUMMARY])
-    noise = _of_main(found[NOISE_BY_FRAMES])
-    calls = _of_main(found[FALSE_CALLS])
-    verdicts = verdicts_of(found)
+    computed = computed or summaries(tables, examples, about.claim_set)
+    main = _of_main(computed[SUMMARY])
+    noise = _of_main(computed[NOISE_BY_FRAMES])
+    calls = _of_main(computed[FALSE_CALLS])
+    verdicts = verdicts_of(computed)
     frames = sorted(int(n) for n in main["frames"].unique())
     clouds = [example for example in examples if example.variant == MAIN]
     clouds.sort(key=lambda cloud: cloud.frames)
@@ -105,7 +105,7 @@ def report_html(
         sizes=SUMMARY.grid(sections.records(with_most)).html(),
         noise=NOISE_BY_FRAMES.grid(sections.records(noise)).html(),
         claims=sections.claims_section(about.claim_set.title if about.claim_set else "", verdicts),
-        varied=sections.varied_section(tables, found[SET_UPS], ends, original=MAIN),
+        varied=sections.varied_section(tables, computed[SET_UPS], ends, original=MAIN),
         calls=FALSE_CALLS.grid(sections.records(calls), heads={"set-up": ""}).html(),
     )
 
@@ -120,24 +120,24 @@ def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str
     if main.empty:
         return "No trial of the main experiment finished, so there is no answer."
     frames = sorted(int(n) for n in main["frames"].unique())
-    most = frames[-1]
-    fewest = frames[0]
-    answer = f"With {averaged_text(most)} the camera finds {_found_text(main, most)}"
-    if fewest != most:
-        answer += f"; with {averaged_text(fewest)} {_found_text(main, fewest)}"
+    most_frames = frames[-1]
+    fewest_frames = frames[0]
+    answer = f"With {averaged_text(most_frames)} the camera finds {_found_text(main, most_frames)}"
+    if fewest_frames != most_frames:
+        answer += f"; with {averaged_text(fewest_frames)} {_found_text(main, fewest_frames)}"
     return f"{answer}.{sections.counted_verdicts(verdicts)}"
 
 
 def _found_text(main: pd.DataFrame, frames: int) -> str:
     """Return ``8 of 11 holes (no. 4-11; the smallest is 6.35 mm, 1/4 in)``."""
     status = found_holes(main, MAIN, frames)
-    found = [hole for hole, state in status.items() if state == "found"]
+    detected = [hole for hole, state in status.items() if state == "found"]
     undecided = [hole for hole, state in status.items() if state == "undecided"]
-    text = f"{len(found)} of {len(status)} holes"
-    if found:
-        smallest_mm = float(main["true_diameter_mm"][main["hole"].isin(found)].min())
+    text = f"{len(detected)} of {len(status)} holes"
+    if detected:
+        smallest_mm = float(main["true_diameter_mm"][main["hole"].isin(detected)].min())
         drill = f", {inches(smallest_mm)}" if inches(smallest_mm) else ""
-        text += f" (no. {hole_list(found)}; the smallest is {smallest_mm:.2f} mm{drill})"
+        text += f" (no. {hole_list(detected)}; the smallest is {smallest_mm:.2f} mm{drill})"
     if undecided:
         text += f", with {hole_list(undecided)} undecided"
     return text
@@ -156,7 +156,12 @@ def rates_figure(main: pd.DataFrame) -> str:
             low = by_size["rate_low"]
             high = by_size["rate_high"]
             label = many(int(str(frames)), "frame")
-            style: dict[str, Any] = {"marker": marker, "ms": 4, "color": colour, "label": label}
+            style: dict[str, Any] = {
+                "marker": marker,
+                "ms": 4,
+                "color": colour,
+                "label": label,
+            }
             axes.fill_between(diameter_mm, low, high, color=colour, alpha=0.1, lw=0)
             axes.plot(diameter_mm, by_size["rate"], **style)
         axes.axhline(0.5, color=blocks.GREY, lw=0.8, ls=":")
@@ -205,7 +210,15 @@ def _draw_errors(axes: Axes, noise: pd.DataFrame) -> None:
         ("total_rms_mm", blocks.INK, "D", "total error, rms"),
     ):
         errors_mm = noise[column].where(noise[column] > 0)
-        axes.plot(frames, errors_mm, marker=marker, ms=5, lw=1.4, color=colour, label=label)
+        axes.plot(
+            frames,
+            errors_mm,
+            marker=marker,
+            ms=5,
+            lw=1.4,
+            color=colour,
+            label=label,
+        )
     floor_mm = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
     if floor_mm > 0:
         style: dict[str, Any] = {"lw": 0.8, "ls": (0, (6, 3))}

@@ -48,13 +48,13 @@ def perspectives_html(
     tables: ResultTables,
     examples: Sequence[MappedExample],
     about: sections.About,
-    found: Summaries | None = None,
+    computed: Summaries | None = None,
 ) -> str:
     """Return the page as text; see `harness.report.page.write_report`."""
-    found = found or summaries(tables, claim_set=about.claim_set)
-    compared = found[SET_UPS]
-    verdicts = verdicts_of(found)
-    cases = maps.map_cases(tables, found[SUMMARY])
+    computed = computed or summaries(tables, claim_set=about.claim_set)
+    compared = computed[SET_UPS]
+    verdicts = verdicts_of(computed)
+    cases = maps.map_cases(tables, computed[SUMMARY])
     set_ups = compared[~compared["is_variation"]] if len(compared) else compared
     registrations = of_set_ups(tables.registrations, tables)
     frames = sections.shown_frames(set_ups)
@@ -80,7 +80,7 @@ def perspectives_html(
         rule=sections.rule_note(repeats, rule),
         claims=sections.claims_section(claims_title, verdicts),
         ways=sections.ways_grid(compared).html(),
-        errors=_by_frames(REGISTRATION_ERRORS, found[REGISTRATION_ERRORS], frames_falling),
+        errors=_by_frames(REGISTRATION_ERRORS, computed[REGISTRATION_ERRORS], frames_falling),
         maps=[(name, map_text(example)) for name, example in map_files(examples).items()],
         each=_by_frames(SET_UPS, set_ups, frames_falling, MAPS_SHOWN),
         varied=sections.varied_section(tables, compared),
@@ -137,8 +137,8 @@ def _case_sentence(case: maps.MapCase) -> str:
             candidates.append((set_up, case.status(mapped)))
     if candidates:
         best, status = min(candidates, key=lambda pair: (-pair[0].views, -_found(pair[1])))
-        way = maps.label_of(method_text(best.registration), best.merge)
-        text += f", {best.views} views ({way}) {_found(status)}{_undecided(status)}"
+        method = maps.label_of(method_text(best.registration), best.merge)
+        text += f", {best.views} views ({method}) {_found(status)}{_undecided(status)}"
     return f"With {maps.frames_text(single.frames)} {text}."
 
 
@@ -186,9 +186,9 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
 def map_text(example: MappedExample) -> str:
     """Describe one map in words."""
     variation = f": {example.variant}" if example.is_variation else ""
-    way = maps.label_of(method_text(example.registration), example.merge)
+    method = maps.label_of(method_text(example.registration), example.merge)
     views = many(example.views, "view")
-    return f"{views} ({way}), {maps.frames_text(example.frames)}{variation}"
+    return f"{views} ({method}), {maps.frames_text(example.frames)}{variation}"
 
 
 def method_text(method: str) -> str:
@@ -235,8 +235,10 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
                 color=blocks.COLOURS[number % len(blocks.COLOURS)],
                 label=maps.label_of(method_text(registration), merge),
             )
-        most = max(row["holes"] for row in rows)
-        axes.set(xlabel="views", ylabel=f"holes found, of {most}", ylim=(-0.3, most + 0.3))
+        all_holes = max(row["holes"] for row in rows)
+        axes.set(
+            xlabel="views", ylabel=f"holes found, of {all_holes}", ylim=(-0.3, all_holes + 0.3)
+        )
         axes.set_xticks(sorted({row["views"] for row in rows}))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
@@ -279,7 +281,13 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
     return blocks.svg("tre", (10, 4.4), alt, draw)
 
 
-def _draw_method(axes: Axes, rows: pd.DataFrame, column: str, x: float, colour: str) -> None:
+def _draw_method(
+    axes: Axes,
+    rows: pd.DataFrame,
+    column: str,
+    x: float,
+    colour: str,
+) -> None:
     """Draw the errors in a column around ``x``: a dot for each registration, a cross where it
     failed, and the median."""
     trusted = maps.trusted(rows)
@@ -292,7 +300,12 @@ def _draw_method(axes: Axes, rows: pd.DataFrame, column: str, x: float, colour: 
 
 
 def _draw_points(
-    axes: Axes, errors: pd.Series, x: float, marker: str, size: float, colour: str
+    axes: Axes,
+    errors: pd.Series,
+    x: float,
+    marker: str,
+    size: float,
+    colour: str,
 ) -> None:
     """Draw positive errors, spread evenly by rank, so that the picture is reproducible."""
     errors_mm = errors.to_numpy(float)

@@ -87,8 +87,8 @@ def _choice_note(statement: PodStatement) -> str:
 
 def _tests_grid(statement: PodStatement) -> Grid:
     rows = []
-    for what, p, meaning in statement.tests:
-        rows.append((what, "< 0.001" if p < 0.001 else f"{p:.3f}", meaning))
+    for test, p, meaning in statement.tests:
+        rows.append((test, "< 0.001" if p < 0.001 else f"{p:.3f}", meaning))
     return Grid.of(("test", "p", "reads"), rows, left=3)
 
 
@@ -107,7 +107,7 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
     ]
     if statement.tests:
         parts.append("")
-        parts += [f"{what}: p = {p:.3g}, {meaning}" for what, p, meaning in statement.tests]
+        parts += [f"{test}: p = {p:.3g}, {meaning}" for test, p, meaning in statement.tests]
     if statement.notes:
         parts.append("")
         parts += [f"note: {line}" for line in statement.notes]
@@ -245,7 +245,12 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
         for axes in panels:
             axes.set_xlim(statement.sizes[0], statement.sizes[-1])
             axes.set_xlabel(axis_text(statement.read.size_column, statement.unit))
-            axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=2, borderaxespad=0)
+            axes.legend(
+                loc="upper left",
+                bbox_to_anchor=(0, -0.16),
+                ncols=2,
+                borderaxespad=0,
+            )
 
     return ((11.0, 4.8) if statement.signal else (8.6, 5.2)), draw
 
@@ -256,7 +261,14 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
     lower, upper = statement.band
     band = f"{_confidence(statement.bound)} band, {statement.bound.method}"
     axes.fill_between(sizes, lower, upper, color=BLUE, alpha=0.16, lw=0)
-    axes.plot(sizes, lower, color=BLUE, lw=0.9, ls="--", label=band)
+    axes.plot(
+        sizes,
+        lower,
+        color=BLUE,
+        lw=0.9,
+        ls="--",
+        label=band,
+    )
     axes.plot(sizes, upper, color=BLUE, lw=0.9, ls="--")
     pod = statement.curve.pod(sizes)
     axes.plot(sizes, pod, color=BLUE, lw=2.0, label=f"POD, {statement.model}")
@@ -277,7 +289,12 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
 
 
 def _draw_size(
-    axes: Axes, sizes: np.ndarray, size: float, pod: float, colour: str, label: str
+    axes: Axes,
+    sizes: np.ndarray,
+    size: float,
+    pod: float,
+    colour: str,
+    label: str,
 ) -> None:
     """Draw a size with its plumb line; one outside ``sizes`` stands in the legend alone."""
     x: list[float] = []
@@ -286,7 +303,13 @@ def _draw_size(
         axes.plot([size, size], [0, pod], color=colour, lw=1.1)
         x.append(size)
         y.append(pod)
-    style: dict[str, Any] = {"color": colour, "ms": 6, "mec": "white", "mew": 0.8, "zorder": 5}
+    style: dict[str, Any] = {
+        "color": colour,
+        "ms": 6,
+        "mec": "white",
+        "mew": 0.8,
+        "zorder": 5,
+    }
     axes.plot(x, y, "o", label=plain(label), **style)
 
 

@@ -269,13 +269,13 @@ TONES: dict[Any, Tone] = {"found": "key", "missed": "bad", "undecided": "open"}
 SHOWN = ("set-up", "frames", "found", "from (mm)", "50 % size (mm)")
 
 
-def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
+def final_tables(tables: ResultTables, computed: Summaries) -> list[str | Grid]:
     """Return what a terminal shows at the end, which depends on the kind of experiment."""
     if not tables.registrations.empty:
-        return [ways_grid(found[SET_UPS])]
+        return [ways_grid(computed[SET_UPS])]
     if len(set_ups_of(tables)) > 1:
-        return [set_ups_grid(of_set_ups(found[SET_UPS], tables), terminal=True)]
-    return [holes_grid(found[SUMMARY], terminal=True)]
+        return [set_ups_grid(of_set_ups(computed[SET_UPS], tables), terminal=True)]
+    return [holes_grid(computed[SUMMARY], terminal=True)]
 
 
 def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
@@ -335,11 +335,11 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
     rows_of_way: dict[str, dict[tuple[int, int], Row]] = {}
     for row in rows:
         conditions = row["conditions"] if has_conditions else ""
-        way = label_of(row["registration"], row["merge"], conditions)
-        rows_of_way.setdefault(way, {})[row["views"], row["frames"]] = row
+        method = label_of(row["registration"], row["merge"], conditions)
+        rows_of_way.setdefault(method, {})[row["views"], row["frames"]] = row
     cells = []
-    for way, by_count in rows_of_way.items():
-        line = [way]
+    for method, by_count in rows_of_way.items():
+        line = [method]
         for views in counts:
             line.append(" / ".join(_holes_found(by_count.get((views, n))) for n in frames))
         cells.append(line)

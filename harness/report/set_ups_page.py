@@ -48,13 +48,13 @@ def set_ups_html(
     tables: ResultTables,
     examples: Sequence[ExampleCloud],
     about: sections.About,
-    found: Summaries | None = None,
+    computed: Summaries | None = None,
 ) -> str:
     """Return the page of several set-ups as text; see `harness.report.page.write_report`."""
-    found = found or summaries(tables, examples, about.claim_set)
-    compared = of_set_ups(found[SET_UPS], tables)
-    costs = found[trials.EFFECTS]
-    verdicts = verdicts_of(found)
+    computed = computed or summaries(tables, examples, about.claim_set)
+    compared = of_set_ups(computed[SET_UPS], tables)
+    costs = computed[trials.EFFECTS]
+    verdicts = verdicts_of(computed)
     layout = Layout.of(tables)
     frames = sections.shown_frames(compared)
     figures: dict[str, str] = {}
@@ -67,12 +67,12 @@ def set_ups_html(
     claims_title = ""
     if about.claim_set is not None:
         claims_title = about.claim_set.title_of_set_ups
-        posterior = found.get(trials.POSTERIOR)
+        posterior = computed.get(trials.POSTERIOR)
         if posterior is not None:
             answer = about.claim_set.posterior_answer(posterior)
             posterior_section = blocks.joined(about.claim_set.posterior_section(posterior))
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
-    calls = of_set_ups(found[FALSE_CALLS], tables)
+    calls = of_set_ups(computed[FALSE_CALLS], tables)
     calls = calls[(calls["role"] == "damaged") & calls["frames"].isin(frames)]
     repeats = int(compared["repeats"].max()) if len(compared) else 0
     own_threshold = "Each set-up has its own hole-free runs and threshold."
@@ -90,7 +90,7 @@ def set_ups_html(
         errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
         cameras=SET_UPS.grid(shown, only=CAMERA).html(),
         claims=sections.claims_section(claims_title, verdicts),
-        varied=sections.varied_section(tables, found[SET_UPS], frames),
+        varied=sections.varied_section(tables, computed[SET_UPS], frames),
         calls=FALSE_CALLS.grid(sections.records(calls)).html(),
     )
 
@@ -110,8 +110,8 @@ def set_ups_answer(
     frames = sections.shown_frames(compared)
     if len(costs):
         sentences = [
-            _loss_sentence(place, count, by_effect)
-            for (place, count), by_effect in costs_by_place(costs).items()
+            _loss_sentence(conditions, count, by_effect)
+            for (conditions, count), by_effect in costs_by_place(costs).items()
             if count in frames and ("all", "nothing") in by_effect
         ]
     else:
@@ -269,9 +269,9 @@ def cost_text(cost: sections.Row) -> str:
     return f"{loss_mm:+.2f} mm ({low} to {high}{bound})".replace("-", "−")
 
 
-def _loss_sentence(place: str, frames: int, by_effect: CostsOfEffects) -> str:
+def _loss_sentence(conditions: str, frames: int, by_effect: CostsOfEffects) -> str:
     """State the loss due to all effects together, and the effect with the largest loss alone."""
-    conditions = f"{place}, " if place else ""
+    beginning = f"{conditions}, " if conditions else ""
     together = cost_text(by_effect["all", "nothing"])
     single = [
         row
@@ -283,7 +283,7 @@ def _loss_sentence(place: str, frames: int, by_effect: CostsOfEffects) -> str:
         row = max(single, key=lambda row: np.nan_to_num(row["loss_mm"], nan=-np.inf))
         largest = f"; the largest single effect is {row['effect']}: {cost_text(row)}"
     return (
-        f"With {conditions}{averaged_text(frames)}, all effects together change the 50 % size by"
+        f"With {beginning}{averaged_text(frames)}, all effects together change the 50 % size by"
         f" {together}{largest}."
     )
 
@@ -292,8 +292,8 @@ def _costs_grid(costs: pd.DataFrame) -> Grid:
     """Return the table of effects (down) at each place, alone and on top of all others (across)."""
     by_place = costs_by_place(costs)
     heads = ["effect"]
-    for place, frames in by_place:
-        name = ", ".join(part for part in (place, many(frames, "frame")) if part)
+    for conditions, frames in by_place:
+        name = ", ".join(part for part in (conditions, many(frames, "frame")) if part)
         heads += [f"{name}: alone", f"{name}: on top of all others"]
     rows = []
     for effect in dict.fromkeys(costs["effect"]):
@@ -314,12 +314,11 @@ def effects_figure(costs: pd.DataFrame) -> str:
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(by_place), squeeze=False, sharex=True, sharey=True)[0]
-        for axes, (place, by_effect) in zip(panels, by_place.items(), strict=True):
+        for axes, ((_, frames), by_effect) in zip(panels, by_place.items(), strict=True):
             alone = list(_bars(effects, by_effect, "nothing", -0.2))
             on_top = list(_bars(effects, by_effect, "all others", 0.2))
             _draw_losses(axes, alone, blocks.BLUE, "alone")
             _draw_losses(axes, on_top, blocks.ORANGE, "on top of all the others")
-            _, frames = place
             axes.set(title=many(frames, "frame"), xlabel="loss of the 50 % size (mm)")
             axes.axvline(0, color=blocks.GREY, lw=1)
             axes.grid(axis="y", visible=False)
@@ -339,8 +338,8 @@ def _bars(
     effects: Sequence[str], by_effect: CostsOfEffects, against: str, shift: float
 ) -> Iterator[tuple[float, sections.Row]]:
     """Yield the position and the row of each bar."""
-    for (effect, on), row in by_effect.items():
-        if on == against:
+    for (effect, background), row in by_effect.items():
+        if background == against:
             yield effects.index(effect) + shift, row
 
 
@@ -352,7 +351,12 @@ def _draw_losses(
     losses_mm = np.array([np.nan_to_num(row["loss_mm"], posinf=0.0, neginf=0.0) for _, row in bars])
     ends_mm = np.array([[row["loss_low_mm"], row["loss_high_mm"]] for _, row in bars])
     ends_mm = np.where(np.isfinite(ends_mm), ends_mm, losses_mm[:, None])
-    style: dict[str, Any] = {"color": colour, "label": label, "ecolor": blocks.INK, "capsize": 2}
+    style: dict[str, Any] = {
+        "color": colour,
+        "label": label,
+        "ecolor": blocks.INK,
+        "capsize": 2,
+    }
     errors_mm = np.abs(ends_mm - losses_mm[:, None]).T
     axes.barh(positions, losses_mm, 0.36, xerr=errors_mm, **style)
     for position, row in bars:

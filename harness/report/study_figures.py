@@ -95,7 +95,15 @@ def _draw_curve(axes: Axes, limit: SetUpLimit, colour: str, line: str) -> None:
         axes.fill_between(sizes_mm, lower, upper, color=colour, alpha=0.1, lw=0)
         axes.plot(sizes_mm, limit.statement.curve.pod(sizes_mm), line, color=colour, label=name)
     if is_within_sizes(limit):
-        axes.plot(limit.a90_95.value, 0.9, "o", color=colour, ms=6, mec="white", zorder=5)
+        axes.plot(
+            limit.a90_95.value,
+            0.9,
+            "o",
+            color=colour,
+            ms=6,
+            mec="white",
+            zorder=5,
+        )
 
 
 def _draw_inspections(axes: Axes, limit: SetUpLimit, number: int, colour: str) -> None:
@@ -209,7 +217,16 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
 def _draw_roc(axes: Axes, roc: Roc, colour: str) -> None:
     axes.plot(roc.false, roc.true, color=colour, lw=1.5, label=f"{roc.area:.3f}")
     false, true = roc.in_use
-    axes.plot(false, true, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
+    axes.plot(
+        false,
+        true,
+        "o",
+        color=colour,
+        ms=5.5,
+        mec="white",
+        mew=0.8,
+        zorder=5,
+    )
 
 
 def _draw_free_response(axes: Axes, curve: FreeResponse, colour: str, name: str) -> None:
@@ -220,7 +237,13 @@ def _draw_free_response(axes: Axes, curve: FreeResponse, colour: str, name: str)
     axes.fill_between(calls, curve.found_low, curve.found_high, color=colour, alpha=0.13, lw=0)
     axes.plot(calls, curve.found_share, color=colour, lw=1.6, label=name)
     calls_in_use, found_in_use = curve.in_use
-    style: dict[str, Any] = {"color": colour, "ms": 6.5, "mec": "white", "mew": 0.9, "zorder": 5}
+    style: dict[str, Any] = {
+        "color": colour,
+        "ms": 6.5,
+        "mec": "white",
+        "mew": 0.9,
+        "zorder": 5,
+    }
     axes.plot(max(calls_in_use, least), found_in_use, "o", **style)
 
 
@@ -300,12 +323,34 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
                 "fmt": MARKERS[number],
             }
             is_any_beyond |= _draw_line(axes, x, line.limits, top_mm, style)
-        axes.plot([], [], "_", color=GREY, ms=11, mew=2.2, label="a90/95")
+        axes.plot(
+            [],
+            [],
+            "_",
+            color=GREY,
+            ms=11,
+            mew=2.2,
+            label="a90/95",
+        )
         if is_any_beyond:
             words = "continues beyond the axis"
-            axes.plot([], [], marker="^", ls="none", color=GREY, ms=6, label=words)
+            axes.plot(
+                [],
+                [],
+                marker="^",
+                ls="none",
+                color=GREY,
+                ms=6,
+                label=words,
+            )
         if np.isfinite(top_mm):
-            axes.axhline(top_mm / ROOM, color=GREY, lw=1.0, ls=":", label="largest size inspected")
+            axes.axhline(
+                top_mm / ROOM,
+                color=GREY,
+                lw=1.0,
+                ls=":",
+                label="largest size inspected",
+            )
         _name_missing(axes, axis, scale, dict(shown))
         if scale.is_logarithmic:
             axes.set_xscale("log")
@@ -330,7 +375,11 @@ def _scale_of(axis: study.AxisGroup) -> AxisScale:
 
 
 def _draw_line(
-    axes: Axes, x: np.ndarray, limits: Sequence[SetUpLimit], top_mm: float, style: dict[str, Any]
+    axes: Axes,
+    x: np.ndarray,
+    limits: Sequence[SetUpLimit],
+    top_mm: float,
+    style: dict[str, Any],
 ) -> bool:
     """Draw a line of limits at ``x`` (n,); return whether a size lies beyond ``top_mm``."""
     a90_mm = np.array([limit.a90_mm for limit in limits])
@@ -340,7 +389,15 @@ def _draw_line(
     inside_mm = np.where(a90_mm <= top_mm, a90_mm, np.nan)
     ends_mm = [inside_mm - low_mm, np.minimum(high_mm, top_mm) - inside_mm]
     errors_mm = np.nan_to_num(np.clip(ends_mm, 0, None))
-    axes.errorbar(x, inside_mm, errors_mm, lw=1.2, ms=5.5, capsize=3, **style)
+    axes.errorbar(
+        x,
+        inside_mm,
+        errors_mm,
+        lw=1.2,
+        ms=5.5,
+        capsize=3,
+        **style,
+    )
     is_bound_inside = bound_mm <= top_mm
     dash: dict[str, Any] = {"color": style["color"], "ms": 13, "mew": 2.4}
     axes.plot(x[is_bound_inside], bound_mm[is_bound_inside], "_", **dash)
@@ -359,10 +416,15 @@ def _name_missing(
         missing = 0
         for line in shown.values():
             pairs = zip(line.values, line.limits, strict=True)
-            missing += sum(at == value and not is_within_sizes(limit) for at, limit in pairs)
+            missing += sum(x == value and not is_within_sizes(limit) for x, limit in pairs)
         if missing:
             words = "no limit" if len(shown) == 1 else f"no limit\n({missing})"
-            style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 8, "color": GREY}
+            style: dict[str, Any] = {
+                "ha": "center",
+                "va": "bottom",
+                "fontsize": 8,
+                "color": GREY,
+            }
             axes.text(position, 1.02, words, transform=axes.get_xaxis_transform(), **style)
 
 

@@ -49,7 +49,10 @@ def view3d_html(scene: Scene3d, title: str) -> str:
     present = {circle.kind for circle in scene.circles}
     kinds = [(kind, words, colour) for kind, (words, colour) in KINDS.items() if kind in present]
     return template("view3d.html").render(
-        title=title, facts=scene.facts, data=packed(scene), kinds=kinds
+        title=title,
+        facts=scene.facts,
+        data=packed(scene),
+        kinds=kinds,
     )
 
 
@@ -133,9 +136,9 @@ def _shown(scene: Scene3d) -> np.ndarray:
     if scene.detected is not None:
         is_finding = scene.detected[finite]
     findings = finite[is_finding][:MOST_POINTS]
-    others = finite[~is_finding]
-    shuffled = np.random.default_rng(0).permutation(len(others))
-    sample = others[shuffled[: MOST_POINTS - len(findings)]]
+    unmarked = finite[~is_finding]
+    shuffled = np.random.default_rng(0).permutation(len(unmarked))
+    sample = unmarked[shuffled[: MOST_POINTS - len(findings)]]
     return np.sort(np.concatenate([findings, sample]))
 
 

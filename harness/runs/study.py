@@ -216,7 +216,7 @@ def _write_report(
     found = summaries(tables, outcome.examples, claim_set_of(facts))
     write_tables(folder, as_files(found), provenance)
     about = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
-    write_report(folder, tables, outcome.examples, *about, found=found)
+    write_report(folder, tables, outcome.examples, *about, computed=found)
     return final_tables(tables, found)
 
 

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 STORED = "atlas.parquet"
 """The table of limits that comes with tofpod, in baselines."""
-KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind", "crack": "slot"}
+KINDS = {
+    "hole": "through",
+    "through-hole": "through",
+    "blind-hole": "blind",
+    "crack": "slot",
+}
 """Kinds of damage by words that users may say instead."""
 BEST = "matched"
 """The detector that is asked for if the atlas has it."""
@@ -279,13 +284,13 @@ def _counts(rows: Sequence[Row]) -> str:
     from harness.vocabulary.text import many
 
     verdicts = [row.verdict for row in rows]
-    others = [
+    unfavourable = [
         f"{verdict} for {verdicts.count(verdict)}"
         for verdict in ("no", "undecided")
         if verdict in verdicts
     ]
     text = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}"
-    return f"{text} ({', '.join(others)})" if others else text
+    return f"{text} ({', '.join(unfavourable)})" if unfavourable else text
 
 
 def _basis(rows: Sequence[Row], about: Mapping[str, Any]) -> str:
@@ -333,7 +338,7 @@ def _refuse_unknown(option: str, unknown: Sequence[str], in_atlas: Iterable[str]
 
 def _refuse_kind(damage: str, kind: str, in_atlas: Sequence[str]) -> None:
     """Raise UserError: the ``damage`` that the user named is of a ``kind`` not in the atlas."""
-    legal = [*(word for word, known in KINDS.items() if known in in_atlas), *in_atlas]
+    legal = [*(word for word, meant_kind in KINDS.items() if meant_kind in in_atlas), *in_atlas]
     raise UserError(
         f"--damage {damage}: not in the atlas{_meant(kind, [*legal, *KINDS])}",
         legal=", ".join(legal),

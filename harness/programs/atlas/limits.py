@@ -139,11 +139,11 @@ class LimitSurface:
 
     def _check_inside(self, place: Mapping[str, float]) -> None:
         for axis, values in self.grid.items():
-            least = values[0]
-            most = values[-1]
-            if axis not in place or least - TOLERANCE <= place[axis] <= most + TOLERANCE:
+            lowest = values[0]
+            highest = values[-1]
+            if axis not in place or lowest - TOLERANCE <= place[axis] <= highest + TOLERANCE:
                 continue
-            computed = f"{least:g} to {most:g}" if len(values) > 1 else f"{least:g} only"
+            computed = f"{lowest:g} to {highest:g}" if len(values) > 1 else f"{lowest:g} only"
             name, _, unit = axis.partition("_")
             wanted = f"{name} {place[axis]:g} {unit}".rstrip()
             raise Outside(wanted + f": the atlas has {computed} {unit}".rstrip())
@@ -254,10 +254,10 @@ def _terms(counts: Sequence[int], limits: int) -> tuple[tuple[int, ...], ...]:
     varied = [axis for axis, count in enumerate(counts) if count > 1]
     plane: list[tuple[int, ...]] = [()]
     plane += [(axis,) for axis in varied]
-    further: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]
-    further += combinations(varied, 2)
+    products: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]
+    products += combinations(varied, 2)
     room = limits - 2 - len(plane)
-    return tuple(plane + further[:room]) if room >= 0 else ()
+    return tuple(plane + products[:room]) if room >= 0 else ()
 
 
 def _design(scaled: np.ndarray, terms: Iterable[tuple[int, ...]]) -> np.ndarray:

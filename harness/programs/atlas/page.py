@@ -84,9 +84,9 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
     damages = _damages_with_limits(rows)
     titles = list(dict.fromkeys(row.title for row in rows))
     frames = sorted({int(row.place["frames"]) for row in rows})
-    fewest = frames[0]
-    most = frames[-1]
-    styles = {fewest: "--", most: "-"}
+    fewest_frames = frames[0]
+    most_frames = frames[-1]
+    styles = {fewest_frames: "--", most_frames: "-"}
     detector = rows[0].surface.detector
     columns = len(damages) if len(damages) <= 3 else 2
     columns = max(1, columns)
@@ -106,7 +106,7 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
                         == (damage, title, detector)
                         and row.place["frames"] == count
                     ]
-                    _draw_curve(panel, curve, style, colour, title if count == most else "")
+                    _draw_curve(panel, curve, style, colour, title if count == most_frames else "")
             panel.set(title=damage, yscale="log")
             plain_decades(panel.yaxis)
         for panel in axes[-1]:
@@ -114,7 +114,7 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
         for panel in axes[:, 0]:
             panel.set_ylabel("size found 90 % of the time (mm)")
         target = f"target of albedo {albedos[-1]:g}; " if albedos else ""
-        bands = f"bands: 95 % intervals, {many(most, 'frame')}"
+        bands = f"bands: 95 % intervals, {many(most_frames, 'frame')}"
         figure.suptitle(target + bands, fontsize="medium")
         for count, style in styles.items():
             axes[0, 0].plot([], [], style, color=GREY, label=many(count, "frame"))
@@ -131,7 +131,13 @@ def _damages_with_limits(rows: Sequence[Row]) -> list[str]:
     return [str(damage) for damage, share in shares.items() if share >= 0.5]
 
 
-def _draw_curve(panel: Axes, curve: Sequence[Row], style: str, colour: str, name: str) -> None:
+def _draw_curve(
+    panel: Axes,
+    curve: Sequence[Row],
+    style: str,
+    colour: str,
+    name: str,
+) -> None:
     """Draw a camera's limits against distance; a curve with a name has its band."""
     distance_m = [row.place["distance_m"] for row in curve]
     a90_mm = [row.answer.a90_mm for row in curve]

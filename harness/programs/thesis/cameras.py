@@ -45,9 +45,11 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     evidence.append(_counts_text(counts))
     answers: list[bool | None] = []
     for camera in OTHERS:
-        places = _places_by_standing(counts, camera)
-        answers.append(_is_better(places))
-        texts = [f"{standing} at {', '.join(at)}" for standing, at in places.items() if at]
+        standings = _places_by_standing(counts, camera)
+        answers.append(_is_better(standings))
+        texts = [
+            f"{standing} at {', '.join(places)}" for standing, places in standings.items() if places
+        ]
         if texts:
             evidence.append(f"Against {camera}: {'; '.join(texts)}.")
     answer = decide(answers) if units >= FEWEST_UNITS else "undecided"

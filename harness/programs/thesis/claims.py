@@ -173,13 +173,13 @@ def _found(
         return "undecided", f"Not judged: no trial has {frames} frames."
     if set(status) != set(THESIS_HOLES):
         return "undecided", "Not judged: the target is not the thesis' row of eleven holes."
-    found = [hole for hole, state in status.items() if state == "found"]
+    detected = [hole for hole, state in status.items() if state == "found"]
     missed = [hole for hole, state in status.items() if state == "missed"]
     undecided = [hole for hole, state in status.items() if state == "undecided"]
-    too_many = [hole for hole in found if hole in unexpected]
+    too_many = [hole for hole in detected if hole in unexpected]
     too_few = [hole for hole in missed if hole in expected]
     open_holes = [hole for hole in undecided if hole in expected | unexpected]
-    sentences = [f"With {many(frames, 'frame')} found: {hole_list(found)}."]
+    sentences = [f"With {many(frames, 'frame')} found: {hole_list(detected)}."]
     if too_many:
         sentences.append(f"More than the thesis: {hole_list(too_many)}.")
     if too_few:

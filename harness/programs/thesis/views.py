@@ -138,13 +138,13 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
     gaps = [intervals.mean_difference(noise_mm[0], values) for values in noise_mm[1:]]
     parts = [gap.over(0) for gap in gaps]
     texts = [_gaps_text("surface noise", means_mm, gaps)]
-    for what, quantity in (("size error", "diameter"), ("position error", "offset")):
+    for name, quantity in (("size error", "diameter"), ("position error", "offset")):
         errors_mm = [_errors_mm(case, mapped, holes, quantity) for mapped in three]
         if errors_mm[0].size:
             rms_mm = [_rms(errors) for errors in errors_mm]
             gaps = [rms_gap(errors_mm[0], errors) for errors in errors_mm[1:]]
             parts += [gap.over(0) for gap in gaps]
-            texts.append(_gaps_text(what, rms_mm, gaps))
+            texts.append(_gaps_text(name, rms_mm, gaps))
     if not holes:
         parts.append(_finds_none_of_theirs(case, three))
         texts.append("no hole is measured by all three")
@@ -212,8 +212,10 @@ def _finds_none_of_theirs(case: maps.MapCase, three: Sequence[maps.Map]) -> bool
 
 def _gaps_text(what: str, sizes_mm: Sequence[float], gaps: Sequence[intervals.Interval]) -> str:
     slam_mm, single_mm, pair_mm = sizes_mm
-    more = " and ".join(map(maps.span, gaps))
-    return f"{what} {slam_mm:.2f} mm against {single_mm:.2f} and {pair_mm:.2f} (more by {more})"
+    differences = " and ".join(map(maps.span, gaps))
+    return (
+        f"{what} {slam_mm:.2f} mm against {single_mm:.2f} and {pair_mm:.2f} (more by {differences})"
+    )
 
 
 def rms_gap(first: np.ndarray, second: np.ndarray) -> intervals.Interval:
@@ -358,7 +360,12 @@ def _duel(case: maps.MapCase, mapped: maps.Map, rival: maps.Map, registration: s
         f" {_found_text(case, rival)}; |size error| {maps.change_text(sizes)}; surface noise"
         f" {maps.ratio_text(noise)}."
     )
-    return Duel(holes=holes_standing, size=size_standing, noise=noise_standing, text=text)
+    return Duel(
+        holes=holes_standing,
+        size=size_standing,
+        noise=noise_standing,
+        text=text,
+    )
 
 
 def _standing_of(change: maps.Change) -> Standing:
@@ -371,8 +378,8 @@ def _standing_of(change: maps.Change) -> Standing:
 def _hole_count(case: maps.MapCase, mapped: maps.Map) -> HoleCount:
     """Return the fewest and most holes that a map finds."""
     states = list(case.status(mapped).values())
-    found = states.count("found")
-    return HoleCount(fewest=found, most=found + states.count("undecided"))
+    certain_holes = states.count("found")
+    return HoleCount(fewest=certain_holes, most=certain_holes + states.count("undecided"))
 
 
 def _found_text(case: maps.MapCase, mapped: maps.Map) -> str:
