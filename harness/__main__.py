@@ -11,7 +11,7 @@ from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.files import shipped
 
 
-class Listed(NamedTuple):
+class ProgramEntry(NamedTuple):
     """A program of the list below: what a user types, where it is, and what it does."""
 
     name: str
@@ -20,114 +20,114 @@ class Listed(NamedTuple):
 
 
 PROGRAMS = (
-    Listed(
+    ProgramEntry(
         "ask",
         "harness.programs.atlas.ask",
         "which camera finds a damage, at which distance, with how many frames, by stored limits",
     ),
-    Listed(
+    ProgramEntry(
         "characterise",
         "harness.programs.camera.characterise",
         "measures your own camera on static captures, as a page and a camera file",
     ),
-    Listed(
+    ProgramEntry(
         "check",
         "harness.programs.gate.check",
         "a gate that fails if a detection limit has become worse",
     ),
-    Listed(
+    ProgramEntry(
         "clean",
         "harness.programs.keeping.clean",
         "removes stored renders or results folders, after confirmation",
     ),
-    Listed(
+    ProgramEntry(
         "compare",
         "harness.programs.gate.compare",
         "compares two studies of detection limits, set-up by set-up, with paired tests",
     ),
-    Listed(
+    ProgramEntry(
         "coverage",
         "harness.programs.coverage.coverage",
         "where on a part damage is missed, and which poses cover most of it",
     ),
-    Listed(
+    ProgramEntry(
         "dataset",
         "harness.programs.dataset.dataset",
         "writes boards with masks to train and score on",
     ),
-    Listed(
+    ProgramEntry(
         "design",
         "harness.programs.inspections.design",
         "predicts what a planned study of detection limits can demonstrate",
     ),
-    Listed(
+    ProgramEntry(
         "detect",
         "harness.detect",
         "finds the damage in a real capture, prints a table and, with --out, writes files",
     ),
-    Listed(
+    ProgramEntry(
         "efficiency",
         "harness.programs.efficiency.efficiency",
         "compares every detector of a study with the ideal observer",
     ),
-    Listed(
+    ProgramEntry(
         "export",
         "harness.programs.dataset.export",
         "exports an experiment's simulated views, with truth, for other mapping programs",
     ),
-    Listed(
+    ProgramEntry(
         "export_noise",
         "harness.programs.camera.export_noise",
         "writes a camera's noise as a table and a file of code",
     ),
-    Listed(
+    ProgramEntry(
         "flatfield",
         "harness.programs.camera.flatfield",
         "measures a unit's fixed pattern on captures of a flat surface",
     ),
-    Listed(
+    ProgramEntry(
         "gauge",
         "harness.programs.inspections.gauge",
         "designs boards with holes to check a detection limit: drilling template and truth",
     ),
-    Listed(
+    ProgramEntry(
         "implant",
         "harness.programs.implant.implant",
         "states your camera's detection limit on your part, by virtual damage in captures",
     ),
-    Listed(
+    ProgramEntry(
         "ls",
         "harness.programs.keeping.ls",
         "lists detectors and cameras with their settings, results folders, and stored renders",
     ),
-    Listed(
+    ProgramEntry(
         "merge",
         "harness.programs.cluster.merge",
         "joins the journals of shards and machines in one results folder",
     ),
-    Listed(
+    ProgramEntry(
         "pod",
         "harness.programs.inspections.pod",
         "fits the probability of detection to the user's own inspections (MIL-HDBK-1823A)",
     ),
-    Listed(
+    ProgramEntry(
         "score",
         "harness.programs.dataset.score",
         "states the detection limit of a method's anomaly maps",
     ),
-    Listed("sweep", "harness.sweep", "runs an experiment and writes its report"),
-    Listed(
+    ProgramEntry("sweep", "harness.sweep", "runs an experiment and writes its report"),
+    ProgramEntry(
         "target",
         "harness.target",
         "builds a target, prints its truth, and writes its mesh and truth",
     ),
-    Listed(
+    ProgramEntry(
         "validate",
         "harness.programs.scorecard.validate",
         "compares the simulated cameras with published figures, or with a real capture",
     ),
 )
-PART_OF_SET_UP = Listed(
+PART_OF_SET_UP = ProgramEntry(
     "prepare", "harness.programs.keeping.prepare", "compiles the inner loops once"
 )
 """It runs as the others do and is not listed, because `make` calls it once."""
@@ -160,17 +160,19 @@ complete -o filenames -F _tofpod tofpod
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command. Returns the program's exit code, or 2 for an unknown program."""
-    given = sys.argv[1:] if arguments is None else arguments
-    name, *rest = given or [""]
+    words = sys.argv[1:] if arguments is None else arguments
+    name, *program_arguments = words or [""]
     if name in MODULES:
-        sys.argv[1:] = rest
+        sys.argv[1:] = program_arguments
         return int(
-            importlib.import_module(MODULES[name]).main(rest if arguments is not None else None)
+            importlib.import_module(MODULES[name]).main(
+                program_arguments if arguments is not None else None
+            )
         )
-    return exit_code_of(lambda: _run(name, rest))
+    return exit_code_of(lambda: _run(name, program_arguments))
 
 
-def _run(name: str, rest: list[str]) -> int:
+def _run(name: str, program_arguments: list[str]) -> int:
     if name in ("", "-h", "--help"):
         wide = max(len(program.name) for program in PROGRAMS)
         print("How small a damage can a time-of-flight depth camera detect?\n")
@@ -185,13 +187,13 @@ def _run(name: str, rest: list[str]) -> int:
         print(f"tofpod {__version__}")
         return 0
     if name == "completion":
-        if rest not in (["bash"], ["zsh"]):
+        if program_arguments not in (["bash"], ["zsh"]):
             raise UserError(
-                f"completion {shlex.join(rest)}: no such shell",
+                f"completion {shlex.join(program_arguments)}: no such shell",
                 legal="tofpod completion bash, or zsh",
             )
         print(
-            ("autoload -U bashcompinit && bashcompinit\n" if rest == ["zsh"] else "")
+            ("autoload -U bashcompinit && bashcompinit\n" if program_arguments == ["zsh"] else "")
             + _completion(),
             end="",
         )

@@ -39,7 +39,7 @@ from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import DEFAULT_DETECTOR
-from harness.inspection.run import analysed, judged, threshold_of
+from harness.inspection.judging import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_figures import draw_overlay
 from harness.runs.options import EngineOptions
@@ -194,10 +194,13 @@ def sweep(
     """
     from harness.runs.study import run_study  # imports pandas
 
-    found = load_experiment(Path(experiment), changes)
+    loaded = load_experiment(Path(experiment), changes)
     out = Path(out)
     code = run_study(
-        found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
+        loaded,
+        out,
+        EngineOptions(jobs=jobs, serial=jobs == 1),
+        f"tofpod.sweep({str(experiment)!r})",
     )
     if code == 130:
         raise KeyboardInterrupt
@@ -206,7 +209,7 @@ def sweep(
             f"{experiment}: trials failed, as printed above",
             fix="correct the cause and run it again",
         )
-    return found.folder(out)
+    return loaded.folder(out)
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:

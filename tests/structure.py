@@ -1,8 +1,9 @@
 """Prints how the folders of code depend on each other: ``python tests/structure.py [ROOT]``.
 
-A room is a folder with code. An arrow leads from a room to another one that it imports, also inside
-functions and for type checks. A circle is a set of modules, or of rooms, each of which reaches all
-others along imports. ``from a.b import c`` imports the module ``a.b.c`` if there is one, and
+A room is a folder with code; each file directly in `harness`, `scenes` or `detectors` stands alone,
+because these files are doors that others come in by. An arrow leads from a room to another one that
+it imports, also inside functions and for type checks. A circle is a set of modules, or of rooms,
+each of which reaches all others along imports. ``from a.b import c`` imports the module ``a.b.c`` if there is one, and
 otherwise ``a.b``. Asking a package for its version is no import here. Modules that are loaded by a
 name in a text are not seen.
 """
@@ -68,12 +69,9 @@ def module_graph(modules: Mapping[str, Path]) -> Graph:
     return graph
 
 
-def room_graph(graph: Graph, modules: Mapping[str, Path], apart: str | None = None) -> Graph:
-    """Return the arrows of each room. ``apart``: a room each of whose modules counts as a room."""
-    room_names = {}
-    for module in graph:
-        room = room_of(module, modules)
-        room_names[module] = module if room == apart else room
+def room_graph(graph: Graph, modules: Mapping[str, Path]) -> Graph:
+    """Return the arrows of each room."""
+    room_names = {module: room_of(module, modules) for module in graph}
     rooms: Graph = {}
     for module, imported in graph.items():
         room = room_names[module]
@@ -83,9 +81,10 @@ def room_graph(graph: Graph, modules: Mapping[str, Path], apart: str | None = No
 
 
 def room_of(module: str, modules: Mapping[str, Path]) -> str:
-    """Return the dotted name of the folder that a module lies in."""
+    """Return the dotted name of a module's folder, or its own name if it is a door."""
     is_package = modules[module].name == "__init__.py"
-    return module if is_package else module.rpartition(".")[0]
+    folder = module if is_package else module.rpartition(".")[0]
+    return module if folder in CODE_FOLDERS else folder
 
 
 def circles(graph: Graph) -> list[list[str]]:
@@ -137,11 +136,11 @@ def arrows_to_programs(graph: Graph) -> tuple[set[tuple[str, str]], set[tuple[st
     return among_programs, from_core
 
 
-def report_lines(root: Path, apart: str | None = None) -> Iterator[str]:
-    """Yield the figures of a checkout; ``apart`` as in `room_graph`."""
+def report_lines(root: Path) -> Iterator[str]:
+    """Yield the figures of a checkout."""
     modules = modules_in(root)
     graph = module_graph(modules)
-    rooms = room_graph(graph, modules, apart)
+    rooms = room_graph(graph, modules)
     among_programs, from_core = arrows_to_programs(graph)
     yield f"modules: {len(modules)}"
     yield f"rooms: {len(rooms)}"
@@ -167,10 +166,8 @@ def main() -> int:
     )
     here = Path(__file__).resolve().parents[1]
     parser.add_argument("root", type=Path, nargs="?", default=here, help="another checkout")
-    apart = "a room each of whose modules counts as a room, such as harness"
-    parser.add_argument("--apart", metavar="ROOM", help=apart)
     options = parser.parse_args()
-    for line in report_lines(options.root, options.apart):
+    for line in report_lines(options.root):
         print(line)
     return 0
 

@@ -8,74 +8,83 @@ import sys
 from functools import cache
 from pathlib import Path
 
+from harness.__main__ import MODULES
+from tests import structure
+
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("harness", "scenes", "detectors")
+CORE = (
+    "harness.vocabulary",
+    "harness.experiment",
+    "harness.records",
+    "harness.evaluation",
+    "harness.tables",
+    "harness.stills",
+    "harness.report",
+    "harness.testing",
+    "harness.inspection",
+    "harness.trials",
+    "harness.runs",
+)
+"""Rooms of the core, lowest first: none imports one that stands below it in this list but those
+that `ALLOWED` names."""
 ALLOWED = {
-    # the first matching prefix of a module decides; "" means every room
-    "harness/vocabulary": ("harness.vocabulary",),
-    "scenes": ("harness.vocabulary", "scenes"),
-    "detectors": ("harness.vocabulary", "detectors"),
-    "harness/experiment": ("harness.vocabulary", "harness.experiment", "scenes", "detectors"),
-    "harness/exchange": ("harness.vocabulary", "harness.programs.dataset.exchange"),
-    "harness/tables": ("harness.vocabulary", "harness.evaluation", "harness.tables"),
-    "harness/evaluation": ("harness.vocabulary", "harness.evaluation", "harness.records.trials"),
-    "harness/thesis": (
-        "harness.vocabulary",
+    "harness.vocabulary": (),
+    "harness.experiment": ("scenes", "detectors"),
+    "harness.records": (),
+    "harness.evaluation": ("harness.records",),
+    "harness.tables": ("harness.records", "harness.evaluation"),
+    "harness.stills": ("harness.evaluation", "scenes.closed_form"),
+    "harness.report": (
+        "harness.records",
         "harness.evaluation",
         "harness.tables",
-        "harness.thesis",
-    ),
-    "harness/report": (
-        "harness.vocabulary",
-        "harness.evaluation",
-        "harness.tables",
-        "harness.thesis",
-        "harness.report",
         "detectors.interface",
     ),
-    "harness": ("",),
+    "harness.testing": ("detectors",),
+    "harness.inspection": ("harness.records", "harness.report", "scenes.sensor", "detectors"),
+    "harness.trials": (
+        "harness.records",
+        "harness.evaluation",
+        "harness.experiment",
+        "scenes",
+        "detectors",
+    ),
+    "harness.runs": (
+        "harness.records",
+        "harness.evaluation",
+        "harness.tables",
+        "harness.experiment",
+        "harness.report",
+        "harness.inspection",
+        "harness.trials",
+        "scenes",
+        "detectors",
+    ),
+    "scenes": (),
+    "detectors": (),
 }
-"""Imports inside functions count as well, but for a version number that a leaf may ask for."""
+"""What a room imports beside itself and `harness.vocabulary`. Front doors and programs: any room of
+the core. Imports inside functions and for type checks count as well."""
+PROGRAMS_THAT_IMPORT_A_PROGRAM = {
+    ("keeping", "atlas"): "`ls` and `clean` know the files that each program writes",
+    ("keeping", "coverage"): "likewise",
+    ("keeping", "efficiency"): "likewise",
+    ("scorecard", "camera"): "`validate --capture` measures a capture as `characterise` does",
+}
 FRAGMENTS = {
-    *(
-        "Of",
-        "For",
-        "With",
-        "By",
-        "In",
-        "At",
-        "On",
-        "To",
-        "As",
-        "From",
-        "Into",
-        "Without",
-        "Beyond",
-        "Between",
-        "Under",
-    ),
-    *(
-        "What",
-        "How",
-        "Where",
-        "Whether",
-        "That",
-        "Which",
-        "Why",
-        "When",
-        "Per",
-        "Among",
-        "Within",
-        "Because",
-    ),
+    *("Of", "For", "With", "By", "In", "At", "On", "To", "As", "From", "Into", "Without", "Beyond"),
+    *("Between", "Under", "What", "How", "Where", "Whether", "That", "Which", "Why", "When", "Per"),
+    *("Among", "Within", "Because"),
 }
-PROGRAMS = [
-    path.stem for path in sorted((ROOT / "harness").glob("*.py")) if "@program(" in path.read_text()
-]
+
+
+@cache
+def graph() -> structure.Graph:
+    return structure.module_graph(structure.modules_in(ROOT))
 
 
 def sources() -> list[Path]:
-    return sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+    return sorted(path for room in structure.CODE_FOLDERS for path in (ROOT / room).rglob("*.py"))
 
 
 @cache
@@ -83,61 +92,98 @@ def nodes(path: Path) -> tuple[ast.AST, ...]:
     return tuple(ast.walk(ast.parse(path.read_text())))
 
 
-def imported(path: Path) -> set[str]:
-    names: set[str] = set()
-    for node in nodes(path):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            names.add(node.module or "")
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return {
-        name
-        for name in names
-        if name.split(".")[0] in ROOMS and name not in ("harness", "harness.__version__")
-    }
+def is_in(module: str, room: str) -> bool:
+    return module == room or module.startswith(f"{room}.")
 
 
 def test_imports_go_one_way():
     wrong = []
-    for path in sources():
-        here = path.relative_to(ROOT).as_posix()
-        allowed = next(
-            rule
-            for prefix, rule in ALLOWED.items()
-            if here.startswith((f"{prefix}/", f"{prefix}.py"))
-        )
-        for name in imported(path):
-            if not any(
-                rule == "" or name == rule or name.startswith(rule + ".") for rule in allowed
-            ):
-                wrong.append(f"{here}: {name}")
+    for module, imported in graph().items():
+        room = next((room for room in ALLOWED if is_in(module, room)), None)
+        if room is None:
+            continue  # a front door or a program
+        legal = (room, "harness.vocabulary", *ALLOWED[room])
+        for target in imported - {"harness"}:
+            if not any(is_in(target, legal_room) for legal_room in legal):
+                wrong.append(f"{module} imports {target}")
     assert not wrong
 
 
-def test_the_rule_sees_a_forbidden_import(tmp_path):
-    path = tmp_path / "wrong.py"
-    path.write_text(
-        "from scenes.optics import NoiseFreeView\ndef f():\n    import detectors.averages.average\n"
+def test_the_core_imports_no_program_and_programs_import_none_but_with_a_reason():
+    among_programs, from_core = structure.arrows_to_programs(graph())
+    assert not from_core
+    assert among_programs == set(PROGRAMS_THAT_IMPORT_A_PROGRAM)
+
+
+def test_there_is_no_circle_of_modules_or_of_rooms():
+    modules = structure.modules_in(ROOT)
+    assert structure.circles(graph()) == []
+    assert structure.circles(structure.room_graph(graph(), modules)) == []
+
+
+def test_the_rules_see_a_forbidden_import_and_a_circle(tmp_path):
+    texts = {
+        "harness/__init__.py": "",
+        "harness/core.py": "def f():\n    from harness.programs.one import first\n",
+        "harness/programs/one/first.py": (
+            "import harness.core\nimport harness.programs.two.second\n"
+        ),
+        "harness/programs/two/second.py": "",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    made = structure.module_graph(structure.modules_in(tmp_path))
+    assert structure.circles(made) == [["harness.core", "harness.programs.one.first"]]
+    assert structure.arrows_to_programs(made) == (
+        {("one", "two")},
+        {("harness.core", "harness.programs.one.first")},
     )
-    assert {"scenes.optics", "detectors.averages.average"} <= imported(path)
+
+
+def test_tests_have_the_same_folders_as_the_product():
+    """A folder of tests that has no room of the product would be of code that has moved."""
+    own = {"support", "strangers", "validation", "benchmarks", "mutants"}
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        folder = path.parent.relative_to(ROOT / "tests")
+        if folder.parts and folder.parts[0] not in own:
+            assert (ROOT / folder).is_dir(), path
+
+
+def test_a_program_loads_no_other_program():
+    code = (
+        "import contextlib, importlib, io, sys\n"
+        "from harness.__main__ import MODULES\n"
+        "assert not [name for name in sys.modules if name.startswith('harness.programs')]\n"
+        "for name, module in MODULES.items():\n"
+        "    importlib.import_module(module)\n"
+        "    loaded = {name for name in sys.modules if name.startswith('harness.programs.')}\n"
+        "    own_room = module.rpartition('.')[0]\n"
+        "    others = {other for other in loaded if not other.startswith(own_room)}\n"
+        "    assert not others, (name, others)\n"
+        "    for name in loaded:\n"
+        "        del sys.modules[name]\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_no_further_code_folder():
     folders = {path.parts[0] for path in (p.relative_to(ROOT) for p in ROOT.glob("*/*.py"))}
-    assert folders <= {*ROOMS, "tests"}
+    assert folders <= {*structure.CODE_FOLDERS, "tests"}
 
 
 def test_help_loads_nothing_heavy():
     """All programs in one process: what one of them loads is there after the next as well."""
     code = (
         "import contextlib, importlib, io, sys\n"
-        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2', 'rosbags'}\n"
-        f"for name in {PROGRAMS}:\n"
-        "    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):\n"
-        "        importlib.import_module(f'harness.{name}').main(['--help'])\n"
-        "    assert 'usage: python -m harness.' in said.getvalue(), name\n"
+        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av'}\n"
+        "heavy |= {'cv2', 'rosbags'}\n"
+        f"for name, module in {MODULES}.items():\n"
+        "    said = io.StringIO()\n"
+        "    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):\n"
+        "        importlib.import_module(module).main(['--help'])\n"
+        "    assert f'usage: tofpod {name} ' in said.getvalue(), name\n"
         "    assert not heavy & set(sys.modules), (name, heavy & set(sys.modules))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
@@ -151,7 +197,8 @@ def test_detectors_and_their_program_never_import_mitsuba():
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] in ('mitsuba', 'drjit'): raise ImportError(name)\n"
         "sys.meta_path.insert(0, Wall())\n"
-        "import detectors, detectors.averages.average, detectors.findings.measure, detectors.methods.thesis\n"
+        "import detectors, detectors.averages.average, detectors.findings.measure\n"
+        "import detectors.methods.thesis\n"
         "import detectors.recordings, harness.detect\n"
         "assert 'mitsuba' not in sys.modules\n"
     )

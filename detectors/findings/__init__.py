@@ -1,1 +1,1 @@
-"""What lies off the surface: clusters, thresholds, sizes, missing returns."""
+"""Findings off the surface: clusters, thresholds, sizes, missing returns."""

@@ -53,9 +53,9 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     if config is None or problems:
         return config, problems
     if config.capture.average.frames is not None:
-        place = source.key_place_of(("capture", "average", "frames"))
+        position = source.key_place_of(("capture", "average", "frames"))
         message = "the number of frames is set by"
-        problems.append(Problem(f"{message} `capture.frames`", place, fix="remove this key"))
+        problems.append(Problem(f"{message} `capture.frames`", position, fix="remove this key"))
     if isinstance(config.source, SimulatedSource):
         for check in (_target_problems, _mapping_problems, _flat_field_problems):
             problems += check(config, config.source, source)
@@ -100,9 +100,11 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             )
             yield Problem(message, source.key_place_of(("sweep", path)), fix=fix)
     if calibrate is not None and calibrate.boards is None:
-        place = source.place_of(("threshold", "calibrate"))
+        position = source.place_of(("threshold", "calibrate"))
         yield Problem(
-            "a study calibrates its threshold on separate boards", place, fix="write `boards: 60`"
+            "a study calibrates its threshold on separate boards",
+            position,
+            fix="write `boards: 60`",
         )
     elif calibrate is not None and calibrate.boards is not None:
         # the number of boards bounds the rate that they can show, even if their whole face is
@@ -130,15 +132,15 @@ def _target_problems(
     ) as error:  # this includes a family of boards that are too full for their damage
         yield Problem(error.message, source.place_of(TARGET), legal=error.legal, fix=error.fix)
         return
-    if found := _unseen(simulated.camera, simulated.views, simulated.target):
-        path, mistake = found
+    if unseen := _unseen(simulated.camera, simulated.views, simulated.target):
+        path, mistake = unseen
         yield Problem(mistake.message, source.place_of(path), legal=mistake.legal, fix=mistake.fix)
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
-        what = f"within a matching radius of {config.matching.radius_mm:g} mm, a detection can match two damages"
+        message = f"within a matching radius of {config.matching.radius_mm:g} mm, a detection can match two damages"
         legal = f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart"
-        yield Problem(what, source.place_of(("matching", "radius_mm")), legal=legal)
+        yield Problem(message, source.place_of(("matching", "radius_mm")), legal=legal)
 
 
 @lru_cache(maxsize=10_000)
@@ -168,9 +170,11 @@ def _unseen(
         return _unseen_pose(optics, views, target)
     for pose in declared.extreme_poses():
         posed = target.model_copy(update={"pose": pose})
-        found = _unseen_pose(optics, None, posed) or (views and _unseen_pose(optics, views, posed))
-        if found:
-            path, first = found
+        message = _unseen_pose(optics, None, posed) or (
+            views and _unseen_pose(optics, views, posed)
+        )
+        if message:
+            path, first = message
             aside = f"{pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off the axis"
             turned = f"tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
             where = f"a board drawn at {pose.distance_m:.3g} m, {aside}, {turned}"
@@ -225,9 +229,9 @@ def _mapping_problems(
         and mapping is not None
         and (mapping.views or 0) > (count := view_count(views))
     ):
-        place = source.place_of(("mapping", "views"))
+        position = source.place_of(("mapping", "views"))
         yield Problem(
-            f"{mapping.views} views, but source.views has {count}", place, legal=f"1 to {count}"
+            f"{mapping.views} views, but source.views has {count}", position, legal=f"1 to {count}"
         )
 
 
@@ -241,10 +245,10 @@ def _flat_field_problems(
     except UserError:
         return  # reported together with the target's pose
     if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
-        place = source.place_of(("capture", "flat_field"))
+        position = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
         yield Problem(
-            f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal
+            f"{optics.title} gives no range at {flat_field.distance_m:g} m", position, legal=legal
         )
 
 
@@ -255,14 +259,14 @@ def _capture_problems(
     have."""
     missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
     for number, path in ((number, Path(capture.paths[number])) for number in missing):
-        near = nearest(path.name, [file.name for file in path.parent.glob("*")])
-        place = source.place_of(("source", "paths", number))
-        yield Problem(f"{path}: there is no such file or folder", place, nearest=near)
+        nearest_name = nearest(path.name, [file.name for file in path.parent.glob("*")])
+        position = source.place_of(("source", "paths", number))
+        yield Problem(f"{path}: there is no such file or folder", position, nearest=nearest_name)
     lens = capture.intrinsics
     if unknown := bool(lens) and lens not in camera_names() and not Path(str(lens)).is_file():
         legal = f"a file, or one of {', '.join(camera_names())}"
-        place = source.place_of(("source", "intrinsics"))
-        yield Problem(f"{lens}: is neither a file nor a camera", place, legal)
+        position = source.place_of(("source", "intrinsics"))
+        yield Problem(f"{lens}: is neither a file nor a camera", position, legal)
     try:
         if not missing and not unknown:
             recording_of(capture)
@@ -270,13 +274,13 @@ def _capture_problems(
         yield Problem(
             error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix
         )
-    apart = "a flat field needs a simulated unit"
+    reason = "a flat field needs a simulated unit"
     hole_free = "only on hole-free repeats, which a capture does not have"
     for key, value, message, fix in (
         (
             "capture.flat_field",
             config.capture.flat_field,
-            apart,
+            reason,
             "use tofpod flatfield, tofpod detect --flat-field",
         ),
         (

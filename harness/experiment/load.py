@@ -56,10 +56,10 @@ def load_experiment(
     path = _experiment_file(Path(path))
     written = read_yaml(path)
     # a file in a result folder states its version; a file that is written by hand states none
-    found = stamp_of(written.text, STAMP_KIND)
-    if found is not None:
+    stamp = stamp_of(written.text, STAMP_KIND)
+    if stamp is not None:
         again = "use the original experiment, or remove the first line and correct the problems that are then reported"
-        check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
+        check_version(stamp, EXPERIMENT_VERSION, path, "an experiment", again=again)
     overrides = [*_quick(written.data), *overrides] if quick else overrides
     source, problems = overridden(written, overrides, declared_of)
     source = _with_absolute_paths(source, path.resolve().parent)
@@ -74,7 +74,7 @@ def load_experiment(
     varied = [*config.sweep]
     for variation in config.sensitivity.vary if config.sensitivity else ():
         varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
-    if any(each.startswith("detector") for each in varied):
+    if any(path.startswith("detector") for path in varied):
         # a detector may fill some settings from others (a preset); written out, they would
         # override a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
@@ -87,13 +87,13 @@ def _quick(data: Any) -> list[str]:
     title = shape.get(data, ("title",)) or shape.get(data, ("name",))
     overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
-    own = "threshold.calibrate"
+    calibration_path = "threshold.calibrate"
     for path in (
         "repeats",
-        f"{own}.repeats",
+        f"{calibration_path}.repeats",
         "study.boards",
         "study.hole_free_boards",
-        f"{own}.boards",
+        f"{calibration_path}.boards",
     ):
         number = shape.get(data, tuple(path.split(".")))
         if isinstance(number, int):
@@ -107,13 +107,13 @@ def _experiment_file(path: Path) -> Path:
     that of a folder here (``detectors``). Raises UserError."""
     if path.is_file() or path.name != str(path):
         return path
-    own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
-    if not (own.is_file() or path.suffix or path.exists()):
-        names = ", ".join(sorted(each.stem for each in own.parent.glob("*.yaml")))
+    shipped_file = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
+    if not (shipped_file.is_file() or path.suffix or path.exists()):
+        names = ", ".join(sorted(file.stem for file in shipped_file.parent.glob("*.yaml")))
         raise UserError(
             f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}"
         )
-    return own if own.is_file() else path
+    return shipped_file if shipped_file.is_file() else path
 
 
 def resolved_yaml(experiment: Experiment) -> str:
@@ -128,10 +128,11 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     data = source.data
     swept: KeyPath = ("sweep", dotted(checks.CAMERA_NAME))
     listed = shape.get(data, swept)
-    named: list[KeyPath] = [checks.CAMERA_NAME]
-    named += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
+    named_paths: list[KeyPath] = [checks.CAMERA_NAME]
+    named_paths += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
     files = [
-        (*checks.TARGET, *at, "file") for at in ((), ("board", "shape"), ("material", "texture"))
+        (*checks.TARGET, *part, "file")
+        for part in ((), ("board", "shape"), ("material", "texture"))
     ]
     if shape.get(data, ("source", "kind")) == "capture":
         files += [
@@ -142,11 +143,11 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
             if shape.get(data, ("source", "intrinsics")) in camera_names()
             else [("source", "intrinsics")]
         )
-    for at in (*named, *files):
-        name = shape.get(data, at)
-        if isinstance(name, str) and name and (at in files or is_camera_path(name)):
-            start = Path.cwd() if source.place_of(at).origin == OPTION else folder
-            data = set_path(data, at, str(start / Path(name).expanduser()))
+    for key in (*named_paths, *files):
+        name = shape.get(data, key)
+        if isinstance(name, str) and name and (key in files or is_camera_path(name)):
+            start = Path.cwd() if source.place_of(key).origin == OPTION else folder
+            data = set_path(data, key, str(start / Path(name).expanduser()))
     return replace(source, data=data)
 
 
@@ -200,6 +201,6 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
             fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
-            what = f"{recording}: its calibration is for {lens.width} x {lens.height} pixels"
-            raise UserError(what, legal=legal, fix=fix)
+            message = f"{recording}: its calibration is for {lens.width} x {lens.height} pixels"
+            raise UserError(message, legal=legal, fix=fix)
     return numbers_of_lens(lens)

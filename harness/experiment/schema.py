@@ -266,8 +266,8 @@ def splices_of(data: Any) -> shape.Splices:
     """Return the path of the detector's settings and their model; empty for an unknown detector."""
     detector = shape.child(data, "detector")
     name = detector.get("name", "thesis") if isinstance(detector, dict) else "thesis"
-    known = isinstance(name, str) and name in detector_names()
-    return {DETECTOR_SETTINGS: detector_type(name).settings_type} if known else {}
+    is_known = isinstance(name, str) and name in detector_names()
+    return {DETECTOR_SETTINGS: detector_type(name).settings_type} if is_known else {}
 
 
 def declared_of(data: Any) -> shape.Declared:
@@ -335,8 +335,8 @@ def point_of(
     if isinstance(source, CaptureSource):
         files = [[file.name, file_digest(file)] for file in recording_of(source).files]
         camera_name = lens_names().get(source.intrinsics) if source.intrinsics else None
-        named = load_camera(camera_name).lens.to_data() if camera_name else None
-        frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
+        nominal_lens = load_camera(camera_name).lens.to_data() if camera_name else None
+        frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": nominal_lens}
     else:
         # the full target, or the distribution of a family of boards, and the camera's numbers
         drawn = isinstance(source.target, DrawnTargetConfig)

@@ -36,9 +36,9 @@ class PathError(UserError):
 def key_path(text: str) -> KeyPath:
     """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the
     file."""
-    head, _, rest = text.partition(".")
-    if head == "sweep" and rest:
-        return (head, rest)
+    head, _, inner = text.partition(".")
+    if head == "sweep" and inner:
+        return (head, inner)
     return tuple(
         int(part) if part.isascii() and part.isdigit() else part for part in text.split(".")
     )
@@ -58,30 +58,30 @@ def set_path(
     if not path:
         return value
     key = _index(data, path[0], above)
-    rest = path[1:]
+    inner_path = path[1:]
     full_path = (*above, key)
     if isinstance(data, list):
         if key >= len(data):
             raise PathError(f"the list has no item {key}; it has {len(data)}, counted from 0")
         return [
             *data[:key],
-            set_path(data[key], rest, value, declared, full_path),
+            set_path(data[key], inner_path, value, declared, full_path),
             *data[key + 1 :],
         ]
     inner = data.get(key)
-    if key not in data and rest:
+    if key not in data and inner_path:
         default = shape.default_at(declared.at(full_path)) if declared else ()
         if not default:
             raise PathError(f"there is no `{key}`")
         inner = default[0]
-    around = declared.at(above) if declared and not rest else None
+    around = declared.at(above) if declared and not inner_path else None
     kinds = shape.kinds_of(around)
     if kinds and kinds[0] == key:
         old = shape.model_for(around, data)
         new = shape.model_for(around, {**data, key: value})
         gone = {*(old.model_fields if old else ())} - {*(new.model_fields if new else ())}
-        data = {name: held for name, held in data.items() if name not in gone}
-    return {**data, key: set_path(inner, rest, value, declared, full_path)}
+        data = {name: member for name, member in data.items() if name not in gone}
+    return {**data, key: set_path(inner, inner_path, value, declared, full_path)}
 
 
 def _index(data: Any, key: str | int, above: KeyPath) -> Any:
@@ -92,21 +92,21 @@ def _index(data: Any, key: str | int, above: KeyPath) -> Any:
     raise PathError(f"`{dotted(above)}` is {shown(data)} here, which has no `{key}`")
 
 
-def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -> Problem | None:
+def path_problem(path: KeyPath, declared: shape.Declared, position: Place | None) -> Problem | None:
     """Return the problem for a path that the declaration lacks, with the nearest legal path; None
     for a legal path."""
     for depth in range(1, len(path) + 1):
         if declared.at(path[:depth]) is None:
-            known = [
+            legal_paths = [
                 dotted(legal)
                 for legal in declared.paths()
                 if path[0] in NOT_VARIED or legal[0] not in NOT_VARIED
             ]
-            found = unknown_key(
-                str(path[depth - 1]), path[: depth - 1], declared.names(path[: depth - 1]), place
+            problem = unknown_key(
+                str(path[depth - 1]), path[: depth - 1], declared.names(path[: depth - 1]), position
             )
-            message = f"unknown path `{dotted(path)}`: {found.message}"
-            return Problem(message, place, found.legal, nearest(dotted(path), known))
+            message = f"unknown path `{dotted(path)}`: {problem.message}"
+            return Problem(message, position, problem.legal, nearest(dotted(path), legal_paths))
     return None
 
 
@@ -120,18 +120,18 @@ def overridden(
         (text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("="))))
         for text in overrides
     ]
-    for text, name, written, place in parts:
+    for text, name, written, position in parts:
         if not name.strip() or not written.strip():
             fix = "write null to state no value" if "=" in text and name.strip() else None
             problems.append(
-                Problem("not of the form path=value", place, "capture.frames=10", fix=fix)
+                Problem("not of the form path=value", position, "capture.frames=10", fix=fix)
             )
             continue
         path = key_path(name.strip())
         declared = declared_of(source.data)
         try:
             value = parse_yaml(text, OPTION, start=len(name) + 1, is_argument=True)
-            problem = path_problem(path, declared, place)
+            problem = path_problem(path, declared, position)
             if problem is None:
                 source = source.with_value(
                     path, set_path(source.data, path, value.data, declared), value
@@ -140,13 +140,13 @@ def overridden(
         except DeclarationError as error:
             problems += error.problems
         except PathError as error:
-            problems.append(Problem(error.message, place))
+            problems.append(Problem(error.message, position))
     swept = shape.child(source.data, "sweep")
-    for _, name, written, place in parts:
+    for _, name, written, position in parts:
         if isinstance(swept, dict) and (path_text := name.strip()) in swept:
             message = f"`{path_text}` is an axis of the sweep, so this value would never be used"
             problems.append(
-                Problem(message, place, fix=f"{OPTION} 'sweep.{path_text}=[{written.strip()}]'")
+                Problem(message, position, fix=f"{OPTION} 'sweep.{path_text}=[{written.strip()}]'")
             )
     return source, problems
 
@@ -232,15 +232,15 @@ def _written_variations(data: Any) -> Iterator[Draft]:
     sensitivity study."""
     vary = shape.get(data, ("sensitivity", "vary"))
     for index, variation in enumerate(vary if isinstance(vary, list) else ()):
-        at: KeyPath = ("sensitivity", "vary", index)
+        written_at: KeyPath = ("sensitivity", "vary", index)
         path = shape.child(variation, "path")
         values = shape.child(variation, "values")
         label = shape.child(variation, "label")
         together = shape.child(variation, "set")
-        frames = _frame_settings(shape.child(variation, "frames"), (*at, "frames"))
+        frames = _frame_settings(shape.child(variation, "frames"), (*written_at, "frames"))
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
-                setting = Setting(path, value, (*at, "values", number))
+                setting = Setting(path, value, (*written_at, "values", number))
                 yield Draft(
                     _label([setting]),
                     _label([setting]),
@@ -251,14 +251,14 @@ def _written_variations(data: Any) -> Iterator[Draft]:
                 )
         elif isinstance(label, str) and isinstance(together, dict):
             settings = tuple(
-                Setting(key, value, (*at, "set", key)) for key, value in together.items()
+                Setting(key, value, (*written_at, "set", key)) for key, value in together.items()
             )
-            yield Draft(label, label, settings, (*at, "label"), True, frames)
+            yield Draft(label, label, settings, (*written_at, "label"), True, frames)
 
 
-def _frame_settings(frames: Any, at: KeyPath) -> tuple[Setting, ...]:
+def _frame_settings(frames: Any, written_at: KeyPath) -> tuple[Setting, ...]:
     return tuple(
-        Setting(FRAMES, n, (*at, k))
+        Setting(FRAMES, n, (*written_at, k))
         for k, n in enumerate(frames if isinstance(frames, list | tuple) else ())
     )
 
@@ -271,12 +271,12 @@ def _label(settings: Iterable[Setting]) -> str:
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
     paths = [axis[0].path for axis in axes]
     for path in paths:
-        at = source.key_place_of(("sweep", path))
-        yield from _path_problems(path, at, source, FIXED)
+        position = source.key_place_of(("sweep", path))
+        yield from _path_problems(path, position, source, FIXED)
         outer = next((prefix for prefix in paths if path.startswith(prefix + ".")), None)
         if outer:
             message = f"the axes `{outer}` and `{path}` set the same key"
-            yield Problem(message, at, fix=f"sweep only `{outer}`, or only keys within it")
+            yield Problem(message, position, fix=f"sweep only `{outer}`, or only keys within it")
     count = prod(len(axis) for axis in axes)
     if count > MAX_POINTS:
         yield Problem(
@@ -290,35 +290,43 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
     """Return an axis over the mapping of switches that the file names: none on, each alone, all
     but each, and all."""
     path = config.switches or ""
-    place = source.place_of((SWITCHES,))
+    position = source.place_of((SWITCHES,))
     problems = []
-    found = shape.get(config.to_data(), key_path(path))
+    switches = shape.get(config.to_data(), key_path(path))
     names = (
-        [*found]
-        if isinstance(found, dict) and all(isinstance(value, bool) for value in found.values())
+        [*switches]
+        if isinstance(switches, dict)
+        and all(isinstance(value, bool) for value in switches.values())
         else []
     )
     if len(names) < 2:
         legal = (
             "a mapping of at least two keys that are true or false, such as source.camera.effects"
         )
-        problems.append(Problem(f"`{path}` does not hold switches", place, legal=legal))
+        problems.append(Problem(f"`{path}` does not hold switches", position, legal=legal))
     for axis in config.sweep:
         if f"{axis}.".startswith(f"{path}.") or f"{path}.".startswith(f"{axis}."):
             message = f"the switches `{path}` and the axis `{axis}` set the same key"
             problems.append(
-                Problem(message, place, fix="sweep other keys, or leave the switches out")
+                Problem(message, position, fix="sweep other keys, or leave the switches out")
             )
     alone = [frozenset({name}) for name in names]
-    whole = frozenset(names)
+    all_names = frozenset(names)
 
-    def label(on: frozenset[str]) -> str:
-        few = {0: "none", len(whole): "all", 1: f"{''.join(on)} alone"}
-        return few.get(len(on), f"all but {''.join(whole - on)}").replace("_", " ")
+    def label(switched_on: frozenset[str]) -> str:
+        words = {0: "none", len(all_names): "all", 1: f"{''.join(switched_on)} alone"}
+        return words.get(len(switched_on), f"all but {''.join(all_names - switched_on)}").replace(
+            "_", " "
+        )
 
-    chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - switch for switch in alone), whole])
+    chosen = dict.fromkeys(
+        [frozenset[str](), *alone, *(all_names - switch for switch in alone), all_names]
+    )
     return [
-        Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen
+        Setting(
+            path, {name: name in switched_on for name in names}, (SWITCHES,), label(switched_on)
+        )
+        for switched_on in chosen
     ], problems
 
 
@@ -328,12 +336,12 @@ def _variation_problems(
     for draft in variations:
         for setting in draft.settings:
             listed = source.place_of((*setting.written_at[:3], "path"))
-            at = (
+            position = (
                 listed
                 if "values" in setting.written_at
                 else source.key_place_of(setting.written_at)
             )
-            yield from _path_problems(setting.path, at, source, (*FIXED, FRAMES))
+            yield from _path_problems(setting.path, position, source, (*FIXED, FRAMES))
     # a variation needs a set-up of the main experiment with the same number of frames for
     # comparison
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
@@ -350,12 +358,12 @@ def _variation_problems(
 
 
 def _path_problems(
-    path: str, place: Place | None, source: Source, fixed: Iterable[str]
+    path: str, position: Place | None, source: Source, fixed: Iterable[str]
 ) -> Iterator[Problem]:
     if any(path == key or path.startswith(key + ".") for key in fixed):
         reason = "set by `sensitivity.frames`" if path == FRAMES else "the same for all points"
-        yield Problem(f"`{path}` cannot be varied here: it is {reason}", place)
-    elif problem := path_problem(key_path(path), declared_of(source.data), place):
+        yield Problem(f"`{path}` cannot be varied here: it is {reason}", position)
+    elif problem := path_problem(key_path(path), declared_of(source.data), position):
         yield problem
 
 
@@ -364,7 +372,7 @@ def _resolved(
 ) -> tuple[ExperimentConfig | None, list[Problem]]:
     """Return a point's declaration, or its problems: at the wrong value, or else (if ``keep_all``)
     at its name."""
-    place = source.place_of(draft.named_at)
+    position = source.place_of(draft.named_at)
     located = replace(
         source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")}
     )
@@ -374,22 +382,26 @@ def _resolved(
             changed = set_path(located.data, path, setting.value, declared_of(located.data))
             located = located.with_value(path, changed, source, setting.written_at)
     except PathError as error:
-        return None, [Problem(error.message, place)]
-    config, found = checks.resolved(located)
+        return None, [Problem(error.message, position)]
+    config, problems = checks.resolved(located)
     starts = [setting.written_at for setting in draft.settings]
     written = (
-        (item for places in (source.values, source.keys) for item in places.items())
-        if found
+        (item for positions in (source.values, source.keys) for item in positions.items())
+        if problems
         else ()
     )
-    own = {spot for at, spot in written if any(at[: len(start)] == start for start in starts)}
+    own_spots = {
+        spot
+        for written_at, spot in written
+        if any(written_at[: len(start)] == start for start in starts)
+    }
     elsewhere = f"with {draft.label}: " if draft.settings else ""
     return config, [
         problem
-        if problem.place in own
-        else replace(problem, message=elsewhere + problem.message, place=place)
-        for problem in found
-        if problem.place in own or keep_all
+        if problem.place in own_spots
+        else replace(problem, message=elsewhere + problem.message, place=position)
+        for problem in problems
+        if problem.place in own_spots or keep_all
     ]
 
 
@@ -403,7 +415,7 @@ def _drafts(
     for axis in axes:
         for setting in axis if axis[0].path in telling else ():
             value = value_text(
-                setting.path, differing(setting.value, (other.value for other in axis))
+                setting.path, differing(setting.value, (setting.value for setting in axis))
             )
             texts[id(setting)] = setting.name or f"{names[setting.path]}={value}"
     chosen = list(product(*axes))
@@ -437,14 +449,14 @@ def _points(
 ) -> tuple[tuple[Point, ...], list[Problem]]:
     points: list[Point] = []
     problems: list[Problem] = []
-    called: dict[str, list[Any]] = {}
-    known: dict[tuple[str, str], Draft] = {}
+    labels: dict[str, list[Any]] = {}
+    drafts_by_name: dict[tuple[str, str], Draft] = {}
     set_ups: dict[str, str] = {}
     for draft in drafts:
         # a set-up and a variation, or two set-ups with long values that are shortened, may get the
         # same name
         values = [setting.value for setting in draft.settings if setting.path != FRAMES]
-        if called.setdefault(draft.variant, values) != values:
+        if labels.setdefault(draft.variant, values) != values:
             message = f"two different set-ups are called `{draft.variant}`"
             return (), [
                 Problem(
@@ -481,7 +493,9 @@ def _points(
             reference = set_ups.get(canonical_json(placed), "")
         else:
             set_ups.setdefault(canonical_json(placed), draft.variant)
-        twin = known.setdefault((point.digest, draft.variant if draft.is_variation else ""), draft)
+        twin = drafts_by_name.setdefault(
+            (point.digest, draft.variant if draft.is_variation else ""), draft
+        )
         if twin is not draft and experiment.draws is not None:
             continue
         if twin is not draft:

@@ -82,19 +82,23 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
     """Raise UserError for arguments of several views with one capture, and vice versa."""
     several = f"--register {'|'.join(METHODS)}"
     if arguments.register is None:
-        given = [
+        given_options = [
             name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None
         ]
-        given += [
+        given_options += [
             f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)
         ]
-        if given:
-            what = f"--{given[0]}: concerns several views, but without --register all PATHs are one capture"
-            raise UserError(what, legal=several)
-        whole = [path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
-        if len(paths) > 1 and whole:
+        if given_options:
+            message = f"--{given_options[0]}: concerns several views, but without --register all PATHs are one capture"
+            raise UserError(message, legal=several)
+        whole_captures = [
+            path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES
+        ]
+        if len(paths) > 1 and whole_captures:
             fix = f"run each separately, or register them as views of one target: {several}"
-            raise UserError(f"{len(paths)} PATHs, but {whole[0]} is a whole capture", fix=fix)
+            raise UserError(
+                f"{len(paths)} PATHs, but {whole_captures[0]} is a whole capture", fix=fix
+            )
         return
     if len(paths) < 2:
         fix = "name the other views, or leave out --register"
@@ -105,17 +109,17 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             "--register nominal uses the stated poses, and none are stated", fix="give --poses FILE"
         )
     if arguments.quiet_capture is not None:
-        what = "--quiet-capture is one cloud, and its noise differs from that of a cloud merged from several views"
+        message = "--quiet-capture is one cloud, and its noise differs from that of a cloud merged from several views"
         raise UserError(
-            what, fix="use --threshold with a value at which undamaged views have no finding"
+            message, fix="use --threshold with a value at which undamaged views have no finding"
         )
 
 
 def refuse_repeats(paths: Sequence[Path]) -> None:
     """Raise UserError if a capture is named twice."""
-    places = [path.resolve() for path in paths]
-    for path, place in zip(paths, places, strict=True):
-        if places.count(place) > 1:
+    resolved_paths = [path.resolve() for path in paths]
+    for path, resolved_path in zip(paths, resolved_paths, strict=True):
+        if resolved_paths.count(resolved_path) > 1:
             legal = "captures from different places, each named once"
             raise UserError(
                 f"{path}: is named twice; counting the same noise twice would understate it",
@@ -130,8 +134,8 @@ def detector_of(
     from detectors import detector_type, load_detector
 
     settings: dict[str, Any] = {}
-    known = detector_type(arguments.detector).settings_type
-    if "crop" in known.model_fields:
+    settings_type = detector_type(arguments.detector).settings_type
+    if "crop" in settings_type.model_fields:
         # with several views, --crop and --target belong to the mapping
         settings["crop"] = crop_from_text(
             crop, arguments.target if crop == arguments.crop else None
@@ -142,18 +146,18 @@ def detector_of(
         )
     reference = getattr(arguments, "reference", None)
     if reference is not None:
-        if "surface" not in known.model_fields:
+        if "surface" not in settings_type.model_fields:
             raise UserError(
                 f"--reference {reference}: detector {arguments.detector} has no surface setting"
             )
         settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
-    elif "surface" in known.model_fields and not any(
-        each.startswith(STATED_SURFACE) for each in assignments
+    elif "surface" in settings_type.model_fields and not any(
+        assignment.startswith(STATED_SURFACE) for assignment in assignments
     ):
         settings["surface"] = {"shape": "auto"}
     for assignment in assignments:
         assign(settings, assignment)
-    return load_detector(arguments.detector, settings), known.from_data(settings).to_data()
+    return load_detector(arguments.detector, settings), settings_type.from_data(settings).to_data()
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
@@ -179,8 +183,8 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
-        what = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
-        raise UserError(what, fix="leave out one of the two")
+        message = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
+        raise UserError(message, fix="leave out one of the two")
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
     except ValueError as error:
@@ -192,9 +196,9 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
         if not all(low < high for low, high in pairs):
-            what = f"--crop {text}: a lower bound is not below the upper one"
+            message = f"--crop {text}: a lower bound is not below the upper one"
             raise UserError(
-                what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first"
+                message, legal=LEGAL_CROP, fix="state the smaller bound of each axis first"
             )
         return {
             "kind": "box",
@@ -318,8 +322,8 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
                 from_first.append(invert(poses[0]) @ pose)
                 distance_m = float(np.linalg.norm(from_first[-1][:3, 3]))
             if not distance_m <= FARTHEST_M:  # or NaN, where numbers are near the largest
-                what = f"{path}: pose {number} is {distance_m:.4g} m from pose 0 (up to {FARTHEST_M:g} m)"
-                raise UserError(what, fix="write translations in metres, not millimetres")
+                message = f"{path}: pose {number} is {distance_m:.4g} m from pose 0 (up to {FARTHEST_M:g} m)"
+                raise UserError(message, fix="write translations in metres, not millimetres")
     return tuple(from_first)
 
 
@@ -335,7 +339,7 @@ def _from_json(path: Path, text: str) -> list[np.ndarray]:
         if POSES_KEY not in data:
             raise ValueError(f"an object without the key {POSES_KEY}")
         data = data[POSES_KEY]
-    return [np.array(each, float) for each in data]
+    return [np.array(matrix, float) for matrix in data]
 
 
 def _from_lines(path: Path, text: str) -> list[np.ndarray]:

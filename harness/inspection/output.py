@@ -62,8 +62,8 @@ def print_capture(
     if cloud.noise_reach_px > WIDEST_NATIVE_PX:
         why = "the depth was upsampled, aligned to another camera or smoothed; sizes are measured with that blur"
         print(f"note: {cloud.noise_reach_px:.0f} pixels share their noise: {why}")
-    for left in cloud.left_out:
-        print(f"left out: {left.name}: {left.why}")
+    for left_out in cloud.left_out:
+        print(f"left out: {left_out.name}: {left_out.why}")
     print(f"crop: {crop} keeps {kept.sum()} of {cloud.valid.sum()} valid points")
 
 
@@ -81,7 +81,7 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
     return {
         "name": recording.name,
         "frames_used": cloud.n_frames,
-        "frames_left_out": [asdict(left) for left in cloud.left_out],
+        "frames_left_out": [asdict(left_out) for left_out in cloud.left_out],
         "lens": asdict(cloud.lens) if cloud.lens else None,
         "noise_reach_px": cloud.noise_reach_px or None,
         "depth_unit": {"mm": recording.scale_m / MM, "from": recording.unit_from},
@@ -174,7 +174,7 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
     if not findings:
         print("no findings")
         return
-    places = {
+    columns = {
         "u_px": f"u {grid}",
         "v_px": f"v {grid}",
         "x_mm": "x mm",
@@ -184,7 +184,7 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
     heads = (
         "id",
         "kind",
-        *places.values(),
+        *columns.values(),
         "diam. mm",
         "from",
         "depth mm",
@@ -204,7 +204,7 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
             (
                 f.id,
                 f.kind,
-                *(number(getattr(f, key), 1) for key in places),
+                *(number(getattr(f, key), 1) for key in columns),
                 *sizes,
                 f.points,
                 f"{f.score:.2f}",
@@ -236,14 +236,14 @@ def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
     )
     circles = [
         Circle3d(
-            place,
+            place_mm,
             np.array([0.0, 0.0, -1.0]),
             f.diameter_mm,
             f"{f.id}: {f.diameter_mm:.1f}",
             "finding",
         )
         for f in judged.findings
-        if np.isfinite([*(place := np.array([f.x_mm, f.y_mm, f.z_mm])), f.diameter_mm]).all()
+        if np.isfinite([*(place_mm := np.array([f.x_mm, f.y_mm, f.z_mm])), f.diameter_mm]).all()
     ]
     return Scene3d(
         points_mm=cloud.points_m.reshape(-1, 3)[valid] / MM,

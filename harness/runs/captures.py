@@ -6,6 +6,7 @@ from detectors import load_detector
 from detectors.averages.average import prefix_averages
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import CaptureSource, Experiment, recording_of
+from harness.inspection.judging import judged
 from harness.inspection.output import (
     capture_facts,
     choice_by,
@@ -13,7 +14,6 @@ from harness.inspection.output import (
     pictures,
     print_warnings,
 )
-from harness.inspection.run import judged
 from harness.records.outputs import EXPERIMENT, PROVENANCE
 from harness.records.schema import write_table
 from harness.records.trials import POINTS_OF_CAPTURES
@@ -41,15 +41,15 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         cloud = prefix_averages(recording, [frames], config.capture.average)[frames]
         detector = load_detector(config.detector.name, dict(config.detector.settings))
         choice = choice_by(getattr(detector, "settings", None), cloud)
-        found = judged(detector, cloud, detector.analyse(cloud), k)
-        about = {
+        result = judged(detector, cloud, detector.analyse(cloud), k)
+        facts = {
             "target": choice_facts(choice),
             "capture": capture_facts(recording, cloud),
             "threshold": {"k": k, "from": "given"},
             "settings": config.to_data(),
             "provenance": record(command),
         }
-        write_findings(folder / name, found, about, point.label or name, beside=pictures(choice))
+        write_findings(folder / name, result, facts, point.label or name, beside=pictures(choice))
         row = {
             "point": name,
             "variant": point.variant,
@@ -58,21 +58,21 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         }
         row |= {
             "frames_left_out": len(cloud.left_out),
-            "findings": len(found.findings),
+            "findings": len(result.findings),
             "threshold_k": k,
         }
-        rows.append(row | {"threshold_mm": round(k * found.evidence.scale_m / MM, 4)})
+        rows.append(row | {"threshold_mm": round(k * result.evidence.scale_m / MM, 4)})
         warnings = (
             *recording.warnings,
             *(choice.warnings if choice else ()),
-            *found.evidence.warnings,
+            *result.evidence.warnings,
         )
         print_warnings(f"{name}: {text}" for text in warnings)
         print(
-            f"{name} {point.label}: {len(found.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm"
+            f"{name} {point.label}: {len(result.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm"
         )
-        for left in cloud.left_out:
-            print(f"  left out: {left.name}: {left.why}")
+        for left_out in cloud.left_out:
+            print(f"  left out: {left_out.name}: {left_out.why}")
     write_json(folder / PROVENANCE.name, {"results_version": RESULTS_VERSION, **record(command)})
     write_table(folder, POINTS_OF_CAPTURES, POINTS_OF_CAPTURES.frame(rows))
     point_to(folder)

@@ -60,14 +60,16 @@ def progress_display(
                 total = counts.total - counts.found - counts.failed
                 bars.update(task, completed=counts.done, total=total)
                 speed = state.speed if state.speed and total > counts.done else None
-                left = str(timedelta(seconds=round((total - counts.done) / speed))) if speed else ""
+                time_left = (
+                    str(timedelta(seconds=round((total - counts.done) / speed))) if speed else ""
+                )
                 bars.update(
                     task,
                     counts=f"{counts.over}/{counts.total}"
                     + (f" ({counts.found} found)" if counts.found else ""),
                     rate=f"{speed:.{0 if speed >= 10 else 2}f}/s" if speed else "",
                     failed=f"{counts.failed} failed" if counts.failed else "",
-                    left=f"about {left} left" if left else "",
+                    left=f"about {time_left} left" if time_left else "",
                 )
         if (
             bars.disable
@@ -104,14 +106,14 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     parts = [part for group in (*first, *then) for part in group]
     renders = {path for part in parts for path in part.batch.paths}
     trials = sum(len(part.repeats) for part in parts)
-    held = len(Journal(folder / "journal"))
+    stored_records = len(Journal(folder / "journal"))
     print(f"{name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))
     print(f"  {points}, {many(len(plan.groups), 'set')} of frames")
     print(f"  renders: {len(renders)}, {sum(path.exists() for path in renders)} of them cached")
     print(f"  trials: {trials}")
-    if held:
+    if stored_records:
         print(
-            f"  the journal holds {many(held, 'trial')}; those of the same code and settings are not run again"
+            f"  the journal holds {many(stored_records, 'trial')}; those of the same code and settings are not run again"
         )
     print(f"  results would go to {folder}")
     return 0

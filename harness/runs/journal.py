@@ -61,21 +61,21 @@ class Journal:
 
     def state(self, key: str) -> State | None:
         """Return how a trial ended; None if there is no entry."""
-        place = self._known().get(key)
-        return None if place is None else place.state
+        location = self._known().get(key)
+        return None if location is None else location.state
 
     def read(self, key: str) -> Ended | None:
         """Return the entry of a trial; None if there is none."""
-        place = self._known().get(key)
-        if place is None:
+        location = self._known().get(key)
+        if location is None:
             return None
         try:
-            with open_plain(self.folder / place.segment, os.O_RDONLY) as file:
-                file.seek(place.start)
-                found = _parsed(file.read(place.length))
+            with open_plain(self.folder / location.segment, os.O_RDONLY) as file:
+                file.seek(location.start)
+                record = _parsed(file.read(location.length))
         except OSError:
             return None
-        return found[1] if found is not None and found[0] == key else None
+        return record[1] if record is not None and record[0] == key else None
 
     def entries(self) -> Iterator[tuple[str, Ended]]:
         """Yield (key, entry) of all trials and thresholds, in the order of the segments."""
@@ -105,12 +105,12 @@ class Journal:
                     for name in os.listdir(self.folder)
                     if SEGMENT_NAME.fullmatch(name)
                 ]
-                own = (
+                segment = (
                     self.folder / f"{max(numbers, default=0) + 1:06d}-{secrets.token_hex(4)}.jsonl"
                 )
-                with open_plain(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file:
+                with open_plain(segment, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as file:
                     file.write(stamped("journal", JOURNAL_VERSION).encode())
-                self._own = own
+                self._own = segment
             with open_plain(self._own, os.O_WRONLY | os.O_APPEND) as file:
                 start = os.fstat(file.fileno()).st_size
                 if os.write(file.fileno(), line) < len(line):
@@ -155,12 +155,12 @@ class Journal:
                     return
                 file.seek(start := max(start, file.tell()))
                 while (line := file.readline(RECORD_BYTES)).endswith(b"\n"):
-                    found = _parsed(line)
-                    if found is None:
+                    record = _parsed(line)
+                    if record is None:
                         self.damaged.append(f"{path}: byte {start}")
                     else:
                         self._remember(
-                            found[0], _Location(path.name, start, len(line), found[1].state)
+                            record[0], _Location(path.name, start, len(line), record[1].state)
                         )
                     start += len(line)
                 if line and path.name not in self._read_to:
@@ -180,12 +180,12 @@ class Journal:
             self.damaged.append(str(path))
         return version == JOURNAL_VERSION
 
-    def _remember(self, key: str, place: _Location) -> None:
+    def _remember(self, key: str, location: _Location) -> None:
         """Store an entry's location. A later entry replaces an earlier one, unless only the
         earlier one is done."""
         before = self._places.get(key)
-        if before is None or before.state != "done" or place.state == "done":
-            self._places[key] = place
+        if before is None or before.state != "done" or location.state == "done":
+            self._places[key] = location
 
 
 def _parsed(line: bytes) -> tuple[str, Ended] | None:

@@ -76,8 +76,10 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         )
     if options.memory_limit < LEAST_MEMORY_GB:
         legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
-        what = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
-        raise UserError(what, legal=legal)
+        message = (
+            f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
+        )
+        raise UserError(message, legal=legal)
     limits = Limits(options.time_limit, round(1000 * options.memory_limit))
     shard = WHOLE if options.shard is None else Shard.of(options.shard)
     where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)

@@ -85,7 +85,7 @@ class LocalEngine:
 
     def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
         self.code = dict(code or {})
-        self.digests = {stage: source_digest(*which) for stage, which in self.code.items()}
+        self.digests = {stage: source_digest(*code) for stage, code in self.code.items()}
         self.false_starts = 0
         self.is_over = False
         self.trace_files: tempfile.TemporaryDirectory[str]
@@ -126,15 +126,15 @@ class LocalEngine:
 
     def ended(self) -> list[tuple[Job, Ended]]:
         """Wait for jobs to end. Raises UserError if processes run other code or cannot start."""
-        found: list[tuple[Job, Ended]] = []
-        while not found or not self._answers.ended.empty():
+        ended_jobs: list[tuple[Job, Ended]] = []
+        while not ended_jobs or not self._answers.ended.empty():
             answer = self._answers.ended.get()
             if isinstance(answer, UserError):
                 raise answer
             job, ended = answer
             self._out[job.stage] -= 1
-            found.append((job, ended))
-        return found
+            ended_jobs.append((job, ended))
+        return ended_jobs
 
     def put(self, job: Job, limits: Limits, answers: Answers) -> None:
         """Queue a job whose end goes into ``answers``; from any thread."""
@@ -143,9 +143,9 @@ class LocalEngine:
             self._waiting[stage].append(
                 (job, limits if stage == "trials" else Limits(limits.seconds), answers)
             )
-            own = [worker for worker in self._workers if worker.stage == stage]
-            idle = sum(worker.holds is None for worker in own)
-            if idle < len(self._waiting[stage]) and len(own) < self._most[stage]:
+            stage_workers = [worker for worker in self._workers if worker.stage == stage]
+            idle = sum(worker.holds is None for worker in stage_workers)
+            if idle < len(self._waiting[stage]) and len(stage_workers) < self._most[stage]:
                 self._workers.append(_Worker(self, stage, len(self._workers)))
                 self._workers[-1].start()
             self._state.notify_all()
@@ -244,21 +244,22 @@ class _Worker(threading.Thread):
             self.end()
             engine.false_starts += 1
             if engine.false_starts >= FALSE_STARTS:
-                what = (
+                message = (
                     f"{FALSE_STARTS} worker processes in a row died as they started: {digest.why}"
                 )
                 fix = "run the same command again, with fewer --jobs if memory is short, or a higher --memory-limit"
                 raise UserError(
-                    what,
+                    message,
                     legal="about 1 GB of memory per process for trials, 2 GB for renders",
                     fix=fix,
                 )
             return
         engine.false_starts = 0
         if digest != engine.digests.get(self.stage):
-            what = f"the code of {self.stage} was edited while this sweep ran: a new process has loaded other sources"
+            message = f"the code of {self.stage} was edited while this sweep ran: a new process has loaded other sources"
             raise UserError(
-                what, fix="run the same command again: the trials that are left run by the new code"
+                message,
+                fix="run the same command again: the trials that are left run by the new code",
             )
 
     def _answer(self, limit_s: float | None) -> Any:
@@ -305,8 +306,10 @@ class _Worker(threading.Thread):
             name = (
                 signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
             )
-            by = ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
-            why = f"its process was ended by {name}{by}"
+            cause = (
+                ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
+            )
+            why = f"its process was ended by {name}{cause}"
         trace = self._trace.read_text()[-TRACEBACK_CHARACTERS:] if self._trace.exists() else ""
         return why + (f"\n{trace}" if trace else "")
 
@@ -344,8 +347,8 @@ def _starting() -> Iterator[None]:
     process finds modules where this process does, not first in the folder in which it starts."""
     config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
     started_in = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
-    own = os.pathsep.join(path or started_in for path in sys.path)
-    with _STARTING, _environment(ONE_THREAD | {"PYTHONPATH": own, "PYTHONSAFEPATH": "1"}):
+    search_path = os.pathsep.join(path or started_in for path in sys.path)
+    with _STARTING, _environment(ONE_THREAD | {"PYTHONPATH": search_path, "PYTHONSAFEPATH": "1"}):
         daemon = config.get("daemon")
         config["daemon"] = False
         has_masks = hasattr(signal, "pthread_sigmask")
@@ -453,12 +456,14 @@ def render_into_cache(
 
     target = TargetConfig.from_data(target_data)
     optics = camera_of(CameraConfig.from_data(camera_data)).optics
-    view, found = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
+    view, was_stored = cached_view(
+        target, optics, RenderConfig.from_data(render_data), Path(folder)
+    )
     if (
         "drjit" in sys.modules
     ):  # threads wait busily: from the second render on, a process gets its share
         sys.modules["drjit"].set_thread_count(max((os.cpu_count() or 1) // MOST_RENDERERS, 1))
-    return found, view.seconds
+    return was_stored, view.seconds
 
 
 class SerialEngine:

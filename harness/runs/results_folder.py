@@ -16,12 +16,12 @@ DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
 def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
     """Return the folders with such names, sorted and without links."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
-        found = [
+        folders = [
             entry
             for entry in entries
             if names.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)
         ]
-        return sorted(Path(entry.path) for entry in found)
+        return sorted(Path(entry.path) for entry in folders)
     return []
 
 

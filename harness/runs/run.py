@@ -1,170 +1,35 @@
 """Runs a plan. Renders feed trials; detectors learn on hole-free boards, other hole-free trials
 set thresholds, and judged trials use both. Trials in the journal are not run again, nor are views
-rendered that only they need.
-
-Each shard calibrates its own thresholds, and different processors give slightly different last
-digits. So the journal stores the thresholds in use; after a merge, trials judged within `AGREES`
-of them count as judged at them."""
+rendered that only they need."""
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from math import isclose
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import numpy as np
-
-from harness.evaluation.intervals import threshold_for_rate
-from harness.experiment.schema import Point
-from harness.runs.jobs import Ended, Failure, Job, JobEngine, Outcome
-from harness.runs.journal import THRESHOLDS, Journal, record_text
+from harness.runs.calibration import Calibration, Quiet, refiled
+from harness.runs.job_batches import (
+    failure_of,
+    lost_view,
+    pictures_from,
+    render_job,
+    render_missing,
+)
+from harness.runs.jobs import Ended, Job, JobEngine, Outcome
+from harness.runs.journal import Journal, record_text
 from harness.runs.pictures import pictures_of
-from harness.runs.plan import Group, PlanPart, RenderJob, SweepPlan, parts_of
-from harness.runs.processes import render_into_cache
+from harness.runs.plan import PlanPart, RenderJob, SweepPlan, parts_of
 from harness.runs.shards import WHOLE, Shard
-from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, grid
 from harness.trials.learning import learn, learned_file
 from harness.trials.trial import TrialTask, run_trial
-from harness.vocabulary.errors import DiskFull, UserError
+from harness.vocabulary.errors import DiskFull
 from harness.vocabulary.files import write_bytes
-from harness.vocabulary.geometry import MM
-from harness.vocabulary.seeds import canonical_json, digest
-from scenes.render.cache import read_view
-
-# a camera that allows no threshold sees nothing if at most this share of a board's face is judged
-NOTHING = 0.1
-Quiet = dict[
-    str, dict[str, tuple[float, float]]
-]  # (quiet threshold, judged area in m2) by point, then by trial
-# relative difference of equal thresholds: below a tenth of the standard error of one from twenty
-# boards
-AGREES = 1e-3
-
-
-class Calibration:
-    """Derives thresholds from hole-free trials, which are added in any order. ``quiet``: shared by
-    all groups."""
-
-    def __init__(self, group: Group, quiet: Quiet) -> None:
-        self._group = group
-        self._quiet = quiet
-        self.unlearned: set[str] = set()
-        """Digests of points whose detector failed to learn: they get no threshold, not even a
-        given one."""
-
-    def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
-        """Add the ``runs`` rows of one trial."""
-        for run in runs:
-            if run["quiet_threshold"] is not None:
-                area_m2 = run.get("inspected_m2", np.nan)
-                self._quiet.setdefault(run["point"], {})[key] = (run["quiet_threshold"], area_m2)
-
-    def thresholds(self) -> tuple[dict[str, float], list[Failure]]:
-        """Return thresholds by point digest; and a failure for each point that has none."""
-        found: dict[str, float] = {}
-        failures: list[Failure] = []
-        for point in self._group.points:
-            quiet = self._quiet.get(point.digest, {})
-            threshold = None
-            why = "no hole-free run ended"
-            try:
-                if point.digest in self.unlearned:
-                    raise UserError("its detector has learned nothing")
-                threshold = threshold_of(point, [quiet[key] for key in sorted(quiet)])
-            except UserError as error:
-                why = str(error)
-            if threshold is None:
-                failures.append(Failure(f"threshold of {point.label}", why))
-            else:
-                found[point.digest] = threshold
-        return found, failures
-
-    def sets(self, own: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
-        """Return sets of thresholds that agree with ``own``, the set to use first: ``own``, or one
-        from the journal."""
-        prefix = self._prefix()
-        stored = []
-        for key in journal.thresholds():
-            entry = journal.read(key) if prefix and key.startswith(prefix) else None
-            thresholds = entry.record if entry is not None else None
-            if thresholds is None or thresholds.keys() != own.keys():
-                continue
-            if all(isclose(thresholds[name], own[name], rel_tol=AGREES) for name in own):
-                stored.append({name: float(value) for name, value in thresholds.items()})
-        mine = [dict(own)] if dict(own) in stored or not stored else []
-        return mine + [known for known in stored if known not in mine]
-
-    def store(self, thresholds: Mapping[str, float], journal: Journal) -> None:
-        """Store the thresholds at which this process judges, if trials set them."""
-        prefix = self._prefix()
-        key = f"{prefix}{digest(dict(thresholds))}"
-        if prefix and thresholds and journal.state(key) is None:
-            journal.write(key, Ended("done", canonical_json(dict(thresholds))))
-
-    def _prefix(self) -> str:
-        """Return the prefix of the keys of thresholds that are based on the added trials; empty
-        without such trials."""
-        keys = sorted(
-            {key for point in self._group.points for key in self._quiet.get(point.digest, ())}
-        )
-        return f"{THRESHOLDS}{digest(keys)}-" if keys else ""
-
-
-def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
-    """Return a trial's entry with the thresholds of ``task``, which agree with those at which it
-    was judged."""
-    new = {(point.variant, point.frames): point.threshold for point in task.points}
-    old = {(point.variant, point.frames): point.threshold for point in judged.points}
-    octaves = {"operating": FINDING_OCTAVES, "pixels": PIXEL_OCTAVES}
-    record = entry.record or {}
-    for table, rows in record.items():
-        for row in rows:
-            place = row.get("variant"), row.get("frames")
-            now = new.get(place)
-            if now is None or old.get(place) is None or row.get("threshold") is None:
-                continue
-            if table in octaves:
-                row["threshold"] = (
-                    grid(now, octaves[table]).tolist() if len(row["threshold"]) > 1 else [now]
-                )
-            else:
-                row["threshold"] = now
-    return replace(entry, value=record_text(record))
-
-
-def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | None:
-    """Return a point's threshold: given, or from its hole-free runs (quiet threshold, judged area
-    in m2): the highest or, in a study, the one for the wanted rate of false calls. None without
-    runs. Raises UserError."""
-    given = point.config.threshold.k
-    calibrate = point.config.threshold.calibrate
-    quiet = list(quiet)
-    if given is not None or not quiet:
-        return given
-    thresholds, areas_m2 = np.array(quiet).T
-    if calibrate is None or calibrate.false_calls_per_m2 is None:
-        return float(thresholds.max())
-    if not areas_m2.mean() > 0:
-        message = f"the detector {point.config.detector.name!r} gave no score to any pixel of the hole-free boards"
-        raise UserError(message, fix="check its crop against the boards' poses")
-    try:
-        return threshold_for_rate(
-            thresholds, float(areas_m2.mean()), calibrate.false_calls_per_m2
-        ).value
-    except UserError as error:
-        board = point.config.simulated.target.declare().board
-        seen = float(areas_m2.mean()) / (board.width_mm * board.height_mm * MM**2)
-        if seen > NOTHING:
-            raise
-        message = f"the camera sees nothing of the board here but {100 * seen:.2g} % of its face"
-        raise UserError(f"{message}, too little for a threshold") from error
-
 
 Report = Callable[[Outcome], None]
 AHEAD = 4096  # most trials that wait to be run: enough for a thousand workers, and a few megabytes
-# attempts at a render (two at once may need too much memory) or at a trial that sets a threshold
 TRIES = 2
+"""Attempts at a render (two at once may need too much memory) or at a trial that sets a
+threshold."""
 PARTS_AT_ONCE = 200  # parts looked up in the journal between two calls of the engine: about 0.1 s
 MOST_TRACEBACKS = 200  # failures whose traceback stays in memory; the journal has those of all
 
@@ -179,29 +44,29 @@ def run_plan(
     retry_failed: bool = False,
 ) -> Outcome:
     """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and
-    draw a whole sweep's pictures. A job that fails becomes a `Failure`; trials that need it are
-    skipped. Raises UserError if nothing can be written or the engine is gone. KeyboardInterrupt
-    passes through; the journal has all finished trials."""
-    first, then = parts_of(plan, shard)
-    run = _Run(plan, journal, engine, report, shard, retry_failed)
+    draw a whole sweep's pictures.
+
+    A job that fails becomes a `Failure`; trials that need it are skipped. Raises UserError if
+    nothing can be written or the engine is gone. KeyboardInterrupt passes through; the journal has
+    all finished trials.
+    """
+    calibrating_parts, judged_parts = parts_of(plan, shard)
+    run = _Run(plan, journal, engine, report, shard, retry_failed=retry_failed)
     outcome = run.outcome
-    outcome.trials.total = sum(len(part.repeats) for parts in (*first, *then) for part in parts)
-    run.judged_paths = {
-        n: [path for part in parts for path in part.batch.paths] for n, parts in enumerate(then)
-    }
+    for parts in (*calibrating_parts, *judged_parts):
+        outcome.trials.total += sum(len(part.repeats) for part in parts)
+    for number, parts in enumerate(judged_parts):
+        run.judged_paths[number] = [path for part in parts for path in part.batch.paths]
     try:
-        before = [part for parts in first for part in shard.rotated(parts)]
-        run.carry_out([part for part in before if part.batch.role == "learning"])
+        before = [part for parts in calibrating_parts for part in shard.rotated(parts)]
+        run.carry_out(part for part in before if part.batch.role == "learning")
         run.take_learned()
-        run.carry_out([part for part in before if part.batch.role != "learning"])
-        run.carry_out(
-            [
-                part
-                for number, parts in enumerate(then)
-                if parts
-                for part in run.calibrated(number, parts)
-            ]
-        )
+        run.carry_out(part for part in before if part.batch.role != "learning")
+        to_judge: list[PlanPart] = []
+        for number, parts in enumerate(judged_parts):
+            if parts:
+                to_judge += run.calibrated(number, parts)
+        run.carry_out(to_judge)
         while run.under_way:  # renders that no trial waits for
             run.step()
     finally:
@@ -209,111 +74,38 @@ def run_plan(
     if outcome.trials.over != outcome.trials.total:
         raise RuntimeError(f"trials were lost: {outcome.trials}")
     if shard.is_whole:
-        _draw(plan, outcome, engine, run.there)
+        _draw(plan, outcome, engine, run.rendered)
     outcome.finished.sort()
     outcome.failures.sort(key=lambda failure: failure.what)
     return outcome
 
 
-def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, stored: set[Path]) -> None:
+def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, rendered: set[Path]) -> None:
     """Add the pictures of all judged groups, except in studies, whose limits determine which
     boards are shown."""
-    groups = [group for group in plan.groups if group.damaged.board is None]
-    groups = [
-        group
-        for group in groups
-        if any(point.digest in outcome.thresholds for point in group.points)
-    ]
-    missing = (job for group in groups for job in group.damaged.renders if job.path not in stored)
-    failures = render_missing(missing, engine)
+    groups = []
+    for group in plan.groups:
+        is_judged = any(point.digest in outcome.thresholds for point in group.points)
+        if group.damaged.board is None and is_judged:
+            groups.append(group)
+    renders = [render for group in groups for render in group.damaged.renders]
+    failures = render_missing((job for job in renders if job.path not in rendered), engine)
     outcome.failures += failures
-    lost = {failure.what for failure in failures}
-    jobs = [
-        Job(f"pictures of set-up {number}", "trials", pictures_of, (group, outcome.thresholds))
-        for number, group in enumerate(groups)
-        if not any(_lost_view(path.name) in lost for path in group.damaged.paths)
-    ]
+    lost_views = {failure.what for failure in failures}
+    jobs = []
+    for number, group in enumerate(groups):
+        if not any(lost_view(path.name) in lost_views for path in group.damaged.paths):
+            arguments = (group, outcome.thresholds)
+            jobs.append(Job(f"pictures of set-up {number}", "trials", pictures_of, arguments))
     outcome.examples += pictures_from(jobs, engine, outcome)
 
 
-def pictures_from(jobs: Sequence[Job], engine: JobEngine, outcome: Outcome) -> Iterator[Any]:
-    """Start jobs that draw pictures again; return an iterator over all pictures in the order of
-    the jobs. While it is used, jobs that failed are added to the outcome."""
-    ends = carried_out(jobs, engine)
+@dataclass(frozen=True)
+class _Trial:
+    """A trial of the plan."""
 
-    def pictures() -> Iterator[Any]:
-        by_name = {job.name: ended for job, ended in ends}
-        for job in jobs:
-            if by_name[job.name].state == "done":
-                yield from by_name[job.name].value
-            else:
-                outcome.failures.append(_failure(job.name, by_name[job.name]))
-
-    return pictures()
-
-
-def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
-    """Render views that the cache lacks or holds damaged. Return a failure for each that could not
-    be rendered."""
-    missing = [
-        _render_job(job)
-        for job in {job.path: job for job in jobs}.values()
-        if read_view(job.path) is None
-    ]
-    ends = carried_out(missing, engine)
-    return [_failure(_lost_view(job.name), ended) for job, ended in ends if ended.state != "done"]
-
-
-def _lost_view(name: str) -> str:
-    return f"view {name} for a picture"
-
-
-def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, Ended]]:
-    """Run jobs; yield each with its end, in the order in which they end. The first jobs start with
-    this call."""
-    waiting = deque(jobs)
-
-    def started() -> int:
-        """Start the jobs for which there is room, and return their number."""
-        count = len(waiting)
-        while waiting and engine.room(waiting[0].stage) > 0:
-            engine.submit(waiting.popleft())
-        return count - len(waiting)
-
-    def ends(under_way: int) -> Iterator[tuple[Job, Ended]]:
-        while waiting or under_way:
-            for job, ended in engine.ended():
-                under_way -= 1
-                yield job, ended
-            under_way += started()
-
-    return ends(started())
-
-
-def values_of(
-    function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], engine: JobEngine
-) -> list[Any]:
-    """Return the values of a function of each of several arguments, None for a user's mistake. A
-    bug is raised."""
-    jobs = [Job(str(number), "trials", function, each) for number, each in enumerate(arguments)]
-    ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
-    if bug := next((end.why for end in ends.values() if end.is_bug), None):
-        raise RuntimeError(bug)
-    return [ends[job.name].value for job in jobs]
-
-
-def _render_job(job: RenderJob) -> Job:
-    arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
-    return Job(job.path.name, "renders", render_into_cache, arguments)
-
-
-def _failure(what: str, ended: Ended) -> Failure:
-    return Failure(what, ended.why, ended.is_bug, ended.state)
-
-
-class _Trial(NamedTuple):
     part: PlanPart
-    key: str
+    key: str  # its key in the journal, which also names its job
     task: TrialTask
 
 
@@ -328,135 +120,160 @@ class _Run:
         engine: JobEngine,
         report: Report,
         shard: Shard,
-        retry: bool,
+        *,
+        retry_failed: bool,
     ) -> None:
-        self.outcome = Outcome()
-        self.under_way: dict[str, _Trial | RenderJob] = {}
-        self.there: set[Path] = set()
-        self.judged_paths: dict[int, list[Path]] = {}
         self._groups = plan.groups
         self._journal = journal
         self._engine = engine
         self._report = report
         self._shard = shard
-        self._retry_failed = retry
-        self._renders = {job.path: job for job in plan.renders}
+        self._retry_failed = retry_failed
+
+        self.outcome = Outcome()
+        self.under_way: dict[str, _Trial | RenderJob] = {}
+        """What runs in the engine, by the name of its job."""
+        self._deaths: Counter[str] = Counter()
+        """How often the process of a job died, by the job's name."""
+
+        # views
+        self._renders = {render.path: render for render in plan.renders}
+        self.rendered: set[Path] = set()
+        """Files of views that are in the cache."""
+        self._lost: dict[Path, str] = {}
+        """The reasons why views could not be rendered."""
+        self._requested: set[Path] = set()
+        """Views that were ever requested."""
+        self._render_now: deque[Path] = deque()
+        self._render_when_idle: deque[Path] = deque()
+        self.judged_paths: dict[int, list[Path]] = {}
+        """The views that judged trials of a group need, by the group's number: rendered while the
+        engine is idle, from when its calibration has begun."""
+
+        # trials
+        self._queue: deque[_Trial] = deque()
+        """Trials whose views are rendered."""
+        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}
+        """Parts that wait for a view, with their trials."""
+        self._unstarted = 0
+        """Number of trials that are queued or wait for a view."""
+        self._running = 0
+        """Number of trials that run."""
+
+        # thresholds
         quiet: Quiet = {}
         self._calibrations = [Calibration(group, quiet) for group in plan.groups]
-        # by group: thresholds of other shards that agree with those in use
-        self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
-        self._deaths: Counter[str] = (
-            Counter()
-        )  # by job: how often the process of a render or calibrating trial died
-        self._queue: deque[_Trial] = deque()
-        self._waiting: dict[
-            Path, list[tuple[PlanPart, list[_Trial]]]
-        ] = {}  # by view: parts that wait for it
-        self._unstarted = self._running = (
-            0  # numbers of queued or waiting trials, and of running trials
-        )
-        self._lost: dict[Path, str] = {}
-        self._requested: set[Path] = set()  # views that were ever requested
-        self._wanted: deque[Path] = deque()  # views to render now; then those to render later
-        self._later: deque[Path] = deque()
+        self._others_thresholds: list[list[dict[str, float]]] = [[] for _ in plan.groups]
+        """By group: thresholds of other shards that agree with those in use."""
 
     def carry_out(self, parts: Iterable[PlanPart]) -> None:
         """Run all trials of the parts that the journal lacks."""
-        to_open = deque(parts)
-        while to_open or self._unstarted or self._running:
+        unopened = deque(parts)
+        while unopened or self._unstarted or self._running:
             for _ in range(PARTS_AT_ONCE):
-                if not to_open or self._unstarted >= AHEAD:
+                if not unopened or self._unstarted >= AHEAD:
                     break
-                self._open(to_open.popleft())
-            while self._engine.room("renders") > 0:
-                while (
-                    self._later and not to_open and not self._wanted
-                ):  # rendered while the engine is idle
-                    self._want(self._later.popleft())
-                if not self._wanted:
-                    break
-                render = self._renders[self._wanted.popleft()]
-                self.under_way[render.path.name] = render
-                self._engine.submit(_render_job(render))
+                self._open(unopened.popleft())
+            self._start_renders(is_idle=not unopened)
             while self._engine.room("trials") > 0 and self._queue:
                 self._begin(self._queue.popleft())
             self.step()
 
+    def _start_renders(self, *, is_idle: bool) -> None:
+        """Give the engine the renders for which it has room; if it is idle, also those that only
+        later trials need."""
+        while self._engine.room("renders") > 0:
+            while is_idle and self._render_when_idle and not self._render_now:
+                self._request(self._render_when_idle.popleft())
+            if not self._render_now:
+                return
+            render = self._renders[self._render_now.popleft()]
+            self.under_way[render.path.name] = render
+            self._engine.submit(render_job(render))
+
     def step(self) -> None:
         """Wait for jobs to end, and process their results."""
         self._report(self.outcome)
-        for job, ended in self._engine.ended() if self.under_way else ():
-            if ended.ends_all:
-                raise DiskFull(ended.why)
-            work = self.under_way.pop(job.name)
-            self._deaths[job.name] += ended.state == "crashed"
-            again = ended.state == "crashed" and self._deaths[job.name] < TRIES
-            if isinstance(work, RenderJob):
-                if again:
-                    self._wanted.appendleft(work.path)
-                else:
-                    self._render_over(work.path, ended)
-                continue
-            self._running -= 1
-            if again and work.part.sets_threshold:
-                self._queue.append(work)
-                self._unstarted += 1
-                continue
-            self._journal.write(work.key, ended)
-            self.outcome.peak_mb = max(self.outcome.peak_mb, ended.peak_mb)
-            self.outcome.trials.done += ended.state == "done"
-            self._count(work, ended)
+        if self.under_way:
+            for job, ended in self._engine.ended():
+                self._job_over(job, ended)
         self._report(self.outcome)
+
+    def _job_over(self, job: Job, ended: Ended) -> None:
+        if ended.ends_all:
+            raise DiskFull(ended.why)
+        work = self.under_way.pop(job.name)
+        self._deaths[job.name] += ended.state == "crashed"
+        is_tried_again = ended.state == "crashed" and self._deaths[job.name] < TRIES
+        if isinstance(work, RenderJob):
+            if is_tried_again:
+                self._render_now.appendleft(work.path)
+            else:
+                self._render_over(work.path, ended)
+            return
+        self._running -= 1
+        if is_tried_again and work.part.sets_threshold:
+            self._queue.append(work)
+            self._unstarted += 1
+            return
+        self._journal.write(work.key, ended)
+        self.outcome.peak_mb = max(self.outcome.peak_mb, ended.peak_mb)
+        self.outcome.trials.done += ended.state == "done"
+        self._count(work, ended)
 
     def take_learned(self) -> None:
         """Write what detectors have learned into files, which trials read."""
         for group, calibration in zip(self._groups, self._calibrations, strict=True):
-            for point, path in ((point, Path(file)) for point, file in group.learned.items()):
+            for point_digest, file in group.learned.items():
+                path = Path(file)
                 entry = self._journal.read(path.stem)
                 if entry is None or entry.record is None:
-                    calibration.unlearned.add(point)
+                    calibration.unlearned.add(point_digest)
                 elif not path.exists():
                     write_bytes(path, learned_file(entry.record))
 
     def calibrated(self, number: int, judged: list[PlanPart]) -> list[PlanPart]:
         """Set the thresholds of a group. Return the parts that can be judged at them."""
         calibration = self._calibrations[number]
-        thresholds, failures = calibration.thresholds()
+        own_thresholds, failures = calibration.thresholds()
         if not self._shard.is_whole:
             self._journal.refresh()
-        thresholds, *self._others[number] = calibration.sets(thresholds, self._journal)
+        thresholds, *others_thresholds = calibration.sets(own_thresholds, self._journal)
+        self._others_thresholds[number] = others_thresholds
         calibration.store(thresholds, self._journal)
         self.outcome.thresholds |= thresholds
         self.outcome.failures += failures
-        for part in () if thresholds else judged:
-            made = self._groups[number].trials(part.batch, None, part.repeats)
-            self._skip(
-                [_Trial(part, *keyed) for keyed in made], f"no threshold: {failures[0].in_short}"
-            )
-        return judged if thresholds else []
+        if thresholds:
+            return judged
+        for part in judged:
+            keyed_tasks = self._groups[number].trials(part.batch, None, part.repeats)
+            trials = [_Trial(part, key, task) for key, task in keyed_tasks]
+            self._skip(trials, f"no threshold: {failures[0].in_short}")
+        return []
 
-    def _want(self, path: Path) -> None:
+    def _request(self, path: Path) -> None:
+        """Have a view rendered, unless it was requested before."""
         if path not in self._requested:
             self._requested.add(path)
-            self._wanted.append(path)
+            self._render_now.append(path)
             self.outcome.renders.total += 1
 
     def _open(self, part: PlanPart) -> None:
         """Take the finished trials of a part from the journal, and queue the others once their
         views are rendered."""
-        missing = [trial for trial in self._trials(part) if not self._found(trial)]
+        missing = [trial for trial in self._trials(part) if not self._take_from_journal(trial)]
         if not missing:
             return
-        absent = [path for path in part.batch.paths if path not in self.there]
+        absent = [path for path in part.batch.paths if path not in self.rendered]
         for path in absent:
-            self._want(path)
+            self._request(path)
         lost = [self._lost[path] for path in absent if path in self._lost]
         if lost:
             self._skip(missing, lost[0])
             return
         self._unstarted += len(missing)
         if part.sets_threshold:
-            self._later += self.judged_paths.pop(part.group, ())
+            self._render_when_idle += self.judged_paths.pop(part.group, ())
         if not absent:
             self._queue += missing
         for path in absent:
@@ -467,7 +284,7 @@ class _Run:
         if not self._shard.is_whole and trial.part.sets_threshold:
             # another shard in the same folder may have run it in the meantime
             self._journal.refresh()
-            if self._found(trial):
+            if self._take_from_journal(trial):
                 return
         self._running += 1
         self.under_way[trial.key] = trial
@@ -477,70 +294,74 @@ class _Run:
         """Return a part's trials. Those that others judged at agreeing thresholds are filed under
         this run's keys."""
         group = self._groups[part.group]
-        made = group.trials(
-            part.batch,
-            self.outcome.thresholds,
-            part.repeats,
-            self._calibrations[part.group].unlearned,
-        )
-        found = [_Trial(part, key, task) for key, task in made]
-        self.outcome.trials.total += len(found) - len(part.repeats)
+        unlearned = self._calibrations[part.group].unlearned
+        keyed_tasks = group.trials(part.batch, self.outcome.thresholds, part.repeats, unlearned)
+        trials = [_Trial(part, key, task) for key, task in keyed_tasks]
+        self.outcome.trials.total += len(trials) - len(part.repeats)
         if part.sets_threshold:
-            return self._shard.rotated(found)
-        for thresholds in self._others[part.group]:
-            for trial, (key, judged) in zip(
-                found, group.trials(part.batch, thresholds, part.repeats), strict=True
-            ):
-                is_new = (
-                    self._journal.state(trial.key) != "done" and self._journal.state(key) == "done"
-                )
-                if is_new and (entry := self._journal.read(key)) is not None:
-                    self._journal.write(trial.key, refiled(entry, judged, trial.task))
-        return found
+            return self._shard.rotated(trials)
+        for thresholds in self._others_thresholds[part.group]:
+            others_tasks = group.trials(part.batch, thresholds, part.repeats)
+            for trial, (others_key, others_task) in zip(trials, others_tasks, strict=True):
+                self._refile(trial, others_key, others_task)
+        return trials
 
-    def _found(self, trial: _Trial) -> bool:
-        """Return whether the journal has a trial's final end, so that it is not run again."""
+    def _refile(self, trial: _Trial, others_key: str, others_task: TrialTask) -> None:
+        """File what another shard has judged under this run's key, unless it is there."""
+        if self._journal.state(trial.key) == "done" or self._journal.state(others_key) != "done":
+            return
+        entry = self._journal.read(others_key)
+        if entry is not None:
+            self._journal.write(trial.key, refiled(entry, others_task, trial.task))
+
+    def _take_from_journal(self, trial: _Trial) -> bool:
+        """Count a trial whose final end is in the journal, which is not run again. Returns whether
+        it is."""
         entry = self._journal.read(trial.key)
-        if (
-            entry is None
-            or entry.state == "skipped"
-            or (self._retry_failed and entry.state != "done")
-        ):
+        if entry is None or entry.state == "skipped":
+            return False
+        if self._retry_failed and entry.state != "done":
             return False
         self.outcome.trials.found += entry.state == "done"
         self._count(trial, entry)
         return True
 
     def _count(self, trial: _Trial, entry: Ended) -> None:
+        """Count a trial's end; what sets a threshold goes to the calibration."""
         if entry.state == "done":
             self.outcome.finished.append(trial.key)
             if trial.part.sets_threshold and entry.record is not None:
                 self._calibrations[trial.part.group].add(trial.key, entry.record["runs"])
             return
         self.outcome.trials.failed += 1
-        failure = _failure(trial.key, entry)
-        whole = len(self.outcome.failures) < MOST_TRACEBACKS
-        self.outcome.failures.append(failure if whole else replace(failure, why=failure.in_short))
+        failure = failure_of(trial.key, entry)
+        if len(self.outcome.failures) >= MOST_TRACEBACKS:
+            failure = replace(failure, why=failure.in_short)
+        self.outcome.failures.append(failure)
 
     def _render_over(self, path: Path, ended: Ended) -> None:
+        """Count a render's end; queue the trials that waited for it, or skip them."""
         counts = self.outcome.renders
         waiting = self._waiting.pop(path, ())
         if ended.state == "done":
-            was_there, seconds = ended.value
-            counts.found += was_there
-            counts.done += not was_there
-            counts.seconds += 0.0 if was_there else seconds
-            self.there.add(path)
+            was_stored, seconds = ended.value
+            if was_stored:
+                counts.found += 1
+            else:
+                counts.done += 1
+                counts.seconds += seconds
+            self.rendered.add(path)
             for part, trials in waiting:
-                if self.there.issuperset(part.batch.paths):
+                if self.rendered.issuperset(part.batch.paths):
                     self._queue += trials
             return
         counts.failed += 1
-        self.outcome.failures.append(_failure(f"render {path.stem}", ended))
-        self._lost[path] = self.outcome.failures[-1].in_short
+        failure = failure_of(f"render {path.stem}", ended)
+        self.outcome.failures.append(failure)
+        self._lost[path] = failure.in_short
         for _, trials in waiting:
             self._unstarted -= len(trials)
-            self._skip(trials, self._lost[path])
+            self._skip(trials, failure.in_short)
             trials.clear()  # the part's other views wait with the same list
 
     def _skip(self, trials: Iterable[_Trial], why: str) -> None:

@@ -30,8 +30,8 @@ class Shard:
     @classmethod
     def of(cls, text: str) -> Shard:
         """Parse text such as ``3/10``. Raises UserError."""
-        found = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-        shard = cls(int(found[1]), int(found[2])) if found else None
+        match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+        shard = cls(int(match[1]), int(match[2])) if match else None
         if shard is None or not 1 <= shard.number <= shard.count <= MOST:
             raise UserError(
                 f"--shard {text!r}: is not a part", legal=f"1/10 to 10/10, for up to {MOST} parts"
@@ -78,8 +78,8 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            what = f"{path.parent}: another sweep is running in this folder"
-            raise UserError(what, fix="wait for it, or name another folder with --out")
+            message = f"{path.parent}: another sweep is running in this folder"
+            raise UserError(message, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(
                 f"{path.parent}: cannot be locked on this system: do not start a second sweep in it",

@@ -48,12 +48,12 @@ def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float]) -> 
 
 def mean_of(values: ArrayLike) -> Reading:
     """Return the mean of independent values with Student's interval; NaN values are left out."""
-    known = np.asarray(values, float)
-    known = known[np.isfinite(known)]
-    if known.size < 2:
-        return Reading(float(known[0])) if known.size else NOTHING
-    low, high = mean_t(known.mean(), known.std(ddof=1), known.size)
-    return Reading(float(known.mean()), Interval(float(low), float(high)))
+    valid = np.asarray(values, float)
+    valid = valid[np.isfinite(valid)]
+    if valid.size < 2:
+        return Reading(float(valid[0])) if valid.size else NOTHING
+    low, high = mean_t(valid.mean(), valid.std(ddof=1), valid.size)
+    return Reading(float(valid.mean()), Interval(float(low), float(high)))
 
 
 def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
@@ -110,49 +110,51 @@ def find_planes(
     belong to it, and connected points up to `GROWN` times as far. Planes with fewer than
     ``least_px`` pixels are left out. Equal images give equal planes."""
     basis = _with_ones(slopes)
-    left = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
-    found: list[tuple[Plane, np.ndarray]] = []
-    while len(found) < MOST_PLANES and left.sum() >= least_px:
-        inverse = _best_candidate(z_m, basis, left, tolerance_m, len(found))
+    free = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
+    planes: list[tuple[Plane, np.ndarray]] = []
+    while len(planes) < MOST_PLANES and free.sum() >= least_px:
+        inverse = _best_candidate(z_m, basis, free, tolerance_m, len(planes))
         for _ in range(3):
-            mask = left & (_distance_m(inverse, basis, z_m) < tolerance_m)
+            mask = free & (_distance_m(inverse, basis, z_m) < tolerance_m)
             if mask.sum() < 3:
                 break
             inverse = robust_inverse_fit(basis[mask], z_m[mask])[0]
-        labels, _ = ndimage.label(left & (_distance_m(inverse, basis, z_m) < GROWN * tolerance_m))
+        labels, _ = ndimage.label(free & (_distance_m(inverse, basis, z_m) < GROWN * tolerance_m))
         sizes = np.bincount(labels[mask & (labels > 0)], minlength=1)
-        mask = labels == sizes.argmax() if sizes.any() else np.zeros_like(left)
+        mask = labels == sizes.argmax() if sizes.any() else np.zeros_like(free)
         if mask.sum() < least_px:
             break
-        found.append((fit_plane(z_m[mask], slopes[mask]), mask))
-        left = left & ~mask
-    return sorted(found, key=lambda each: -int(each[1].sum()))
+        planes.append((fit_plane(z_m[mask], slopes[mask]), mask))
+        free = free & ~mask
+    return sorted(planes, key=lambda plane_and_mask: -int(plane_and_mask[1].sum()))
 
 
 def _best_candidate(
-    z_m: np.ndarray, basis: np.ndarray, left: np.ndarray, tolerance_m: float, number: int
+    z_m: np.ndarray, basis: np.ndarray, free: np.ndarray, tolerance_m: float, number: int
 ) -> np.ndarray:
     """Return the coefficients (3,) of 1/z of the plane through three close points that has most
     screened pixels."""
     rng = random_stream(0, "planes", number)
-    points = np.argwhere(left)
+    points = np.argwhere(free)
     shift = rng.integers(-TRIPLE_PX, TRIPLE_PX + 1, (CANDIDATES, 3, 2))
     shift[:, 0] = 0
-    at = np.clip(
+    sample = np.clip(
         points[rng.integers(0, len(points), CANDIDATES)][:, None] + shift,
         0,
-        np.array(left.shape) - 1,
+        np.array(free.shape) - 1,
     )
-    rays = basis[at[..., 0], at[..., 1]]
-    z = z_m[at[..., 0], at[..., 1]]
-    usable = left[at[..., 0], at[..., 1]].all(axis=1)
+    rays = basis[sample[..., 0], sample[..., 1]]
+    z = z_m[sample[..., 0], sample[..., 1]]
+    usable = free[sample[..., 0], sample[..., 1]].all(axis=1)
     usable[usable] = np.abs(np.linalg.det(rays[usable])) > 1e-8
     if not usable.any():
-        return np.array([1 / np.nanmedian(z_m[left]), 0.0, 0.0])
+        return np.array([1 / np.nanmedian(z_m[free]), 0.0, 0.0])
     candidates = np.linalg.solve(rays[usable], 1 / z[usable][..., None])[..., 0]
     row, column = points[rng.integers(0, len(points), SCREENED)].T
-    near = _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column]) < tolerance_m
-    return np.asarray(candidates[int(near.sum(axis=1).argmax())])
+    is_close = (
+        _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column]) < tolerance_m
+    )
+    return np.asarray(candidates[int(is_close.sum(axis=1).argmax())])
 
 
 def _distance_m(inverse: np.ndarray, basis: np.ndarray, z_m: np.ndarray) -> np.ndarray:
@@ -200,9 +202,9 @@ def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tupl
     h, w = where.shape
     first = (slice(h - lag_y), slice(w - lag_x))
     second = (slice(lag_y, h), slice(lag_x, w))
-    both = where[first] & where[second]
-    a = d[..., *first][..., both]
-    b = d[..., *second][..., both]
+    valid_pairs = where[first] & where[second]
+    a = d[..., *first][..., valid_pairs]
+    b = d[..., *second][..., valid_pairs]
     pair = np.isfinite(a) & np.isfinite(b)
     if not pair.any():
         return float("nan"), float("nan")
@@ -260,8 +262,10 @@ def fixed_pattern(
         of_noise = covariance(noise, good, lag_x, lag_y)[0] / (len(z_m) - 1)
         return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
 
-    left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(axis=1)
-    return FixedPattern(float(np.sqrt(max(left[0], 0))), left)
+    correlation_left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(
+        axis=1
+    )
+    return FixedPattern(float(np.sqrt(max(correlation_left[0], 0))), correlation_left)
 
 
 TOLERANCE_SIGMAS = 4.0
@@ -294,21 +298,22 @@ def edge_widths(
     ``flying`` pixels with a range off both surfaces, and the share of lines ``with_flying``
     pixels. All but the gap are NaN if noise hides the step. ``front_z_m`` and ``back_z_m`` (h, w)
     are z along each ray; ``from_edge_px`` (h, w) is negative in front, NaN for excluded pixels."""
-    near = np.abs(from_edge_px) <= reach_px
-    z = z_m[:, near]
+    within_reach = np.abs(from_edge_px) <= reach_px
+    z = z_m[:, within_reach]
     on_surface = np.any(
-        [np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m)], axis=0
+        [np.abs(z - surface[within_reach]) <= tolerance_m for surface in (front_z_m, back_z_m)],
+        axis=0,
     )
-    lines = np.asarray(near.any(axis=across - 1))
+    lines = np.asarray(within_reach.any(axis=across - 1))
     flying = np.zeros(z_m.shape, bool)
-    flying[:, near] = np.isfinite(z) & ~on_surface
-    found = {
+    flying[:, within_reach] = np.isfinite(z) & ~on_surface
+    readings = {
         "gap": (~np.isfinite(z)).sum(axis=1) / lines.sum(),
         "flying": flying.sum(axis=(1, 2)) / lines.sum(),
     }
-    found["with_flying"] = np.asarray(flying.any(axis=across))[:, lines].mean(axis=1)
+    readings["with_flying"] = np.asarray(flying.any(axis=across))[:, lines].mean(axis=1)
     unknown = np.full(len(z_m), np.nan)
     return {
-        name: unknown if np.isnan(tolerance_m) and name != "gap" else each
-        for name, each in found.items()
+        name: unknown if np.isnan(tolerance_m) and name != "gap" else reading
+        for name, reading in readings.items()
     }

@@ -86,11 +86,11 @@ Make = Callable[[], Detector]
 T = TypeVar("T")
 
 
-def require(kept: bool | np.bool_, what: str) -> None:
+def require(kept: bool | np.bool_, message: str) -> None:
     """Raise AssertionError unless this part of the contract is kept; unlike assert, it also works
     with python -O."""
     if not kept:
-        raise AssertionError(what)
+        raise AssertionError(message)
 
 
 @dataclass(frozen=True)
@@ -126,30 +126,30 @@ class Look:
 
     def measured(self, finding: Detection) -> Measurement:
         """Measure a finding, and check that the numbers are valid."""
-        found = self.detector.measure(self.cloud, self.evidence, finding)
-        diameter = found.extent_diameter_m
-        centre = np.asarray(found.extent_centre_m)
+        measurement = self.detector.measure(self.cloud, self.evidence, finding)
+        diameter = measurement.extent_diameter_m
+        centre = np.asarray(measurement.extent_centre_m)
         require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
         require(
             centre.shape == (3,) and np.isfinite(centre).all(),
             "`extent_centre_m` is not 3 finite numbers",
         )
         require(
-            found.score == finding.score,
-            f"`measure` gives score {found.score:g}, the finding {finding.score:g}",
+            measurement.score == finding.score,
+            f"`measure` gives score {measurement.score:g}, the finding {finding.score:g}",
         )
-        require(found.points >= 1, f"`measure` gives {found.points} points")
-        return found
+        require(measurement.points >= 1, f"`measure` gives {measurement.points} points")
+        return measurement
 
     def everything(self) -> tuple[Any, ...]:
         """Return all results of a detector on a cloud."""
         quiet = self.quiet
-        found = self.find(quiet / 2)
+        findings = self.find(quiet / 2)
         return (
             self.evidence,
             quiet,
-            found,
-            [self.measured(finding) for finding in found[:STRONGEST]],
+            findings,
+            [self.measured(finding) for finding in findings[:STRONGEST]],
         )
 
 
@@ -196,12 +196,12 @@ def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
 
 def keeps_its_input(make: Make, cloud: Cloud) -> None:
     """Check that the detector never writes to the cloud or the evidence, not even temporarily."""
-    given = _with_arrays(cloud, np.ndarray.copy)
-    look = Look.at(make(), given)
-    require(_same(given, cloud), "`analyse` changed the cloud that it was given")
+    original = _with_arrays(cloud, np.ndarray.copy)
+    look = Look.at(make(), original)
+    require(_same(original, cloud), "`analyse` changed the cloud that it was given")
     kept = _with_arrays(look.evidence, np.ndarray.copy)
     look.everything()
-    require(_same(given, cloud), "`find`, `quiet_threshold` or `measure` changed the cloud")
+    require(_same(original, cloud), "`find`, `quiet_threshold` or `measure` changed the cloud")
     require(
         _same(look.evidence, kept), "`find`, `quiet_threshold` or `measure` changed the evidence"
     )
@@ -214,8 +214,8 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
     equal to their score."""
     look = Look.at(make(), cloud)
     for threshold in look.thresholds():
-        found = look.find(threshold)
-        scores = np.array([finding.score for finding in found], dtype=float)
+        findings = look.find(threshold)
+        scores = np.array([finding.score for finding in findings], dtype=float)
         require(
             np.isfinite(scores).all(),
             f"at a threshold of {threshold:g} a finding's score is not finite",
@@ -229,7 +229,7 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
             (np.diff(scores) <= 0).all(),
             f"at a threshold of {threshold:g} the strongest finding is not first",
         )
-        for finding in found[:STRONGEST]:
+        for finding in findings[:STRONGEST]:
             gone = look.find(finding.score)
             kept = look.find(float(np.nextafter(finding.score, 0.0)))
             require(
@@ -256,10 +256,10 @@ def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
         f"just below the quiet threshold of {quiet:g} nothing is found",
     )
     for threshold in look.thresholds():
-        found = look.find(threshold)
-        strongest = found[0].score if found else float("nan")
-        what = f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but {quiet:g} is quiet"
-        require(strongest == quiet, what)
+        findings = look.find(threshold)
+        strongest = findings[0].score if findings else float("nan")
+        message = f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but {quiet:g} is quiet"
+        require(strongest == quiet, message)
 
 
 def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
@@ -299,14 +299,14 @@ def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
     gone = np.ones_like(cloud.valid)
     for points in (0, 1):
         gone.reshape(-1)[np.flatnonzero(cloud.valid)[:points]] = False
-        few = without(cloud, gone)
+        few_points = without(cloud, gone)
         try:
-            look = Look(detector, few, detector.analyse(few))
+            look = Look(detector, few_points, detector.analyse(few_points))
         except UserError:
             continue
         except Exception as error:
-            what = f"{type(error).__name__}: {error}"
-            text = f"a cloud with {points} valid points is not refused by a UserError but ends in {what}"
+            message = f"{type(error).__name__}: {error}"
+            text = f"a cloud with {points} valid points is not refused by a UserError but ends in {message}"
             raise AssertionError(text) from error
         require(points > 0, "a cloud without any point was not refused")
         look.everything()
@@ -425,7 +425,7 @@ def _sound_findings(look: Look, *thresholds: float) -> None:
     points = cloud.points_m[cloud.valid]
     low = points.min(axis=0) - CENTRE_MARGIN_M
     high = points.max(axis=0) + CENTRE_MARGIN_M
-    for finding in (each for threshold in thresholds for each in look.find(threshold)):
+    for finding in (finding for threshold in thresholds for finding in look.find(threshold)):
         pixels = np.asarray(finding.pixels)
         centre = np.asarray(finding.centre_m)
         require(
@@ -453,9 +453,11 @@ def _sound_findings(look: Look, *thresholds: float) -> None:
         )
 
 
-def _pixels_of(found: tuple[Detection, ...]) -> np.ndarray:
+def _pixels_of(findings: tuple[Detection, ...]) -> np.ndarray:
     return np.unique(
-        np.concatenate([np.zeros(0, np.int64), *(np.asarray(finding.pixels) for finding in found)])
+        np.concatenate(
+            [np.zeros(0, np.int64), *(np.asarray(finding.pixels) for finding in findings)]
+        )
     )
 
 
@@ -483,15 +485,17 @@ def _same(a: Any, b: Any) -> bool:
 
 def _with_arrays(value: T, change: Callable[[np.ndarray], np.ndarray]) -> T:
     """Return a copy of a dataclass with changed arrays."""
-    held = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
-    changed = {name: change(array) for name, array in held.items() if isinstance(array, np.ndarray)}
+    values = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
+    changed = {
+        name: change(array) for name, array in values.items() if isinstance(array, np.ndarray)
+    }
     return cast(T, replace(cast(Any, value), **changed))
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    seen = array.copy()
-    seen.setflags(write=False)
-    return seen
+    read_only = array.copy()
+    read_only.setflags(write=False)
+    return read_only
 
 
 def turned_once(cloud: Cloud) -> Cloud:
@@ -514,8 +518,8 @@ def turned_once(cloud: Cloud) -> Cloud:
     width = lens.width if lens is not None else region.col1
     turned["region"] = Region(width - region.col1, width - region.col0, region.row0, region.row1)
     if lens is not None:
-        k1, k2, p1, p2, *further = lens.distortion
-        distortion = (k1, k2, -p2, p1, *further)
+        k1, k2, p1, p2, *further_coefficients = lens.distortion
+        distortion = (k1, k2, -p2, p1, *further_coefficients)
         turned["lens"] = Lens(
             lens.height, width, lens.fy, lens.fx, lens.cy, width - 1 - lens.cx, distortion
         )
@@ -528,7 +532,7 @@ def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
 
 
 def _compare(
-    before: Look, after: Look, pixels: np.ndarray, T_after_before: np.ndarray, how: str
+    before: Look, after: Look, pixels: np.ndarray, T_after_before: np.ndarray, motion: str
 ) -> None:
     """Compare scores and findings; ``pixels`` (h, w) holds the flat index before of each pixel
     afterwards."""
@@ -537,17 +541,17 @@ def _compare(
     changed = int((np.isfinite(was) != np.isfinite(now)).sum())
     require(
         changed <= CROP_TOLERANCE * now.size,
-        f"{how}, {changed} of {now.size} pixels gained or lost their score",
+        f"{motion}, {changed} of {now.size} pixels gained or lost their score",
     )
     tolerance = SCORE_TOLERANCE * max(float(np.nanmax(was)), 1e-12)
     changes = {
         "a score": float(np.nanmax(np.abs(was - now))),
         "the quiet threshold": abs(before.quiet - after.quiet),
     }
-    for what, difference in changes.items():
+    for quantity, difference in changes.items():
         require(
             difference <= tolerance,
-            f"{how}, {what} changed by {difference:g} (allowed {tolerance:g})",
+            f"{motion}, {quantity} changed by {difference:g} (allowed {tolerance:g})",
         )
 
     # findings are compared in the middle of the widest gap between scores from a fifth of the
@@ -568,12 +572,15 @@ def _compare(
     lost = (
         f"{len(of_before.keys() - of_after.keys())} of {len(of_before)} findings have other pixels"
     )
-    require(of_before.keys() == of_after.keys(), f"{how}, {lost}, and there are {len(of_after)}")
+    require(of_before.keys() == of_after.keys(), f"{motion}, {lost}, and there are {len(of_after)}")
     for key, finding in of_before.items():
         moved_to = transform_points(T_after_before, finding.centre_m)
-        apart = float(np.linalg.norm(np.asarray(moved_to) - np.asarray(of_after[key].centre_m)))
+        distance_m = float(
+            np.linalg.norm(np.asarray(moved_to) - np.asarray(of_after[key].centre_m))
+        )
         require(
-            apart <= PLACE_TOLERANCE_M, f"{how}, a finding's centre moved by {1e3 * apart:.2f} mm"
+            distance_m <= PLACE_TOLERANCE_M,
+            f"{motion}, a finding's centre moved by {1e3 * distance_m:.2f} mm",
         )
         sizes = (
             before.measured(finding).extent_diameter_m,
@@ -581,5 +588,6 @@ def _compare(
         )
         grown = abs(sizes[1] - sizes[0])
         require(
-            grown <= PLACE_TOLERANCE_M, f"{how}, a finding's extent changed by {1e3 * grown:.2f} mm"
+            grown <= PLACE_TOLERANCE_M,
+            f"{motion}, a finding's extent changed by {1e3 * grown:.2f} mm",
         )

@@ -22,9 +22,9 @@ class Config(BaseModel):
             else data
         )
 
-    def model_copy(self, **how: Any) -> Self:
+    def model_copy(self, **options: Any) -> Self:
         """Copy as pydantic does, but drop the values that the original has cached."""
-        copied = super().model_copy(**how)
+        copied = super().model_copy(**options)
         for name in copied.__dict__.keys() - type(self).model_fields.keys():
             del copied.__dict__[name]
         return copied

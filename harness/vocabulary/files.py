@@ -52,11 +52,11 @@ def size_text(count: int) -> str:
     )
 
 
-def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: str = RAISE) -> None:
+def refuse_bytes(name: str, count: int, at_most: int, verb: str = "has", fix: str = RAISE) -> None:
     """Raise UserError if ``count`` bytes exceed ``at_most``."""
     if count > at_most:
         raise UserError(
-            f"{name}: {what} {size_text(count)}", legal=f"at most {size_text(at_most)}", fix=fix
+            f"{name}: {verb} {size_text(count)}", legal=f"at most {size_text(at_most)}", fix=fix
         )
 
 
@@ -138,12 +138,12 @@ def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
     deeply, or holds too long an integer."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        mapping: dict[str, Any] = {}
         for key, value in pairs:
-            if key in found:
+            if key in mapping:
                 raise ValueError(f"the key {key[:60]} occurs twice")
-            found[key] = value
-        return found
+            mapping[key] = value
+        return mapping
 
     def no_number(word: str) -> Any:
         raise ValueError(f"{word} is not a JSON number")
@@ -342,8 +342,8 @@ def one_at_a_time(path: Path, number: int) -> Iterator[None]:
 def file_digest(path: Path) -> str:
     """Return the digest of a file's content; the file is read again if its size or modification
     time has changed."""
-    found = path.stat()
-    return _digest_of(path, found.st_size, found.st_mtime_ns)
+    status = path.stat()
+    return _digest_of(path, status.st_size, status.st_mtime_ns)
 
 
 @lru_cache(maxsize=100_000)

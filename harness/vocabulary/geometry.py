@@ -81,10 +81,10 @@ class Region:
         """Number of pixels."""
         return (self.row1 - self.row0) * (self.col1 - self.col0)
 
-    def joined(self, other: Region) -> Region:
+    def joined(self, second: Region) -> Region:
         """Return the smallest region that holds both."""
-        rows = min(self.row0, other.row0), max(self.row1, other.row1)
-        return Region(*rows, min(self.col0, other.col0), max(self.col1, other.col1))
+        rows = min(self.row0, second.row0), max(self.row1, second.row1)
+        return Region(*rows, min(self.col0, second.col0), max(self.col1, second.col1))
 
     def within(self, outer: Region) -> tuple[slice, slice]:
         """Return the slices that cut this region out of an array that covers ``outer``."""
@@ -140,21 +140,24 @@ class Lens:
         """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2), or
         ``shift_px`` beside and below them; do not write to it. Slopes are kept, as the boards of a
         study lie in nearly one place."""
-        known, slopes = _slopes.pop((self, shift_px), (region, None))
-        joint = known.joined(region)
-        if slopes is None or joint != known:
+        kept_region, slopes = _slopes.pop((self, shift_px), (region, None))
+        joint = kept_region.joined(region)
+        if slopes is None or joint != kept_region:
             joint = joint.grown(SPARE_PX, self.height + 1, self.width + 1)
-            known = (
+            kept_region = (
                 joint
-                if slopes is not None and joint.area <= 2 * (known.area + region.area)
+                if slopes is not None and joint.area <= 2 * (kept_region.area + region.area)
                 else region
             )
-            v, u = np.mgrid[known.row0 : known.row1, known.col0 : known.col1] + shift_px
+            v, u = (
+                np.mgrid[kept_region.row0 : kept_region.row1, kept_region.col0 : kept_region.col1]
+                + shift_px
+            )
             slopes = self.slopes(u, v)
-        _slopes[self, shift_px] = known, slopes
+        _slopes[self, shift_px] = kept_region, slopes
         if len(_slopes) > MOST_LENSES:
             _slopes.pop(next(iter(_slopes)))
-        return np.ascontiguousarray(slopes[region.within(known)])
+        return np.ascontiguousarray(slopes[region.within(kept_region)])
 
     def project(self, points_camera_m: np.ndarray) -> np.ndarray:
         """Return the pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the
@@ -173,12 +176,12 @@ class Lens:
         ahead = points_camera_m[..., 2] > 0
         points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
         u, v = np.moveaxis(self.project(points), -1, 0)
-        found = ahead & (u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)
+        is_seen = ahead & (u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)
         back = (
-            self.slopes(np.where(found, u, 0.0), np.where(found, v, 0.0))
+            self.slopes(np.where(is_seen, u, 0.0), np.where(is_seen, v, 0.0))
             - points[..., :2] / points[..., 2:]
         )
-        return np.asarray(found & (np.abs(back).max(axis=-1) < SAME_SLOPE))
+        return np.asarray(is_seen & (np.abs(back).max(axis=-1) < SAME_SLOPE))
 
 
 @dataclass(frozen=True)

@@ -49,12 +49,12 @@ def value_text(path: str, value: Any) -> str:
     values."""
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
-        rest = (
-            f"{_split(key)[0]} {value_text(key, held)}"
-            for key, held in value.items()
+        settings = (
+            f"{_split(key)[0]} {value_text(key, setting)}"
+            for key, setting in value.items()
             if key != choice
         )
-        return on_one_line(", ".join(([str(value[choice])] if choice else []) + list(rest)))
+        return on_one_line(", ".join(([str(value[choice])] if choice else []) + list(settings)))
     unit = unit_of(path)
     if unit and isinstance(value, list | tuple) and len(value) == 2 and all(map(_is_number, value)):
         low, high = value
@@ -71,13 +71,13 @@ def camera_title(name: str) -> str:
     words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
-        found = (
+        title = (
             re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
             if file.is_file()
             else None
         )
-        if found:
-            return found[1].replace(",", "")
+        if title:
+            return title[1].replace(",", "")
     return name.rpartition("/")[2].removesuffix(".yaml").replace("_", " ")
 
 
@@ -100,13 +100,17 @@ def _setting_in_words(part: str) -> str:
     return camera_title(text) if name in NAMED else f"{name} {text}".strip()
 
 
-def differing(value: Any, others: Iterable[Any]) -> Any:
+def differing(value: Any, siblings: Iterable[Any]) -> Any:
     """Return a mapping without the entries that all ``others`` share; return any other value
     unchanged."""
-    held = list(others)
-    if not all(isinstance(item, dict) for item in (value, *held)):
+    sibling_values = list(siblings)
+    if not all(isinstance(item, dict) for item in (value, *sibling_values)):
         return value
-    return {key: own for key, own in value.items() if any(item.get(key) != own for item in held)}
+    return {
+        key: part
+        for key, part in value.items()
+        if any(item.get(key) != part for item in sibling_values)
+    }
 
 
 def _is_number(value: Any) -> bool:
@@ -118,8 +122,8 @@ def on_one_line(value: Any) -> str:
     in ``flat {...}``."""
     choice = next((key for key in CHOICES if key in value), "") if isinstance(value, dict) else ""
     if choice:
-        rest = {key: part for key, part in value.items() if key != choice}
-        text = f"{value[choice]} {json.dumps(rest, ensure_ascii=False)}".replace(
+        settings = {key: part for key, part in value.items() if key != choice}
+        text = f"{value[choice]} {json.dumps(settings, ensure_ascii=False)}".replace(
             '"', ""
         ).removesuffix(" {}")
     else:

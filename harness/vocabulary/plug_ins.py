@@ -55,34 +55,34 @@ class PlugIns:
     def offer(self, name: str) -> Offer:
         """Find the offer of a name. Raises UserError if the name is unknown (with the nearest
         name) or taken twice."""
-        found = [offer for offer in self.offers() if offer.name == name]
-        if not found:
+        offers = [offer for offer in self.offers() if offer.name == name]
+        if not offers:
             from harness.vocabulary.declaration.diagnose import nearest
 
-            near = nearest(name, self.names())
+            nearest_name = nearest(name, self.names())
             message = f"there is no {self.noun} {name!r}" + (
-                f"; did you mean {near!r}?" if near else ""
+                f"; did you mean {nearest_name!r}?" if nearest_name else ""
             )
             fix = (
                 self.fix
                 or f"install the package that offers it through the entry point group {self.group!r}"
             )
             raise UserError(message, legal=", ".join(self.names()), fix=fix)
-        if len({offer.target for offer in found}) > 1:
-            both = " and ".join(f"{offer.target} ({offer.origin})" for offer in found)
+        if len({offer.target for offer in offers}) > 1:
+            origins = " and ".join(f"{offer.target} ({offer.origin})" for offer in offers)
             fix = "uninstall all of these packages but one, or rename an entry point"
-            raise UserError(f"{len(found)} {self.noun}s are called {name!r}: {both}", fix=fix)
-        return found[0]
+            raise UserError(f"{len(offers)} {self.noun}s are called {name!r}: {origins}", fix=fix)
+        return offers[0]
 
     def load(self, offer: Offer) -> Any:
         """Import and return an offer's attribute. Raises UserError if a plug-in fails; built-in
         parts must not fail."""
         module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
         try:
-            found: Any = importlib.import_module(module)
+            loaded: Any = importlib.import_module(module)
             for part in filter(None, attribute.split(".")):
-                found = getattr(found, part)
-            return found
+                loaded = getattr(loaded, part)
+            return loaded
         # whatever a foreign module does on import, even sys.exit(), the user must repair or
         # uninstall it
         except (Exception, SystemExit) as error:
@@ -98,8 +98,8 @@ class PlugIns:
         fix = f"repair or uninstall the package {offer.package}" + (
             f"; `{command}` shows more" if command else ""
         )
-        what = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
-        return UserError(what, fix=fix)
+        message = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
+        return UserError(message, fix=fix)
 
 
 @lru_cache(maxsize=8)
@@ -110,8 +110,8 @@ def _offers(
     takes 7 ms."""
     from harness import __version__
 
-    found = [Offer(name, target, OWN, __version__) for name, target in built_in]
-    found += [
+    offers = [Offer(name, target, OWN, __version__) for name, target in built_in]
+    offers += [
         Offer(
             entry.name,
             entry.value,
@@ -121,6 +121,6 @@ def _offers(
     ]
     return tuple(
         sorted(
-            dict.fromkeys(found), key=lambda offer: (offer.name, not offer.built_in, offer.package)
+            dict.fromkeys(offers), key=lambda offer: (offer.name, not offer.built_in, offer.package)
         )
     )

@@ -58,11 +58,11 @@ def versions() -> dict[str, str]:
     """Return the versions of tofpod, Python and the packages that affect results."""
     from harness import __version__
 
-    found = {"tofpod": __version__, "python": platform.python_version()}
+    versions_found = {"tofpod": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
+            versions_found[name] = importlib.metadata.version(name)
+    return versions_found
 
 
 def record(command: str) -> dict[str, Any]:
@@ -91,10 +91,10 @@ STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 
 def check_version(
-    found: object,
-    known: int,
+    version: object,
+    newest: int,
     path: Path,
-    what: str,
+    noun: str,
     *,
     oldest: int | None = None,
     again: str | None = None,
@@ -102,23 +102,23 @@ def check_version(
     """Return a file's version if it lies between ``oldest`` (default: ``known``) and ``known``;
     else raise UserError. ``what`` names the kind of file, such as "a record"; ``again`` says how
     to make an outdated file again."""
-    first = known if oldest is None else oldest
-    legal = f"version {known}" if first == known else f"versions {first} to {known}"
+    first = newest if oldest is None else oldest
+    legal = f"version {newest}" if first == newest else f"versions {first} to {newest}"
     fix = again
-    if isinstance(found, bool) or not isinstance(found, int) or found < 0:
+    if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         fault = (
             "states no version"
-            if found is None
-            else f"states the invalid version {str(found)[:40]!r}"
+            if version is None
+            else f"states the invalid version {str(version)[:40]!r}"
         )
-        message = f"is {what} that {fault}"
-    elif found > known:
-        message = f"was written by a newer tofpod: it is {what} of version {found}"
+        message = f"is {noun} that {fault}"
+    elif version > newest:
+        message = f"was written by a newer tofpod: it is {noun} of version {version}"
         fix = "upgrade tofpod, or use the version that wrote it"
-    elif found < first:
-        message = f"is {what} of version {found}"
+    elif version < first:
+        message = f"is {noun} of version {version}"
     else:
-        return found
+        return version
     raise UserError(f"{path}: {message}", legal=legal, fix=fix)
 
 
@@ -152,9 +152,9 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
     ``packages``. A module of another project counts with all sources of its package. Computed
     once, since a process runs what it first read."""
     state = hashlib.blake2b(digest_size=8)
-    own = tuple(name for name in modules if name.partition(".")[0] in OWN)
-    files = {path.relative_to(ROOT).as_posix(): path for path in reached_sources(own)}
-    for name in sorted(set(modules) - set(own)):
+    own_modules = tuple(name for name in modules if name.partition(".")[0] in OWN)
+    files = {path.relative_to(ROOT).as_posix(): path for path in reached_sources(own_modules)}
+    for name in sorted(set(modules) - set(own_modules)):
         files |= {f"{name}/{relative}": path for relative, path in _foreign_sources(name)}
     for shown, path in sorted(files.items()):
         content = _content(path)
@@ -170,17 +170,17 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
     """Return the sorted source files that modules reach by import statements, also inside
     functions and for type checking. A module that is loaded by a name in a variable is not seen:
     list it in ``modules``."""
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     waiting = list(modules)
     while waiting:
         name = waiting.pop()
-        path = None if name in found else _source_of(name)
+        path = None if name in paths else _source_of(name)
         if path is None:
             continue
-        found[name] = path
+        paths[name] = path
         waiting.append(name.rpartition(".")[0])  # a package's own code runs before its modules
         waiting += _imported(_content(path).decode())
-    return tuple(sorted(found.values()))
+    return tuple(sorted(paths.values()))
 
 
 @cache
@@ -192,10 +192,8 @@ def _content(path: Path) -> bytes:
 
 def _source_of(name: str) -> Path | None:
     """Return the file of a module of the project, or None if there is no such module."""
-    place = ROOT.joinpath(*name.split("."))
-    files = (
-        (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
-    )
+    base = ROOT.joinpath(*name.split("."))
+    files = (base / "__init__.py", base.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
     return next((path for path in files if path.is_file()), None)
 
 

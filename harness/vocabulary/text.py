@@ -42,11 +42,11 @@ def plus_minus(mean: float, std: float, sign: str = "") -> str:
     return UNKNOWN_TEXT if np.isnan(mean) else text
 
 
-def size(value: float, most: float = np.inf) -> str:
+def size(value: float, largest: float = np.inf) -> str:
     """Return a limit in mm with two digits; ``> 15.9`` beyond the largest inspected, ``most``;
     ``none`` for NaN."""
-    if np.isnan(value) or value > most:
-        return "none" if np.isnan(value) else f">\u00a0{most:.3g}"
+    if np.isnan(value) or value > largest:
+        return "none" if np.isnan(value) else f">\u00a0{largest:.3g}"
     return (
         "∞"
         if np.isinf(value)
@@ -70,31 +70,31 @@ def p_value(p: float) -> str:
     return "< 0.0001" if p < 0.0001 else UNKNOWN_TEXT if np.isnan(p) else f"{p:.2g}"
 
 
-def interval(low: float, high: float, digits: int = 2, most: float = np.inf) -> str:
+def interval(low: float, high: float, digits: int = 2, largest: float = np.inf) -> str:
     """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` if an end lies beyond ``most``; ``unknown``
     without interval."""
     if np.isnan(low) or np.isnan(high):
         return "unknown"
-    return " to ".join(_number(end, digits, most) for end in (low, high))
+    return " to ".join(_number(end, digits, largest) for end in (low, high))
 
 
 def with_interval(
-    value: float, low: float, high: float, digits: int = 2, most: float = np.inf
+    value: float, low: float, high: float, digits: int = 2, largest: float = np.inf
 ) -> str:
     """Return ``5.1 (4.8 to 5.6)``, or only the estimate if its interval is unknown or beyond
     ``most``. Numbers have at most ``digits`` decimals. They have two significant digits if the
     interval is wider than `ROUGH` times the value (or times its upper end if the value is 0)."""
-    if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > most:
-        return _number(value, digits, most)
+    if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > largest:
+        return _number(value, digits, largest)
     scale = abs(value or high)
     if np.isfinite([scale, low, high]).all() and scale and high - low > ROUGH * scale:
         digits = min(digits, max(0, 1 - int(np.floor(np.log10(scale)))))
-    return f"{_number(value, digits, most)} ({interval(low, high, digits, most)})"
+    return f"{_number(value, digits, largest)} ({interval(low, high, digits, largest)})"
 
 
-def many(count: int, what: str) -> str:
+def many(count: int, noun: str) -> str:
     """Return ``1 trial``, ``2 trials``."""
-    return f"{count} {what}" + ("" if count == 1 else "s")
+    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def unbroken(text: str) -> str:
@@ -107,12 +107,16 @@ def inches(diameter_mm: float) -> str:
     """Return the size of a common inch drill as a fraction, such as ``1/4 in``; an empty text for
     other sizes."""
     sixteenths = diameter_mm / 25.4 * 16
-    known = INCHES.get(round(sixteenths)) if abs(sixteenths - round(sixteenths)) < 1e-3 else None
-    return f"{known} in" if known else ""
+    fraction = INCHES.get(round(sixteenths)) if abs(sixteenths - round(sixteenths)) < 1e-3 else None
+    return f"{fraction} in" if fraction else ""
 
 
-def _number(value: float, digits: int, most: float) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) and not value > most else size(value, most)
+def _number(value: float, digits: int, largest: float) -> str:
+    return (
+        f"{value:.{digits}f}"
+        if np.isfinite(value) and not value > largest
+        else size(value, largest)
+    )
 
 
 Tone = Literal["", "good", "key", "bad", "open", "changed"]
@@ -161,7 +165,7 @@ class Grid:
     def lines(self) -> list[str]:
         """Return plain lines with aligned columns."""
         lines = [self.heads, *([cell.text for cell in row] for row in self.rows)]
-        widths = [max(len(line[place]) for line in lines) for place in range(len(self.heads))]
+        widths = [max(len(line[column]) for line in lines) for column in range(len(self.heads))]
         signs = "<" * self.left + ">" * len(self.heads)
         return [
             "  ".join(
@@ -178,9 +182,9 @@ class Grid:
         from rich.text import Text
 
         table = Table(title=self.title or None, box=None, pad_edge=False, collapse_padding=True)
-        for place, head in enumerate(self.heads):
-            justify: Literal["left", "right"] = "left" if place < self.left else "right"
-            table.add_column(head, justify=justify, no_wrap=place > 0, overflow="fold")
+        for column, head in enumerate(self.heads):
+            justify: Literal["left", "right"] = "left" if column < self.left else "right"
+            table.add_column(head, justify=justify, no_wrap=column > 0, overflow="fold")
         for row in self.rows:
             table.add_row(*(Text(cell.text, style=COLOURS.get(cell.tone, "")) for cell in row))
         return table
@@ -191,13 +195,15 @@ class Grid:
         from markupsafe import Markup
 
         number = [
-            Markup("" if place < self.left else ' class="n"') for place in range(len(self.heads))
+            Markup("" if column < self.left else ' class="n"') for column in range(len(self.heads))
         ]
         heads = Markup("").join(map(Markup("<th{}>{}</th>").format, number, self.heads))
         rows = []
         for row in self.rows:
             cells = [Markup('<th scope="row">{}</th>').format(row[0].text)]
-            cells += [_data_cell(cell, place >= self.left) for place, cell in enumerate(row[1:], 1)]
+            cells += [
+                _data_cell(cell, column >= self.left) for column, cell in enumerate(row[1:], 1)
+            ]
             rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
         table = '<div class="scroll"><table class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
         return Markup(table).format(self.kind, heads, Markup("\n").join(rows))
@@ -225,8 +231,8 @@ def _data_cell(cell: Cell, is_number: bool) -> Markup:
         "" if cell.share is None else "rate",
     )
     kind = " ".join(filter(None, kinds))
-    named = Markup(' class="{}"').format(kind) if kind else Markup("")
-    return Markup("<td{}{}>{}{}</td>").format(named, style, escape(large), below)
+    class_attribute = Markup(' class="{}"').format(kind) if kind else Markup("")
+    return Markup("<td{}{}>{}{}</td>").format(class_attribute, style, escape(large), below)
 
 
 def text_of(parts: Iterable[str | Grid]) -> str:

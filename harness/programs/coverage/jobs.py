@@ -18,10 +18,11 @@ from scipy import ndimage
 from harness.experiment.schema import Experiment, ExperimentConfig, Point, SimulatedSource
 from harness.programs.coverage.statistics import Findable, Patches, ScoredDamage, Seen, findable
 from harness.runs.estimate import progress_display
+from harness.runs.job_batches import render_missing, values_of
 from harness.runs.jobs import JobEngine
 from harness.runs.journal import Journal
 from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
-from harness.runs.run import render_missing, run_plan, values_of
+from harness.runs.run import run_plan
 from harness.trials.judge import detector_of
 from harness.trials.setup import load_set_up
 from harness.trials.trial import PointTask, TrialTask, cloud_of

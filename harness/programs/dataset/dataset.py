@@ -152,7 +152,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     to stderr."""
     from harness.programs.dataset.boards import TRUTH, seen_region, write_board
     from harness.runs.estimate import progress_display
-    from harness.runs.run import carried_out
+    from harness.runs.job_batches import carried_out
     from harness.vocabulary.geometry import Region
 
     outcome = Outcome()
@@ -209,7 +209,9 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")
     write_text(
         out / "README.md",
-        template("dataset_card.md", Path(__file__).parent).render(about=about, inset=INSET_PX, title=camera_title),
+        template("dataset_card.md", Path(__file__).parent).render(
+            about=about, inset=INSET_PX, title=camera_title
+        ),
     )
     write_text(out / INDEX, json.dumps({**about, "samples": [*truths]}, indent=1) + "\n")
 

@@ -202,7 +202,7 @@ def _judged(
     from harness.evaluation.intervals import threshold_for_rate
     from harness.evaluation.study.limit import limit_of
     from harness.programs.dataset.boards import read_arrays, read_truth
-    from harness.runs.study import set_up_of
+    from harness.runs.study_record import set_up_of
     from harness.trials.judge import matched_places, smeared
     from harness.trials.setup import highest_within, pixel_areas
 

@@ -18,9 +18,9 @@ from harness.programs.efficiency.ideal_observer import (
     ideal_damages,
     noise_sums,
 )
+from harness.runs.job_batches import carried_out, render_missing
 from harness.runs.jobs import Job, JobEngine
 from harness.runs.plan import Batch, RenderJob, SweepPlan
-from harness.runs.run import carried_out, render_missing
 from harness.trials.setup import SetUp, load_set_up
 from harness.trials.trial import averages_of
 from harness.vocabulary.errors import UserError

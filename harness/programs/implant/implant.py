@@ -154,7 +154,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.evaluation.study.result import evaluate_study
     from harness.inspection.arguments import opened_as
-    from harness.inspection.run import analysed, refuse_thresholds, threshold_of
+    from harness.inspection.judging import analysed, refuse_thresholds, threshold_of
     from harness.programs.implant.scans import Judging, Scan, judge_scans, placements
     from harness.records.outputs import PROVENANCE, REPORT, STUDY
     from harness.report.study_page import study_html, study_parts

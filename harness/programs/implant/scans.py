@@ -22,7 +22,7 @@ from detectors.averages.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
 from harness.records.trials import ResultTables
-from harness.runs.study import set_up_of
+from harness.runs.study_record import set_up_of
 from harness.runs.tables import columns_of
 from harness.trials.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
 from harness.trials.setup import INTACT_MARGIN_PX, KnownCloud, far_from, outlined, pixel_areas

@@ -76,7 +76,7 @@ def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
         return value
     inner = with_value_at(shape.child(data, path[0]), path[1:], value)
     if isinstance(data, list):
-        return [inner if index == path[0] else each for index, each in enumerate(data)]
+        return [inner if index == path[0] else item for index, item in enumerate(data)]
     return {**(data or {}), path[0]: inner} if data is None or isinstance(data, dict) else data
 
 
@@ -84,13 +84,15 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
     """Return the declaration in a file whose ``key`` selects one of ``models``. Raises
     DeclarationError."""
     name = source.data.get(key)
-    place = source.place_of((key,))
+    position = source.place_of((key,))
     if name is None:
         problems = [
-            Problem(f"the file lacks the key `{key}`", place, legal="one of " + ", ".join(models))
+            Problem(
+                f"the file lacks the key `{key}`", position, legal="one of " + ", ".join(models)
+            )
         ]
     elif not isinstance(name, str) or name not in models:
-        problems = [wrong_choice((key,), name, list(models), place)]
+        problems = [wrong_choice((key,), name, list(models), position)]
     else:
         config, problems = validated(models[name], source, {})
         if config is not None:
@@ -98,7 +100,7 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
     raise DeclarationError(source.origin, problems)
 
 
-def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str | None = None) -> C:
+def settings_of(model: type[C], data: Mapping[str, Any], noun: str, within: str | None = None) -> C:
     """Validate plain data from command line options and return it as a declaration. Raises a
     single UserError with all problems under the heading ``what``; ``within`` is the key that
     precedes each path there."""
@@ -107,14 +109,16 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
     except ValidationError as error:
         # without a source text, only the path says which option is wrong
         base: KeyPath = () if within is None else (within,)
-        whole = data if within is None else {within: data}
-        source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
-        declared = shape.Declared(Config if base else model, whole, {base: model} if base else {})
+        document = data if within is None else {within: data}
+        source = Source(noun, "", document, {(): Place(noun, 0, 1, "")}, {})
+        declared = shape.Declared(
+            Config if base else model, document, {base: model} if base else {}
+        )
         problems = [
-            replace(each, place=None) for each in problems_of(error, declared, source, base)
+            replace(problem, place=None) for problem in problems_of(error, declared, source, base)
         ]
-        lines = dict.fromkeys(str(each).replace("\n", "\n  ") for each in problems)
-        raise UserError(f"{what}:\n  " + "\n  ".join(lines)) from error
+        lines = dict.fromkeys(str(problem).replace("\n", "\n  ") for problem in problems)
+        raise UserError(f"{noun}:\n  " + "\n  ".join(lines)) from error
 
 
 def problems_of(
@@ -132,12 +136,12 @@ def problems_of(
         location = (*base, *detail["loc"])
         data = declared.data
         for number, key in enumerate(location, start=1):
-            known = (
+            exists = (
                 key in data
                 if isinstance(data, Mapping)
                 else isinstance(data, list) and key in range(len(data))
             )
-            if known or (detail["type"] == "missing" and number == len(location)):
+            if exists or (detail["type"] == "missing" and number == len(location)):
                 path = (*path, key)
                 data = shape.child(data, key)
             else:
@@ -156,7 +160,7 @@ def problems_of(
             meant = meant or {getattr(shape.model_for(slot, data), "__name__", "")} & labels
         elif isinstance(data, list):
             meant = meant or {label for label in labels if label.startswith(("list[", "tuple["))}
-        alone += [(at, detail) for label, at, detail in errors if label in meant]
+        alone += [(path, detail) for label, path, detail in errors if label in meant]
         if not meant:
             message = f"`{dotted(path)}` is {shown(data)}, which matches none of the legal forms"
             problems.append(Problem(message, source.place_of(path), legal=shape.legal_at(slot)))
@@ -167,7 +171,7 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     """Describe one of pydantic's errors, at a path in the data, in the user's terms."""
     value = shape.get(source.data, path)
     slot = declared.at(path)
-    place = source.place_of(path)
+    position = source.place_of(path)
     kind = error["type"]
     legal = shape.legal_at(slot)
     kinds = shape.kinds_of(slot)
@@ -188,34 +192,34 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     if kinds and not isinstance(value, dict):
         message = f"`{dotted(path)}` is {shown(value)}, not a mapping"
         return Problem(
-            message, place, legal=f"a mapping with `{kinds[0]}`: one of {', '.join(kinds[1])}"
+            message, position, legal=f"a mapping with `{kinds[0]}`: one of {', '.join(kinds[1])}"
         )
     if kinds and kind in ("union_tag_invalid", "union_tag_not_found"):
         key = kinds[0]
         tags = list(kinds[1])
         if key in value:
             return wrong_choice((*path, key), value[key], tags, source.place_of((*path, key)))
-        near = nearest(key, value)
+        nearest_word = nearest(key, value)
         message = f"`{dotted(path)}` lacks the key `{key}`, which selects its kind"
-        fix = f"rename `{near}` to `{key}`" if near else None
+        fix = f"rename `{nearest_word}` to `{key}`" if nearest_word else None
         return Problem(
             message, source.key_place_of(path), legal="one of " + ", ".join(tags), fix=fix
         )
     if kind == "literal_error" and (choices := shape.choices_of(slot)):
-        return wrong_choice(path, value, choices, place)
+        return wrong_choice(path, value, choices, position)
     if kind in ("value_error", "assertion_error"):
         message = (f"`{dotted(path)}`: " if path else "") + str(
             error.get("ctx", {}).get("error", error["msg"])
         )
         # the message of a whole mapping's validator is complete; a list of keys would not help
-        return Problem(message, place, legal=None if isinstance(value, dict) else legal)
+        return Problem(message, position, legal=None if isinstance(value, dict) else legal)
     if isinstance(value, dict | list) and kind in (
         "model_type",
         "dict_type",
         "tuple_type",
         "list_type",
     ):
-        return Problem(f"`{dotted(path)}` is {shown(value)}", place, legal)
+        return Problem(f"`{dotted(path)}` is {shown(value)}", position, legal)
     if kind.startswith("int_") and isinstance(value, float) and value.is_integer():
         fix = f"write {int(value)} without a decimal point or exponent"
     if kind.startswith("bool_") and str(value).lower() in YES_AND_NO:
@@ -224,7 +228,7 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     for old, new in WORDS.items():
         text = text.replace(old, new)
     return Problem(
-        f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", place, legal, fix=fix
+        f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", position, legal, fix=fix
     )
 
 
@@ -232,14 +236,15 @@ def nearest(word: object, words: Iterable[object]) -> str | None:
     """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most
     similar spelling, else the shortest that contains the word (three letters or more), as
     realsense_l515 contains l515; None if neither."""
-    folded = {str(known).lower().replace("-", "_"): str(known) for known in words}
+    folded = {str(word).lower().replace("-", "_"): str(word) for word in words}
     sought = str(word).lower().replace("-", "_")
-    found = difflib.get_close_matches(sought, folded, n=1)
-    if not found and len(sought) >= LEAST_HELD:
-        found = sorted(
-            (known for known in folded if sought in known), key=lambda known: (len(known), known)
+    matches = difflib.get_close_matches(sought, folded, n=1)
+    if not matches and len(sought) >= LEAST_HELD:
+        matches = sorted(
+            (candidate for candidate in folded if sought in candidate),
+            key=lambda candidate: (len(candidate), candidate),
         )
-    return folded[found[0]] if found else None
+    return folded[matches[0]] if matches else None
 
 
 def dotted(path: Sequence[str | int]) -> str:
@@ -262,18 +267,22 @@ def shown(value: Any) -> str:
 
 
 def wrong_choice(
-    path: Sequence[str | int], value: Any, choices: Iterable[Any], place: Place
+    path: Sequence[str | int], value: Any, choices: Iterable[Any], position: Place
 ) -> Problem:
     """Return the problem for a value that is not among its legal ``choices``."""
     words = [shape.plain(choice) for choice in choices]
     message = f"`{dotted(path)}` is {shown(value)}, which is none of the legal values"
     return Problem(
-        message, place, legal="one of " + ", ".join(words), nearest=nearest(value, words)
+        message, position, legal="one of " + ", ".join(words), nearest=nearest(value, words)
     )
 
 
 def unknown_key(
-    name: str, where: KeyPath, legal: Sequence[str], place: Place | None, taken: Iterable[str] = ()
+    name: str,
+    where: KeyPath,
+    legal: Sequence[str],
+    position: Place | None,
+    taken: Iterable[str] = (),
 ) -> Problem:
     """Return the problem for an illegal key in the mapping at ``where``, which already has the
     keys ``taken``."""
@@ -281,7 +290,7 @@ def unknown_key(
     free = [key for key in legal if key not in set(taken)]
     return Problem(
         f"unknown key `{name}`{inside}",
-        place,
+        position,
         ", ".join(legal) or "no key here",
         nearest(name, free),
     )

@@ -91,9 +91,10 @@ def _branches(
     annotation: Any, metadata: tuple[Any, ...]
 ) -> Iterator[tuple[Any, Mapping[str, Any]]]:
     if get_origin(annotation) is Annotated:
-        inner, *more = get_args(annotation)
+        inner, *further_arguments = get_args(annotation)
         yield from _branches(
-            inner, (*metadata, *(m for x in more for m in getattr(x, "metadata", (x,))))
+            inner,
+            (*metadata, *(m for x in further_arguments for m in getattr(x, "metadata", (x,)))),
         )
     elif get_origin(annotation) in (Union, UnionType):
         for member in get_args(annotation):
@@ -120,9 +121,13 @@ def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[
             get_args(f.annotation) if f and get_origin(f.annotation) is Literal else ()
             for f in fields
         ]
-        found = {str(tag): model for model, mine in zip(models, tags, strict=True) for tag in mine}
-        if all(tags) and len(found) == sum(map(len, tags)):
-            return key, found
+        models_by_tag = {
+            str(tag): model
+            for model, model_tags in zip(models, tags, strict=True)
+            for tag in model_tags
+        }
+        if all(tags) and len(models_by_tag) == sum(map(len, tags)):
+            return key, models_by_tag
     return None
 
 
@@ -130,12 +135,12 @@ def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
     """Return the model that a mapping is meant to fill: by its kind, or else the model with most
     keys in common."""
     kinds = kinds_of(slot)
-    given = data if isinstance(data, Mapping) else {}
-    if kinds and str(given.get(kinds[0])) in kinds[1]:
-        return kinds[1][str(given[kinds[0]])]
+    values = data if isinstance(data, Mapping) else {}
+    if kinds and str(values.get(kinds[0])) in kinds[1]:
+        return kinds[1][str(values[kinds[0]])]
     return max(
         slot.models if slot else (),
-        key=lambda m: len(given.keys() & m.model_fields.keys()),
+        key=lambda m: len(values.keys() & m.model_fields.keys()),
         default=None,
     )
 
@@ -152,8 +157,12 @@ def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
         if kind is Any:
             return slot
         if isinstance(key, int) and get_origin(kind) in (tuple, list):
-            many = get_origin(kind) is list or arguments[-1] is Ellipsis
-            return slot_of(arguments[0 if many else key]) if many or key < len(arguments) else None
+            is_list = get_origin(kind) is list or arguments[-1] is Ellipsis
+            return (
+                slot_of(arguments[0 if is_list else key])
+                if is_list or key < len(arguments)
+                else None
+            )
         if isinstance(key, str) and get_origin(kind) is dict:
             return slot_of(arguments[1])
     return None
@@ -227,21 +236,23 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
         inner = legal_at(slot_of(arguments[1]))
         return f"a mapping of names to {inner}" if inner else "a mapping"
     if origin is tuple and arguments[-1] is not Ellipsis:
-        return "a list of " + ", ".join(legal_at(slot_of(each)) or "a value" for each in arguments)
+        return "a list of " + ", ".join(
+            legal_at(slot_of(argument)) or "a value" for argument in arguments
+        )
     if origin in (tuple, list):
         least = limits.get("min_length")
-        most = limits.get("max_length")
+        longest = limits.get("max_length")
         inner = legal_at(slot_of(arguments[0]))
         count = (
-            f"at most {most}"
+            f"at most {longest}"
             if not least
-            else f"{least} to {most}"
-            if most
+            else f"{least} to {longest}"
+            if longest
             else f"at least {least}"
         )
         return (
             "a list"
-            + (f" ({count} items)" if least or most else "")
+            + (f" ({count} items)" if least or longest else "")
             + (f", each {inner}" if inner else "")
         )
     if kind is str:

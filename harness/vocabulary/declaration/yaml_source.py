@@ -104,7 +104,9 @@ class DeclarationError(UserError):
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         lines = [*map(str, self.problems[:MAX_PROBLEMS])]
         lines += (
-            [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
+            [f"and {hidden_count} more"]
+            if (hidden_count := len(self.problems) - MAX_PROBLEMS) > 0
+            else []
         )
         super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(lines))
 
@@ -118,8 +120,12 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
     unique = {(problem.place, problem.message): problem for problem in problems}.values()
 
     def position(problem: Problem) -> tuple[int, int]:
-        place = problem.place
-        return (-1, 0) if place is None else (place.line, place.column if place.line else 0)
+        position = problem.place
+        return (
+            (-1, 0)
+            if position is None
+            else (position.line, position.column if position.line else 0)
+        )
 
     return tuple(sorted(unique, key=position))
 
@@ -166,11 +172,19 @@ class Source:
         ``donor_path``."""
         depth = len(donor_path)
         merged = []
-        for own, donated in ((self.values, donor.values), (self.keys, donor.keys)):
-            kept = {at: place for at, place in own.items() if at[: len(path)] != path}
+        for own_positions, donated in ((self.values, donor.values), (self.keys, donor.keys)):
+            kept = {
+                path_there: position
+                for path_there, position in own_positions.items()
+                if path_there[: len(path)] != path
+            }
             merged.append(
                 kept
-                | {path + at[depth:]: p for at, p in donated.items() if at[:depth] == donor_path}
+                | {
+                    path + path_there[depth:]: p
+                    for path_there, p in donated.items()
+                    if path_there[:depth] == donor_path
+                }
             )
         merged[1][path] = donor.place_of(donor_path)
         return Source(self.origin, self.text, data, *merged)
@@ -180,7 +194,7 @@ def read_yaml(path: Path) -> Source:
     """Read a file whose top level is a mapping. Raises DeclarationError with every problem and its
     place."""
     path = Path(path)
-    place = None
+    position = None
     legal = None
     fix = None
     try:
@@ -193,28 +207,28 @@ def read_yaml(path: Path) -> Source:
                 return source
             kind = "is empty" if source.data is None else "does not hold a mapping at its top level"
             message = f"the file {kind}"
-            place = source.place_of(())
+            position = source.place_of(())
             legal = "keys and values, as in `name: thesis`"
         else:
             message = "the file is too large for a declaration"
             legal = f"at most {MAX_BYTES} bytes"
     except FileNotFoundError:
-        found = (
-            sorted(str(near) for near in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        yaml_files = (
+            sorted(str(file) for file in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
         )
         message = "there is no such file"
-        legal = ", ".join(found[:10]) or None
+        legal = ", ".join(yaml_files[:10]) or None
     except IsADirectoryError:
         message = "this is a folder, not a YAML file"
     except OSError as error:
         message = f"cannot be read ({error.strerror})"
     except UnicodeDecodeError as error:
         lines = content[: error.start].decode("utf-8", errors="replace").split("\n")
-        rest = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
-        place = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + rest)
+        undecodable = content[error.start :].split(b"\n")[0].decode("utf-8", errors="replace")
+        position = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + undecodable)
         message = f"byte 0x{content[error.start]:02x} is not UTF-8"
         fix = "save the file as UTF-8"
-    raise DeclarationError(str(path), [Problem(message, place, legal=legal, fix=fix)])
+    raise DeclarationError(str(path), [Problem(message, position, legal=legal, fix=fix)])
 
 
 def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
@@ -234,8 +248,8 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         )
 
     if version := _OTHER_VERSION.search(text):
-        at = place(version.start() - start, version.end())
-        raise DeclarationError(origin, [Problem("only YAML 1.2 is supported", at)])
+        version_place = place(version.start() - start, version.end())
+        raise DeclarationError(origin, [Problem("only YAML 1.2 is supported", version_place)])
     reader = YAML(typ="safe", pure=True)
     reader.Parser = _BoundedParser
     try:
@@ -310,8 +324,8 @@ class _BoundedParser(Parser):
 class _Builder:
     """Converts nodes to plain data and collects places and problems."""
 
-    def __init__(self, place: Callable[[int, int], Place]) -> None:
-        self._place = place
+    def __init__(self, place_of_span: Callable[[int, int], Place]) -> None:
+        self._place = place_of_span
         self.values: dict[KeyPath, Place] = {}
         self.keys: dict[KeyPath, Place] = {}
         self.problems: list[Problem] = []
@@ -319,18 +333,20 @@ class _Builder:
 
     def build(self, node: Node, path: KeyPath, within: tuple[Node, ...]) -> Any:
         """Return the data of a node at a path; ``within`` are the nodes that enclose it."""
-        self.values[path] = place = self._of(node)
+        self.values[path] = position = self._of(node)
         self._nodes += 1
         if len(self.problems) >= MAX_PROBLEMS or self._nodes > MAX_NODES + 1:
             return None
         if self._nodes > MAX_NODES:
             return self._refuse(
-                "too many values", place, f"at most {MAX_NODES} values after aliases are expanded"
+                "too many values",
+                position,
+                f"at most {MAX_NODES} values after aliases are expanded",
             )
         if any(node is outer for outer in within):
-            return self._refuse("an alias refers to a value that contains it", place)
+            return self._refuse("an alias refers to a value that contains it", position)
         if len(within) >= MAX_DEPTH:
-            return self._refuse("nested too deeply", place, f"at most {MAX_DEPTH} levels")
+            return self._refuse("nested too deeply", position, f"at most {MAX_DEPTH} levels")
         if isinstance(node, MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, path, (*within, node))
         if isinstance(node, SequenceNode) and node.tag == _TAG + "seq":
@@ -338,38 +354,42 @@ class _Builder:
                 self.build(item, (*path, index), (*within, node))
                 for index, item in enumerate(node.value)
             ]
-        return self._scalar(node, place)
+        return self._scalar(node, position)
 
     def _mapping(
         self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]
     ) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            at = self._of(key_node)
+            key_place = self._of(key_node)
             before = len(self.problems)
             if key_node.tag == _TAG + "merge":
                 fix = "write the keys out, or use an alias for a whole value"
                 self.problems.append(
-                    Problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix)
+                    Problem("merge keys (`<<`) are not part of YAML 1.2", key_place, fix=fix)
                 )
                 continue
-            key = self._scalar(key_node, at) if isinstance(key_node, ScalarNode) else None
+            key = self._scalar(key_node, key_place) if isinstance(key_node, ScalarNode) else None
             if isinstance(key, str) and key not in result:
-                self.keys[(*path, key)] = at
+                self.keys[(*path, key)] = key_place
                 result[key] = self.build(value_node, (*path, key), within)
             elif isinstance(key, str):
                 first = self.keys[(*path, key)]
                 message = f"duplicate key `{key}`"
                 self.problems.append(
                     Problem(
-                        message, at, other=first, other_says="already written at", fix="keep one"
+                        message,
+                        key_place,
+                        other=first,
+                        other_says="already written at",
+                        fix="keep one",
                     )
                 )
             elif len(self.problems) == before:
-                self._refuse("a key must be text", at, "text; put quotes around numbers")
+                self._refuse("a key must be text", key_place, "text; put quotes around numbers")
         return result
 
-    def _scalar(self, node: Node, place: Place) -> Any:
+    def _scalar(self, node: Node, position: Place) -> Any:
         kind = str(node.tag).removeprefix(_TAG)
         text = node.value
         try:
@@ -390,14 +410,14 @@ class _Builder:
                 text.encode()
                 return text
         except (ValueError, KeyError):
-            return self._refuse(f"{text[:40]!r} cannot be read as {kind}", place)
+            return self._refuse(f"{text[:40]!r} cannot be read as {kind}", position)
         tag = str(node.tag).replace(_TAG, "!!")
         return self._refuse(
-            f"the tag {tag} is not supported", place, "plain mappings, lists, text and numbers"
+            f"the tag {tag} is not supported", position, "plain mappings, lists, text and numbers"
         )
 
-    def _refuse(self, message: str, place: Place, legal: str | None = None) -> None:
-        self.problems.append(Problem(message, place, legal=legal))
+    def _refuse(self, message: str, position: Place, legal: str | None = None) -> None:
+        self.problems.append(Problem(message, position, legal=legal))
 
     def _of(self, node: Node) -> Place:
         return self._place(node.start_mark.index, node.end_mark.index)

@@ -16,7 +16,7 @@ from detectors import load_detector
 from detectors.findings.missing import ALPHA, measure_missing, missing_returns, one_damage_once
 from detectors.interface import Detection, Evidence
 from harness.evaluation.study.limit import limit_of
-from harness.inspection.run import judged as judged_cloud
+from harness.inspection.judging import judged as judged_cloud
 from harness.report.findings import write_findings
 from harness.tables.limits import LIMITS, notes_of
 from harness.testing.synthetic_clouds import LENS, SHAPE, plane, without

@@ -255,24 +255,24 @@ def test_a_newer_journal_is_refused(home):
 def test_a_lost_render_costs_what_needs_it(home, tmp_path, monkeypatch):
     """The damaged view cannot be rendered: hole-free trials end, the others are skipped, and run
     when it can be."""
-    from harness.runs import run as engine_run
+    from harness.runs import job_batches
 
     monkeypatch.syspath_prepend(str(home / "plug_in"))
     experiment = load_experiment(home / "tiny.yaml", [REPEATS])
     plan = plan_of(experiment, home / "calm" / ".cache" / "renders")
     damaged = plan.groups[0].damaged.renders[0].target.to_data()
-    real = engine_run.render_into_cache
+    real = job_batches.render_into_cache
 
     def refuses(target: dict, *rest: object) -> object:
         if target == damaged:
             raise UserError("no such view")
         return real(target, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(engine_run, "render_into_cache", refuses)
+    monkeypatch.setattr(job_batches, "render_into_cache", refuses)
     outcome = run_serially(plan, tmp_path)
     assert (outcome.trials.done, outcome.trials.failed) == (6, 6)
     assert {failure.state for failure in outcome.failures} == {"failed", "skipped"}
     assert {failure.why for failure in outcome.failures} == {"no such view"}
-    monkeypatch.setattr(engine_run, "render_into_cache", real)
+    monkeypatch.setattr(job_batches, "render_into_cache", real)
     outcome = run_serially(plan, tmp_path)
     assert (outcome.trials.found, outcome.trials.done, outcome.failures) == (6, 6, [])

@@ -18,7 +18,7 @@ from harness.programs.cluster import merge
 from harness.runs.journal import Journal
 from harness.runs.plan import Group, SweepPlan, plan_of
 from harness.runs.shards import Shard
-from harness.runs.study import record_of
+from harness.runs.study_record import record_of
 from harness.runs.tables import tables_of
 from harness.tables.limits import limits_grid, quoted, study_answer
 from harness.tables.study import set_by, threshold_warnings

@@ -21,9 +21,9 @@ from harness.experiment.load import load_experiment
 from harness.experiment.schema import Point
 from harness.records.trials import ResultTables
 from harness.runs import run
+from harness.runs.calibration import threshold_of
 from harness.runs.plan import plan_of
-from harness.runs.run import threshold_of
-from harness.runs.study import failures_by_point, record_of, without_limit
+from harness.runs.study_record import failures_by_point, record_of, without_limit
 from harness.runs.tables import tables_of
 from harness.trials.trial import TrialTask, run_trial
 from harness.vocabulary.declaration.yaml_source import DeclarationError

@@ -26,9 +26,9 @@ from harness.programs.coverage.tables import COVERAGE_TABLES
 from harness.programs.keeping.written_files import is_output
 from harness.records.outputs import COVERAGE_PAGE
 from harness.runs.engines import engine_of
+from harness.runs.job_batches import render_missing
 from harness.runs.options import EngineOptions
 from harness.runs.plan import batch_of, plan_of
-from harness.runs.run import render_missing
 from harness.trials.trial import TrialTask, run_trial
 from harness.vocabulary.errors import UserError
 

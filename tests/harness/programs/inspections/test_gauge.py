@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from harness import detect, sweep
+from harness import sweep
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record
 from harness.programs.inspections import design_statistics as plan
@@ -175,7 +175,7 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
 ):
     truth = read_gauge(made / "gauge.json")
     given = [str(captured(tmp_path / "seen", truth)), "--gauge", str(made / "gauge.json")]
-    assert detect.main([*given, "--out", str(tmp_path / "found")]) == 0
+    assert gauge.main(["read", *given, "--out", str(tmp_path / "found")]) == 0
     said = capsys.readouterr().out
     assert "4 marks" in said and "0 false calls" in said
     lines = (tmp_path / "found" / "gauge.csv").read_text().splitlines()
@@ -195,10 +195,10 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
     assert pod.main([table, *asked, "--out", str(tmp_path / "pod")]) == 0
 
     hidden = captured(tmp_path / "hidden", truth, hidden=(0, 2))
-    assert detect.main([str(hidden), "--gauge", str(made / "gauge.json")]) == 2
+    assert gauge.main(["read", str(hidden), "--gauge", str(made / "gauge.json")]) == 2
     assert "no board is recognised" in capsys.readouterr().err
     (tmp_path / "no.json").write_text('{"gauge_version": 1, "boards": []}')
-    assert detect.main([str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
+    assert gauge.main(["read", str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
     assert "boards" in capsys.readouterr().err
 
 
@@ -306,7 +306,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         ]
         given += ["--intrinsics", CAMERA, "--detector", "local", "--threshold", str(THRESHOLD)]
         given += ["--gauge", str(tmp_path / "gauge" / "gauge.json"), "--out", str(out / "found")]
-        assert detect.main(given) == 0
+        assert gauge.main(["read", *given]) == 0
         given = [
             str(out / "found" / "gauge.csv"),
             "--size",
