@@ -34,7 +34,7 @@ class Verdict:
     text: str
     """The claim in one sentence."""
     verdict: Answer
-    """Whether the experiment bears the claim out."""
+    """The answer of the experiment."""
     evidence: str
     """The numbers that support the verdict."""
     rule: str

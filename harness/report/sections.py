@@ -29,7 +29,7 @@ class About(NamedTuple):
     """Title and origin of a report."""
 
     provenance: Mapping[str, Any]
-    """As in `harness.report.blocks.closing`."""
+    """The origin, as in `harness.report.blocks.closing`."""
     experiment_yaml_text: str
     """The resolved experiment as YAML."""
     title: str

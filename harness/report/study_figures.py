@@ -283,7 +283,7 @@ class AxisScale(NamedTuple):
     positions: np.ndarray
     """(v,): position of each value."""
     is_logarithmic: bool
-    """Whether the axis is logarithmic."""
+    """True for a logarithmic axis."""
 
     @property
     def even(self) -> np.ndarray:

@@ -40,7 +40,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Whether damage of the size in question is found; empty without one."""
+        """The verdict on damage of the size in question; empty without one."""
         return "" if np.isnan(self.size_mm) else self.answer.verdict(self.size_mm)
 
 

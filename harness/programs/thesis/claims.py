@@ -107,7 +107,7 @@ def certain(holds: bool, fails: bool) -> bool | None:
 
 @dataclass(frozen=True)
 class Case:
-    """What the rules use of the main set-up."""
+    """The tables of the main set-up that rules use."""
 
     summary: pd.DataFrame
     """Its rows of `summarise_holes`."""
