@@ -17,7 +17,9 @@ def holes_filled(mask: np.ndarray, rim_px: int = 0) -> np.ndarray:
     image = np.zeros((mask.shape[0] + 2, mask.shape[1] + 2), np.uint8)
     image[1:-1, 1:-1] = mask
     cv2.floodFill(image, None, (0, 0), 2)
-    return np.asarray((image if rim_px else image[1:-1, 1:-1]) != 2)
+    if not rim_px:
+        image = image[1:-1, 1:-1]
+    return image != 2
 
 
 def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
@@ -27,36 +29,44 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
     right-angled corners only hold a smaller disc (0.17)."""
 
     def deep_in(gaps: np.ndarray) -> np.ndarray:
-        depths = np.asarray(cv2.distanceTransform(np.pad(gaps, 1).astype(np.uint8), cv2.DIST_L2, 5))
-        return depths[1:-1, 1:-1] > 1 + radius_px / 4
+        padded = np.pad(gaps, 1).astype(np.uint8)
+        depth_px = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
+        return depth_px > 1 + radius_px / 4
 
     # a closing is slow and stays within the convex hull, so it is computed only there
     rows = np.flatnonzero(mask.any(axis=1))
-    hull = np.zeros(mask.shape, np.uint8)
-    ends = np.append(mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1))
-    outline = cv2.convexHull(np.column_stack([ends, np.tile(rows, 2)]).astype(np.int32))
-    if not len(rows) or not deep_in(cv2.fillConvexPoly(hull, outline, 1) > mask).any():
+    if not len(rows):
+        return mask
+    first = mask[rows].argmax(axis=1)
+    last = mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
+    ends = np.column_stack([np.append(first, last), np.tile(rows, 2)])
+    outline = cv2.convexHull(ends.astype(np.int32))
+    hull = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1)
+    if not deep_in(hull > mask).any():
         return mask
     side = 2 * radius_px + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    closed = cv2.morphologyEx(np.pad(mask.astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)[
-        side:-side, side:-side
-    ]
+    padded = np.pad(mask.astype(np.uint8), side)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[side:-side, side:-side]
     gaps = holes_filled(closed > 0) & ~mask
     return mask | parts_with(gaps, deep_in(gaps), connectivity=4)
 
 
-def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndarray:
+def grown(
+    mask: np.ndarray,
+    pixels: int,
+    shape: int = cv2.MORPH_RECT,
+) -> np.ndarray:
     """Return the mask grown by all pixels within this distance: in a square, or in OpenCV's
     ``shape``."""
     kernel = cv2.getStructuringElement(shape, (2 * pixels + 1, 2 * pixels + 1))
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    return cv2.dilate(mask.astype(np.uint8), kernel) > 0
 
 
 def shrunk(mask: np.ndarray, side: int) -> np.ndarray:
     """Return the pixels whose square of ``side`` pixels lies inside the mask; beyond the picture
     counts as inside."""
-    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+    return cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
 def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
@@ -70,34 +80,42 @@ def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def parts_with(
-    mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least: int = 0
+    mask: np.ndarray,
+    seeds: np.ndarray,
+    connectivity: int = 8,
+    least: int = 0,
 ) -> np.ndarray:
     """Return the connected parts of the mask that hold a seed (h, w) and at least ``least``
     pixels."""
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
-    wanted = np.zeros(count, dtype=bool)
-    wanted[labels[seeds & mask]] = True
+    has_seed = np.zeros(count, dtype=bool)
+    has_seed[labels[seeds & mask]] = True
     if least:
-        wanted &= np.bincount(labels.ravel(), minlength=count) >= least
-    wanted[0] = False
-    return np.asarray(wanted[labels])
+        has_seed &= np.bincount(labels.ravel(), minlength=count) >= least
+    has_seed[0] = False
+    return has_seed[labels]
 
 
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each pixel's distance (h, w) to the mask, in pixels, and the flat index of the mask's
     nearest pixel."""
     beyond = (~mask).astype(np.uint8)
-    apart, labels = cv2.distanceTransformWithLabels(
-        beyond, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    distance_px, labels = cv2.distanceTransformWithLabels(
+        beyond,
+        cv2.DIST_L2,
+        3,
+        labelType=cv2.DIST_LABEL_PIXEL,
     )
     inside = np.flatnonzero(mask)
-    flat = np.zeros(len(inside) + 1, dtype=np.int64)
-    flat[labels.reshape(-1)[inside]] = inside
-    return apart, flat[labels]
+    pixel_of_label = np.zeros(len(inside) + 1, dtype=np.int64)
+    pixel_of_label[labels.reshape(-1)[inside]] = inside
+    return distance_px, pixel_of_label[labels]
 
 
 def components(
-    nodes: np.ndarray, right: np.ndarray, down: np.ndarray
+    nodes: np.ndarray,
+    right: np.ndarray,
+    down: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number the sets of nodes (h, w) that links join, largest first; return the numbers (h, w)
     and the sizes. ``right`` and ``down`` (h, w) bool: whether a pixel is linked to the next in its
@@ -107,7 +125,8 @@ def components(
     spread[::2, ::2] = nodes
     spread[::2, 1::2] = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
     spread[1::2, ::2] = down[:-1] & nodes[:-1] & nodes[1:]
-    labels = cv2.connectedComponents(spread, connectivity=4)[1][::2, ::2]
+    _, labels = cv2.connectedComponents(spread, connectivity=4)
+    labels = labels[::2, ::2]
     sizes = np.bincount(labels.ravel())[1:]
     order = np.argsort(-sizes, kind="stable")
     number = np.zeros(len(sizes) + 1, dtype=np.int32)

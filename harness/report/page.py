@@ -7,10 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.evaluation.set_ups import set_ups_of
-from harness.evaluation.summary import MAIN, fit_floor, found_holes, hole_list
+from harness.evaluation.summary import MAIN, fit_floor, found_holes
 from harness.records.examples import ExampleCloud, MappedExample
 from harness.records.outputs import REPORT
-from harness.records.trials import FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
+from harness.records.trials import (
+    FALSE_CALLS,
+    NOISE_BY_FRAMES,
+    SET_UPS,
+    SUMMARY,
+    ResultTables,
+    hole_list,
+)
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
 from harness.report.claims import Verdict, claim_set_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from harness.evaluation.study.limit import depth_varies
 from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.evaluation.study.surface import depth_varies
 from harness.records.examples import StudyExample
 from harness.records.schema import Table
 from harness.report.blocks import COLOURS, closing, joined, template

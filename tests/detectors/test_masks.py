@@ -25,11 +25,11 @@ def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
 def by_graph(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Number the components by scipy's search of the graph whose edges are the links; -1 off the
     nodes."""
-    places = np.arange(nodes.size).reshape(nodes.shape)
+    pixels = np.arange(nodes.size).reshape(nodes.shape)
     across = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
     below = down[:-1] & nodes[:-1] & nodes[1:]
-    starts = np.concatenate([places[:, :-1][across], places[:-1][below]])
-    ends = np.concatenate([places[:, 1:][across], places[1:][below]])
+    starts = np.concatenate([pixels[:, :-1][across], pixels[:-1][below]])
+    ends = np.concatenate([pixels[:, 1:][across], pixels[1:][below]])
     graph = coo_array((np.ones(len(starts)), (starts, ends)), shape=(nodes.size, nodes.size))
     labels = connected_components(graph, directed=False)[1].reshape(nodes.shape)
     return np.where(nodes, labels, -1)
@@ -40,20 +40,25 @@ def by_graph(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarr
 def test_links_are_steps_within_tilt_and_noise(seed: int, central: bool) -> None:
     points = rough_points(seed)
     right, down = links(points, 6.0, 3e-3, central)
-    for found, there, here in (
+    for result, neighbours, pixels in (
         (right[:, :-1], points[:, 1:], points[:, :-1]),
         (down[:-1], points[1:], points[:-1]),
     ):
+        x, y, z = np.moveaxis(pixels, -1, 0)
+        next_x, next_y, next_z = np.moveaxis(neighbours, -1, 0)
         with np.errstate(invalid="ignore"):
-            across = there[..., :2] - here[..., :2]
+            across = np.hypot(next_x - x, next_y - y)
             if central:
-                between_rays = there[..., :2] / there[..., 2:] - here[..., :2] / here[..., 2:]
-                across = np.minimum(there[..., 2:], here[..., 2:]) * between_rays
-            step = np.abs(there[..., 2] - here[..., 2])
-            expected = step <= 6.0 * np.hypot(across[..., 0], across[..., 1]) + 3e-3
-        np.testing.assert_array_equal(found, expected)
-        assert expected.any() and not expected.all()
-    assert not right[:, -1].any() and not down[-1].any()
+                nearer_z = np.minimum(next_z, z)
+                between_rays_x = next_x / next_z - x / z
+                between_rays_y = next_y / next_z - y / z
+                across = np.hypot(nearer_z * between_rays_x, nearer_z * between_rays_y)
+            expected = np.abs(next_z - z) <= 6.0 * across + 3e-3
+        np.testing.assert_array_equal(result, expected)
+        assert expected.any()
+        assert not expected.all()
+    assert not right[:, -1].any()
+    assert not down[-1].any()
 
 
 def test_a_step_far_off_the_axis_is_a_step() -> None:
@@ -69,25 +74,25 @@ def test_a_step_far_off_the_axis_is_a_step() -> None:
 def test_the_components_are_those_of_a_graph(seed: int, share: float) -> None:
     random = np.random.default_rng(seed)
     nodes, right, down = random.random((3, 9, 13)) < share
-    found, sizes = components(nodes, right, down)
+    result, sizes = components(nodes, right, down)
     expected = by_graph(nodes, right, down)
     counts = np.bincount(expected[nodes]) if nodes.any() else np.zeros(1, int)
     assert sizes.tolist() == sorted((n for n in counts.tolist() if n), reverse=True)
-    assert not found[~nodes].any()
-    firsts = [int(np.flatnonzero(found == number)[0]) for number in range(1, len(sizes) + 1)]
+    assert not result[~nodes].any()
+    firsts = [int(np.flatnonzero(result == number)[0]) for number in range(1, len(sizes) + 1)]
     # of equal sizes the first in the order of the pixels is the first
-    assert sorted(zip((-sizes).tolist(), firsts, strict=True)) == list(
-        zip((-sizes).tolist(), firsts, strict=True)
-    )
+    order = list(zip((-sizes).tolist(), firsts, strict=True))
+    assert order == sorted(order)
     for number, size in enumerate(sizes, start=1):
-        assert (found == number).sum() == size
-        assert len(set(expected[found == number].tolist())) == 1
+        assert (result == number).sum() == size
+        assert len(set(expected[result == number].tolist())) == 1
 
 
 def test_no_node_has_no_component() -> None:
     nothing = np.zeros((4, 5), dtype=bool)
-    found, sizes = components(nothing, ~nothing, ~nothing)
-    assert not found.any() and not len(sizes)
+    result, sizes = components(nothing, ~nothing, ~nothing)
+    assert not result.any()
+    assert not len(sizes)
 
 
 @pytest.mark.parametrize("half", [1, 4])
@@ -104,7 +109,8 @@ def test_normals_and_their_turns_equal_plain_ones(half: int) -> None:
         cosine = np.einsum("ijk,ijk->ij", n[2 * half :], n[: -2 * half])
         np.moveaxis(expected, axis, 0)[half:-half] |= cosine < 0.8
     np.testing.assert_array_equal(turns(normals, half, 0.8), expected)
-    assert expected.any() and not expected.all()
+    assert expected.any()
+    assert not expected.all()
 
 
 def test_a_line_of_points_has_no_normal() -> None:

@@ -18,7 +18,7 @@ import sys
 import numpy as np
 
 from detectors.averages.average import AverageConfig
-from harness.trials.trial import averages_of
+from harness.trials.averages import averages_of
 from scenes.optics import RenderConfig
 from scenes.render.view import render_view
 from scenes.sensor.amcw.at_once import EVEN, UNEVEN, AtOnce

@@ -29,7 +29,7 @@ from detectors import load_detector
 from detectors.averages.average import AverageConfig
 from detectors.findings.null import own_threshold
 from detectors.interface import Detector
-from harness.trials.trial import averages_of
+from harness.trials.averages import averages_of
 from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import RenderConfig

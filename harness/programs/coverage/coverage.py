@@ -184,7 +184,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     config = chosen.point.config
     scene = scene_of(patches, limits_mm, found)
     camera = config.simulated.camera
-    detector = f"the detector {config.detector.name} at a threshold of {chosen.task.threshold:.3g}"
+    detector = f"the detector {config.detector.name} at a threshold of {chosen.task.criteria.threshold:.3g}"
     unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
     first = f"Simulated, for {unit}, {detector}. {found.statement}"
     html = coverage_html(name, sentence, first, scene, poses, goals, warnings, command)

@@ -122,7 +122,7 @@ def _about(
     categories: dict[str, Any] = {}
     for name, point in categories_of(experiment).items():
         own = [sample for sample in samples if sample.category == name]
-        cameras = [sample.task.set_ups[0].camera for sample in own]
+        cameras = [sample.task.views[0].camera for sample in own]
         categories[name] = {
             "camera": cameras[0].name,
             "units": len({camera.unit_seed for camera in cameras}),

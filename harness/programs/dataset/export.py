@@ -14,7 +14,7 @@ from harness.vocabulary.program import program, whole_number
 if TYPE_CHECKING:
     from harness.experiment.schema import Experiment
     from harness.programs.dataset.exchange import ExportedView
-    from harness.trials.trial import Role
+    from harness.records.rows import Role
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")

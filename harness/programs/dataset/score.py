@@ -204,7 +204,7 @@ def _judged(
     from harness.programs.dataset.boards import read_arrays, read_truth
     from harness.runs.study_record import set_up_of
     from harness.trials.judge import matched_places, smeared
-    from harness.trials.setup import highest_within, pixel_areas
+    from harness.trials.board import highest_within, pixel_areas
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Yield the boards of a split: name, scores (NaN if not inspected), places, damage,

@@ -55,7 +55,7 @@ def analyse() -> None:
     """Draw an average at once, and search for damage on every kind of surface."""
     from detectors import load_detector
     from detectors.averages.average import AverageConfig
-    from harness.trials.trial import FEWEST_FRAMES, averages_of
+    from harness.trials.averages import FEWEST_FRAMES, averages_of
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import CameraConfig, load_camera

@@ -21,13 +21,12 @@ from harness.evaluation.profile import hole_shapes
 from harness.evaluation.summary import (
     MAIN,
     found_holes,
-    hole_list,
     noise_law,
     summarise_holes,
     with_columns,
 )
 from harness.records.examples import ExampleCloud
-from harness.records.trials import ResultTables
+from harness.records.trials import ResultTables, hole_list
 from harness.report.claims import Answer, Verdict
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.text import many

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation import intervals, maps
-from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     FEWEST_PAIRS,
     FEWEST_UNITS,
@@ -21,6 +20,7 @@ from harness.programs.thesis.claims import (
     verdict_of,
 )
 from harness.programs.thesis.counts import HoleCount, Standing
+from harness.records.trials import hole_list
 from harness.report.claims import Answer, Verdict
 from harness.vocabulary.text import many
 

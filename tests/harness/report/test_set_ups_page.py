@@ -16,9 +16,9 @@ from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
 from harness.programs.thesis.answers import THESIS
 from harness.report.page import write_report
-from harness.report.set_ups_page import Layout, set_ups_html
 from harness.report.sections import About, set_ups_grid
-from harness.trials.trial import pair_noise
+from harness.report.set_ups_page import Layout, set_ups_html
+from harness.trials.clouds import pair_noise
 from harness.vocabulary.path_names import camera_title, in_words
 from tests.harness.evaluation.test_limits import switched
 from tests.support.synthetic_tables import (

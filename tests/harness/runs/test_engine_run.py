@@ -20,7 +20,7 @@ from harness.runs.plan import Group, SweepPlan, parts_of, plan_of
 from harness.runs.run import run_plan
 from harness.runs.shards import Shard
 from harness.trials.judge import FINDING_OCTAVES, grid
-from harness.trials.trial import TrialTask
+from harness.trials.trial import Trial
 from tests.support.serial_run import trial_count
 from tests.support.tiny_sweep import STUDY, TINY
 
@@ -68,7 +68,7 @@ class Pretended:
         return [(job, Ended("done", made_up(job.arguments[0], self._factor)))]
 
 
-def made_up(task: TrialTask, factor: float = 1.0) -> str:
+def made_up(task: Trial, factor: float = 1.0) -> str:
     """A record. ``factor``: by which this machine's scores differ from another's."""
     word = hashlib.sha256(f"{task.board} {task.repeat} {task.role}".encode()).digest()
     quiet = factor * (3 + word[0] / 256)
@@ -77,9 +77,9 @@ def made_up(task: TrialTask, factor: float = 1.0) -> str:
             "point": one.digest,
             "variant": one.variant,
             "frames": one.frames,
-            "quiet_threshold": quiet if one.threshold is None else None,
+            "quiet_threshold": quiet if one.criteria.threshold is None else None,
             "inspected_m2": 0.06,
-            "threshold": one.threshold,
+            "threshold": one.criteria.threshold,
         }
         for one in task.points
     ]
@@ -87,10 +87,10 @@ def made_up(task: TrialTask, factor: float = 1.0) -> str:
         {
             "variant": one.variant,
             "frames": one.frames,
-            "threshold": grid(one.threshold, FINDING_OCTAVES).tolist(),
+            "threshold": grid(one.criteria.threshold, FINDING_OCTAVES).tolist(),
         }
         for one in task.points
-        if one.threshold is not None
+        if one.criteria.threshold is not None
     ]
     return record_text({"runs": runs, "operating": operating})
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from harness.programs.camera.export_noise import main, noise_table
-from harness.trials.trial import pair_noise
+from harness.trials.clouds import pair_noise
 from scenes.sensor.calibration import unit_before_plane
 from scenes.sensor.camera import load_camera
 from scenes.sensor.tabled import DepthNoise, TorchDepthNoise

@@ -277,7 +277,7 @@ def renders_and_set_ups(experiment: Path, cache: Path) -> tuple[list[Job], list[
     ]
     batches = [batch for group in plan.groups for batch in group.batches]
     loads = [
-        Job(f"load {n} {again}", "trials", probes_of, (batch.set_ups[0],))
+        Job(f"load {n} {again}", "trials", probes_of, (batch.views[0],))
         for n, batch in enumerate(batches)
         for again in range(4)
     ]

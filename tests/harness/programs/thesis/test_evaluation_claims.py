@@ -13,7 +13,6 @@ import pytest
 from scipy.stats import spearmanr
 
 from harness.evaluation.profile import hole_shape, hole_shapes
-from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     RULES,
     decide,
@@ -22,7 +21,7 @@ from harness.programs.thesis.claims import (
     score_claims,
 )
 from harness.records.examples import ExampleCloud, HoleInView
-from harness.records.trials import CLAIMS
+from harness.records.trials import CLAIMS, hole_list
 from harness.report.claims import Verdict
 from tests.support.synthetic_tables import World, example, joined, tables
 

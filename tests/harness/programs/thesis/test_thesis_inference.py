@@ -12,8 +12,8 @@ from harness.evaluation.summary import summarise_holes
 from harness.experiment.load import load_experiment
 from harness.programs.thesis.answers import THESIS
 from harness.programs.thesis.inference import KIND, SET_UP, borne_out_if, posterior_of
-from harness.report.set_ups_page import Layout, set_ups_html
 from harness.report.sections import About
+from harness.report.set_ups_page import Layout, set_ups_html
 from tests.support.synthetic_tables import World, joined, provenance, tables
 
 AXES = {

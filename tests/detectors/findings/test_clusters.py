@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from detectors.findings.clusters import euclidean_clusters
+from detectors.findings.clusters import euclidean_clusters, nested_clusters
 from harness.vocabulary.errors import UserError
 
 
@@ -57,6 +57,46 @@ def test_a_distance_exactly_reached_joins() -> None:
     np.testing.assert_array_equal(euclidean_clusters(points, 0.25), [0, 0, 1])
 
 
+@pytest.mark.parametrize(
+    "direction",
+    [
+        (1, 0, 0),
+        (0, 1, 0),
+        (0, 0, 1),
+        (0.6, 0.0, -0.8),
+    ],
+)
+def test_points_are_joined_up_to_the_distance_and_no_farther(direction) -> None:
+    first = np.array([0.03, 0.01, 0.7])
+    for distance_m, count in ((0.0099, 1), (0.0101, 2)):
+        second = first + distance_m * np.array(direction)
+        labels = euclidean_clusters(np.stack([first, second]), 0.01)
+        assert labels.max() + 1 == count
+
+
+def test_nested_clusters_are_those_of_each_threshold() -> None:
+    """Labels at several thresholds beside clusters of the points above each, and the threshold at
+    which each is gone."""
+    random = np.random.default_rng(5)
+    points = random.uniform(0, 0.1, (200, 3)) * [1.0, 1.0, 0.1]
+    scores = random.exponential(size=200)
+    thresholds = np.array([0.1, 0.7, 1.6])
+    labels, strengths = nested_clusters(points, scores, 0.012, 3, thresholds)
+    for level, threshold in enumerate(thresholds):
+        above = scores > threshold
+        alone = euclidean_clusters(points[above], 0.012, 3)
+        np.testing.assert_array_equal(labels[level][above], alone)
+        assert (labels[level][~above] == -1).all()
+        for number in range(alone.max() + 1):
+            cluster = points[above][alone == number]
+            cluster_scores = scores[above][alone == number]
+            strength = strengths[level, number]
+            just_below = cluster_scores > np.nextafter(strength, 0.0)
+            highest = cluster[cluster_scores > strength]
+            assert euclidean_clusters(cluster[just_below], 0.012, 3).max() >= 0
+            assert euclidean_clusters(highest, 0.012, 3).max(initial=-1) < 0
+
+
 def test_small_clusters_and_missing_points_get_no_label() -> None:
     points = np.array(
         [[0.0, 0, 0], [1, 0, 0], [1.001, 0, 0], [np.nan, 0, 0], [2, 0, 0], [2, 0.001, 0]]
@@ -72,7 +112,8 @@ def test_a_dense_sheet_of_100_000_points_is_one_cluster() -> None:
     points = np.stack([u.ravel(), v.ravel(), np.full(u.size, 0.7)], axis=1)
     points[points[:, 0] > 0.2, 0] += 0.0101
     labels = euclidean_clusters(points, 0.01)
-    assert labels.max() == 1 and (labels == 0).sum() == 320 * 201
+    assert labels.max() == 1
+    assert (labels == 0).sum() == 320 * 201
 
 
 def test_a_wrong_unit_is_a_clear_mistake() -> None:
