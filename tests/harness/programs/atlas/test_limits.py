@@ -193,7 +193,7 @@ def test_an_axis_that_is_not_asked_for_takes_its_first_value() -> None:
 
 def test_the_ends_of_the_range_are_inside() -> None:
     surface = surfaces_of(limits())[0]
-    # 1 - 1e-10 of a metre is a metre that was computed with rounding
+    # a value that was rounded does not lie outside
     for distance_m in (0.5 - 1e-10, 0.5, 2.0, 2.0 + 1e-10):
         assert has_limit(surface, distance_m, 1)
     for distance_m in (0.499, 2.001):
