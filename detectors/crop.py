@@ -16,7 +16,14 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled, parts_with
+from detectors.pixels.masks import (
+    grown,
+    holes_filled,
+    inset,
+    nearest_pixel,
+    notches_filled,
+    parts_with,
+)
 from detectors.surfaces.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError

@@ -49,7 +49,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, FrameSource
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 

@@ -18,13 +18,15 @@ from harness.experiment.schema import (
     splices_of,
 )
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
+from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.words import nearest
 from scenes.optics import Optics
 from scenes.perspectives import AnyViews, check_in_view, poses_of, view_count
-from scenes.sensor.camera import CameraConfig, camera_names, camera_of, is_camera_path, load_camera
+from scenes.sensor.camera import camera_names, camera_of, is_camera_path, load_camera
+from scenes.sensor.common.config import CameraConfig
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig

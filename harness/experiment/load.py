@@ -28,13 +28,8 @@ from harness.vocabulary.declaration.yaml_source import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import (
-    CameraConfig,
-    camera_names,
-    is_camera_path,
-    load_camera,
-    numbers_of_lens,
-)
+from scenes.sensor.camera import camera_names, is_camera_path, load_camera, numbers_of_lens
+from scenes.sensor.common.config import CameraConfig
 
 # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 EXPERIMENT_VERSION = 1

@@ -24,9 +24,10 @@ from detectors.averages.flat_field import FlatField, FlatFieldConfig, corrected
 from harness.vocabulary.geometry import MM, Cloud, LeftOut
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.at_once import AtOnce
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.unit import FrameTotals
 from scenes.sensor.source import SimulatedCapture, SimulatedUnit
-from scenes.sensor.unit import FrameTotals
 
 FEWEST_FRAMES = 10
 """Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only,

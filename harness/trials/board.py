@@ -15,11 +15,12 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from detectors.findings.clusters import PLAIN
+from detectors.pixels.clusters import PLAIN
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, invert, rotate_vectors, transform_points
 from scenes.render.cache import read_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 from scenes.target.flaws import from_line_m

@@ -10,7 +10,6 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from detectors import DETECTORS, load_detector
-from detectors.averages.noise import median_of, sigma_of
 from detectors.findings.missing import missing_returns, one_damage_once
 from detectors.interface import (
     Calibratable,
@@ -21,7 +20,8 @@ from detectors.interface import (
     NeedsTruth,
     TrueDamage,
 )
-from detectors.masks import grown
+from detectors.pixels.masks import grown
+from detectors.pixels.noise import median_of, sigma_of
 from detectors.score_map import Findings, findings_at
 from harness.evaluation.match import closest_pairs
 from harness.trials.board import LabelledCloud, highest_within

@@ -110,7 +110,7 @@ class FloorCeilingTest:
 
     @property
     def needed(self) -> bool:
-        """Whether the model with two parameters is rejected at the 5 % level."""
+        """Return whether the model with two parameters is rejected at the 5 % level."""
         return self.p_value < 0.05
 
 

@@ -212,7 +212,7 @@ def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, 
             f"{path}: {header.count(name)} columns are called {name!r}", fix="rename all but one"
         )
     if name not in header:
-        from harness.vocabulary.declaration.diagnose import nearest
+        from harness.vocabulary.words import nearest
 
         meant = nearest(name, header)
         legal = ", ".join(map(repr, header))

@@ -101,7 +101,7 @@ class SetUpLimit:
 
     @property
     def is_at_most(self) -> bool:
-        """Whether everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
+        """Return whether everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
         return self.statement is None and bool(np.isfinite(self.a90_mm))
 
     def beyond(self, size_mm: float) -> bool:

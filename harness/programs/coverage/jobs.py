@@ -110,7 +110,7 @@ def survey(
             )
             pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
             boards = values_of(_board_seen, pairs, engine)
-            inspections = _inspections([each for each in boards if each is not None], point, scores)
+            inspections = _inspections([board for board in boards if board is not None], point, scores)
             found = findable(inspections, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = values_of(

@@ -26,7 +26,8 @@ from harness.trials.board import Board, load_board
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import random_stream
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 
 UNITS_A_BOARD = 10  # units, drawn anew for every board, whose noise is measured there

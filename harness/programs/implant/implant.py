@@ -273,7 +273,8 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     """Return the damage as a family of boards as large as the largest scan. Raises UserError for
     illegal options."""
     from harness.vocabulary.declaration.diagnose import settings_of
-    from scenes.sensor.camera import CameraConfig, camera_of
+    from scenes.sensor.camera import camera_of
+    from scenes.sensor.common.config import CameraConfig
     from scenes.target.drawn import DrawnTargetConfig
 
     width_mm, height_mm = (max(float(scan.size_m[axis]) for scan in scans) / MM for axis in (0, 1))

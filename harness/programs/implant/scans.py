@@ -17,7 +17,7 @@ import pandas as pd
 from scipy import ndimage
 
 from detectors.averages.average import RECORDED, average
-from detectors.averages.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
 from harness.records.rows import Origin, TrialRecord
@@ -278,7 +278,7 @@ def damages_placed(
     them."""
     drawn = family.drawn(purpose, number)
     rim_px = scan.rim_px(family)
-    kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
+    kept = {damage.id for damage in drawn.damages if scan.place(*damage.centre_m, rim_px) is not None}
     left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
     return drawn.model_copy(update=left)
 
