@@ -22,7 +22,7 @@ import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
@@ -59,8 +59,8 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
             stated = sum(entry.file_size for entry in archive.infolist())
         fix = f"save its frames as .npy, which is not unpacked; {RAISE}"
         refuse_bytes(str(path), stated, files.ARRAYS_BYTES, "unpacks to", fix)
-        with np.load(path, allow_pickle=False) as held:
-            return {name: np.asarray(held[name]) for name in held}
+        with np.load(path, allow_pickle=False) as archived:
+            return {name: np.asarray(archived[name]) for name in archived}
 
 
 def load_mat(path: Path) -> dict[str, np.ndarray]:
@@ -170,16 +170,16 @@ class RawLoader:
         width, height, kind, step, offset = match.groups()
         refuse_pixels(f"--raw {text}", int(width), int(height))
         kind = kind or "u2"
-        own = np.dtype(kind).itemsize
-        if int(step or own) < own:
+        item_bytes = np.dtype(kind).itemsize
+        if int(step or item_bytes) < item_bytes:
             raise UserError(
-                f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW
+                f"--raw {text}: a number of {item_bytes} bytes in every {step}", legal=LEGAL_RAW
             )
         return cls(
             int(width),
             int(height),
             kind if kind[0] in "<>" else f"<{kind}",
-            int(step or own),
+            int(step or item_bytes),
             int(offset or 0),
         )
 
@@ -204,11 +204,11 @@ class RawLoader:
         too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
-            what = (
+            problem = (
                 f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
             )
             raise UserError(
-                f"{path}: {what}: this layout is wrong",
+                f"{path}: {problem}: this layout is wrong",
                 legal=LEGAL_RAW,
                 fix=raw_layout_of(path).fix,
             )
@@ -250,46 +250,46 @@ Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
 note on the axes."""
 
 
-def open_arrays(path: Path, given: Given) -> Recording:
+def open_arrays(path: Path, options: CaptureOptions) -> Recording:
     """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array
     or several fit."""
-    load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
-    if given.pitch is not None:
-        return _open_height_map(path, load, given)
-    distances, _, _, organised, note = _stack(path, load, given)
+    load = RawLoader.stated(options.raw) if options.raw is not None else LOADERS[path.suffix.lower()]
+    if options.pitch is not None:
+        return _open_height_map(path, load, options)
+    distances, _, _, organised, note = _stack(path, load, options)
     left_over = load.refuse_doubtful(path, distances) if isinstance(load, RawLoader) else 0
     if distances.ndim == 3:
-        _refuse_other_planes(str(path), given.array or "", distances, left_over)
+        _refuse_other_planes(str(path), options.array or "", distances, left_over)
     height, width = distances.shape[1:3]
     lens: Lens | None = None
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
         hint = "; for a height map, state the distance between its pixels: --pitch 0.5mm"
         lens, files = lens_for(
-            str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint
+            str(path), options, width, height, beside=[path.parent, path.parent.parent], hint=hint
         )
-    scale_m = given.scale_m or default_metres(distances.dtype)
+    scale_m = options.scale_m or default_metres(distances.dtype)
 
     def read() -> Iterator[Frame]:
         # ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole
-        distances, *beside, _, _ = _stack(path, load, given)
+        distances, *beside, _, _ = _stack(path, load, options)
         for i, stored in enumerate(distances):
             rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
             yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
 
     is_whole = distances.dtype.kind in "iu"
-    more = {"files": (path, *files), "lens": lens, "organised": organised, "notes": (note,)}
-    return Recording.begun(path.name, read, scale_m, is_whole, **more)
+    fields = {"files": (path, *files), "lens": lens, "organised": organised, "notes": (note,)}
+    return Recording.begun(path.name, read, scale_m, is_whole, **fields)
 
 
-def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording:
+def open_array_list(paths: Sequence[Path], options: CaptureOptions, name: str) -> Recording:
     """Open files of arrays of one kind as one capture, in the order given. Raises UserError as
     `open_arrays` does."""
-    first = open_arrays(paths[0], given)
+    first = open_arrays(paths[0], options)
 
     def read() -> Iterator[Frame]:
         for path in paths:
-            yield from open_arrays(path, given).read()
+            yield from open_arrays(path, options).read()
 
     return replace(first, name=name, read=read, files=(*paths, *first.files[1:]))
 
@@ -298,22 +298,22 @@ def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int
     """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y,
     colour or amplitude."""
     changed = [
-        each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)
+        difference for difference in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(difference)
     ]
     worst = max(changed, default=0.0)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
-        more = f" and {left_over} bytes more" * bool(left_over)
-        what = f"{name}: {len(frames)} planes{more}; the median pixel differs by"
-        what += f" {100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness or confidence?"
+        remainder = f" and {left_over} bytes more" * bool(left_over)
+        problem = f"{name}: {len(frames)} planes{remainder}; the median pixel differs by"
+        problem += f" {100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness or confidence?"
         fix = f"choose the plane that holds depth by its number from 0: --array {key}:N"
-        raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
+        raise UserError(problem, legal="frames of one scene, or one plane", fix=fix)
 
 
-def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
+def _stack(path: Path, load: ArraysLoader, options: CaptureOptions) -> Stack:
     """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis
     first."""
     arrays = load(path)
-    name, array = _named_array(str(path), arrays, DISTANCE_NAMES, given.array)
+    name, array = _named_array(str(path), arrays, DISTANCE_NAMES, options.array)
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     note = ""
@@ -324,16 +324,16 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
     if _frames_are_last(array):
         note = f"{name} {array.shape}: the frames are assumed to lie along the last axis"
         array = np.moveaxis(array, -1, 0)
-    has_points, shape, organised = _axes(name, array.shape, given.lens)
+    has_points, shape, organised = _axes(name, array.shape, options.lens)
     refuse_pixels(name, shape[2], shape[1])
     beside = {key.lower(): value for key, value in arrays.items() if value.dtype.kind in "biuf"}
 
-    def named(names: Sequence[str], size: int) -> np.ndarray | None:
-        found = next((beside[key] for key in names if key in beside), None)
-        return found if found is not None and found.size == size else None
+    def companion(names: Sequence[str], size: int) -> np.ndarray | None:
+        values = next((beside[key] for key in names if key in beside), None)
+        return values if values is not None and values.size == size else None
 
-    rgb = named(COLOUR_NAMES, 3 * math.prod(shape))
-    amplitude = named(AMPLITUDE_NAMES, math.prod(shape))
+    rgb = companion(COLOUR_NAMES, 3 * math.prod(shape))
+    amplitude = companion(AMPLITUDE_NAMES, math.prod(shape))
     if rgb is not None:
         if rgb.dtype.kind == "f":
             rgb = np.nan_to_num(
@@ -361,36 +361,36 @@ def _is_deep(array: np.ndarray) -> bool:
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
     """Return the median relative difference where both have a number; infinity if there is none."""
-    both = (first > 0) & (second > 0)
-    before = first[both].astype(np.float64)
-    after = second[both].astype(np.float64)
-    return float(np.median(np.abs(before - after) / before)) if both.any() else float("inf")
+    is_common = (first > 0) & (second > 0)
+    before = first[is_common].astype(np.float64)
+    after = second[is_common].astype(np.float64)
+    return float(np.median(np.abs(before - after) / before)) if is_common.any() else float("inf")
 
 
 def _named_array(
-    name: str, arrays: Arrays, usual: Sequence[str], given: str | None
+    name: str, arrays: Arrays, usual: Sequence[str], selector: str | None
 ) -> tuple[str, np.ndarray]:
     """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else
     the only one."""
-    held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
-    key, _, number = (given or "").partition(":")
+    contents = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
+    key, _, number = (selector or "").partition(":")
     if not key:
-        found = [key for key in arrays if key.lower() in usual]
-        found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
-        if len(found) != 1:
-            what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
+        candidates = [key for key in arrays if key.lower() in usual]
+        candidates = candidates or [key for key in arrays if "depth" in key.lower()] or list(arrays)
+        if len(candidates) != 1:
+            problem = f"{name}: no array, or several arrays, that could be the depth (it holds {contents})"
             fix = (
-                f"choose one, for instance --array {found[0]} (add --pitch for a height map)"
-                if found
+                f"choose one, for instance --array {candidates[0]} (add --pitch for a height map)"
+                if candidates
                 else None
             )
             raise UserError(
-                what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix
+                problem, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix
             )
-        (key,) = found
+        (key,) = candidates
     if key not in arrays:
         raise UserError(
-            f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}"
+            f"{name}: holds no array {key}", legal=contents, fix=f"--array {next(iter(arrays), '')}"
         )
     array = arrays[key]
     name = f"{name}: {key}" if key else name
@@ -398,7 +398,7 @@ def _named_array(
         array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
             raise UserError(
-                f"--array {given}: no such part of {name} {array.shape}",
+                f"--array {selector}: no such part of {name} {array.shape}",
                 legal="NAME, or NAME:0 onwards",
             )
         array = array[int(number)]
@@ -445,21 +445,21 @@ RELIEF = (5e-4, 0.5)
 only one fits."""
 
 
-def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
+def _open_height_map(path: Path, load: ArraysLoader, options: CaptureOptions) -> Recording:
     """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be
     determined."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
+    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (options.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
         legal = "the distance between pixels with its unit, for instance 0.5mm, 200um or 0.001m"
-        raise UserError(f"--pitch {given.pitch}: is not a length", legal=legal)
-    name, heights = _map_in(path, load, given.array)
-    known = heights[np.isfinite(heights)].astype(np.float64)
-    if known.size == 0:
+        raise UserError(f"--pitch {options.pitch}: is not a length", legal=legal)
+    name, heights = _map_in(path, load, options.array)
+    finite_heights = heights[np.isfinite(heights)].astype(np.float64)
+    if finite_heights.size == 0:
         raise UserError(
             f"{name}: has no finite height", legal="numbers, and NaN where there is no height"
         )
-    relief = float(np.ptp(np.quantile(known, (0.01, 0.99))))
+    relief = float(np.ptp(np.quantile(finite_heights, (0.01, 0.99))))
     height, width = heights.shape
     side_m = min(height, width) * pitch_m
     plausible = (
@@ -467,25 +467,25 @@ def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
         for u in ("mm", "m", "um")
         if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1]
     )
-    scale_m = next(plausible, None) if given.scale_m is None else given.scale_m
+    scale_m = next(plausible, None) if options.scale_m is None else options.scale_m
     if scale_m is None:
-        what = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
-        raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
+        problem = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
+        raise UserError(problem, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
     direction = (
         "grow away from the viewer, as its name says"
         if is_down
         else "grow towards the viewer: holes are low"
     )
-    z_step_m = 0.0 if (known % 1).any() else scale_m  # whole numbers were rounded, others were not
-    read = partial(_map_frames, path, load, given.array, pitch_m, scale_m if is_down else -scale_m)
+    z_step_m = 0.0 if (finite_heights % 1).any() else scale_m  # whole numbers were rounded, others were not
+    read = partial(_map_frames, path, load, options.array, pitch_m, scale_m if is_down else -scale_m)
     note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
     notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
     origin = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
-    found = Recording(
+    recording = Recording(
         path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin
     )
-    return replace(found, projection="parallel")
+    return replace(recording, projection="parallel")
 
 
 def _map_frames(
@@ -493,17 +493,17 @@ def _map_frames(
 ) -> Iterator[Frame]:
     """Yield the map as a frame. If ``scale_m`` is below 0, heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)
-    known = np.isfinite(heights)
+    is_finite = np.isfinite(heights)
     z_m = scale_m * heights.astype(np.float64)
-    z_m += DISTANCE_M - (np.median(z_m[known]) if known.any() else 0.0)
-    z_m[~known] = np.nan
+    z_m += DISTANCE_M - (np.median(z_m[is_finite]) if is_finite.any() else 0.0)
+    z_m[~is_finite] = np.nan
     v, u = np.mgrid[: heights.shape[0], : heights.shape[1]]
     xy_m = (
         np.stack([u - (heights.shape[1] - 1) / 2, v - (heights.shape[0] - 1) / 2], axis=-1)
         * pitch_m
     )
-    xy_m[~known] = np.nan
-    reason = np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
+    xy_m[~is_finite] = np.nan
+    reason = np.where(is_finite, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
     yield Frame(name, z_m.astype(np.float32), reason, xy_m=xy_m)
 
 
@@ -513,9 +513,9 @@ def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
     values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
     if values.ndim == 3:
-        what = f"{name}: {values.shape[0]} maps of {values.shape[2]} x {values.shape[1]} pixels"
+        problem = f"{name}: {values.shape[0]} maps of {values.shape[2]} x {values.shape[1]} pixels"
         fix = f"choose one by its number: --array {(array or '').partition(':')[0]}:0"
-        raise UserError(what, legal="one map: different maps are not averaged", fix=fix)
+        raise UserError(problem, legal="one map: different maps are not averaged", fix=fix)
     if values.ndim != 2 or min(values.shape) < 2:
         legal = "(h, w), or (n, h, w) with --array NAME:NUMBER"
         raise UserError(f"{name}: a shape of {values.shape} is not a height map", legal=legal)

@@ -21,7 +21,7 @@ from detectors.recordings.depth_images import NOT_DEPTH
 from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
-from detectors.recordings.recording import NO_GRID, Given, Recording, read_errors
+from detectors.recordings.recording import NO_GRID, CaptureOptions, Recording, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Lens
@@ -65,17 +65,17 @@ class Bag:
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
             wanted = [connection for connection in reader.connections if connection.topic == topic]
-            found = reader.messages(wanted) if wanted else iter(())
+            stored_messages = reader.messages(wanted) if wanted else iter(())
             for number in count():
                 name = f"{self.path.name} {topic} message {number}"
                 with self._readable():
-                    item = next(found, None)
+                    item = next(stored_messages, None)
                     if item is None:
                         break
                     if len(item[2]) > MAX_MESSAGE_BYTES:
-                        most = f"{MAX_MESSAGE_BYTES >> 20} MiB"
+                        limit = f"{MAX_MESSAGE_BYTES >> 20} MiB"
                         raise UserError(
-                            f"{name}: has more than {most}", legal=f"messages up to {most}"
+                            f"{name}: has more than {limit}", legal=f"messages up to {limit}"
                         )
                     message = decode(item[2], item[0].msgtype)
                 yield name, message
@@ -88,9 +88,9 @@ class Bag:
         mend = (
             f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
         )
-        what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is not a bag"
+        problem = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is not a bag"
         return read_errors(
-            what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}"
+            problem, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}"
         )
 
     @contextmanager
@@ -136,10 +136,10 @@ def find_bag(path: Path) -> Bag:
         return Bag(path, (path,))
     metadata = path / METADATA
     if not metadata.is_file():
-        held = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
-        what = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}"
+        pieces = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
+        problem = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(pieces)}"
         raise UserError(
-            what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex"
+            problem, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex"
         )
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
     with read_errors(
@@ -155,8 +155,8 @@ def find_bag(path: Path) -> Bag:
         file.name for file in files if not (file.is_file() and file.suffix.lower() in BAG_SUFFIXES)
     ]
     if absent or not files:
-        what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is missing or is not a file that can be read"
-        raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
+        problem = f"{METADATA} names {', '.join(absent) or 'no file'}, which is missing or is not a file that can be read"
+        raise UserError(f"{path}: {problem}", legal=LEGAL_BAG, fix="copy the whole folder again")
     return Bag(path, files, metadata)
 
 
@@ -174,19 +174,19 @@ RAY_TOLERANCE_PX = 0.01
 of float32."""
 
 
-def open_bag(path: Path, given: Given) -> Recording:
+def open_bag(path: Path, options: CaptureOptions) -> Recording:
     """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens
     does not fit."""
     bag = find_bag(path)
-    chosen, note = _chosen_topic(bag, given)
+    chosen, note = _chosen_topic(bag, options)
     if bag.first(chosen) is None:
         raise UserError(
             f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again"
         )
     recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(
-        bag, chosen, given
+        bag, chosen, options
     )
-    files = (*bag.files, *filter(None, (bag.metadata, given.intrinsics)))
+    files = (*bag.files, *filter(None, (bag.metadata, options.intrinsics)))
     return replace(recording, files=files, notes=(note, *recording.notes))
 
 
@@ -198,49 +198,49 @@ def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Fra
         yield replace(frame, xy_m=None) if by_lens else frame
 
 
-def _open_clouds(bag: Bag, topic: str, given: Given) -> Recording:
-    scale_m = given.scale_m or UNITS_M["m"]
+def _open_clouds(bag: Bag, topic: str, options: CaptureOptions) -> Recording:
+    scale_m = options.scale_m or UNITS_M["m"]
     first = next(_frames(bag, topic, scale_m, by_lens=False))
     height, width = first.z_m.shape
-    lens = read_lens(given.intrinsics, width, height) if given.intrinsics else given.lens
+    lens = read_lens(options.intrinsics, width, height) if options.intrinsics else options.lens
     note = ""
     if lens is not None:
         if (lens.height, lens.width) != (height, width):
-            what = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
-            raise UserError(f"{bag.path}: {what}")
+            problem = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
+            raise UserError(f"{bag.path}: {problem}")
         if (off := _off_ray_px(lens, first)) > RAY_TOLERANCE_PX:
-            what = f"the named lens does not fit these points: they lie up to {off:.2g} pixels beside its rays"
+            problem = f"the named lens does not fit these points: they lie up to {off:.2g} pixels beside its rays"
             fix = "leave --intrinsics out: the points are then used as they are stored"
-            raise UserError(f"{bag.path}: {what}", fix=fix)
+            raise UserError(f"{bag.path}: {problem}", fix=fix)
     elif height == 1:
         note = NO_GRID
     else:
         messages = (bag.first(name) for name, kind in bag.topics.items() if kind == INFO_TYPE)
-        found = (
+        info_lenses = (
             lens_of_info(message, (height, width)) for message in messages if message is not None
         )
         fitting = (
-            each
-            for each in found
-            if isinstance(each, Lens) and _off_ray_px(each, first) <= RAY_TOLERANCE_PX
+            info_lens
+            for info_lens in info_lenses
+            if isinstance(info_lens, Lens) and _off_ray_px(info_lens, first) <= RAY_TOLERANCE_PX
         )
         lens = next(fitting, None)
         if lens is None:
             note = "no CameraInfo in the bag fits the points; each frame's own x and y are averaged"
     read = partial(_frames, bag, topic, scale_m, lens is not None)
     unit_from = "ROS, whose clouds are in metres"
-    more = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
-    return Recording.begun(bag.path.name, read, scale_m, **more)
+    fields = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
+    return Recording.begun(bag.path.name, read, scale_m, **fields)
 
 
-def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
+def _open_images(bag: Bag, topic: str, options: CaptureOptions) -> Recording:
     name, message = next(bag.messages(topic))
     stored = stored_depth(name, message)
     height, width = stored.shape
     is_whole = stored.dtype.kind == "u"
-    own = partial(_lens_of_images, bag, topic, (height, width))
-    lens, _ = lens_for(str(bag.path), given, width, height, own)
-    scale_m = given.scale_m
+    capture_lens = partial(_lens_of_images, bag, topic, (height, width))
+    lens, _ = lens_for(str(bag.path), options, width, height, capture_lens)
+    scale_m = options.scale_m
     unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
     for name, kind in bag.topics.items():
         # RealSense's viewer states the unit with a sensor's streams
@@ -261,52 +261,52 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
     return Recording.begun(bag.path.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
 
 
-def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
+def _chosen_topic(bag: Bag, options: CaptureOptions) -> tuple[str, str]:
     """Return the topic to read, and a note on the other topics."""
     path = bag.path
     topics = bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     images = _depth_topics(bag)
-    both = ", ".join([*clouds, *images])
-    held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
+    depth_topics = ", ".join([*clouds, *images])
+    contents = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
-    if given.topic is not None:
-        name = given.topic if given.topic in topics else f"/{given.topic}"
+    if options.topic is not None:
+        name = options.topic if options.topic in topics else f"/{options.topic}"
         if name not in topics:
             raise UserError(
-                f"{path}: no topic {given.topic}; its topics: {held}", legal=both or LEGAL_BAG
+                f"{path}: no topic {options.topic}; its topics: {contents}", legal=depth_topics or LEGAL_BAG
             )
         if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
         return name, ""
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
     if len(images) == 1 and (
-        not clouds or given.intrinsics or given.lens or _infos_of(bag, images[0])
+        not clouds or options.intrinsics or options.lens or _infos_of(bag, images[0])
     ):
         also = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
         return images[0], f"the depth images on {images[0]} are read{also}" if clouds else ""
     if len(usual) == 1:
         also = f"; depth images: {', '.join(images)}; --topic chooses"
         return usual[0], f"the clouds on {usual[0]} are read{also}" if images else ""
-    if not both:
+    if not depth_topics:
         fix = "record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info"
         raise UserError(
-            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}",
+            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {contents}",
             legal=kinds,
             fix=fix,
         )
-    own = next((topic for topic in images if _infos_of(bag, topic)), "")
-    found = (
+    calibrated_topic = next((topic for topic in images if _infos_of(bag, topic)), "")
+    problem = (
         f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
     )
-    fix = f"choose one, for instance --topic {own or (images or clouds)[0]}"
-    raise UserError(f"{path}: {found}", legal=both, fix=fix)
+    fix = f"choose one, for instance --topic {calibrated_topic or (images or clouds)[0]}"
+    raise UserError(f"{path}: {problem}", legal=depth_topics, fix=fix)
 
 
 def _depth_topics(bag: Bag) -> list[str]:
     """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and
     no copies."""
-    found = []
+    depth_topics = []
     for topic in (
         name
         for name, kind in bag.topics.items()
@@ -315,9 +315,9 @@ def _depth_topics(bag: Bag) -> list[str]:
         message = bag.first(topic)
         encoding = encoding_of(message) if message is not None else ""
         if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
-            found.append(topic)
+            depth_topics.append(topic)
     return [
-        topic for topic in found if _of_pictures(topic) == topic or _of_pictures(topic) not in found
+        topic for topic in depth_topics if _of_pictures(topic) == topic or _of_pictures(topic) not in depth_topics
     ]
 
 
@@ -339,10 +339,10 @@ def _infos_of(bag: Bag, topic: str) -> list[str]:
 def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
     """Return the lens of depth images. Raises UserError if the bag has none for them, or one of
     another model."""
-    every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
+    infos = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
-    for info in _infos_of(bag, topic) or (every if len(every) == 1 else []):
+    for info in _infos_of(bag, topic) or (infos if len(infos) == 1 else []):
         message = bag.first(info)
         lens = "is empty" if message is None else lens_of_info(message, shape, is_rectified)
         if isinstance(lens, Lens):
@@ -350,11 +350,11 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
         why.append(f"{info} {lens}")
     reason = (
         "; ".join(why)
-        or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+        or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(infos) or 'none'})"
     )
-    what = f"{bag.path}: {reason}: the lens of these depth images is unknown; without it they give no points"
+    problem = f"{bag.path}: {reason}: the lens of these depth images is unknown; without it they give no points"
     fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
-    raise UserError(what, legal=LEGAL_LENS, fix=fix)
+    raise UserError(problem, legal=LEGAL_LENS, fix=fix)
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:

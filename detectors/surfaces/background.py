@@ -95,7 +95,7 @@ class _Cells:
     weights: np.ndarray
     noise: np.ndarray
     level_noise: float
-    of: np.ndarray
+    cell_of_point: np.ndarray
     row: np.ndarray
     column: np.ndarray
     side: float
@@ -117,15 +117,15 @@ class _Cells:
     def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
         """Return the cells with medians and deviations of the points' residuals (n,); some cells
         are then dropped."""
-        medians, deviations = _group_medians(residuals, self.of, len(self.points))
+        medians, deviations = _group_medians(residuals, self.cell_of_point, len(self.points))
         z = fit(self.points) + medians
-        known = np.isfinite(z)
+        is_judged = np.isfinite(z)
         moved = (
             self.points * (z / self.points[:, 2])[:, None] if self.central else self.points.copy()
         )
         moved[:, 2] = z
-        moved[~known] = self.points[~known]
-        weights = np.where(known, self.weights, 0.0)
+        moved[~is_judged] = self.points[~is_judged]
+        weights = np.where(is_judged, self.weights, 0.0)
         level_noise = _cell_noise(self.image(medians))[0]
         return replace(
             self, points=moved, weights=weights, noise=deviations, level_noise=level_noise
@@ -153,11 +153,11 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         fitted = fit(points)
         noise_m = sigma_of(points[:, 2] - fitted)
         warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
-        few: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
+        facts: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
         z_m = on_grid(fitted, mask)
         residual_m = on_grid(points[:, 2] - fitted, mask)
         return Background(
-            z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, few
+            z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, facts
         )
     wavelength = None
     if config.shape in STATED:
@@ -182,12 +182,12 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     if cells.central:
         # only the few pixels near the steepest incidence are examined one by one; a ray that
         # misses the surface beside the pixel gives NaN, which is not below the limit either
-        near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
-        looked = np.flatnonzero((cells.of < 0) | near[cells.of])
+        is_steep = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
+        looked = np.flatnonzero((cells.cell_of_point < 0) | is_steep[cells.cell_of_point])
         unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
     if unseen.all():
-        what = f"the whole target is seen at more than {STEEPEST_DEG:g} degrees, where nothing is judged"
-        raise UserError(what, fix="choose another target or crop, or record it from its front")
+        problem = f"the whole target is seen at more than {STEEPEST_DEG:g} degrees, where nothing is judged"
+        raise UserError(problem, fix="choose another target or crop, or record it from its front")
     fitted[unseen] = np.nan
     cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)
@@ -211,7 +211,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         local = np.hypot(np.nanmedian(around, axis=1), cells.level_noise)
     pixel = cells.pixel_noise
     noise = np.where(
-        cells.of >= 0, np.where(local > NOISIER * pixel, local, pixel)[cells.of], pixel
+        cells.cell_of_point >= 0, np.where(local > NOISIER * pixel, local, pixel)[cells.cell_of_point], pixel
     )
     z_m = on_grid(fitted, mask)
     residual_m = on_grid(points[:, 2] - fitted, mask)
@@ -227,7 +227,7 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:
         return ""
-    medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
+    medians, deviations = _group_medians(residual_m[mask], cells.cell_of_point, len(cells.points))
     level_noise = _cell_noise(cells.image(medians))[0]
     flat = np.column_stack([cells.points[:, :2], medians])
     level = replace(cells, points=flat, noise=deviations, level_noise=level_noise)
@@ -261,22 +261,22 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
         keys = down * columns + across
         counts = np.bincount(keys)
         side *= float(np.sqrt(wanted / max(median_of(counts[counts > 0].astype(float)), 1.0)))
-    held = np.flatnonzero(counts >= max(4, wanted / 4))
-    if len(held) < FEW_CELLS:
+    filled = np.flatnonzero(counts >= max(4, wanted / 4))
+    if len(filled) < FEW_CELLS:
         return None
     number = np.full(len(counts), -1)
-    number[held] = np.arange(len(held))
-    of = number[keys]
-    row, column = np.divmod(held, columns)
-    x = np.bincount(keys, x)[held] / counts[held]
-    y = np.bincount(keys, y)[held] / counts[held]
-    z = np.bincount(keys, points[:, 2])[held] / counts[held]
+    number[filled] = np.arange(len(filled))
+    cell_of_point = number[keys]
+    row, column = np.divmod(filled, columns)
+    x = np.bincount(keys, x)[filled] / counts[filled]
+    y = np.bincount(keys, y)[filled] / counts[filled]
+    z = np.bincount(keys, points[:, 2])[filled] / counts[filled]
     side_m = side * (float(np.median(points[:, 2])) if central else 1.0)
     rays = np.column_stack([x, y]) * (z[:, None] if central else 1.0)
-    weights = np.minimum(counts[held] / wanted, 1.0)
-    none = np.zeros(len(held))
+    weights = np.minimum(counts[filled] / wanted, 1.0)
+    none = np.zeros(len(filled))
     return _Cells(
-        np.column_stack([rays, z]), weights, none, 0.0, of, row, column, side, side_m, central
+        np.column_stack([rays, z]), weights, none, 0.0, cell_of_point, row, column, side, side_m, central
     )
 
 
@@ -291,19 +291,19 @@ def _group_medians(
         if group[i] >= 0 and np.isfinite(values[i]):
             starts[group[i] + 1] += 1
     starts = np.cumsum(starts)
-    at = starts[:-1].copy()
-    held = np.empty(starts[-1])
+    next_slot = starts[:-1].copy()
+    grouped = np.empty(starts[-1])
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
-            held[at[group[i]]] = values[i]
-            at[group[i]] += 1
+            grouped[next_slot[group[i]]] = values[i]
+            next_slot[group[i]] += 1
     medians = np.full(groups, np.nan)
     deviations = np.full(groups, np.nan)
     for g in range(groups):
         if starts[g + 1] > starts[g]:
-            some = held[starts[g] : starts[g + 1]]
-            medians[g] = _median(some)
-            deviations[g] = _median(np.abs(some - medians[g])) / 0.6745
+            members = grouped[starts[g] : starts[g + 1]]
+            medians[g] = _median(members)
+            deviations[g] = _median(np.abs(members - medians[g])) / 0.6745
     return medians, deviations
 
 
@@ -330,17 +330,17 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
 
     def bend(step: int) -> float:
         bends = [
-            each[2 * step :] - 2 * each[step:-step] + each[: -2 * step] for each in (image, image.T)
+            values[2 * step :] - 2 * values[step:-step] + values[: -2 * step] for values in (image, image.T)
         ]
-        some = np.concatenate([each.ravel() for each in bends])
-        some = some[np.isfinite(some)]
-        return sigma_of(some) if len(some) else 0.0
+        differences = np.concatenate([bend.ravel() for bend in bends])
+        differences = differences[np.isfinite(differences)]
+        return sigma_of(differences) if len(differences) else 0.0
 
-    near = bend(1)
+    adjacent = bend(1)
     far = bend(2)
     # for cells with variance s^2 and correlation r with direct neighbours: (6 - 8 r) s^2 and 6 s^2
-    deviation = max(near, far) / np.sqrt(6.0)
-    return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
+    deviation = max(adjacent, far) / np.sqrt(6.0)
+    return deviation, float(np.clip((6.0 - (adjacent / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
 
 
 def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
@@ -366,7 +366,7 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     best = shapes[_simplest(errors, worth)]
     if auto and _misfit(cells, best.fit, "")[1]["misfit_share"] < FREE_FORM_FROM:
         return best
-    base = shapes[int(np.argmin([each.mean() for each in errors]))]
+    base = shapes[int(np.argmin([tile_errors.mean() for tile_errors in errors]))]
     # wavelengths in cells, longest first, down to twice the side of a tile or to the least scale
     ladder: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
     while ladder[-1] / 1.6 >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
@@ -374,12 +374,12 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     if config.scale_mm is not None:
         ladder = [2 * config.scale_mm * MM / cells.side_m]
     free = [best] if auto else []
-    for wavelength in (each * cells.side for each in ladder):
+    for wavelength in (cells_long * cells.side for cells_long in ladder):
         fit_to = partial(
             free_form, base=base.fit, wavelength=wavelength, cell=cells.side, central=cells.central
         )
-        made = _fitted(cells, "free form", fit_to, wavelength)
-        free += [] if made is None else [made]
+        fitted = _fitted(cells, "free form", fit_to, wavelength)
+        free += [] if fitted is None else [fitted]
     return free[_simplest([_prediction_errors(cells, shape) for shape in free], worth)]
 
 
@@ -395,12 +395,12 @@ def _fitted(
         if fit is None:
             return None
         error = cells.points[:, 2] - fit(cells.points)
-        known = np.isfinite(error) & (cells.weights > 0)
-        if known.sum() < 0.98 * (cells.weights > 0).sum():
+        is_fitted = np.isfinite(error) & (cells.weights > 0)
+        if is_fitted.sum() < 0.98 * (cells.weights > 0).sum():
             return None
-        scale = max(sigma_of(error[known]), floor)
+        scale = max(sigma_of(error[is_fitted]), floor)
         before = weights
-        robust = bisquare_weights(np.where(known, error, np.inf), BISQUARE_TUNING * scale)
+        robust = bisquare_weights(np.where(is_fitted, error, np.inf), BISQUARE_TUNING * scale)
         if widened:
             # pairs of neighbouring cells without weight, and the neighbours of these pairs
             image = cells.image((robust == 0).astype(float), 0.0) > 0
@@ -437,10 +437,10 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
 def _simplest(errors: list[np.ndarray], worth: float) -> int:
     """Return the first shape whose mean error exceeds the least by at most ``worth`` or a standard
     error."""
-    best = int(np.argmin([each.mean() for each in errors]))
-    for i, each in enumerate(errors):
-        difference = each - errors[best]
-        if each.mean() - errors[best].mean() <= max(
+    best = int(np.argmin([tile_errors.mean() for tile_errors in errors]))
+    for i, tile_errors in enumerate(errors):
+        difference = tile_errors - errors[best]
+        if tile_errors.mean() - errors[best].mean() <= max(
             worth, float(difference.std()) / np.sqrt(len(difference))
         ):
             return i
@@ -459,8 +459,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     used = valid & (np.abs(np.nan_to_num(image)) < max(limit, BISQUARE_TUNING * noise))
     size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
     count, total = (
-        cv2.boxFilter(each, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for each in (used.astype(float), np.where(used, image, 0.0))
+        cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for values in (used.astype(float), np.where(used, image, 0.0))
     )
     smooth = total / np.maximum(count, 1)
     enough = valid & (count >= 9)
@@ -492,11 +492,11 @@ def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
             p = rays * fit(p)[:, None]
         return p
 
-    here = on_surface(0.0, 0.0)
-    normal = np.cross(on_surface(step, 0.0) - here, on_surface(0.0, step) - here)
-    along = np.abs((normal * here).sum(axis=1))
+    surface_points = on_surface(0.0, 0.0)
+    normal = np.cross(on_surface(step, 0.0) - surface_points, on_surface(0.0, step) - surface_points)
+    along = np.abs((normal * surface_points).sum(axis=1))
     return np.asarray(
         np.degrees(
-            np.arccos(along / (np.linalg.norm(normal, axis=1) * np.linalg.norm(here, axis=1)))
+            np.arccos(along / (np.linalg.norm(normal, axis=1) * np.linalg.norm(surface_points, axis=1)))
         )
     )

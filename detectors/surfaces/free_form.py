@@ -30,14 +30,14 @@ def free_form(
     third derivatives (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones
     less (as its sixth power); in units of x/z (central) or metres, as ``cell``, the spacing of the
     points."""
-    places = picture_places(points, central)
-    low = places.min(axis=0)
-    extent = np.ptp(places, axis=0)
+    positions = picture_places(points, central)
+    low = positions.min(axis=0)
+    extent = np.ptp(positions, axis=0)
     spacing = max(wavelength / KNOTS_PER_WAVELENGTH, float(extent.max()) / MOST_KNOTS)
     counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 3
     residual = points[:, 2] - base(points)
     w = np.where(np.isfinite(residual), weights, 0.0)
-    values, numbers = _splines((places - low) / spacing, counts)
+    values, numbers = _splines((positions - low) / spacing, counts)
     # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the
     # factor
     stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
@@ -63,10 +63,10 @@ def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
 
 
 @numba.njit(**PLAIN)
-def _spline(place: float, count: int, out: np.ndarray) -> int:
+def _spline(position: float, count: int, out: np.ndarray) -> int:
     """Fill (4,) with the cubic splines that reach a place, the nearest on the knots, and return
     the first's number."""
-    x = min(max(place, 0.0), count - 3.0) if np.isfinite(place) else 0.0
+    x = min(max(position, 0.0), count - 3.0) if np.isfinite(position) else 0.0
     first = min(int(x), count - 4)
     t = x - first
     s = 1.0 - t
@@ -76,15 +76,15 @@ def _spline(place: float, count: int, out: np.ndarray) -> int:
 
 
 @numba.njit(**PLAIN)
-def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _splines(positions: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the 16 products of cubic splines that reach each place (n, 2), and their numbers."""
-    values = np.empty((len(places), 16))
-    numbers = np.empty((len(places), 16), np.int64)
+    values = np.empty((len(positions), 16))
+    numbers = np.empty((len(positions), 16), np.int64)
     down = np.empty(4)
     across = np.empty(4)
-    for i in range(len(places)):
-        row = _spline(places[i, 0], counts[0], down)
-        column = _spline(places[i, 1], counts[1], across)
+    for i in range(len(positions)):
+        row = _spline(positions[i, 0], counts[0], down)
+        column = _spline(positions[i, 1], counts[1], across)
         for k in range(16):
             values[i, k] = down[k // 4] * across[k % 4]
             numbers[i, k] = (row + k // 4) * counts[1] + column + k % 4
@@ -105,9 +105,9 @@ def _normal_bands(
     a, b = np.triu_indices(16)
     rows = numbers[:, a]
     columns = numbers[:, b]
-    places = (width + rows - columns) * size + columns
+    entries = (width + rows - columns) * size + columns
     squares = weighted[:, a] * values[:, b]
-    banded = np.bincount(places.ravel(), squares.ravel(), (width + 1) * size).reshape(
+    banded = np.bincount(entries.ravel(), squares.ravel(), (width + 1) * size).reshape(
         width + 1, size
     )
     return banded, np.bincount(numbers.ravel(), (weighted * z[:, None]).ravel(), size)
@@ -145,11 +145,11 @@ def _penalty(rows: int, columns: int) -> sparse.coo_array:
         differences = np.diff(np.eye(count), order, axis=0)
         return np.asarray(differences.T @ differences)
 
-    whole = sum(
+    penalty = sum(
         factor
         * sparse.csr_array(
             sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr")
         )
         for order, factor in enumerate((1.0, 3.0, 3.0, 1.0))
     )
-    return sparse.coo_array(sparse.triu(whole))
+    return sparse.coo_array(sparse.triu(penalty))

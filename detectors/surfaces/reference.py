@@ -56,11 +56,11 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
     as `front_of` does."""
     corners, normals = front_of(reference)
     ahead = normals[:, 2] > -LOOSE
-    whole = _scene(corners)
+    part = _scene(corners)
     front = _scene(corners[ahead])
-    some = points[:: max(1, len(points) // SAMPLE)]
-    tried = (_fitted(front, corners[ahead], normals[ahead], some, turn) for turn in range(4))
-    T_part_camera, off_m, error_m = min(tried, key=lambda found: found[1])
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    tried = (_fitted(front, corners[ahead], normals[ahead], sample, turn) for turn in range(4))
+    T_part_camera, off_m, error_m = min(tried, key=lambda pose: pose[1])
 
     flat = points / points[:, 2:] if central else points
     pitch = float(np.sqrt(np.prod(np.ptp(flat[:, :2], axis=0)) / len(flat)))
@@ -68,30 +68,30 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
     def met(rays: np.ndarray) -> np.ndarray:
         """Return z where rays meet the part: from the lens through (n, 2) at z = 1, or along z at
         (n, 2)."""
-        places = np.column_stack([rays, np.full(len(rays), 1.0 if central else -FAR_M)])
+        targets = np.column_stack([rays, np.full(len(rays), 1.0 if central else -FAR_M)])
         starts, along = (
-            (np.zeros(places.shape), places) if central else (places, np.eye(3)[[2] * len(places)])
+            (np.zeros(targets.shape), targets) if central else (targets, np.eye(3)[[2] * len(targets)])
         )
         origin = transform_points(T_part_camera, starts)
         ray = rotate_vectors(T_part_camera, along)
-        hit = whole.cast_rays(np.concatenate([origin, ray], axis=1).astype(np.float32))[
+        hit = part.cast_rays(np.concatenate([origin, ray], axis=1).astype(np.float32))[
             "primitive_ids"
         ].numpy()
-        number = np.where(there := hit != whole.INVALID_ID, hit, 0)
+        number = np.where(is_hit := hit != part.INVALID_ID, hit, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.einsum("ni,ni->n", corners[number, 0] - origin, normals[number])
             reach /= np.einsum("ni,ni->n", ray, normals[number])
-            return np.where(there, starts[:, 2] + reach, np.nan)
+            return np.where(is_hit, starts[:, 2] + reach, np.nan)
 
-    def z_at(places: np.ndarray) -> np.ndarray:
+    def z_at(points_camera: np.ndarray) -> np.ndarray:
         """Return z of the surface; NaN within `EDGE_PX` of a step, where a camera mixes both
         sides."""
-        rays = places[:, :2] / places[:, 2:] if central else places[:, :2]
+        rays = points_camera[:, :2] / points_camera[:, 2:] if central else points_camera[:, :2]
         z = met(rays)
         side = EDGE_PX * pitch
         bends = [
-            met(rays + way) + met(rays - way) - 2 * z
-            for way in (np.array([side, 0]), np.array([0, side]))
+            met(rays + shift) + met(rays - shift) - 2 * z
+            for shift in (np.array([side, 0]), np.array([0, side]))
         ]
         return np.where(
             np.abs(bends).max(axis=0) < BENT * pitch * (np.abs(z) if central else 1.0), z, np.nan
@@ -123,16 +123,16 @@ def _fitted(
     pitch_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
     for step in range(4 * STEPS):
         moved = transform_points(T, points)
-        found = scene.compute_closest_points(moved.astype(np.float32))
-        apart = moved - found["points"].numpy()
-        towards = normals[found["primitive_ids"].numpy()]
-        off = np.linalg.norm(apart, axis=1)
+        closest = scene.compute_closest_points(moved.astype(np.float32))
+        offsets = moved - closest["points"].numpy()
+        towards = normals[closest["primitive_ids"].numpy()]
+        off = np.linalg.norm(offsets, axis=1)
         if step >= 3 * STEPS:
-            off = np.einsum("ni,ni->n", apart, towards)
+            off = np.einsum("ni,ni->n", offsets, towards)
         else:  # a point beyond an edge attracts that edge
             towards = np.where(
                 off[:, None] > LEAST_SCALE_M,
-                apart / np.maximum(off, LEAST_SCALE_M)[:, None],
+                offsets / np.maximum(off, LEAST_SCALE_M)[:, None],
                 towards,
             )
         scale_m = max(
@@ -140,9 +140,9 @@ def _fitted(
         )
         weight = bisquare_weights(off, BISQUARE_TUNING * scale_m)
         if step < STEPS:
-            T = kabsch(moved, moved - apart, weight) @ T
+            T = kabsch(moved, moved - offsets, weight) @ T
             continue
-        off = np.einsum("ni,ni->n", apart, towards)
+        off = np.einsum("ni,ni->n", offsets, towards)
         middle = moved.mean(axis=0)
         slopes = np.einsum("ni,nij->nj", towards, displacement_jacobian(moved, middle))
         information = (slopes * weight[:, None]).T @ slopes

@@ -69,12 +69,12 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider in
     noisy clouds."""
     points = np.array(cloud.points_m, np.float64)
-    seen = cloud.valid
-    valid = seen
-    if seen.any() and not seen.all():
-        apart, nearest = nearest_pixel(seen)
-        valid = apart <= BRIDGED_PX
-        gaps = valid & ~seen
+    has_return = cloud.valid
+    valid = has_return
+    if has_return.any() and not has_return.all():
+        distance_px, nearest = nearest_pixel(has_return)
+        valid = distance_px <= BRIDGED_PX
+        gaps = valid & ~has_return
         points[gaps] = points.reshape(-1, 3)[nearest[gaps]]
     # noise of a difference between neighbours, from the lowest quarter of the second differences
     # of z along rows (three quarters of the picture may be rubble): they have sqrt(6) of white
@@ -112,8 +112,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
         right, down = links(points, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m, central)
     else:
         # single points would need a tolerance so wide that it joins separate surfaces
-        known = np.where(valid[..., None], smooth, np.nan)
-        right, down = links(known, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m / window, central)
+        known_m = np.where(valid[..., None], smooth, np.nan)
+        right, down = links(known_m, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m / window, central)
     normals = unit_normals(smooth)
     bent = turns(normals, half, math.cos(math.radians(crease_deg)))
     cores, sizes = components(valid & ~bent, right, down)
@@ -122,18 +122,18 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given
     # back if no step and no other surface's core separates them from the core
     reach = window // 2 + 1 + half
-    own = np.zeros((count, *valid.shape), dtype=bool)
-    for number, mask in enumerate(own, start=1):
+    masks = np.zeros((count, *valid.shape), dtype=bool)
+    for number, mask in enumerate(masks, start=1):
         core = cores == number
         free = valid & grown(core, reach) & (core | (cores == 0))
         mask[:] = core | (components(free, right, down)[0] == 1)
     local = _Smooth(points.reshape(-1, 3), smooth.reshape(-1, 3), normals.reshape(-1, 3), central)
     contact_m = max(CONTACT_MM * MM, CONTACT_SIGMAS * noise_m)
-    own = _joined(own, cores, local, contact_m, math.radians(crease_deg / 2.0))
-    _share_contested(own, cores, local)
-    _trim_rims(own, cores, seen, local, window, reach, contact_m)
-    filled = np.array([holes_filled(each) for each in own]) if len(own) else own.copy()
-    return Surfaces(own & seen, filled, contact_m, reach)
+    masks = _joined(masks, cores, local, contact_m, math.radians(crease_deg / 2.0))
+    _share_contested(masks, cores, local)
+    _trim_rims(masks, cores, has_return, local, window, reach, contact_m)
+    filled = np.array([holes_filled(mask) for mask in masks]) if len(masks) else masks.copy()
+    return Surfaces(masks & has_return, filled, contact_m, reach)
 
 
 def _before_lens(points: np.ndarray) -> bool:
@@ -154,21 +154,21 @@ def links(
     linked = np.zeros((2, h, w), np.bool_)
     for v in range(h):
         for u in range(w):
-            for way in range(2):
-                row = v + way
-                column = u + 1 - way
+            for axis in range(2):
+                row = v + axis
+                column = u + 1 - axis
                 if row < h and column < w:
-                    here = points_m[v, u]
-                    there = points_m[row, column]
+                    point = points_m[v, u]
+                    neighbour = points_m[row, column]
                     ours = 1.0
                     theirs = 1.0
                     if central:
-                        ours = min(there[2] / here[2], 1.0)
-                        theirs = min(here[2] / there[2], 1.0)
-                    dx = there[0] * theirs - here[0] * ours
-                    dy = there[1] * theirs - here[1] * ours
-                    linked[way, v, u] = (
-                        abs(there[2] - here[2]) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
+                        ours = min(neighbour[2] / point[2], 1.0)
+                        theirs = min(point[2] / neighbour[2], 1.0)
+                    dx = neighbour[0] * theirs - point[0] * ours
+                    dy = neighbour[1] * theirs - point[1] * ours
+                    linked[axis, v, u] = (
+                        abs(neighbour[2] - point[2]) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
                     )
     return linked[0], linked[1]
 
@@ -185,10 +185,10 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
         above = max(v - 1, 0)
         below = min(v + 1, h - 1)
         for u in range(w):
-            left = max(u - 1, 0)
+            before = max(u - 1, 0)
             right = min(u + 1, w - 1)
             for k in range(3):  # the length of either step does not matter
-                along[k] = surface_m[v, right, k] - surface_m[v, left, k]
+                along[k] = surface_m[v, right, k] - surface_m[v, before, k]
                 down[k] = surface_m[below, u, k] - surface_m[above, u, k]
             x = along[1] * down[2] - along[2] * down[1]
             y = along[2] * down[0] - along[0] * down[2]
@@ -229,8 +229,8 @@ class _Smooth(NamedTuple):
         points = self.points_m[pixels]
         normals = self.normals[seeds]
         height = ((self.means_m[seeds] - points) * normals).sum(axis=1)
-        way = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
-        return np.abs(height) / np.maximum(np.abs((normals * way).sum(axis=1)), 1e-3)
+        rays = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
+        return np.abs(height) / np.maximum(np.abs((normals * rays).sum(axis=1)), 1e-3)
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
@@ -241,8 +241,8 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
         core = cores == number
         u, v, width, height = cv2.boundingRect(core.view(np.uint8))
-        whole = holes_filled(core[v : v + height, u : u + width], rim_px=1)
-        if np.count_nonzero(shrunk(whole, window)) >= WIDE_PART * np.count_nonzero(whole):
+        filled_core = holes_filled(core[v : v + height, u : u + width], rim_px=1)
+        if np.count_nonzero(shrunk(filled_core, window)) >= WIDE_PART * np.count_nonzero(filled_core):
             kept.append(number)
     if not kept and len(sizes):
         kept = [1]
@@ -254,47 +254,47 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
 
 
 def _joined(
-    own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
+    masks: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
 ) -> np.ndarray:
     """Return ``own`` with surfaces merged, also in ``cores``, if their rims share pixels and their
     planes agree."""
-    stays = np.arange(len(own))
-    for i in range(len(own)):
-        for j in range(i + 1, len(own)):
-            pixels = np.flatnonzero(own[i] & own[j])
+    stays = np.arange(len(masks))
+    for i in range(len(masks)):
+        for j in range(i + 1, len(masks)):
+            pixels = np.flatnonzero(masks[i] & masks[j])
             if len(pixels) < LEAST_SHARED_PX or stays[i] == stays[j]:
                 continue
             seeds = [nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels] for number in (i, j)]
-            misses = np.maximum(*(smooth.misses_m(pixels, each) for each in seeds))
+            misses = np.maximum(*(smooth.misses_m(pixels, seed_pixels) for seed_pixels in seeds))
             cosines = (smooth.normals[seeds[0]] * smooth.normals[seeds[1]]).sum(axis=1)
             if np.median(misses) <= apart_m and np.median(cosines) >= math.cos(turn):
                 stays[stays == stays[j]] = stays[i]
     kept = np.unique(stays)
-    numbers = np.zeros(max(len(own), int(cores.max(initial=0))) + 1, dtype=cores.dtype)
-    numbers[1 : len(own) + 1] = np.searchsorted(kept, stays) + 1
+    numbers = np.zeros(max(len(masks), int(cores.max(initial=0))) + 1, dtype=cores.dtype)
+    numbers[1 : len(masks) + 1] = np.searchsorted(kept, stays) + 1
     cores[:] = numbers[cores]
-    return np.array([own[stays == each].any(axis=0) for each in kept]) if len(own) else own
+    return np.array([masks[stays == label].any(axis=0) for label in kept]) if len(masks) else masks
 
 
-def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> None:
+def _share_contested(masks: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> None:
     """Give each pixel of several rims to the surface whose plane, extended from its core, is
     nearest."""
-    pixels = np.flatnonzero(own.sum(axis=0) > 1)
+    pixels = np.flatnonzero(masks.sum(axis=0) > 1)
     if not len(pixels):
         return
-    misses = np.full((len(own), len(pixels)), np.inf)
-    for number, mask in enumerate(own):
+    misses = np.full((len(masks), len(pixels)), np.inf)
+    for number, mask in enumerate(masks):
         holds = mask.reshape(-1)[pixels]
         if holds.any():
             seeds = nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels[holds]]
             misses[number, holds] = smooth.misses_m(pixels[holds], seeds)
     winner = misses.argmin(axis=0)
-    for number in range(len(own)):
-        own[number].reshape(-1)[pixels[winner != number]] = False
+    for number in range(len(masks)):
+        masks[number].reshape(-1)[pixels[winner != number]] = False
 
 
 def _trim_rims(
-    own: np.ndarray,
+    masks: np.ndarray,
     cores: np.ndarray,
     valid: np.ndarray,
     smooth: _Smooth,
@@ -305,15 +305,15 @@ def _trim_rims(
     """Remove the parts of each surface's rim that depart from the surface inside, and pixels
     connected only by them."""
     points, means, normals, _ = smooth
-    for number in range(len(own)):
+    for number in range(len(masks)):
         # the picture's edge is a rim too: a strip of background may lie there
-        whole = holes_filled(own[number] & valid, rim_px=1)
-        rim = own[number] & ~shrunk(whole, 2 * reach + 1)[1:-1, 1:-1]
-        inner = shrunk(whole, 2 * reach + window)[1:-1, 1:-1] & shrunk(cores == number + 1, window)
+        filled_mask = holes_filled(masks[number] & valid, rim_px=1)
+        rim = masks[number] & ~shrunk(filled_mask, 2 * reach + 1)[1:-1, 1:-1]
+        inner = shrunk(filled_mask, 2 * reach + window)[1:-1, 1:-1] & shrunk(cores == number + 1, window)
         if not inner.any():
             continue
-        apart, nearest = nearest_pixel(inner)
-        pixels = np.flatnonzero(rim & (apart <= 3 * reach))
+        distance_px, nearest = nearest_pixel(inner)
+        pixels = np.flatnonzero(rim & (distance_px <= 3 * reach))
         leaves = _leaves(
             pixels,
             nearest.reshape(-1)[pixels],
@@ -324,15 +324,15 @@ def _trim_rims(
             reach,
             apart_m,
         )
-        own[number].reshape(-1)[pixels[leaves]] = False
-        own[number] = parts_with(own[number], inner, connectivity=4)
+        masks[number].reshape(-1)[pixels[leaves]] = False
+        masks[number] = parts_with(masks[number], inner, connectivity=4)
 
 
 @numba.njit(**PLAIN)
 def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # type: ignore[no-untyped-def]
     """Return whether each of the pixels (n,) departs from the surface at its seed (n,) farther
     inside."""
-    found = np.zeros(len(pixels), np.bool_)
+    departs = np.zeros(len(pixels), np.bool_)
     for i in range(len(pixels)):
         pixel = pixels[i]
         seed = seeds[i]
@@ -353,8 +353,8 @@ def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # typ
             span += (means[seed, k] - means[end, k]) ** 2
         bend = math.acos(min(max(cosine, 0.0), 1.0)) / max(math.sqrt(span), 1e-9)
         turn = min(math.radians(RIM_TURN_DEG) + bend * math.sqrt(distance) / 2.0, math.pi / 2.0)
-        found[i] = abs(off) > max(apart_m, math.sin(turn) * math.sqrt(distance))
-    return found
+        departs[i] = abs(off) > max(apart_m, math.sin(turn) * math.sqrt(distance))
+    return departs
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:
@@ -367,17 +367,17 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     if _before_lens(points):
         plan = plan / z
     # the 90th percentile of the distances to the nearest neighbour, from about 2000 places
-    some = plan[:: max(1, len(plan) // 2000)]
-    to_nearest = cKDTree(plan).query(some, k=min(2, len(plan)))[0].reshape(len(some), -1)[:, -1]
+    sample = plan[:: max(1, len(plan) // 2000)]
+    to_nearest = cKDTree(plan).query(sample, k=min(2, len(plan)))[0].reshape(len(sample), -1)[:, -1]
     spacing = max(float(np.quantile(to_nearest, 0.9)), 1e-9)
     side = max(CELL_SPACINGS * spacing, float(np.ptp(plan, axis=0).max()) / MAX_RASTER)
     while True:
         columns, rows = np.floor((plan - plan.min(axis=0)) / side).astype(int).T
         # share of filled cells in blocks of 2 x 2 that hold a place and whose eight neighbours do:
         # a gap that is wider than a block does not come from a lack of points
-        held = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
-        held[rows, columns] = True
-        in_block = held.reshape(held.shape[0] // 2, 2, held.shape[1] // 2, 2).sum(axis=(1, 3))
+        occupied = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
+        occupied[rows, columns] = True
+        in_block = occupied.reshape(occupied.shape[0] // 2, 2, occupied.shape[1] // 2, 2).sum(axis=(1, 3))
         inner = shrunk(np.pad(in_block > 0, 1), 3)[1:-1, 1:-1]
         if not inner.any() or float(in_block[inner].mean()) / 4.0 >= CELLS_FILLED:
             break

@@ -172,7 +172,7 @@ class Surface:
         twice = [
             self.evaluate(x_m - dx, y_m - dy) - self.evaluate(x_m + dx, y_m + dy) for dx, dy in ways
         ]
-        return np.stack([*(each / (2 * step_m) for each in twice), np.ones_like(twice[0])], axis=-1)
+        return np.stack([*(difference / (2 * step_m) for difference in twice), np.ones_like(twice[0])], axis=-1)
 
 
 def fit_surface(
@@ -189,10 +189,10 @@ def fit_surface(
     )
     if len(z_m) < terms:
         degree = f"a surface of degree {config.degree}"
-        what = f"{len(z_m)} valid points cannot determine the {terms} coefficients of {degree}"
+        problem = f"{len(z_m)} valid points cannot determine the {terms} coefficients of {degree}"
         legal = f"at least {terms} points"
         fix = "widen the crop, lower surface.degree, or check the capture"
-        raise UserError(what, legal=legal, fix=fix)
+        raise UserError(problem, legal=legal, fix=fix)
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
     chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
     basis = chebyshev.basis(xy)
@@ -204,8 +204,8 @@ def fit_surface(
         else _solved(*_thinned(basis, z, SAMPLE_POINTS))
     )
     if plain is None:
-        what = f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve"
-        raise UserError(what, fix="widen the crop, or lower surface.degree")
+        problem = f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve"
+        raise UserError(problem, fix="widen the crop, or lower surface.degree")
     if config.method == "lar":
         c, note = _lar(basis, z, plain[0])
     elif config.method == "bisquare":
@@ -267,10 +267,10 @@ def _lar(
         reach = max(margin * scale, 10.0 * knee)
         while True:
             far = np.abs(r) >= reach
-            near = np.flatnonzero(~far)
+            inliers = np.flatnonzero(~far)
             far_pull = basis @ np.where(far, np.sign(r), 0.0)
-            rows = np.ascontiguousarray(np.take(basis, near, axis=1).T)
-            new = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
+            rows = np.ascontiguousarray(np.take(basis, inliers, axis=1).T)
+            new = _smoothed_descent(rows, z[inliers], far_pull, c, knee, enough)
             after = z - new @ basis
             # a far point may have crossed the surface or come within its knee
             if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
@@ -328,9 +328,9 @@ def _smoothed_descent(
         value, pull, inside = _huber(rows, z, c, knee)
         return value - float(c @ far_pull), c, pull + far_pull, inside
 
-    def lower(way: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
+    def lower(direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
         """Return the first of the full, half, quarter ... step that lowers the value."""
-        trials = (state(c + way * 0.5**halvings) for halvings in range(HALVINGS))
+        trials = (state(c + direction * 0.5**halvings) for halvings in range(HALVINGS))
         return next((trial for trial in trials if trial[0] < value), None)
 
     value, c, pull, inside = state(start)
@@ -338,10 +338,10 @@ def _smoothed_descent(
         factor = _factor(inside)
         moved = None
         if factor is not None:
-            way = knee * dpotrs(factor, pull, lower=True)[0]
-            if way @ pull < enough:
+            direction = knee * dpotrs(factor, pull, lower=True)[0]
+            if direction @ pull < enough:
                 return c
-            moved = lower(way)
+            moved = lower(direction)
         if moved is None:
             # reweighted least squares: each |r| beyond the knee under its tangent parabola
             weighted = rows / np.maximum(np.abs(z - rows @ c), knee)[:, None]
@@ -379,12 +379,12 @@ def _reweighted(
         # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each
         # term
         sizes = np.abs(adjusted)
-        place = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
-        scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
-        found = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
-        if found is None:
+        rank = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
+        scale = max(float(np.partition(sizes, rank)[rank]) / 0.6745, TINY_M)
+        solution = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
+        if solution is None:
             return c, note + "; stopped: too few points kept weight"
-        new, factor = found
+        new, factor = solution
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance
         # times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
