@@ -70,7 +70,9 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
         (n, 2)."""
         targets = np.column_stack([rays, np.full(len(rays), 1.0 if central else -FAR_M)])
         starts, along = (
-            (np.zeros(targets.shape), targets) if central else (targets, np.eye(3)[[2] * len(targets)])
+            (np.zeros(targets.shape), targets)
+            if central
+            else (targets, np.eye(3)[[2] * len(targets)])
         )
         origin = transform_points(T_part_camera, starts)
         ray = rotate_vectors(T_part_camera, along)

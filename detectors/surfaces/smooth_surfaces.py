@@ -168,7 +168,8 @@ def links(
                     dx = neighbour[0] * theirs - point[0] * ours
                     dy = neighbour[1] * theirs - point[1] * ours
                     linked[axis, v, u] = (
-                        abs(neighbour[2] - point[2]) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
+                        abs(neighbour[2] - point[2])
+                        <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
                     )
     return linked[0], linked[1]
 
@@ -242,7 +243,9 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
         core = cores == number
         u, v, width, height = cv2.boundingRect(core.view(np.uint8))
         filled_core = holes_filled(core[v : v + height, u : u + width], rim_px=1)
-        if np.count_nonzero(shrunk(filled_core, window)) >= WIDE_PART * np.count_nonzero(filled_core):
+        if np.count_nonzero(shrunk(filled_core, window)) >= WIDE_PART * np.count_nonzero(
+            filled_core
+        ):
             kept.append(number)
     if not kept and len(sizes):
         kept = [1]
@@ -309,7 +312,9 @@ def _trim_rims(
         # the picture's edge is a rim too: a strip of background may lie there
         filled_mask = holes_filled(masks[number] & valid, rim_px=1)
         rim = masks[number] & ~shrunk(filled_mask, 2 * reach + 1)[1:-1, 1:-1]
-        inner = shrunk(filled_mask, 2 * reach + window)[1:-1, 1:-1] & shrunk(cores == number + 1, window)
+        inner = shrunk(filled_mask, 2 * reach + window)[1:-1, 1:-1] & shrunk(
+            cores == number + 1, window
+        )
         if not inner.any():
             continue
         distance_px, nearest = nearest_pixel(inner)
@@ -377,7 +382,9 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
         # a gap that is wider than a block does not come from a lack of points
         occupied = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
         occupied[rows, columns] = True
-        in_block = occupied.reshape(occupied.shape[0] // 2, 2, occupied.shape[1] // 2, 2).sum(axis=(1, 3))
+        in_block = occupied.reshape(occupied.shape[0] // 2, 2, occupied.shape[1] // 2, 2).sum(
+            axis=(1, 3)
+        )
         inner = shrunk(np.pad(in_block > 0, 1), 3)[1:-1, 1:-1]
         if not inner.any() or float(in_block[inner].mean()) / 4.0 >= CELLS_FILLED:
             break
