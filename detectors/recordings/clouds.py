@@ -81,7 +81,8 @@ def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
             v, u = np.divmod(np.arange(count), width)
             slopes = points[valid, :2] / points[valid, 2, None]
             turns = [
-                np.corrcoef(slopes[:, axis], pixels[valid])[0, 1] for axis, pixels in enumerate((u, v))
+                np.corrcoef(slopes[:, axis], pixels[valid])[0, 1]
+                for axis, pixels in enumerate((u, v))
             ]
             if min(map(abs, turns)) > RASTER_CORRELATION:
                 return height, width
@@ -124,7 +125,9 @@ def _read_cloud(
         )
     read = len(cloud.point.positions) if "positions" in cloud.point else 0
     if read != width * height:
-        problem = f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
+        problem = (
+            f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
+        )
         raise UserError(problem, legal=LEGAL_CLOUD, fix="copy or export it again")
     attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
     points = attributes["positions"]

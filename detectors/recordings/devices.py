@@ -398,7 +398,9 @@ def open_r3d(path: Path, options: CaptureOptions) -> Recording:
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
             contents = ", ".join(archive.namelist()[:6]) or "nothing"
-            raise UserError(f"{path}: contains no Record3D capture ({contents[:200]})", legal=LEGAL_R3D)
+            raise UserError(
+                f"{path}: contains no Record3D capture ({contents[:200]})", legal=LEGAL_R3D
+            )
         content = _content(path, archive, "metadata")
     with read_errors(f"{path}: its metadata cannot be read", LEGAL_R3D):
         info = strict_json(content)
@@ -461,6 +463,8 @@ def _plane(
         import liblzfse  # type: ignore[import-not-found]
     except ImportError as error:
         problem = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
-        raise UserError(problem, fix="pip install pyliblzfse, or export the capture as PLY") from error
+        raise UserError(
+            problem, fix="pip install pyliblzfse, or export the capture as PLY"
+        ) from error
     with read_errors(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
         return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])

@@ -130,7 +130,10 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
-    if SHARED_CODE <= negative.size < stored.size and (codes_below_zero := np.unique(negative)).size <= 3:
+    if (
+        SHARED_CODE <= negative.size < stored.size
+        and (codes_below_zero := np.unique(negative)).size <= 3
+    ):
         # a surface's distances differ from pixel to pixel; codes do not
         codes += [float(code) for code in codes_below_zero]
     distances = stored[stored > 0]
@@ -144,7 +147,9 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
         bits = math.log2(top + 3) if top < 2**32 else 0
         below_power = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
         shared = (
-            distances.size - below.size >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
+            distances.size - below.size >= SHARED_CODE
+            and below.size > 0
+            and top > 1.25 * below.max()
         )
         if not (is_largest or (below_power and shared)):
             break
@@ -152,7 +157,10 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
         distances = below
     # Between neighbours that differ by a factor of four, an octave is empty: most frames need no
     # sorting.
-    if distances.size and not np.bincount((octaves := np.frexp(distances)[1]) - octaves.min()).all():
+    if (
+        distances.size
+        and not np.bincount((octaves := np.frexp(distances)[1]) - octaves.min()).all()
+    ):
         different = np.unique(distances)
         ratios = different[1:] / different[:-1].astype(np.float64)
         far = np.flatnonzero(ratios >= ISOLATED)
@@ -244,7 +252,9 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
             continue
         unit_m = UNIT_NAMES.get(counted.group(2).rstrip("s"))
         scales = (
-            [number * unit_m] if unit_m else [number, number * 1e-3, 1.0 / number if number else 0.0]
+            [number * unit_m]
+            if unit_m
+            else [number, number * 1e-3, 1.0 / number if number else 0.0]
         )
         fitting = {scale for scale in scales if 0.1 <= median * scale <= 10.0}
         if len(fitting) == 1:
@@ -347,7 +357,9 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
     fix = (
         "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
     )
-    raise UserError(problem, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix)
+    raise UserError(
+        problem, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix
+    )
 
 
 def refuse_far_aside(frame: Frame) -> None:
@@ -357,7 +369,9 @@ def refuse_far_aside(frame: Frame) -> None:
         problem = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
         problem += " off the camera's axis: the cloud is in another frame, or z has another unit than x and y"
         raise UserError(
-            problem, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it"
+            problem,
+            legal=CAMERA_FRAME,
+            fix="move the cloud into the frame of the camera that took it",
         )
 
 

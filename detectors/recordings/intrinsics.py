@@ -217,7 +217,9 @@ def lens_for(
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
-        problem = f"{name}: the lens of these depth images is unknown; without it they give no points"
+        problem = (
+            f"{name}: the lens of these depth images is unknown; without it they give no points"
+        )
         fix = f"pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough{hint}"
         raise UserError(problem, legal=LEGAL_LENS, fix=fix)
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
@@ -231,7 +233,9 @@ def lens_for(
     )
     problem = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
     fix = "pass --intrinsics FILE with the lens of these images (of the colour camera, if the depth was aligned to it)"
-    raise UserError(problem, legal=f"the modes of this camera: {mode_names}" if mode_names else None, fix=fix)
+    raise UserError(
+        problem, legal=f"the modes of this camera: {mode_names}" if mode_names else None, fix=fix
+    )
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
@@ -349,7 +353,10 @@ def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[s
         for pair in mappings(data)
         if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)
     ]
-    for fits in (lambda _, mapping: _size(mapping) == size, lambda name, _: "depth" in name.lower()):
+    for fits in (
+        lambda _, mapping: _size(mapping) == size,
+        lambda name, _: "depth" in name.lower(),
+    ):
         if len(lenses) > 1:
             lenses = [(name, mapping) for name, mapping in lenses if fits(name, mapping)] or lenses
     if not lenses:
@@ -405,7 +412,9 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
                 f"{path}: {key} has unknown names: {', '.join(unknown)}",
                 legal=", ".join(DISTORTION_NAMES),
             )
-        numbers = tuple(_number(path, name, coefficients.get(name, 0.0)) for name in DISTORTION_NAMES)
+        numbers = tuple(
+            _number(path, name, coefficients.get(name, 0.0)) for name in DISTORTION_NAMES
+        )
     else:
         numbers = _numbers(path, key, data[key], None)
     if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):

@@ -179,7 +179,8 @@ def _points(name: str, message: Any) -> np.ndarray:
             or "none"
         )
         raise UserError(
-            f"{name}: has no field {' or '.join(missing)}; its fields: {contents}", legal=LEGAL_CLOUD
+            f"{name}: has no field {' or '.join(missing)}; its fields: {contents}",
+            legal=LEGAL_CLOUD,
         )
     types = {key: np.dtype(order + FIELD_TYPES[f.datatype]) for key, f in single.items()}
     for key, field in single.items():

@@ -103,7 +103,9 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
 def _unit_not_stated(recording: Recording) -> Unit:
     """Return a unit that the format leaves open: from a file beside the capture, the named camera,
     or the data."""
-    frames_m = (frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected())
+    frames_m = (
+        frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected()
+    )
     z_m = next((frame_m for frame_m in frames_m if frame_m.size), None)
     if z_m is None:
         return Unit(recording.scale_m, "what is usual")
@@ -138,7 +140,9 @@ def _opened(paths: list[Path], options: CaptureOptions) -> Recording:
     path = paths[0]
     is_single = len(paths) == 1
     suffix, *other_suffixes = {file.suffix.lower() for file in paths}
-    opener: Callable[[Path, CaptureOptions], Recording] | None = FILES.get(suffix) if is_single else None
+    opener: Callable[[Path, CaptureOptions], Recording] | None = (
+        FILES.get(suffix) if is_single else None
+    )
     if is_single and path.is_dir():
         opener = open_bag if is_bag(path) and options.raw is None else _open_folder
     elif is_single and options.raw is not None:
@@ -213,7 +217,9 @@ def _open_folder(folder: Path, options: CaptureOptions) -> Recording:
     frames = depth_named(arrays, arrays)
     if len(frames) > 1 and len({path.suffix.lower() for path in frames}) == 1:
         return open_array_list(frames, options, folder.name)
-    contents = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
+    contents = ", ".join(path.name for path in inside[:HELD]) + (
+        ", .." if len(inside) > HELD else ""
+    )
     is_capture = (
         p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir()
         for p in inside

@@ -138,7 +138,9 @@ class Recording:
                 sizes = [
                     f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)
                 ]
-                elements = f"{frame.name}: {sizes[0]} {elements}, but the first frame has {sizes[1]}"
+                elements = (
+                    f"{frame.name}: {sizes[0]} {elements}, but the first frame has {sizes[1]}"
+                )
                 raise UserError(
                     elements, legal="frames of one size", fix="run the differing frames separately"
                 )

@@ -15,7 +15,7 @@ from detectors import load_detector
 from detectors.surfaces.reference import front_of, laid_on
 from detectors.surfaces.surface import ReferenceConfig
 from harness.detect import main
-from harness.inspection.arguments import measuring
+from harness.inspection.arguments import detector_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens, Reason, Region, transform_points
 
@@ -141,9 +141,9 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot be read"):
         front_of(ReferenceConfig(file=str(tmp_path / "none.stl")))
     arguments = ["capture", "--reference", str(path), "--set", "surface.reference.unit=cm"]
-    _, settings = measuring(
+    _, settings = detector_of(
         main.parser().parse_args(arguments), "none", ["surface.reference.unit=cm"]
     )
     assert settings["surface"]["reference"] == {"file": str(path), "unit": "cm", "front": "+z"}
     with pytest.raises(UserError, match="has no surface setting"):
-        measuring(main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", [])
+        detector_of(main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", [])
