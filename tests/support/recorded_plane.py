@@ -110,18 +110,18 @@ def write_points(
     path: Path,
     points: np.ndarray,
     head: str = "",
-    apart: str = " ",
-    rest: str = "",
+    separator: str = " ",
+    ending: str = "",
     decimal: str = ".",
     before: str = "",
 ) -> Path:
     """A point a line, with something ``before`` and after its three numbers."""
     rows = (
-        apart.join(f"{x:.9f}".replace(".", decimal) for x in point)
+        separator.join(f"{x:.9f}".replace(".", decimal) for x in point)
         for point in points.reshape(-1, 3).tolist()
     )
     path.write_text(
-        head + "".join(f"{before}{apart if before else ''}{row}{rest}\n" for row in rows)
+        head + "".join(f"{before}{separator if before else ''}{row}{ending}\n" for row in rows)
     )
     return path
 
