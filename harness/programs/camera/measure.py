@@ -108,8 +108,8 @@ class StillCapture:
     @cached_property
     def apart_m(self) -> np.ndarray:
         """Displacement (n,) of the frames without the drift."""
-        apart = self.offsets_m - self.drift_m * np.linspace(0, 1, len(self.z_m))
-        return np.asarray(apart - np.median(apart))
+        without_drift_m = self.offsets_m - self.drift_m * np.linspace(0, 1, len(self.z_m))
+        return np.asarray(without_drift_m - np.median(without_drift_m))
 
     @cached_property
     def kept(self) -> np.ndarray:
@@ -127,9 +127,9 @@ class StillCapture:
     @cached_property
     def mean_m(self) -> np.ndarray:
         """Mean z (h, w) of the frames that do not jump; NaN if there is none."""
-        known = np.isfinite(self._moved_m).any(axis=0)
-        mean_m = np.full(known.shape, np.nan)
-        mean_m[known] = np.nanmean(self._moved_m[:, known], axis=0)
+        has_return = np.isfinite(self._moved_m).any(axis=0)
+        mean_m = np.full(has_return.shape, np.nan)
+        mean_m[has_return] = np.nanmean(self._moved_m[:, has_return], axis=0)
         return mean_m
 
     @cached_property
@@ -177,9 +177,9 @@ class StillCapture:
     def whole(self, mask: np.ndarray) -> np.ndarray:
         """Return a surface's pixels without its rim, (h, w) bool, including pixels without a
         return."""
-        near = ndimage.binary_closing(np.pad(mask, 8), np.ones((3, 3)), iterations=3)
+        closed_mask = ndimage.binary_closing(np.pad(mask, 8), np.ones((3, 3)), iterations=3)
         return np.asarray(
-            inner(np.asarray(ndimage.binary_fill_holes(near))[8:-8, 8:-8]) & self.used
+            inner(np.asarray(ndimage.binary_fill_holes(closed_mask))[8:-8, 8:-8]) & self.used
         )
 
     def cloud(self) -> Cloud:
@@ -216,17 +216,19 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
     lens = recording.lens
     slopes = recording.slopes
     if not recording.organised or lens is None or slopes is None:
-        what = f"{name}: without a pixel grid and a lens, the camera's noise cannot be measured"
+        problem = f"{name}: without a pixel grid and a lens, the camera's noise cannot be measured"
         raise UserError(
-            what, legal="depth images with a lens", fix="state a lens with --intrinsics"
+            problem, legal="depth images with a lens", fix="state a lens with --intrinsics"
         )
     frames = [
         frame for frame in islice(recording.frames(), MOST_FRAMES) if np.isfinite(frame.z_m).any()
     ]
     if len(frames) < LEAST_FRAMES:
-        what = f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}: too few to measure temporal noise"
+        problem = f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}: too few to measure temporal noise"
         raise UserError(
-            what, legal=f"{LEAST_FRAMES} frames or more of a static scene", fix="record 50 or more"
+            problem,
+            legal=f"{LEAST_FRAMES} frames or more of a static scene",
+            fix="record 50 or more",
         )
     z_m = np.stack([frame.z_m for frame in frames]).astype(np.float32)
     used = np.ones(z_m.shape[1:], bool) if used is None else used
@@ -235,9 +237,11 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
         raise UserError("--mask: {} pixels, but the frames have {}".format(*sizes))
     z_m[:, ~used] = np.nan
     if all(np.array_equal(z_m[0], z_m[k], equal_nan=True) for k in (len(z_m) // 2, -1)):
-        what = f"{name}: all frames are equal, so they show no noise"
+        problem = f"{name}: all frames are equal, so they show no noise"
         raise UserError(
-            what, legal="single frames of the camera", fix="record single frames, not their average"
+            problem,
+            legal="single frames of the camera",
+            fix="record single frames, not their average",
         )
     often = np.isfinite(z_m).mean(axis=0) >= 0.5
     median_m = np.full(often.shape, np.nan)
@@ -251,8 +255,8 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
 
 def mean_amplitude(stack: Sequence[np.ndarray | None]) -> np.ndarray | None:
     """Return the mean (h, w) over frames, NaN if never above 0; None if a frame has no amplitude."""
-    known = [np.nan_to_num(each) for each in stack if each is not None]
-    mean = np.mean(known, axis=0) if len(known) == len(stack) else None
+    amplitudes = [np.nan_to_num(amplitude) for amplitude in stack if amplitude is not None]
+    mean = np.mean(amplitudes, axis=0) if len(amplitudes) == len(stack) else None
     return None if mean is None else np.where(mean > 0, mean, np.nan)
 
 
@@ -289,15 +293,17 @@ def cells_of(capture: StillCapture) -> Iterator[NoiseCell]:
         angle_deg / ANGLE_CELL_DEG,
         np.log(light) / np.log(LIGHT_CELLS),
     )
-    places = np.floor(np.stack(where[: 2 if capture.amplitude is None else 3], axis=-1)).astype(int)
-    _, cell, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+    cell_indices = np.floor(
+        np.stack(where[: 2 if capture.amplitude is None else 3], axis=-1)
+    ).astype(int)
+    _, cell, counts = np.unique(cell_indices, axis=0, return_inverse=True, return_counts=True)
     columns = (range_m, angle_deg, amplitude, light, capture.variance_m2[use], capture.stretch[use])
     means = [np.bincount(cell.ravel(), column, len(counts)) / counts for column in columns]
     for number in np.flatnonzero(counts >= LEAST_BIN_PX):
-        *at, variance, stretch = (float(mean[number]) for mean in means)
+        *conditions, variance, stretch = (float(mean[number]) for mean in means)
         sigma_m = np.sqrt(before_rounding_m2(variance, capture.step_m)) * stretch
         if sigma_m > 0:
-            yield NoiseCell._make((capture.name, int(counts[number]), *at, float(sigma_m)))
+            yield NoiseCell._make((capture.name, int(counts[number]), *conditions, float(sigma_m)))
 
 
 def before_rounding_m2(variance_m2: float, step_m: float) -> float:
@@ -342,9 +348,11 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
     while True:
         errors = np.full(3, np.nan)
         design = columns[:, varied] * root[:, None]
-        rest = (y - columns[:, ~varied] @ law[~varied]) * root
-        law[varied] = np.linalg.lstsq(design, rest, rcond=None)[0]
-        spread = float(((rest - design @ law[varied]) ** 2).sum() / max(len(y) - varied.sum(), 1))
+        residual = (y - columns[:, ~varied] @ law[~varied]) * root
+        law[varied] = np.linalg.lstsq(design, residual, rcond=None)[0]
+        spread = float(
+            ((residual - design @ law[varied]) ** 2).sum() / max(len(y) - varied.sum(), 1)
+        )
         errors[varied] = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)) * spread)
         doubtful = (errors > UNSURE) | (varied & (law * signs < 0))
         doubtful[0] = False
@@ -357,10 +365,12 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
     facing = y - law[2] * columns[:, 2]
     number = np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
     groups = [number == cell for cell in np.unique(number)]
-    at, level = (
+    group_range_m, level = (
         np.exp([np.average(v[g], weights=weight[g]) for g in groups]) for v in (log_r, facing)
     )
-    return RangeLaw(at, level, law[1:] * signs[1:], errors[1:], float(np.exp(light_at_1m)))
+    return RangeLaw(
+        group_range_m, level, law[1:] * signs[1:], errors[1:], float(np.exp(light_at_1m))
+    )
 
 
 def correlations(capture: StillCapture) -> np.ndarray:
@@ -395,8 +405,8 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
         share = 1 - np.isfinite(capture.z_m).mean(axis=0)
         level = np.full(share.shape, np.nan) if capture.amplitude is None else capture.amplitude
         parts += [
-            np.stack([level[whole], share[whole]])
-            for whole in (capture.whole(m) for _, m in capture.planes)
+            np.stack([level[whole_mask], share[whole_mask]])
+            for whole_mask in (capture.whole(m) for _, m in capture.planes)
         ]
     level, share = np.concatenate(parts, axis=1)
     cells = np.nan_to_num(np.floor(np.log(level) / np.log(LIGHT_CELLS)), nan=-1e9)
@@ -445,23 +455,30 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         pixels = np.flatnonzero((inner(mask) & capture.steady).ravel())
         if len(pixels) < LEAST_BIN_PX:
             continue
-        few = pixels[:: max(1, len(pixels) // 20_000)]  # a sample gives the same to within 1 %
-        z_m = capture.z_m[capture.kept].reshape(-1, mask.size)[:, few]
-        noise = capture.noise_m.reshape(-1, mask.size)[:, few]
-        mean_m = capture.mean_m.ravel()[few]
-        slopes = capture.slopes.reshape(-1, 2)[few]
+        sample = pixels[:: max(1, len(pixels) // 20_000)]  # a sample gives the same to within 1 %
+        z_m = capture.z_m[capture.kept].reshape(-1, mask.size)[:, sample]
+        noise = capture.noise_m.reshape(-1, mask.size)[:, sample]
+        mean_m = capture.mean_m.ravel()[sample]
+        slopes = capture.slopes.reshape(-1, 2)[sample]
         temporal = statistics.jackknifed(
             noise[:, None], lambda part: statistics.temporal_sigma_m(part) / MM
         )
         rms_mm, *forms_mm = np.mean(
             [_form(frame, slopes) for frame in z_m[:: max(1, len(z_m) // 5)]], axis=0
         ).tolist()
-        at = (
+        place_of_face = (
             float(np.median(mean_m)),
-            float(np.degrees(np.arccos(np.median(capture.cosine.ravel()[few])))),
+            float(np.degrees(np.arccos(np.median(capture.cosine.ravel()[sample])))),
         )
         fill = float(np.isfinite(capture.z_m[:, capture.whole(mask)]).mean())
-        values: list[Any] = [*at, temporal, rms_mm, _form(mean_m, slopes)[0], *forms_mm, fill]
+        values: list[Any] = [
+            *place_of_face,
+            temporal,
+            rms_mm,
+            _form(mean_m, slopes)[0],
+            *forms_mm,
+            fill,
+        ]
         yield SurfaceFigures(capture.name, number, *values)
 
 
@@ -472,8 +489,8 @@ def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
     plane = statistics.fit_plane(z_m, slopes)
     points = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * z_m[:, None]
     off_mm = (points @ plane.normal - plane.distance_m * plane.normal[2]) / MM
-    least, low, high, most = np.quantile(off_mm, (0.0015, 0.025, 0.975, 0.9985))
-    return float(np.sqrt((off_mm**2).mean())), float(high - low), float(most - least)
+    least, low, high, highest = np.quantile(off_mm, (0.0015, 0.025, 0.975, 0.9985))
+    return float(np.sqrt((off_mm**2).mean())), float(high - low), float(highest - least)
 
 
 class EdgeFigures(NamedTuple):
@@ -501,11 +518,11 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
         images = labels, share, capture.mean_m
         for axis, (image, share, z_m) in enumerate((images, tuple(image.T for image in images))):
             for row, line in enumerate(image):
-                (known,) = np.nonzero(line)
-                for at in np.flatnonzero(
-                    (np.diff(line[known]) != 0) & (np.diff(known) <= WIDEST_PX)
+                (valid_index,) = np.nonzero(line)
+                for step_index in np.flatnonzero(
+                    (np.diff(line[valid_index]) != 0) & (np.diff(valid_index) <= WIDEST_PX)
                 ):
-                    last, first = known[at : at + 2]
+                    last, first = valid_index[step_index : step_index + 2]
                     between = share[row, last + 1 : first]
                     counts = (
                         (1 - between).sum(),
@@ -576,9 +593,9 @@ class Characteristics:
                 "no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown"
             )
         if np.isnan(law.errors[0]):
-            near = law.range_m.min()
+            nearest_m = law.range_m.min()
             far = law.range_m.max()
-            notes.append(f"surfaces between {near:.2f} and {far:.2f} m do not show how the noise grows with range: the"
+            notes.append(f"surfaces between {nearest_m:.2f} and {far:.2f} m do not show how the noise grows with range: the"
                         f" power {law.exponents[0]:g} is assumed")  # fmt: skip
         if not self.has_amplitude:
             notes.append(
@@ -589,9 +606,11 @@ class Characteristics:
                         f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
         noise = first.noise_m[:, first.steady]
         sigma_m = float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
-        alike = float(np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)) + 1 / len(noise)
-        if alike > SLOW:
-            notes.append(f"the noise of successive frames is correlated ({alike:.2f}): they were averaged over time"
+        frame_correlation = float(
+            np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)
+        ) + 1 / len(noise)
+        if frame_correlation > SLOW:
+            notes.append(f"the noise of successive frames is correlated ({frame_correlation:.2f}): they were averaged over time"
                          " or repeated, and single frames are noisier than stated")  # fmt: skip
         reach = int(np.argmax([*(self.correlation.max(axis=0) < 0.1), True]))
         if reach > WIDE_PX:
@@ -624,8 +643,10 @@ def characteristics(
         )
     cells = tuple(cell for capture in captures for cell in cells_of(capture))
     if not cells:
-        what = f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, angle and brightness"
-        raise UserError(what, legal="a static scene", fix="record a matte wall that fills the view")
+        problem = f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, angle and brightness"
+        raise UserError(
+            problem, legal="a static scene", fix="record a matte wall that fills the view"
+        )
     correlation = correlations(max(captures, key=lambda capture: int(capture.steady.sum())))
     flat = []
     for capture, pose in zip(captures, poses or [None] * len(captures), strict=True):
@@ -647,15 +668,15 @@ def _pattern_correlation(pattern: Separated, of_noise: np.ndarray) -> np.ndarray
     """Return the correlation (2, lags) of the fixed pattern along x and y, without the map's
     noise, faded to 0."""
     error_m = pattern.field.error_m
-    known = np.isfinite(pattern.field.error_m)
+    in_field = np.isfinite(pattern.field.error_m)
     lags = range(PATTERN_LAGS + 1)
     pairs = [
-        [statistics.covariance(error_m[None], known, *lag)[0] for lag in ((k, 0), (0, k))]
+        [statistics.covariance(error_m[None], in_field, *lag)[0] for lag in ((k, 0), (0, k))]
         for k in lags
     ]
     of_map = float(np.nanmean(pattern.field.variance_m2)) * np.pad(
         of_noise, ((0, 0), (0, PATTERN_LAGS - LAGS))
     )
-    found = np.array(pairs).T - of_map
+    products = np.array(pairs).T - of_map
     faded = np.cos(np.linspace(0, np.pi / 2, len(lags)))
-    return np.clip(np.nan_to_num(found / np.maximum(found[:, :1], 1e-18)), -1, 1) * faded
+    return np.clip(np.nan_to_num(products / np.maximum(products[:, :1], 1e-18)), -1, 1) * faded

@@ -80,9 +80,9 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     captures = []
     with atomic_folder(arguments.out) as folder:
         for number, job in enumerate(batch.renders[:count]):
-            view, found = cached_view(job.target, camera.optics, job.config, cache)
+            view, from_cache = cached_view(job.target, camera.optics, job.config, cache)
             print(
-                f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}"
+                f"view {number}: {'render from the cache' if from_cache else f'rendered in {view.seconds:.1f} s'}"
             )
             unit = SimulatedUnit(camera, job.camera, view)
             labels = ("view", number) if number else ()

@@ -69,14 +69,14 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     that cannot be written."""
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
-    every = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
-    names = dict.fromkeys(options.camera) or dict.fromkeys(each.camera for each in every)
+    all_figures = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
+    names = dict.fromkeys(options.camera) or dict.fromkeys(figure.camera for figure in all_figures)
     titles = {name: load_camera(name).title for name in names}
-    figures = [each for each in every if each.camera in titles]
-    found = scoring.measured(
+    figures = [figure for figure in all_figures if figure.camera in titles]
+    readings = scoring.measured(
         dict.fromkeys(figure.request for figure in figures), FULL, options.jobs
     )
-    scores = [scoring.Score(figure, found[figure.request]) for figure in figures]
+    scores = [scoring.Score(figure, readings[figure.request]) for figure in figures]
     provenance = {
         "results_version": RESULTS_VERSION,
         **record(command),
@@ -156,12 +156,12 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
     axis.axvspan(1 - scoring.NEAR, 1 + scoring.NEAR, color=BLUE, alpha=0.12)
     axis.axvline(1, color=BLUE, linewidth=0.8)
     for row, score in enumerate(scores):
-        known = score.simulated.interval
+        interval = score.simulated.interval
         value = score.figure.published.value
         colour = BLUE if score.passes else RED
-        if known.known and value:
+        if interval.known and value:
             axis.plot(
-                np.maximum([known.low / value, known.high / value], 1e-3),
+                np.maximum([interval.low / value, interval.high / value], 1e-3),
                 [row, row],
                 color=colour,
                 linewidth=1,

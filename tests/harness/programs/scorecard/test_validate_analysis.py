@@ -77,8 +77,8 @@ def test_jackknife_interval_covers_as_stated():
         # all pixels share half of the variance, so an interval from independent pixels would be
         # far too narrow
         z = rng.standard_normal((30, 4, 4)) + rng.standard_normal((30, 1, 1))
-        found = jackknifed(z, lambda s: temporal_sigma_m(s, np.ones((4, 4), bool)))
-        hits += found.interval.low <= np.sqrt(2) <= found.interval.high
+        reading = jackknifed(z, lambda s: temporal_sigma_m(s, np.ones((4, 4), bool)))
+        hits += reading.interval.low <= np.sqrt(2) <= reading.interval.high
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 200, 0.95)
     assert low <= hits <= high
 
@@ -166,14 +166,14 @@ def test_two_planes_are_found_with_their_pixels():
     """1 mm of noise over thousands of pixels: the distance is known to 0.1 mm."""
     z, slopes, board = two_walls()
     z[:5] = np.nan
-    found = find_planes(z, slopes, 8e-3, least_px=1000)
-    assert len(found) == 2
-    (wall, _), (near, on_board) = found
+    planes = find_planes(z, slopes, 8e-3, least_px=1000)
+    assert len(planes) == 2
+    (wall, _), (near, on_board) = planes
     assert (wall.distance_m, wall.slope_x) == pytest.approx((1.6, -0.4), abs=1e-3)
     assert (near.distance_m, near.slope_x) == pytest.approx((0.9, 0.1), abs=1e-3)
     assert (on_board == board)[5:].mean() > 0.999
     again = find_planes(z, slopes, 8e-3, least_px=1000)
-    assert all((one[1] == other[1]).all() for one, other in zip(found, again, strict=True))
+    assert all((first[1] == second[1]).all() for first, second in zip(planes, again, strict=True))
 
 
 def test_no_plane_in_a_ball_nor_in_nothing():
