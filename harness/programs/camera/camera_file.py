@@ -87,8 +87,10 @@ def with_lens(name: str, lens: Lens) -> AnyCamera:
     nominal = load_camera(name).nominal_lens
     if (nominal.width, nominal.height) != (lens.width, lens.height):
         raise UserError(
-            f"the capture has {lens.width} x {lens.height} pixels, but {name} has {nominal.width} x {nominal.height}",
-            legal="a capture in the simulated mode of the camera, not aligned to another camera's pixels",
+            f"the capture has {lens.width} x {lens.height} pixels, but {name} has "
+            f"{nominal.width} x {nominal.height}",
+            legal="a capture in the simulated mode of the camera, not aligned to another "
+            "camera's pixels",
             fix="name the capture's camera, or record the camera's own depth images",
         )
     return camera_of(CameraConfig(name=name, numbers=numbers_of_lens(lens)))
@@ -127,7 +129,10 @@ def write_camera(
     for section in dict.fromkeys(fact.section for fact in (*facts, rate)):
         lines += [f"{section}:"] if section else []
         for fact in (*facts, rate):
-            text = f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: {json.dumps(fact.source)}}}"
+            text = (
+                f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: "
+                f"{json.dumps(fact.source)}}}"
+            )
             lines += (
                 [f"{'  ' if section else ''}{fact.key}: {text}"] if fact.section == section else []
             )

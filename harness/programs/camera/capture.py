@@ -52,7 +52,10 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     ratios = ", ".join(
         f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise"
     )
-    answer = f"Ratio of simulated to measured pixel noise: {ratios}. Albedo {options.albedo:g} is assumed."
+    answer = (
+        f"Ratio of simulated to measured pixel noise: {ratios}. Albedo "
+        f"{options.albedo:g} is assumed."
+    )
     title = f"{capture.name} compared with the simulated {camera.title}"
     facts = {
         "camera": name,

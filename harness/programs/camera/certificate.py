@@ -28,8 +28,10 @@ from harness.vocabulary.text import many
 
 LOD_FRAMES = (1, 10, 50)
 PRINTED = Markup(
-    "<style>@page { margin: 14mm } @media print { body { font-size: 8pt; line-height: 1.25 } table { font-size: 7pt }"
-    " th, td { padding: 1px 4px } h1 { font-size: 15pt } h2 { margin: 8px 0 4px } .answer { font-size: 10.5pt }"
+    "<style>@page { margin: 14mm } @media print { body { font-size: 8pt; line-height: 1.25 } "
+    "table { font-size: 7pt }"
+    " th, td { padding: 1px 4px } h1 { font-size: 15pt } h2 { margin: 8px 0 4px } .answer { "
+    "font-size: 10.5pt }"
     " input { display: none } }</style>"
 )
 SHOWN_LIMITS = (
@@ -42,20 +44,29 @@ SHOWN_LIMITS = (
     "found",
 )
 OF_SURFACES = (
-    "Temporal noise: standard deviation of a single pixel's z over frames. Plane-fit rms: rms distance of points from "
-    "their own plane. Dispersion: width of the layer with 95 % of a frame's points, as in ISO 10360-13; flatness: "
-    "99.7 %, as in VDI/VDE 2634-2; all three include the surface's own shape and the lens's error. Fill rate: share of "
-    "pixels and frames with a return. LoD95: 1.96 standard deviations of a pixel's z, including fixed pattern and "
-    "rounding; for more frames than were recorded, noise is assumed to fall with the square root of their number."
+    "Temporal noise: standard deviation of a single pixel's z over frames. Plane-fit rms: rms "
+    "distance of points from "
+    "their own plane. Dispersion: width of the layer with 95 % of a frame's points, as in ISO "
+    "10360-13; flatness: "
+    "99.7 %, as in VDI/VDE 2634-2; all three include the surface's own shape and the lens's "
+    "error. Fill rate: share of "
+    "pixels and frames with a return. LoD95: 1.96 standard deviations of a pixel's z, "
+    "including fixed pattern and "
+    "rounding; for more frames than were recorded, noise is assumed to fall with the square "
+    "root of their number."
 )
 POD = (
-    "a50, a90 and a90/95 are computed as in MIL-HDBK-1823A, ASTM E2862 (hits and misses) and E3023 (signals); false"
-    " calls per square metre have the exact 95 % Poisson interval; a finding within {:g} mm of a damage is a hit."
+    "a50, a90 and a90/95 are computed as in MIL-HDBK-1823A, ASTM E2862 (hits and misses) and "
+    "E3023 (signals); false"
+    " calls per square metre have the exact 95 % Poisson interval; a finding within {:g} mm "
+    "of a damage is a hit."
 )
 CONDITIONS = (
-    "The figures hold for this unit, mode, distance, angle and surface, and for the stated warm-up.",
+    "The figures hold for this unit, mode, distance, angle and surface, and for the stated "
+    "warm-up.",
     "The tag of each number in the camera file says whether it was measured, adopted or assumed.",
-    "No accreditation is claimed: no artefact was calibrated, and the procedures only resemble those of the standards.",
+    "No accreditation is claimed: no artefact was calibrated, and the procedures only "
+    "resemble those of the standards.",
 )
 
 
@@ -153,7 +164,10 @@ def write_certificate(
         share += (
             f" {implanted if study.name == 'implant' else 'The detection limits were simulated.'}"
         )
-    answer = f"{many(measured.frames, 'frame')} in {many(len(measured.captures), 'capture')}, {len(measured.jumps_m)} displaced."
+    answer = (
+        f"{many(measured.frames, 'frame')} in {many(len(measured.captures), 'capture')}, "
+        f"{len(measured.jumps_m)} displaced."
+    )
     for face in measured.surfaces[:1]:
         recorded = next(
             int(capture.kept.sum()) for capture in measured.captures if capture.name == face.capture
@@ -162,7 +176,10 @@ def write_certificate(
             measured, (face.temporal.value * MM) ** 2, frames := min(recorded, LOD_FRAMES[-1])
         )
         noise = f"A pixel's noise is {face.temporal.value:.3g} mm at {face.distance_m:.2f} m"
-        lod = f"the mean of {many(frames, 'recorded frame')} reveals a change of {lod_mm:.3g} mm (LoD95)"
+        lod = (
+            f"the mean of {many(frames, 'recorded frame')} reveals a change of {lod_mm:.3g} "
+            f"mm (LoD95)"
+        )
         answer = f"{noise}; {lod}. {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in facts.items())]
     body += [

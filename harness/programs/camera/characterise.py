@@ -25,7 +25,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the page, the tables and my_camera.yaml",
     )
-    like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
+    like = (
+        "refit this camera's model (a name or a .yaml file); without it, the file is an "
+        "empirical camera"
+    )
     add("--like", metavar="CAMERA", help=like)
     add_reading(add)
     add(
@@ -51,18 +54,28 @@ def _options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write also a certificate of two pages, certificate.html and .json",
     )
-    study = "results folder of a study (tofpod sweep or tofpod implant), whose limits the certificate quotes"
+    study = (
+        "results folder of a study (tofpod sweep or tofpod implant), whose limits the "
+        "certificate quotes"
+    )
     add("--study", type=Path, metavar="DIR", help=study)
-    fact_help = "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
+    fact_help = (
+        "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 "
+        "minutes'; may be repeated"
+    )
     add("--about", action="append", default=[], metavar="KEY=TEXT", help=fact_help)
 
 
 @program(
     _options,
-    "Measure a depth camera on static captures, preferably of a matte wall that fills the view: noise "
-    "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
-    "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
-    "Each PATH is a capture of 50 frames or more, in any format that tofpod detect reads, in order of time. Captures "
+    "Measure a depth camera on static captures, preferably of a matte wall that fills the "
+    "view: noise "
+    "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed "
+    "pattern, fill rate, edges. "
+    "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: "
+    "./my_camera.yaml). "
+    "Each PATH is a capture of 50 frames or more, in any format that tofpod detect reads, in "
+    "order of time. Captures "
     "at several distances, with the camera moved sideways by 30 mm or more, show the most.",
     epilog="example: tofpod characterise near far --like azure_kinect_nfov --out my_camera",
 )
@@ -147,7 +160,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
         worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
         if worst > REPEATED:
-            wrong = f"the {figure} of {CAMERA_FILE} differs from the captures by up to {100 * worst:.0f} %"
+            wrong = (
+                f"the {figure} of {CAMERA_FILE} differs from the captures by up to "
+                f"{100 * worst:.0f} %"
+            )
             warnings.insert(0, f"{wrong}: limits that are simulated with it are also wrong")
         elif noise:
             repeated.append(f"the {figure} within {100 * worst:.1g} %")

@@ -65,8 +65,11 @@ def main(options: argparse.Namespace, command: str) -> int:
     is_returned = table["seen"] > 0.5
     low = 1000.0 * float(table["sigma_m"][is_returned][-1])
     high = 1000.0 * float(table["sigma_m"][is_returned][0])
-    print(f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern of a unit "
-          f"{1e3 * float(table['pattern_m']):.3g} mm")  # fmt: skip
+    print(
+        f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed "
+        f"pattern of a unit "
+        f"{1e3 * float(table['pattern_m']):.3g} mm"
+    )
     print(f"wrote {options.out / camera.name}.npz, depth_noise.py")
     return 0
 
@@ -126,7 +129,8 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
 def _stack_m(
     camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int
 ) -> np.ndarray:
-    """Return ranges (frames, h, w), NaN without a return, of a plane whose light has this level."""
+    """Return ranges (frames, h, w), NaN without a return, of a plane whose light has this
+    level."""
     from scenes.sensor.calibration import unit_before_plane
 
     distance_m = float(np.clip(np.sqrt(ALBEDO / 2.0**level), nearest_m, farthest_m))

@@ -55,9 +55,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel that is the same in every "
-    "frame. Each PATH is a capture of 50 frames or more of a matte wall that fills the view. Record with a warm "
-    "camera, several times at each of two distances, and move it by 30 mm or more between captures. Name the "
+    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel "
+    "that is the same in every "
+    "frame. Each PATH is a capture of 50 frames or more of a matte wall that fills the view. "
+    "Record with a warm "
+    "camera, several times at each of two distances, and move it by 30 mm or more between "
+    "captures. Name the "
     "captures in the order of recording.",
     epilog="example: tofpod flatfield near1 near2 far1 far2 --out unit.npz, then "
     "tofpod detect captures/board --flat-field unit.npz",
@@ -85,7 +88,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     distance_text = (
         f"{nearest_m:.2f} m" if far < nearest_m * 1.01 else f"{nearest_m:.2f} to {far:.2f} m"
     )
-    answer = f"fixed pattern {mm(field.rms_m)} rms at {distance_text}, known to {mm(separated_field.noise_m)}"
+    answer = (
+        f"fixed pattern {mm(field.rms_m)} rms at {distance_text}, known to "
+        f"{mm(separated_field.noise_m)}"
+    )
     figures = list(figures_of(separated_field))
     error_m = field.error_m
     print_warnings(field.warnings)

@@ -224,7 +224,10 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
         frame for frame in islice(recording.frames(), MOST_FRAMES) if np.isfinite(frame.z_m).any()
     ]
     if len(frames) < LEAST_FRAMES:
-        problem = f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}: too few to measure temporal noise"
+        problem = (
+            f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}: too few to measure "
+            f"temporal noise"
+        )
         raise UserError(
             problem,
             legal=f"{LEAST_FRAMES} frames or more of a static scene",
@@ -254,7 +257,8 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
 
 
 def mean_amplitude(stack: Sequence[np.ndarray | None]) -> np.ndarray | None:
-    """Return the mean (h, w) over frames, NaN if never above 0; None if a frame has no amplitude."""
+    """Return the mean (h, w) over frames, NaN if never above 0; None if a frame has no
+    amplitude."""
     amplitudes = [np.nan_to_num(amplitude) for amplitude in stack if amplitude is not None]
     mean = np.mean(amplitudes, axis=0) if len(amplitudes) == len(stack) else None
     return None if mean is None else np.where(mean > 0, mean, np.nan)
@@ -446,7 +450,10 @@ class SurfaceFigures:
     @property
     def where(self) -> str:
         """The name of the surface."""
-        return f"{self.capture}, surface {self.number} at {self.distance_m:.2f} m, {self.angle_deg:.0f} deg"
+        return (
+            f"{self.capture}, surface {self.number} at {self.distance_m:.2f} m, "
+            f"{self.angle_deg:.0f} deg"
+        )
 
 
 def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
@@ -590,41 +597,61 @@ class Characteristics:
         first = self.captures[0]
         if not self.surfaces:
             notes.append(
-                "no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown"
+                "no flat surface was found: angle, plane fit, fill rate, fixed pattern and "
+                "edges are unknown"
             )
         if np.isnan(law.errors[0]):
             nearest_m = law.range_m.min()
             far = law.range_m.max()
-            notes.append(f"surfaces between {nearest_m:.2f} and {far:.2f} m do not show how the noise grows with range: the"
-                        f" power {law.exponents[0]:g} is assumed")  # fmt: skip
+            notes.append(
+                f"surfaces between {nearest_m:.2f} and {far:.2f} m do not show how the noise "
+                f"grows with range: the"
+                f" power {law.exponents[0]:g} is assumed"
+            )
         if not self.has_amplitude:
             notes.append(
                 "no amplitude is recorded: noise and dropouts of darker surfaces are unknown"
             )
         if np.isnan(law.errors[1]):
-            notes.append("brightness hardly varies, or only together with range: its effect on noise is unknown,"
-                        f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
+            notes.append(
+                "brightness hardly varies, or only together with range: its effect on noise "
+                "is unknown,"
+                f" and the power -{law.exponents[1]:g} is assumed"
+            )
         noise = first.noise_m[:, first.steady]
         sigma_m = float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
         frame_correlation = float(
             np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)
         ) + 1 / len(noise)
         if frame_correlation > SLOW:
-            notes.append(f"the noise of successive frames is correlated ({frame_correlation:.2f}): they were averaged over time"
-                         " or repeated, and single frames are noisier than stated")  # fmt: skip
+            notes.append(
+                f"the noise of successive frames is correlated ({frame_correlation:.2f}): "
+                f"they were averaged over time"
+                " or repeated, and single frames are noisier than stated"
+            )
         reach = int(np.argmax([*(self.correlation.max(axis=0) < 0.1), True]))
         if reach > WIDE_PX:
-            notes.append(f"the noise of pixels is correlated over {reach} pixels: the depth was upsampled, aligned to"
-                         " another camera, compressed or smoothed")  # fmt: skip
+            notes.append(
+                f"the noise of pixels is correlated over {reach} pixels: the depth was "
+                f"upsampled, aligned to"
+                " another camera, compressed or smoothed"
+            )
         if sigma_m < COARSE * first.step_m:
-            notes.append(f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to {first.step_m / MM:.3g} mm,"
-                        " and its size before rounding is uncertain")  # fmt: skip
+            notes.append(
+                f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to "
+                f"{first.step_m / MM:.3g} mm,"
+                " and its size before rounding is uncertain"
+            )
         if drifted := [capture.name for capture in self.captures if abs(capture.drift_m) > JUMP_M]:
-            notes.append(f"the distance drifts by more than {JUMP_M / MM:g} mm during {', '.join(drifted)}: the camera"
-                        " warmed up or moved")  # fmt: skip
+            notes.append(
+                f"the distance drifts by more than {JUMP_M / MM:g} mm during "
+                f"{', '.join(drifted)}: the camera"
+                " warmed up or moved"
+            )
         if jumped := len(self.jumps_m):
             notes.append(
-                f"{jumped} of {self.frames} frames are displaced as a whole and are excluded from the noise"
+                f"{jumped} of {self.frames} frames are displaced as a whole and are excluded "
+                f"from the noise"
             )
         return (*notes, *(self.pattern.field.warnings if self.pattern is not None else ()))
 
@@ -643,7 +670,10 @@ def characteristics(
         )
     cells = tuple(cell for capture in captures for cell in cells_of(capture))
     if not cells:
-        problem = f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, angle and brightness"
+        problem = (
+            f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, "
+            f"angle and brightness"
+        )
         raise UserError(
             problem, legal="a static scene", fix="record a matte wall that fills the view"
         )

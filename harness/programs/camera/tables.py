@@ -93,11 +93,13 @@ OWN_CURVES = Table(
         Column("series", note="capture, or direction"),
         Column(
             "x",
-            note="value on the x axis; the diagram decides whether m, degrees, amplitude, px, 1/px or frames",
+            note="value on the x axis; the diagram decides whether m, degrees, amplitude, px, "
+            "1/px or frames",
         ),
         Column(
             "y",
-            note="value on the y axis; the diagram decides whether mm, share, correlation or density",
+            note="value on the y axis; the diagram decides whether mm, share, correlation or "
+            "density",
         ),
     ),
     formats=("csv",),
@@ -155,15 +157,31 @@ FLAT_CAPTURES = Table(
     (
         Column("capture", "capture", "name", "name of the capture"),
         Column("frames", "frames", "frames", "number of averaged frames"),
-        Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
-        Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
+        Column(
+            "distance_m", "distance (m)", "distance_m", "median distance along the optical axis"
+        ),
+        Column(
+            "tilt_deg",
+            "tilt (°)",
+            "tilt_deg",
+            "angle between the optical axis and the surface's normal",
+        ),
         Column("pixels", "pixels", "pixels", "number of pixels used"),
-        Column("noise_mm", "noise (mm)", lambda row: row.noise_m / MM, "temporal noise of the averaged distance"),
-        Column("residual_mm", "residual (mm)", lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
-               "rms difference between the range and a smooth fit: pattern, shape and noise"),
+        Column(
+            "noise_mm",
+            "noise (mm)",
+            lambda row: row.noise_m / MM,
+            "temporal noise of the averaged distance",
+        ),
+        Column(
+            "residual_mm",
+            "residual (mm)",
+            lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
+            "rms difference between the range and a smooth fit: pattern, shape and noise",
+        ),
     ),
     formats=("csv",),
-)  # fmt: skip
+)
 
 FLAT_FIGURES = Table(
     "flat_field",

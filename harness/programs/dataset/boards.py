@@ -78,7 +78,8 @@ class Sample:
 
 
 def categories_of(experiment: Experiment) -> dict[str, Point]:
-    """Return the points whose clouds differ, by names formed from the axes of source and capture."""
+    """Return the points whose clouds differ, by names formed from the axes of source and
+    capture."""
     points: dict[str, Point] = {}
     for point in experiment.points:
         if not point.is_variation:
@@ -106,7 +107,8 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
 
 
 def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]:
-    """Plan the boards of every category. Raises UserError if the experiment has no random boards."""
+    """Plan the boards of every category. Raises UserError if the experiment has no random
+    boards."""
     samples = []
     for category, point in categories_of(experiment).items():
         source = point.config.simulated

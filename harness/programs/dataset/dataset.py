@@ -55,7 +55,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="the licence that the card states (default: CC-BY-4.0)",
     )
-    results = "results folder of experiments, whose stored renders are used and extended (default: results)"
+    results = (
+        "results folder of experiments, whose stored renders are used and extended "
+        "(default: results)"
+    )
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     add("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     add("--serial", action="store_true", help="run everything in this process, for a debugger")
@@ -63,7 +66,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Write a data set of simulated boards with organised clouds, depth, intensity, validity, masks and "
+    "Write a data set of simulated boards with organised clouds, depth, intensity, validity, "
+    "masks and "
     "truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
     epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
     "tofpod score states the detection limit of any anomaly maps on it.",
@@ -84,7 +88,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     facts = _about(experiment, options.licence, samples, command)
     if (out / INDEX).exists():
         if read_index(out)["content"] != facts["content"]:
-            problem = f"{out}: holds a data set of another experiment, number of boards or version of the code"
+            problem = (
+                f"{out}: holds a data set of another experiment, number of boards or "
+                f"version of the code"
+            )
             raise UserError(problem, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
         raise UserError(
@@ -104,7 +111,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         return 1
     _finish(out, samples, facts)
     print(
-        f"wrote {out}: {len(samples)} boards in {len(facts['categories'])} categories; README.md there explains them"
+        f"wrote {out}: {len(samples)} boards in {len(facts['categories'])} categories; "
+        f"README.md there explains them"
     )
     return 0
 
@@ -193,7 +201,8 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
 
 
 def _finish(out: Path, samples: list[Sample], facts: dict[str, Any]) -> None:
-    """Write the COCO files, the card, and finally the index, which marks the data set as complete."""
+    """Write the COCO files, the card, and finally the index, which marks the data set as
+    complete."""
     from harness.programs.dataset.boards import INDEX, INSET_PX, SPLITS, read_truth
     from harness.programs.dataset.exchange import coco_data
     from harness.report.blocks import template

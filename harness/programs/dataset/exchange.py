@@ -83,7 +83,8 @@ def in_turn(
     n_frames: int,
     frames_per_second: float,
 ) -> tuple[ExportedView, ...]:
-    """Put views in sequence, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
+    """Put views in sequence, named ``view_00`` and so on; ``poses`` are their
+    ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
     starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
@@ -171,7 +172,8 @@ def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
 
 
 def seconds_text(stamp_ns: int) -> str:
-    """Return a time in the benchmark's format: seconds with six digits, exact to the microsecond."""
+    """Return a time in the benchmark's format: seconds with six digits, exact to the
+    microsecond."""
     microseconds = (stamp_ns + 500) // 1000
     return f"{microseconds // 10**6}.{microseconds % 10**6:06d}"
 

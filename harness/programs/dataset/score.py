@@ -68,8 +68,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "State the detection limit (a90, a90/95) of anomaly maps on a data set of tofpod dataset, with "
     "AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
-    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for likely damage.",
-    epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares two such "
+    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher "
+    "for likely damage.",
+    epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares "
+    "two such "
     "folders of results.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -145,10 +147,14 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
             faults.setdefault("invalid", []).append(f"{name} ({fault})")
     if faults:
         lines = [
-            f"{len(names)} maps are {fault}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
+            f"{len(names)} maps are {fault}: "
+            f"{', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
             for fault, names in faults.items()
         ]
-        legal = "a .npy or .tiff of real numbers with the pictures' size for each board of validation and test"
+        legal = (
+            "a .npy or .tiff of real numbers with the pictures' size for each board of "
+            "validation and test"
+        )
         raise UserError(
             f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards again"
         )
@@ -162,7 +168,10 @@ def _fault(path: Path, inspected: np.ndarray) -> str:
     except UserError:
         return "cannot be read as an array of numbers"
     if scores.shape != inspected.shape:
-        return f"{' x '.join(map(str, scores.shape))} instead of {' x '.join(map(str, inspected.shape))}"
+        return (
+            f"{' x '.join(map(str, scores.shape))} instead of "
+            f"{' x '.join(map(str, inspected.shape))}"
+        )
     lacking = int((~np.isfinite(scores[inspected])).sum())
     return (
         f"no finite number at {lacking} inspected pixels; write the lowest score there"

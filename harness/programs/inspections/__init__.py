@@ -1,1 +1,2 @@
-"""`tofpod pod`, `design` and `gauge`: limits of real inspections, and how many targets they need."""
+"""`tofpod pod`, `design` and `gauge`: limits of real inspections, and the targets they need."""
+need."""

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEDIANS = (
-    'Median and 10 % and 90 % quantiles of the simulated studies; "none" means that so many studies demonstrate no '
+    'Median and 10 % and 90 % quantiles of the simulated studies; "none" means that so many '
+    "studies demonstrate no "
     "limit. *: recommended."
 )
 WIDE = 110
@@ -66,7 +67,8 @@ def design_html(design: StudyDesign, command: str) -> str:
     """Return the page as text: answer, figure, plans and sizes, hole-free area; it needs no
     network."""
     caption = (
-        "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below which a "
+        "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below "
+        "which a "
         "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
     )
     drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
@@ -182,8 +184,10 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
     sure = f"{area.confidence:.0%} confidence".replace("%", " %")
     return [
         *lines,
-        f"a threshold for {area.rate_per_m2:g} false calls per m2 needs at least {area.calibration_boards} "
-        f"hole-free boards of {area.board_m2:g} m2; its rate is then at most {area.upper_per_m2:.3g} with {sure}",
+        f"a threshold for {area.rate_per_m2:g} false calls per m2 needs at least "
+        f"{area.calibration_boards} "
+        f"hole-free boards of {area.board_m2:g} m2; its rate is then at most "
+        f"{area.upper_per_m2:.3g} with {sure}",
         f"to show at most {area.rate_per_m2:g} per m2 with {sure}, no false call may occur on "
         f"{area.silent_m2:.4g} m2, which is {area.silent_boards} other boards",
     ]
@@ -198,24 +202,31 @@ def notes(design: StudyDesign) -> list[str]:
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
         texts.append(
-            "the limit approaches the guess's own a90 roughly with the inverse square root of the number of targets: "
+            "the limit approaches the guess's own a90 roughly with the inverse square root of "
+            "the number of targets: "
             f"{design.text(design.goal)} needs about {float(f'{wanted:.2g}'):.0f} targets"
         )
     if high < plan.bound < np.inf:
         texts.append(
-            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, where it depends on the "
+            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, "
+            f"where it depends on the "
             "assumed shape of the curve; make larger targets"
         )
     if plan.targets < LEAST_TARGETS:
         texts.append(
-            f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of signals)"
+            f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 "
+            f"of signals)"
         )
     return [
         *texts,
-        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by {METHOD}; the standard error "
-        f"of the share that demonstrates a limit is at most {50 / np.sqrt(plan.studies):.1f} percentage points",
-        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count as 8 targets",
-        "the plan is only as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
+        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by "
+        f"{METHOD}; the standard error "
+        f"of the share that demonstrates a limit is at most {50 / np.sqrt(plan.studies):.1f} "
+        f"percentage points",
+        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes "
+        "count as 8 targets",
+        "the plan is only as good as the guess: a study whose sizes miss the rise of the true "
+        "curve demonstrates less",
     ]
 
 

@@ -89,11 +89,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the limit that "
-    "tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG for each board, and "
+    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state "
+    "the limit that "
+    "tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG "
+    "for each board, and "
     "gauge.json, the truth that tofpod gauge read needs.",
-    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
-    "gauge, then drill, record, and tofpod gauge read captures/gauge --gauge gauge/gauge.json --out "
+    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 "
+    "frames' --out "
+    "gauge, then drill, record, and tofpod gauge read captures/gauge --gauge gauge/gauge.json "
+    "--out "
     "found",
     further={"read": READ},
 )
@@ -121,9 +125,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     # curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
-        were = f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is {wrong_mm:.3g} mm"
+        were = (
+            f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 "
+            f"is {wrong_mm:.3g} mm"
+        )
         print(
-            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other --diameters"
+            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose "
+            f"other --diameters"
         )
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
@@ -137,10 +145,12 @@ def main(options: argparse.Namespace, command: str) -> int:
         "no a90/95" if chosen.bound == float("inf") else f"a90/95 of about {chosen.bound:.3g} mm"
     )
     print(
-        f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for each: {sheets}"
+        f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for "
+        f"each: {sheets}"
     )
     print(
-        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines them with a study"
+        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines "
+        f"them with a study"
     )
     print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
     print(

@@ -136,7 +136,8 @@ class Transfer:
 
     @cached_property
     def log_prior(self) -> np.ndarray:
-        """The logarithms (g,) of the nodes' weights before any real inspection, minus a constant."""
+        """The logarithms (g,) of the nodes' weights before any real inspection, minus a
+        constant."""
         steeper = stats.norm.logcdf(self.grid[:, 1] / np.sqrt(self.own_spread[1, 1]))
         return np.asarray(
             stats.multivariate_t(np.zeros(2), self.scale, df=FREEDOM).logpdf(self.grid) + steeper
@@ -231,9 +232,14 @@ class Mapod:
 
     @classmethod
     def of(
-        cls, set_up: str, simulated: PodStatement | None, why: str, read: Inspections, boards: np.ndarray | None = None,
+        cls,
+        set_up: str,
+        simulated: PodStatement | None,
+        why: str,
+        read: Inspections,
+        boards: np.ndarray | None = None,
         unlike: str = "",
-    ) -> Mapod:  # fmt: skip
+    ) -> Mapod:
         """Correct a study's curve. Raises UserError if the study has no curve, with the reason
         ``why``."""
         if simulated is None:

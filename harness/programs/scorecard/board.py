@@ -57,14 +57,20 @@ PATTERN_PX = (3, 6, 12)
 ANGLES_DEG = (0, 20, 35, 60)
 CLOSE = 0.3  # largest difference of a ratio from 1 that counts as agreement
 HOW = (
-    "The board is declared, its view is rendered with light between its surfaces, the camera is simulated from its "
-    "unchanged file, and the frames are resampled to the capture's pixels. The same analysis is applied to both: a "
-    "quadratic surface is fitted to a ring of 6.5 to 13.5 mm around each hole, and the hole's peak is the largest "
-    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not simulated: objects on the board, "
-    "its relief, and the maker's treatment of pixels between surfaces. Detectors see whole images, at one threshold."
+    "The board is declared, its view is rendered with light between its surfaces, the camera "
+    "is simulated from its "
+    "unchanged file, and the frames are resampled to the capture's pixels. The same analysis "
+    "is applied to both: a "
+    "quadratic surface is fitted to a ring of 6.5 to 13.5 mm around each hole, and the hole's "
+    "peak is the largest "
+    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not "
+    "simulated: objects on the board, "
+    "its relief, and the maker's treatment of pixels between surfaces. Detectors see whole "
+    "images, at one threshold."
 )
 CAPTION = (
-    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; temporal deviations "
+    "Peak of each hole behind the face around it. Means over holes have Student's 95 % "
+    "intervals; temporal deviations "
     "have those of a jackknife over frames."
 )
 Readings = dict[tuple[str, str, str], tuple[Reading, int]]
@@ -121,8 +127,14 @@ def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Imag
         return Image(lens or depth_lens, T_depth_board, np.eye(4))
     colour = getattr(camera, "colour", None)
     if colour is None:
-        problem = f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has {depth_lens.width} x {depth_lens.height}"
-        legal = "the camera's own depth images, or images aligned to a colour camera that its file places"
+        problem = (
+            f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has "
+            f"{depth_lens.width} x {depth_lens.height}"
+        )
+        legal = (
+            "the camera's own depth images, or images aligned to a colour camera that its "
+            "file places"
+        )
         raise UserError(problem, legal=legal)
     lens = (
         lens if any(lens.distortion) else replace(lens, distortion=tuple(colour.distortion.value))
@@ -251,7 +263,10 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     source = points[0].config.simulated
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
-        problem = f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k"
+        problem = (
+            f"{options.board}: declares no drilled board in front of a simulated "
+            f"camera, or no threshold k"
+        )
         legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
         raise UserError(problem, legal=legal)
     camera = camera_of(source.camera)
@@ -324,7 +339,8 @@ def _simulated(point: Point, image: Image, frames: int, options: argparse.Namesp
 
 
 def _answer(rows: list[Beside]) -> str:
-    """Return a sentence that names the set-up closest to the capture and its figures that differ."""
+    """Return a sentence that names the set-up closest to the capture and its figures that
+    differ."""
     ratios: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.measured.value > 0 and np.isfinite(row.simulated.value):
@@ -339,7 +355,10 @@ def _answer(rows: list[Beside]) -> str:
         off,
         key=lambda where: (len(off[where]), sum(abs(np.log(r)) for r in ratios[where].values())),
     )
-    share = f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within {100 * CLOSE:.0f} %"
+    share = (
+        f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within "
+        f"{100 * CLOSE:.0f} %"
+    )
     other_ratios = "".join(
         f"; {quantity}: {ratio:.2f} of the capture's" for quantity, ratio in off[best].items()
     )

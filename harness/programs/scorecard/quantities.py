@@ -258,7 +258,8 @@ def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
-    """Return one frame's z (h, w) for each of several units, cached for all patches of this plane."""
+    """Return one frame's z (h, w) for each of several units, cached for all patches of this
+    plane."""
     units = range(1, bench.effort.few_frames + 1)
     return tuple(plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] for unit in units)
 
@@ -398,5 +399,6 @@ def flying_share(bench: Bench, c: StepConditions) -> Reading:
 
 @_quantity("height of a step", StepConditions)
 def step_height_mm(bench: Bench, c: StepConditions) -> Reading:
-    """Mean z of the back minus that of the front, more than 8 pixels from the edge, noise alone."""
+    """Mean z of the back minus that of the front, more than 8 pixels from the edge, noise
+    alone."""
     return mean_of(_widths(bench, c)["height"] / MM)

@@ -135,7 +135,7 @@ def simulated(view: NoiseFreeView, number: int) -> FrameSource:
 
 
 # ---- bags
-# ------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", ("ros2", "mcap"))
@@ -275,7 +275,7 @@ def test_without_damage_nothing_is_listed_and_the_noise_is_another(
 
 
 # ---- TUM
-# -------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_a_sequence_has_what_the_benchmark_and_rtabmap_read(exports: dict[str, Path]) -> None:
@@ -411,7 +411,7 @@ def test_views_follow_each_other_in_time(view: NoiseFreeView) -> None:
 
 
 # ---- what it refuses
-# -------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_mistakes_are_one_message_and_leave_nothing(
@@ -419,7 +419,10 @@ def test_mistakes_are_one_message_and_leave_nothing(
 ) -> None:
     start = (experiment, "--format", "mcap", "--out", tmp_path / "out")
     assert "the experiment has 3" in failed(capsys, *start, "--views", "4")
-    away = "source.views={kind: list, poses: [{distance_m: 0.7}, {distance_m: 0.7, offset_x_mm: 900.0}]}"
+    away = (
+        "source.views={kind: list, poses: [{distance_m: 0.7}, {distance_m: 0.7, "
+        "offset_x_mm: 900.0}]}"
+    )
     assert "view 1 of 2" in failed(capsys, *start, "--set", away)
     assert "spread" in failed(capsys, *start, "--set", "source.views.spred_deg=20.0")
     assert "no such file" in failed(capsys, tmp_path / "none.yaml", *start[1:]).lower()

@@ -343,7 +343,8 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         mapod = json.loads((out / "pod" / "mapod.json").read_text())
         last = mapod["after_each_board"][-1]
         print(
-            f"simulated {simulated.statement.a90:.2f}, truth {truth_mm:.2f}, {last}, quoted {mapod['a90_95']}"
+            f"simulated {simulated.statement.a90:.2f}, truth {truth_mm:.2f}, {last}, quoted "
+            f"{mapod['a90_95']}"
         )
         assert mapod["counted_otherwise"] == ""
         assert truth_mm <= last["a90_95"] < 2 * truth_mm

@@ -80,7 +80,8 @@ def test_a_rise_steeper_than_the_simulated_one_is_credited_only_within_the_study
     "curve", [curve_through(4.0, 5.0, log_size=True), curve_through(4.0, 5.0, "cloglog")]
 )
 def test_the_limit_covers_the_truth_whatever_the_camera(curve: PodCurve):
-    """100 campaigns of 24 holes know a share of 0.98 to 0.014; the docs' table has 300 of a case."""
+    """100 campaigns of 24 holes know a share of 0.98 to 0.014; the docs' table has 300 of a
+    case."""
     cases = list(product((1.0, 1.25, 1.5, 2.0), (0.6, 1.0, 1.6)))
     rows = coverage(curve, cases, 24, campaigns=100)
     print("\n".join(map(str, rows)))

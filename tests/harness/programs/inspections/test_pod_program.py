@@ -41,7 +41,7 @@ def stated(folder: Path) -> dict[str, Any]:
 
 
 # ---- what it says
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -83,7 +83,8 @@ def test_the_handbooks_hits_and_misses(
 def test_the_handbooks_signals(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """MIL-HDBK-1823A example 1: a50 8.8, a90 12.69, a90/95 13.68 with the signal against ln size."""
+    """MIL-HDBK-1823A example 1: a50 8.8, a90 12.69, a90/95 13.68 with the signal against ln
+    size."""
     file = str(shared_data / "pod" / "example1_ahat.csv")
     limits = ["--left", "50", "--right", "1375", "--decision", "200"]
     asked = ["--ahat", "Test B", "--size", "size", *limits, "--log", "--no-log-signal"]
@@ -350,7 +351,7 @@ def test_small_studies_and_separation_are_noted(
 
 
 # ---- what it writes
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_same_input_same_bytes(tmp_path: Path) -> None:
@@ -397,7 +398,7 @@ def test_drawn_sizes_hold_data_and_near_marks() -> None:
 
 
 # ---- what it reads
-# ---------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)

@@ -168,7 +168,7 @@ def test_a_negative_tolerance_is_refused():
 
 
 # ---- the judgement
-# ---------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_verdicts(tmp_path):
@@ -240,7 +240,7 @@ def test_numbers_have_three_digits(value, text):
 
 
 # ---- measuring
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
@@ -263,7 +263,7 @@ def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
 
 
 # ---- the program
-# -----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
@@ -331,7 +331,8 @@ def test_help_is_instant():
         "import harness.programs.scorecard.validate as program\n"
         "try: program.main()\n"
         "except SystemExit as end: assert end.code == 0\n"
-        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2', 'numpy'}\n"
+        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', "
+        "'av', 'cv2', 'numpy'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)

@@ -35,7 +35,7 @@ PINHOLE = camera_of(
 
 
 # ---- temporal noise
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def white(frames: int, shape: tuple[int, int], sigma: float, seed: int = 3) -> np.ndarray:
@@ -95,7 +95,7 @@ def test_estimates_without_repeats_have_no_interval():
 
 
 # ---- edges
-# -----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def ideal_step(step: float = 0.1, columns: int = 40) -> tuple[np.ndarray, ...]:
@@ -148,7 +148,7 @@ def test_surfaces_that_noise_makes_one_are_not_told_apart(sigma_m, step_m):
 
 
 # ---- planes
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def two_walls(noise_m: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -196,7 +196,7 @@ def test_a_plane_is_fitted_exactly(distance_m, slope_x, slope_y):
 
 
 # ---- views of steps
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 REGION = Region(300, 330, 280, 360)
 
@@ -206,7 +206,8 @@ def half(edge_slope: float, sign: float = 1.0):  # type: ignore[no-untyped-def]
 
 
 def test_a_front_that_is_everywhere_or_nowhere_is_a_plane():
-    """Averaging over the footprint turns the light by what z bends within a pixel: far below 1e-4."""
+    """Averaging over the footprint turns the light by what z bends within a pixel: far below
+    1e-4."""
     front = Plane(0.8, 0.1)
     back = Plane(1.1)
     for covers, plane in (
@@ -258,7 +259,7 @@ def test_the_shadow_is_as_wide_as_the_emitter_says():
 
 
 # ---- the bench
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
