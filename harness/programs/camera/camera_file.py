@@ -87,8 +87,8 @@ def with_lens(name: str, lens: Lens) -> AnyCamera:
     nominal = load_camera(name).nominal_lens
     if (nominal.width, nominal.height) != (lens.width, lens.height):
         raise UserError(
-            f"the capture has {lens.width} x {lens.height} pixels, but {name} has "
-            f"{nominal.width} x {nominal.height}",
+            f"the capture has {lens.width} x {lens.height} pixels, but {name} has {nominal.width} "
+            f"x {nominal.height}",
             legal="a capture in the simulated mode of the camera, not aligned to another "
             "camera's pixels",
             fix="name the capture's camera, or record the camera's own depth images",

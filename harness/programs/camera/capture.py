@@ -53,8 +53,8 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise"
     )
     answer = (
-        f"Ratio of simulated to measured pixel noise: {ratios}. Albedo "
-        f"{options.albedo:g} is assumed."
+        f"Ratio of simulated to measured pixel noise: {ratios}. Albedo {options.albedo:g} is "
+        "assumed."
     )
     title = f"{capture.name} compared with the simulated {camera.title}"
     facts = {

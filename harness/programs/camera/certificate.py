@@ -29,10 +29,8 @@ from harness.vocabulary.text import many
 LOD_FRAMES = (1, 10, 50)
 PRINTED = Markup(
     "<style>@page { margin: 14mm } @media print { body { font-size: 8pt; line-height: 1.25 } "
-    "table { font-size: 7pt }"
-    " th, td { padding: 1px 4px } h1 { font-size: 15pt } h2 { margin: 8px 0 4px } .answer { "
-    "font-size: 10.5pt }"
-    " input { display: none } }</style>"
+    "table { font-size: 7pt } th, td { padding: 1px 4px } h1 { font-size: 15pt } h2 { margin: 8px "
+    "0 4px } .answer { font-size: 10.5pt } input { display: none } }</style>"
 )
 SHOWN_LIMITS = (
     "set-up",
@@ -45,28 +43,24 @@ SHOWN_LIMITS = (
 )
 OF_SURFACES = (
     "Temporal noise: standard deviation of a single pixel's z over frames. Plane-fit rms: rms "
-    "distance of points from "
-    "their own plane. Dispersion: width of the layer with 95 % of a frame's points, as in ISO "
-    "10360-13; flatness: "
-    "99.7 %, as in VDI/VDE 2634-2; all three include the surface's own shape and the lens's "
-    "error. Fill rate: share of "
-    "pixels and frames with a return. LoD95: 1.96 standard deviations of a pixel's z, "
-    "including fixed pattern and "
-    "rounding; for more frames than were recorded, noise is assumed to fall with the square "
-    "root of their number."
+    "distance of points from their own plane. Dispersion: width of the layer with 95 % of a "
+    "frame's points, as in ISO 10360-13; flatness: 99.7 %, as in VDI/VDE 2634-2; all three "
+    "include the surface's own shape and the lens's error. Fill rate: share of pixels and frames "
+    "with a return. LoD95: 1.96 standard deviations of a pixel's z, including fixed pattern and "
+    "rounding; for more frames than were recorded, noise is assumed to fall with the square root "
+    "of their number."
 )
 POD = (
     "a50, a90 and a90/95 are computed as in MIL-HDBK-1823A, ASTM E2862 (hits and misses) and "
-    "E3023 (signals); false"
-    " calls per square metre have the exact 95 % Poisson interval; a finding within {:g} mm "
-    "of a damage is a hit."
+    "E3023 (signals); false calls per square metre have the exact 95 % Poisson interval; a "
+    "finding within {:g} mm of a damage is a hit."
 )
 CONDITIONS = (
     "The figures hold for this unit, mode, distance, angle and surface, and for the stated "
     "warm-up.",
     "The tag of each number in the camera file says whether it was measured, adopted or assumed.",
-    "No accreditation is claimed: no artefact was calibrated, and the procedures only "
-    "resemble those of the standards.",
+    "No accreditation is claimed: no artefact was calibrated, and the procedures only resemble "
+    "those of the standards.",
 )
 
 
@@ -177,8 +171,8 @@ def write_certificate(
         )
         noise = f"A pixel's noise is {face.temporal.value:.3g} mm at {face.distance_m:.2f} m"
         lod = (
-            f"the mean of {many(frames, 'recorded frame')} reveals a change of {lod_mm:.3g} "
-            f"mm (LoD95)"
+            f"the mean of {many(frames, 'recorded frame')} reveals a change of {lod_mm:.3g} mm "
+            "(LoD95)"
         )
         answer = f"{noise}; {lod}. {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in facts.items())]

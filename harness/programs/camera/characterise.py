@@ -26,8 +26,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="folder for the page, the tables and my_camera.yaml",
     )
     like = (
-        "refit this camera's model (a name or a .yaml file); without it, the file is an "
-        "empirical camera"
+        "refit this camera's model (a name or a .yaml file); without it, the file is an empirical "
+        "camera"
     )
     add("--like", metavar="CAMERA", help=like)
     add_reading(add)
@@ -55,28 +55,25 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="write also a certificate of two pages, certificate.html and .json",
     )
     study = (
-        "results folder of a study (tofpod sweep or tofpod implant), whose limits the "
-        "certificate quotes"
+        "results folder of a study (tofpod sweep or tofpod implant), whose limits the certificate "
+        "quotes"
     )
     add("--study", type=Path, metavar="DIR", help=study)
     fact_help = (
-        "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 "
-        "minutes'; may be repeated"
+        "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be "
+        "repeated"
     )
     add("--about", action="append", default=[], metavar="KEY=TEXT", help=fact_help)
 
 
 @program(
     _options,
-    "Measure a depth camera on static captures, preferably of a matte wall that fills the "
-    "view: noise "
-    "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed "
-    "pattern, fill rate, edges. "
-    "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: "
-    "./my_camera.yaml). "
-    "Each PATH is a capture of 50 frames or more, in any format that tofpod detect reads, in "
-    "order of time. Captures "
-    "at several distances, with the camera moved sideways by 30 mm or more, show the most.",
+    "Measure a depth camera on static captures, preferably of a matte wall that fills the view: "
+    "noise against range, angle and amplitude, correlation, dropouts, displaced frames, fixed "
+    "pattern, fill rate, edges. Write a page, tables, and my_camera.yaml, a camera for "
+    "experiments (source.camera.name: ./my_camera.yaml). Each PATH is a capture of 50 frames or "
+    "more, in any format that tofpod detect reads, in order of time. Captures at several "
+    "distances, with the camera moved sideways by 30 mm or more, show the most.",
     epilog="example: tofpod characterise near far --like azure_kinect_nfov --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:

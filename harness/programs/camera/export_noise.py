@@ -66,9 +66,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     low = 1000.0 * float(table["sigma_m"][is_returned][-1])
     high = 1000.0 * float(table["sigma_m"][is_returned][0])
     print(
-        f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed "
-        f"pattern of a unit "
-        f"{1e3 * float(table['pattern_m']):.3g} mm"
+        f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern "
+        f"of a unit {1e3 * float(table['pattern_m']):.3g} mm"
     )
     print(f"wrote {options.out / camera.name}.npz, depth_noise.py")
     return 0

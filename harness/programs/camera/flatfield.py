@@ -55,13 +55,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel "
-    "that is the same in every "
-    "frame. Each PATH is a capture of 50 frames or more of a matte wall that fills the view. "
-    "Record with a warm "
-    "camera, several times at each of two distances, and move it by 30 mm or more between "
-    "captures. Name the "
-    "captures in the order of recording.",
+    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel that is "
+    "the same in every frame. Each PATH is a capture of 50 frames or more of a matte wall that "
+    "fills the view. Record with a warm camera, several times at each of two distances, and move "
+    "it by 30 mm or more between captures. Name the captures in the order of recording.",
     epilog="example: tofpod flatfield near1 near2 far1 far2 --out unit.npz, then "
     "tofpod detect captures/board --flat-field unit.npz",
 )

@@ -51,11 +51,9 @@ SHOWN_LAGS = (1, 2, 3, 5)
 SHOWN_PATTERN_LAGS = (1, 3, 5, 10)
 CAPTION = (
     "The surfaces that were found; temporal noise against range, angle and amplitude (a dot "
-    "stands for pixels with "
-    "similar values of all three); correlation of noise and of fixed pattern along x and y, "
-    "and their spectra (1 for "
-    "white noise); displacement of whole frames; dropouts. Orange is the simulation from the "
-    "camera file."
+    "stands for pixels with similar values of all three); correlation of noise and of fixed "
+    "pattern along x and y, and their spectra (1 for white noise); displacement of whole frames; "
+    "dropouts. Orange is the simulation from the camera file."
 )
 FigureRow = tuple[str, str, str, float, str]  # name, place, unit, value and meaning of a figure
 
@@ -234,9 +232,9 @@ def write_page(
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, measured, curves))
     notes = (
-        "The simulated frames show the same surfaces, with the smooth shape of the captures, "
-        "by the camera file; they "
-        "are analysed like the captures. A ratio of 1 means that the file reproduces the camera."
+        "The simulated frames show the same surfaces, with the smooth shape of the captures, by "
+        "the camera file; they are analysed like the captures. A ratio of 1 means that the file "
+        "reproduces the camera."
     )
     body = [
         figure({"captures": drawn}, "captures", CAPTION),

@@ -56,8 +56,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="the licence that the card states (default: CC-BY-4.0)",
     )
     results = (
-        "results folder of experiments, whose stored renders are used and extended "
-        "(default: results)"
+        "results folder of experiments, whose stored renders are used and extended (default: "
+        "results)"
     )
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     add("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
@@ -67,8 +67,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 @program(
     _options,
     "Write a data set of simulated boards with organised clouds, depth, intensity, validity, "
-    "masks and "
-    "truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
+    "masks and truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
     epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
     "tofpod score states the detection limit of any anomaly maps on it.",
 )
@@ -89,8 +88,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if (out / INDEX).exists():
         if read_index(out)["content"] != facts["content"]:
             problem = (
-                f"{out}: holds a data set of another experiment, number of boards or "
-                f"version of the code"
+                f"{out}: holds a data set of another experiment, number of boards or version of "
+                "the code"
             )
             raise UserError(problem, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
@@ -111,8 +110,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         return 1
     _finish(out, samples, facts)
     print(
-        f"wrote {out}: {len(samples)} boards in {len(facts['categories'])} categories; "
-        f"README.md there explains them"
+        f"wrote {out}: {len(samples)} boards in {len(facts['categories'])} categories; README.md "
+        "there explains them"
     )
     return 0
 

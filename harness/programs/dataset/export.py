@@ -45,8 +45,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=whole_number(10_000), metavar="N", help=frames)
     add("--hole-free", action="store_true", help="export the same target without its damage")
     results = (
-        "results folder of experiments, whose stored renders are used and extended "
-        "(default: results)"
+        "results folder of experiments, whose stored renders are used and extended (default: "
+        "results)"
     )
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
 
@@ -54,8 +54,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 @program(
     _options,
     "Render and simulate the views of an experiment, and write them with their true poses and "
-    "damages"
-    " as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and "
+    "damages as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and "
     "tf_static.",
     epilog="example: tofpod export experiments/perspectives.yaml --format mcap --views 3 "
     "--out bags/",
@@ -106,12 +105,12 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     if swept:
         print(
             f"note: {', '.join(swept)}: the value of `source` is used, not the axis; --set "
-            f"chooses another value"
+            "chooses another value"
         )
     size_mb = sum(path.stat().st_size for path in arguments.out.rglob("*") if path.is_file()) / 1e6
     print(
-        f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, "
-        f"with truth.json"
+        f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, with "
+        "truth.json"
     )
     return 0
 
@@ -167,8 +166,8 @@ def _write_beside(
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [
-                "The target turns as on a turntable: the poses of all views hold for the "
-                "target, not for the room.",
+                "The target turns as on a turntable: the poses of all views hold for the target, "
+                "not for the room.",
                 "Pixels outside the simulated region of each image have no range and are black.",
                 "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
             ],

@@ -66,13 +66,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "State the detection limit (a90, a90/95) of anomaly maps on a data set of tofpod dataset, with "
-    "AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
-    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher "
-    "for likely damage.",
+    "State the detection limit (a90, a90/95) of anomaly maps on a data set of tofpod dataset, "
+    "with AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
+    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for "
+    "likely damage.",
     epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares "
-    "two such "
-    "folders of results.",
+    "two such folders of results.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""
@@ -152,8 +151,8 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
             for fault, names in faults.items()
         ]
         legal = (
-            "a .npy or .tiff of real numbers with the pictures' size for each board of "
-            "validation and test"
+            "a .npy or .tiff of real numbers with the pictures' size for each board of validation "
+            "and test"
         )
         raise UserError(
             f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards again"

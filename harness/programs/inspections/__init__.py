@@ -1,2 +1,1 @@
-"""`tofpod pod`, `design` and `gauge`: limits of real inspections, and the targets they need."""
-need."""
+"""`tofpod pod`, `design`, `gauge`: limits of real inspections, and the targets that they need."""

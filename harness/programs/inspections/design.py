@@ -86,12 +86,10 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 @program(
     _options,
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
-    "analyse them like real ones, and state which a90/95 to expect, how many targets it "
-    "takes, and which "
-    "sizes to make.",
+    "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, "
+    "and which sizes to make.",
     epilog="example: tofpod design --a50 5 --a90 7 --sizes 2 12 --goal 9. A simulated study "
-    "takes about "
-    "5 ms.",
+    "takes about 5 ms.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130
@@ -147,8 +145,8 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
     if options.study is None and missing:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
         fix = (
-            "make a careful guess; a study that is planned for an optimistic guess "
-            "demonstrates nothing"
+            "make a careful guess; a study that is planned for an optimistic guess demonstrates "
+            "nothing"
         )
         raise UserError(f"{', '.join(missing)}: not stated", legal=legal, fix=fix)
     for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
@@ -174,8 +172,8 @@ def _guess(options: argparse.Namespace) -> Guess:
     limit = limit_of(record)
     if limit.statement is None:
         fix = (
-            "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or "
-            "name another set-up"
+            "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name "
+            "another set-up"
         )
         raise UserError(f"{options.study}: {record.label} has no curve: {limit.why}", fix=fix)
     curve = limit.statement.curve
@@ -221,8 +219,8 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
             raise UserError(problem, legal=legal)
     if options.goal is not None and not options.goal > a90:
         fix = (
-            "no study can demonstrate a limit below the true a90: improve the detector, or "
-            "state a larger goal"
+            "no study can demonstrate a limit below the true a90: improve the detector, or state "
+            "a larger goal"
         )
         problem = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
         raise UserError(problem, legal=f"more than {a90:.4g}", fix=fix)

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 MEDIANS = (
     'Median and 10 % and 90 % quantiles of the simulated studies; "none" means that so many '
-    "studies demonstrate no "
-    "limit. *: recommended."
+    "studies demonstrate no limit. *: recommended."
 )
 WIDE = 110
 SIZE_IN = (11.5, 4.9)
@@ -68,8 +67,8 @@ def design_html(design: StudyDesign, command: str) -> str:
     network."""
     caption = (
         "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below "
-        "which a "
-        "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
+        "which a limit should not fall. Right: the guessed curve and the sizes of the recommended "
+        "plan."
     )
     drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
     body = [blocks.heading("What to expect"), blocks.figure({"design": drawn}, "design", caption)]
@@ -185,9 +184,8 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
     return [
         *lines,
         f"a threshold for {area.rate_per_m2:g} false calls per m2 needs at least "
-        f"{area.calibration_boards} "
-        f"hole-free boards of {area.board_m2:g} m2; its rate is then at most "
-        f"{area.upper_per_m2:.3g} with {sure}",
+        f"{area.calibration_boards} hole-free boards of {area.board_m2:g} m2; its rate is then at "
+        f"most {area.upper_per_m2:.3g} with {sure}",
         f"to show at most {area.rate_per_m2:g} per m2 with {sure}, no false call may occur on "
         f"{area.silent_m2:.4g} m2, which is {area.silent_boards} other boards",
     ]
@@ -203,28 +201,26 @@ def notes(design: StudyDesign) -> list[str]:
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
         texts.append(
             "the limit approaches the guess's own a90 roughly with the inverse square root of "
-            "the number of targets: "
-            f"{design.text(design.goal)} needs about {float(f'{wanted:.2g}'):.0f} targets"
+            f"the number of targets: {design.text(design.goal)} needs about "
+            f"{float(f'{wanted:.2g}'):.0f} targets"
         )
     if high < plan.bound < np.inf:
         texts.append(
-            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, "
-            f"where it depends on the "
-            "assumed shape of the curve; make larger targets"
+            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, where it "
+            "depends on the assumed shape of the curve; make larger targets"
         )
     if plan.targets < LEAST_TARGETS:
         texts.append(
-            f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 "
-            f"of signals)"
+            f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of "
+            "signals)"
         )
     return [
         *texts,
         f"medians and quantiles are over {plan.studies} simulated studies, with bounds by "
-        f"{METHOD}; the standard error "
-        f"of the share that demonstrates a limit is at most {50 / np.sqrt(plan.studies):.1f} "
-        f"percentage points",
-        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes "
-        "count as 8 targets",
+        f"{METHOD}; the standard error of the share that demonstrates a limit is at most "
+        f"{50 / np.sqrt(plan.studies):.1f} percentage points",
+        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count "
+        "as 8 targets",
         "the plan is only as good as the guess: a study whose sizes miss the rise of the true "
         "curve demonstrates less",
     ]

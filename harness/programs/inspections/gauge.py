@@ -89,16 +89,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state "
-    "the limit that "
-    "tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG "
-    "for each board, and "
-    "gauge.json, the truth that tofpod gauge read needs.",
+    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the "
+    "limit that tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), "
+    "an SVG for each board, and gauge.json, the truth that tofpod gauge read needs.",
     epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 "
-    "frames' --out "
-    "gauge, then drill, record, and tofpod gauge read captures/gauge --gauge gauge/gauge.json "
-    "--out "
-    "found",
+    "frames' --out gauge, then drill, record, and tofpod gauge read captures/gauge --gauge "
+    "gauge/gauge.json --out found",
     further={"read": READ},
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -126,12 +122,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
         were = (
-            f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 "
-            f"is {wrong_mm:.3g} mm"
+            f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is "
+            f"{wrong_mm:.3g} mm"
         )
         print(
-            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose "
-            f"other --diameters"
+            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other "
+            "--diameters"
         )
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
@@ -149,8 +145,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         f"each: {sheets}"
     )
     print(
-        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines "
-        f"them with a study"
+        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines them "
+        "with a study"
     )
     print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
     print(

@@ -204,8 +204,8 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         apart_m = np.linalg.norm(transform_points(T_camera_board, on_board) - in_camera, axis=-1)
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
         notes.append(
-            f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on "
-            f"the board"
+            f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on the "
+            "board"
         )
         if fit_mm > WORST_FIT_MM:
             doubt = (
@@ -215,8 +215,8 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         hits, beside = _matched(board, counted, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in hits if row.found == "NA"]:
             outside = (
-                "is too close to the edge of the judged area, so it counts neither as a "
-                "hit nor as a miss"
+                "is too close to the edge of the judged area, so it counts neither as a hit nor "
+                "as a miss"
             )
             warnings.append(f"{board.name}: hole {', '.join(unjudged)} {outside}")
         rows += hits
@@ -226,8 +226,8 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
             marks_read.problem or f"{len(by_code)} codes were read, but no board has three of them"
         )
         fix = (
-            "show the whole board, closer to the camera, in the image that is recorded with "
-            "the depth"
+            "show the whole board, closer to the camera, in the image that is recorded with the "
+            "depth"
         )
         raise UserError(f"--gauge: no board is recognised: {why}", fix=fix)
     return GaugeSeen(tuple(rows), calls, tuple(warnings), tuple(notes))

@@ -48,7 +48,7 @@ READ = Program(
     options=_options,
     run=_run,
     description="Find the boards of a gauge in a capture by their marks, inspect the capture as "
-    "tofpod detect does, and count which holes are hit. Write the findings, and hits and misses to "
-    "gauge.csv, which tofpod pod reads.",
+    "tofpod detect does, and count which holes are hit. Write the findings, and hits and misses "
+    "to gauge.csv, which tofpod pod reads.",
     epilog="example: tofpod gauge read captures/gauge --gauge gauge/gauge.json --out found",
 )

@@ -43,14 +43,14 @@ def answer(mapod: Mapod) -> str:
     first = f"The real hits and misses do not contradict the simulation {agrees}."
     if mapod.contradicted:
         first = (
-            f"The real hits and misses contradict the simulation {agrees}: the larger of "
-            f"the two limits counts."
+            f"The real hits and misses contradict the simulation {agrees}: the larger of the two "
+            "limits counts."
         )
     if not np.isfinite(mapod.a90_95):
         return f"{first} The real targets do not demonstrate a90/95, so no limit is stated."
     return (
-        f"{first} A flaw of {sized(mapod.a90_95, 'mm')} is found 90 % of the time, with 95 "
-        f"% confidence (a90/95)."
+        f"{first} A flaw of {sized(mapod.a90_95, 'mm')} is found 90 % of the time, with 95 % "
+        "confidence (a90/95)."
     )
 
 
@@ -79,23 +79,18 @@ def notes(mapod: Mapod) -> list[str]:
     """Return sentences on the prior, the tests and the stopping rule."""
     lines = [
         "Transfer function: real damage of size k a is found as easily as simulated damage of "
-        "size a, and the rise "
-        f"of the curve is w times as wide. Prior: ln k and ln w follow Student's distribution "
-        f"about 0 with {FREEDOM:g} "
-        f"degrees of freedom and scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} "
-        f"in w, plus "
-        "the simulated curve's own uncertainty; w is below 1 only within that uncertainty.",
-        "Combined: medians of the posterior, and its 97.5 % quantile for a90/95 (for "
-        "simulated and for measured hits, "
-        "a90/95 is the handbook's likelihood ratio bound); the largest over the models that "
-        "fit the simulated hits "
-        "about equally well. If the simulation is contradicted, the larger of combined and "
-        "measured limit counts.",
-        "If the simulated curve were right, hits and misses at least as far from it would "
-        "occur with probability "
-        f"{mapod.agrees:.2g}; a probability below 0.05 counts as a contradiction.",
+        "size a, and the rise of the curve is w times as wide. Prior: ln k and ln w follow "
+        f"Student's distribution about 0 with {FREEDOM:g} degrees of freedom and scales of a "
+        f"factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, plus the simulated curve's own "
+        "uncertainty; w is below 1 only within that uncertainty.",
+        "Combined: medians of the posterior, and its 97.5 % quantile for a90/95 (for simulated "
+        "and for measured hits, a90/95 is the handbook's likelihood ratio bound); the largest "
+        "over the models that fit the simulated hits about equally well. If the simulation is "
+        "contradicted, the larger of combined and measured limit counts.",
+        "If the simulated curve were right, hits and misses at least as far from it would occur "
+        f"with probability {mapod.agrees:.2g}; a probability below 0.05 counts as a contradiction.",
         f"Stopping rule: stop when a90/95 is at most {ENOUGH:g} times a90. The rule was fixed "
-        f"before any board.",
+        "before any board.",
     ]
     return [*lines, *mapod.read.notes, VALIDITY]
 
@@ -126,9 +121,8 @@ def mapod_parts(mapod: Mapod) -> list[str | Grid]:
 def mapod_html(mapod: Mapod, command: str) -> str:
     """Return the page as text; it needs no network."""
     caption = (
-        "The simulated curve, the curve of the real hits (above) and misses (below) alone, "
-        "and the combined curve with "
-        "its 95 % credible band, the widest over all simulated models."
+        "The simulated curve, the curve of the real hits (above) and misses (below) alone, and "
+        "the combined curve with its 95 % credible band, the widest over all simulated models."
     )
     drawn = blocks.svg("mapod", SIZE_IN, answer(mapod), lambda figure: _draw(figure, mapod))
     body = [blocks.heading("Simulated, measured, combined"), sizes_grid(mapod).html()]

@@ -31,8 +31,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
     hits = (
-        "column with 1 (found) and 0 (missed), yes and no, or hit and miss; give it once "
-        "for each inspector"
+        "column with 1 (found) and 0 (missed), yes and no, or hit and miss; give it once for each "
+        "inspector"
     )
     add("--hit", metavar="COL", action="append", help=hits)
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
@@ -77,8 +77,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
     prior_help = (
-        "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by "
-        "these hits and misses"
+        "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and "
+        "misses"
     )
     put = parser.add_argument_group(prior_help).add_argument
     prior = "folder of a study, simulated or by virtual damage (tofpod implant)"
@@ -93,9 +93,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Fit a probability of detection curve to inspections, one per row of a table, and state "
-    "the size that is "
-    "found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png and pod.html.",
+    "Fit a probability of detection curve to inspections, one per row of a table, and state the "
+    "size that is found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png "
+    "and pod.html.",
     epilog="example: tofpod pod blades.csv --hit found --size length --target blade --unit mm",
 )
 def main(options: argparse.Namespace, command: str) -> int:

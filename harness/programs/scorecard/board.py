@@ -57,21 +57,17 @@ PATTERN_PX = (3, 6, 12)
 ANGLES_DEG = (0, 20, 35, 60)
 CLOSE = 0.3  # largest difference of a ratio from 1 that counts as agreement
 HOW = (
-    "The board is declared, its view is rendered with light between its surfaces, the camera "
-    "is simulated from its "
-    "unchanged file, and the frames are resampled to the capture's pixels. The same analysis "
-    "is applied to both: a "
-    "quadratic surface is fitted to a ring of 6.5 to 13.5 mm around each hole, and the hole's "
-    "peak is the largest "
-    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not "
-    "simulated: objects on the board, "
-    "its relief, and the maker's treatment of pixels between surfaces. Detectors see whole "
-    "images, at one threshold."
+    "The board is declared, its view is rendered with light between its surfaces, the camera is "
+    "simulated from its unchanged file, and the frames are resampled to the capture's pixels. The "
+    "same analysis is applied to both: a quadratic surface is fitted to a ring of 6.5 to 13.5 mm "
+    "around each hole, and the hole's peak is the largest deviation from it within 6 mm of the "
+    "centre. No other parameter is fitted. Not simulated: objects on the board, its relief, and "
+    "the maker's treatment of pixels between surfaces. Detectors see whole images, at one "
+    "threshold."
 )
 CAPTION = (
-    "Peak of each hole behind the face around it. Means over holes have Student's 95 % "
-    "intervals; temporal deviations "
-    "have those of a jackknife over frames."
+    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; "
+    "temporal deviations have those of a jackknife over frames."
 )
 Readings = dict[tuple[str, str, str], tuple[Reading, int]]
 """Readings with their numbers of pixels or holes, by quantity, condition and unit."""
@@ -132,8 +128,8 @@ def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Imag
             f"{depth_lens.width} x {depth_lens.height}"
         )
         legal = (
-            "the camera's own depth images, or images aligned to a colour camera that its "
-            "file places"
+            "the camera's own depth images, or images aligned to a colour camera that its file "
+            "places"
         )
         raise UserError(problem, legal=legal)
     lens = (
@@ -264,8 +260,8 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
         problem = (
-            f"{options.board}: declares no drilled board in front of a simulated "
-            f"camera, or no threshold k"
+            f"{options.board}: declares no drilled board in front of a simulated camera, or no "
+            "threshold k"
         )
         legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
         raise UserError(problem, legal=legal)

@@ -40,27 +40,21 @@ if TYPE_CHECKING:
 
 HOW = (
     "Each quantity is measured on simulated frames as it was on the real camera, under the "
-    "conditions of the source. "
-    "A figure of a real camera passes if the simulated value lies within 25 % of the "
-    "published value; if the source "
-    "states a wider tolerance, that applies, and the verdict says so. A bound must hold. "
-    "Blind: nothing was fitted to "
-    "the figure. Calibration: the camera file was, or may have been, fitted to it, so it is "
-    "not a test. Tags of "
-    "sources: R read for this project in the named public source, D derived from such a "
-    "source, S a single secondary "
-    "source, W measured on public captures, M from memory or a guess."
+    "conditions of the source. A figure of a real camera passes if the simulated value lies "
+    "within 25 % of the published value; if the source states a wider tolerance, that applies, "
+    "and the verdict says so. A bound must hold. Blind: nothing was fitted to the figure. "
+    "Calibration: the camera file was, or may have been, fitted to it, so it is not a test. Tags "
+    "of sources: R read for this project in the named public source, D derived from such a "
+    "source, S a single secondary source, W measured on public captures, M from memory or a guess."
 )
 CHECKS = (
-    "These checks compare the program with the arithmetic of a stated filter, gate or limit "
-    "of the camera file. They "
-    "say nothing about real cameras and pass only within their tolerance."
+    "These checks compare the program with the arithmetic of a stated filter, gate or limit of "
+    "the camera file. They say nothing about real cameras and pass only within their tolerance."
 )
 CAPTION = (
-    "Simulated divided by published value with its 95 % interval; the band extends 25 % to "
-    "either side. Blue passes, "
-    "red fails; hollow marks are figures to which the camera file was fitted. Bounds and "
-    "values of 0 have no ratio."
+    "Simulated divided by published value with its 95 % interval; the band extends 25 % to either "
+    "side. Blue passes, red fails; hollow marks are figures to which the camera file was fitted. "
+    "Bounds and values of 0 have no ratio."
 )
 FAMILIES = {
     "azure": "Azure Kinect",
@@ -214,8 +208,8 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     bounds = [score for score in blind if score.figure.published.value is None]
     wide = sum(score.passes_by_tolerance for score in blind)
     text = (
-        f"{share(blind)} blind figures "
-        f"pass{f' ({by_family})' if len(families) > 1 else ''}: {share(values)} values "
+        f"{share(blind)} blind figures pass{f' ({by_family})' if len(families) > 1 else ''}: "
+        f"{share(values)} values "
     )
     text += (
         f"within 25 %{f' ({wide} by a wider tolerance of the source)' if wide else ''}, "

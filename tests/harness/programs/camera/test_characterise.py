@@ -253,9 +253,9 @@ def test_a_known_camera_s_gain_and_pattern_are_found_again(tmp_path, capsys):
     ripples = 2.0 * data["fixed_pattern"]["smooth_mm"]["value"]
     other_file = tmp_path / "other.yaml"
     other_file.write_text(
-        f"name: other\ntitle: other\nlike: {known_file}\n"
-        f"photons: {{signal_electrons: {{value: {gain}, tag: M, source: test}}}}\n"
-        f"fixed_pattern: {{smooth_mm: {{value: {ripples}, tag: M, source: test}}}}\n"
+        f"name: other\ntitle: other\nlike: {known_file}\nphotons: {{signal_electrons: {{value: "
+        f"{gain}, tag: M, source: test}}}}\nfixed_pattern: {{smooth_mm: {{value: {ripples}, tag: "
+        f"M, source: test}}}}\n"
     )
     camera = read_camera(other_file)
     path = recorded(

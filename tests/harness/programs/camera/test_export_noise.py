@@ -90,9 +90,9 @@ def test_the_program_writes_files_that_stand_alone(tmp_path, capsys, monkeypatch
     assert main(["kinect_v2", "--out", str(tmp_path)]) == 0
     assert "fixed pattern of a unit" in capsys.readouterr().out
     code = (
-        "import numpy as np; from depth_noise import DepthNoise; n = DepthNoise('kinect_v2.npz');"
-        "z = n(np.ones(n.shape), np.full(n.shape, 0.6), np.random.default_rng(0));"
-        "print(z.shape, np.isfinite(z).mean())"
+        "import numpy as np; from depth_noise import DepthNoise; n = "
+        "DepthNoise('kinect_v2.npz');z = n(np.ones(n.shape), np.full(n.shape, 0.6), "
+        "np.random.default_rng(0));print(z.shape, np.isfinite(z).mean())"
     )
     ran = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True

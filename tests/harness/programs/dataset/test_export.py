@@ -420,8 +420,8 @@ def test_mistakes_are_one_message_and_leave_nothing(
     start = (experiment, "--format", "mcap", "--out", tmp_path / "out")
     assert "the experiment has 3" in failed(capsys, *start, "--views", "4")
     away = (
-        "source.views={kind: list, poses: [{distance_m: 0.7}, {distance_m: 0.7, "
-        "offset_x_mm: 900.0}]}"
+        "source.views={kind: list, poses: [{distance_m: 0.7}, {distance_m: 0.7, offset_x_mm: "
+        "900.0}]}"
     )
     assert "view 1 of 2" in failed(capsys, *start, "--set", away)
     assert "spread" in failed(capsys, *start, "--set", "source.views.spred_deg=20.0")

@@ -327,13 +327,10 @@ def test_a_mistake_of_the_user_is_one_message_and_exit_code_2(
 
 def test_help_is_instant():
     code = (
-        "import sys; sys.argv = ['x', '--help']\n"
-        "import harness.programs.scorecard.validate as program\n"
-        "try: program.main()\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', "
-        "'av', 'cv2', 'numpy'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "import sys; sys.argv = ['x', '--help']\nimport harness.programs.scorecard.validate as "
+        "program\ntry: program.main()\nexcept SystemExit as end: assert end.code == 0\nheavy = "
+        "{'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2', "
+        "'numpy'}\nassert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
