@@ -10,41 +10,51 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple, cast
+from typing import Annotated, Literal, NamedTuple, NoReturn, cast
 
 import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled, parts_with
+from detectors.pixels.masks import (
+    grown,
+    holes_filled,
+    inset,
+    nearest_pixel,
+    notches_filled,
+    parts_with,
+)
 from detectors.surfaces.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
-DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
-# the choice is also doubtful if this many other surfaces are at least half as large, as in a heap
-# of stones
-CROWD = 4
+# --- which surface people photograph ---
+
 CENTRE_SPREAD = 0.25
 """Standard deviation of the pixels' weights as a share of the picture's sides: people aim at the
 target."""
-LYING_WEIGHT = 0.10
-STANDING_WEIGHT = 0.02
-"""Weight in the view of an object that is as likely the target as the surface under it, or as one
-far behind it."""
-OBSTACLE_AREA = 0.2
-"""Area of an object that is as likely the target as the uncut surface behind it, as a share of
-that surface's area."""
 GRAZING = 0.5
 """Cosine of the tilt (60 degrees) from which a surface counts for less: nobody inspects at a
 grazing angle, and pixels that mix two surfaces look like a third surface at such an angle."""
+LYING_WEIGHT = 0.10
+"""Weight in the view of an object that is as likely the target as the surface under it."""
+STANDING_WEIGHT = 0.02  # the same of an object as likely as a surface far behind it
+OBSTACLE_AREA = 0.2
+"""Area of an object that is as likely the target as the uncut surface behind it, as a share of
+that surface's area."""
 STEEPNESS = 2.0  # odds grow with this power of weights and areas
-SURROUNDED = 0.7
-BORDERING = 0.1
-STEP_PART = 0.3
-"""Shares of the outline on the surface under an object, and on a neighbour; share of a border that
-is a step."""
+DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
+CROWD = 4
+"""The choice is also doubtful if this many other surfaces are at least half as large, as in a heap
+of stones."""
+
+# --- outlines ---
+
+SURROUNDED = 0.7  # share of the outline of an object that is on the surface under it
+BORDERING = 0.1  # share of the outline that is on a neighbour
+STEP_PART = 0.3  # share of a border that is a step
+ENCLOSED = 0.9  # share of a surface inside another's outline that is seen through it
 CUT_OFF = 0.15
 """Share of the outline on the picture's edge from which a surface continues outside it, as walls
 and floors do."""
@@ -52,19 +62,25 @@ NOTCHES_PX = (8, 16)
 """Radii of the discs that close notches of the outline: the edge's blur hides a strip of up to
 about 8 pixels between a hole and the edge, and the hole opens to the outside. Wider gaps belong to
 the part's shape."""
-ENCLOSED = 0.9
-MOST_SAMPLES = 20_000
+RIM_PX = 3
+"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge
+crosses a third."""
+MOST_SAMPLES = 20_000  # points from which a surface's plane and extent are computed
+
+
+# --- candidates ---
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A surface that may be the target. ``own`` (h, w) bool on the choice's ``grid``: its pixels.
-    ``filled``: the same with all that they enclose. ``outline``: the same without other candidates
-    in front of it."""
+    """A surface that may be the target."""
 
     own: np.ndarray
+    """(h, w) bool on the choice's ``grid``: its pixels."""
     filled: np.ndarray
+    """(h, w) bool: its pixels and all that they enclose."""
     outline: np.ndarray
+    """(h, w) bool: the filled ones without other candidates in front of it."""
     grid: Cloud
 
     @property
@@ -75,8 +91,8 @@ class Candidate:
     @cached_property
     def depths_m(self) -> tuple[float, float, float]:
         """First, 50th and 99th percentile of z."""
-        near, middle, far = np.quantile(self._some[:, 2], (0.01, 0.5, 0.99)).tolist()
-        return near, middle, far
+        first, middle, last = np.quantile(self._sample_m[:, 2], (0.01, 0.5, 0.99)).tolist()
+        return first, middle, last
 
     @property
     def tilt_deg(self) -> float:
@@ -87,11 +103,13 @@ class Candidate:
     def extent_m(self) -> tuple[float, float]:
         """Sides, longer first, of the smallest rectangle in the mean plane that holds 99 % of the
         surface."""
-        plan = self._plane[0] @ self._plane[1][:, 1:]
-        turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
-        along = plan @ np.array(
-            [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-        )
+        centred_m, axes = self._plane
+        plan = centred_m @ axes[:, 1:]
+        _, _, turn_deg = cv2.minAreaRect(plan.astype(np.float32))
+        turn = math.radians(float(turn_deg))
+        cosine = math.cos(turn)
+        sine = math.sin(turn)
+        along = plan @ np.array([[cosine, -sine], [sine, cosine]])
         low, high = np.quantile(along, (0.005, 0.995), axis=0)
         short, long = sorted(((high - low) / 0.99).tolist())
         return long, short
@@ -100,195 +118,223 @@ class Candidate:
     def weight(self) -> float:
         """Share of the pixels, weighted by a Gaussian about the picture's centre and reduced at a
         grazing angle."""
-        row, column = (
-            np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2)
-            for n in self.own.shape
-        )
-        weighted = float(row @ self.own @ column / (row.sum() * column.sum()))
+        height, width = self.own.shape
+        rows = _centre_weights(height)
+        columns = _centre_weights(width)
+        weighted = float(rows @ self.own @ columns / (rows.sum() * columns.sum()))
         return weighted * min(1.0, (self._facing / GRAZING) ** 2)
 
     @cached_property
     def cut_off(self) -> float:
         """Share of the outline on the picture's edge, or without a pixel grid on the border of the
         cloud."""
-        outline = self.filled & ~(
-            cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-        )
+        kernel = np.ones((3, 3), np.uint8)
+        inner = cv2.erode(self.filled.astype(np.uint8), kernel, borderValue=0) > 0
+        outline = self.filled & ~inner
         if self.grid.organised:
             edge = np.ones(self.filled.shape, dtype=bool)
             edge[1:-1, 1:-1] = False
         else:
             edge = grown(~holes_filled(grown(self.grid.valid, 2)), 3)
-        return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
+        length = int(np.count_nonzero(outline))
+        return int(np.count_nonzero(outline & edge)) / max(length, 1)
 
     def continues(self, other: Candidate, apart_m: float) -> bool:
         """Return whether this flat surface and the other lie in one plane: 90 % of the points
         within ``apart_m``."""
         normal = self._plane[1][:, 0]
-        middle = self._some.mean(axis=0)
-        off_m = [np.quantile(np.abs((each._some - middle) @ normal), 0.9) for each in (self, other)]
-        return bool(max(off_m) <= apart_m)
+        middle = self._sample_m.mean(axis=0)
+        return all(
+            np.quantile(np.abs((surface._sample_m - middle) @ normal), 0.9) <= apart_m
+            for surface in (self, other)
+        )
 
     @property
     def _facing(self) -> float:
+        """Cosine of the tilt."""
         return min(abs(float(self._plane[1][2, 0])), 1.0)
 
     @cached_property
-    def _some(self) -> np.ndarray:
+    def _sample_m(self) -> np.ndarray:
         """An even sample (n, 3) of its points."""
-        places = np.flatnonzero(self.own)
-        return np.asarray(
-            self.grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]]
-        )
+        pixels = np.flatnonzero(self.own)
+        step = max(1, len(pixels) // MOST_SAMPLES)
+        return self.grid.points_m.reshape(-1, 3)[pixels[::step]]
 
     @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
         """The sample minus its mean, and its principal axes (3, 3), the normal first."""
-        centred = self._some - self._some.mean(axis=0)
-        return centred, np.linalg.eigh(centred.T @ centred)[1]
+        centred_m = self._sample_m - self._sample_m.mean(axis=0)
+        _, axes = np.linalg.eigh(centred_m.T @ centred_m)
+        return centred_m, axes
+
+
+def _centre_weights(length: int) -> np.ndarray:
+    """Return the weights (n,) of the pixels along an axis of the picture, highest in its middle."""
+    position = (np.arange(length) + 0.5) / length - 0.5
+    return np.exp(-0.5 * position**2 / CENTRE_SPREAD**2)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """``candidates``: the proposal first. ``taken``: number, from 1, of the candidate that was
-    taken. ``mask`` (h, w) bool: valid pixels inside its outline. ``grid``: the cloud, or its
-    raster. ``warnings``: doubts about the choice."""
+    """The target among the candidates."""
 
     candidates: tuple[Candidate, ...]
+    """The proposal first."""
     taken: int
+    """Number, from 1, of the candidate that was taken."""
     mask: np.ndarray
+    """(h, w) bool: valid pixels inside its outline."""
     grid: Cloud
+    """The cloud, or its raster."""
     warnings: tuple[str, ...] = ()
-
-
-class _Border(NamedTuple):
-    """Border on another surface: its share of the outline, whether it is a step, and its height in
-    metres."""
-
-    part: float
-    is_step: bool
-    behind_m: float
+    """Doubts about the choice."""
 
 
 def described_text(candidate: Candidate) -> str:
     """Return distance, extent, share of the view and tilt as a text."""
-    long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
-    near, middle, far = candidate.depths_m
-    share = (
-        f"{100 * candidate.share:.2g}"
-        if candidate.share < 0.095
-        else f"{100 * candidate.share:.0f}"
+    length_m, width_m = candidate.extent_m
+    nearest_m, middle_m, farthest_m = candidate.depths_m
+    share = f"{100 * candidate.share:.0f}"
+    if candidate.share < 0.095:
+        share = f"{100 * candidate.share:.2g}"
+    return (
+        f"{middle_m:.2f} m away ({nearest_m:.2f} to {farthest_m:.2f} m),"
+        f" {length_m / MM:.0f} x {width_m / MM:.0f} mm, {share} % of the view,"
+        f" tilted by {candidate.tilt_deg:.0f} degrees"
     )
-    size = f"{long} x {short} mm, {share} % of the view, tilted by {candidate.tilt_deg:.0f} degrees"
-    return f"{middle:.2f} m away ({near:.2f} to {far:.2f} m), {size}"
 
 
-def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
-    """Return the candidates, best odds first, and warnings about taking the first."""
-    numbers = range(len(surfaces.own))
-    outlines = zip(surfaces.own, surfaces.filled, strict=True)
-    described = [Candidate(own, filled, filled, grid) for own, filled in outlines]
-    borders = [_borders(surfaces, grid, number) if len(numbers) > 1 else {} for number in numbers]
+# --- the comparison of candidates ---
 
-    def encloses(outer: int, inner: int) -> bool:
-        own = surfaces.own[inner]
-        return bool(
-            np.count_nonzero(own & surfaces.filled[outer]) >= ENCLOSED * np.count_nonzero(own)
-        )
 
-    def before(front: int, back: int) -> tuple[float, str] | None:
-        """Return the probability that ``front`` is the target, and the reason for a doubt."""
-        ours = borders[front].get(back)
-        if ours is None or not ours.is_step:
+class _Border(NamedTuple):
+    """A border of a surface's outline on another surface."""
+
+    part: float
+    """Its share of the outline."""
+    is_step: bool
+    """True if the other surface lies behind it."""
+    behind_m: float
+    """Height of the step."""
+
+
+class _Comparison:
+    """The surfaces of a cloud, compared by their outlines; they are numbered as in ``surfaces``."""
+
+    def __init__(self, surfaces: Surfaces, grid: Cloud) -> None:
+        self.surfaces = surfaces
+        self.grid = grid
+        self.numbers = range(len(surfaces.own))
+        self.described: list[Candidate] = []
+        self.borders: list[dict[int, _Border]] = []
+        for number in self.numbers:
+            filled = surfaces.filled[number]
+            self.described.append(Candidate(surfaces.own[number], filled, filled, grid))
+            self.borders.append(self._borders(number) if len(self.numbers) > 1 else {})
+
+    def _borders(self, number: int) -> dict[int, _Border]:
+        """Return the borders of this surface's outline on other surfaces, by their numbers."""
+        surfaces = self.surfaces
+        distance_px, nearest = nearest_pixel(surfaces.own[number])
+        around = (distance_px <= surfaces.reach_px + 3) & ~surfaces.filled[number]
+        ring = np.flatnonzero(around)
+        z_m = self.grid.points_m[..., 2].reshape(-1)
+        seeds = nearest.reshape(-1)
+        outline = len(np.unique(seeds[ring]))
+        borders = {}
+        for other in self.numbers:
+            pixels = ring[surfaces.own[other].reshape(-1)[ring]]
+            part = len(np.unique(seeds[pixels])) / max(outline, 1)
+            if other == number or part < BORDERING:
+                continue
+            steps_m = z_m[pixels] - z_m[seeds[pixels]]
+            behind_m = steps_m[steps_m > surfaces.contact_m]
+            ahead = len(behind_m) / len(steps_m)
+            back = float((steps_m < -surfaces.contact_m).mean())
+            is_step = ahead >= STEP_PART and ahead > 2.0 * back
+            height_m = float(np.median(behind_m)) if len(behind_m) else 0.0
+            borders[other] = _Border(part, is_step, height_m)
+        return borders
+
+    def encloses(self, outer: int, inner: int) -> bool:
+        """Return whether a surface is seen through the outline of another."""
+        inner_pixels = self.surfaces.own[inner]
+        enclosed = np.count_nonzero(inner_pixels & self.surfaces.filled[outer])
+        return bool(enclosed >= ENCLOSED * np.count_nonzero(inner_pixels))
+
+    def judged(self, number: int, other: int) -> tuple[float, str]:
+        """Return the probability that the surface rather than the other is the target, and the
+        reason for a doubt."""
+        if number == other:
+            return 1.0, ""
+        in_front = self._in_front(number, other)
+        if in_front is not None:
+            return in_front
+        behind = self._in_front(other, number)
+        if behind is not None:
+            probability, why = behind
+            return 1.0 - probability, why
+        # if the two only meet or are apart, weight, a frontal view and nearness decide
+        this = self.described[number]
+        that = self.described[other]
+        weight = this.weight / max(that.weight, 1e-9)
+        cosine = math.cos(math.radians(this.tilt_deg))
+        facing = cosine / max(math.cos(math.radians(that.tilt_deg)), 1e-2)
+        nearness = that.depths_m[1] / max(this.depths_m[1], 1e-6)
+        probability = _probability(weight**0.5 * facing**2 * nearness)
+        return probability, "two surfaces are about as large and as near"
+
+    def _in_front(self, front: int, back: int) -> tuple[float, str] | None:
+        """Return the probability that ``front`` rather than ``back`` is the target, and the reason
+        for a doubt; None if it is not in front."""
+        border = self.borders[front].get(back)
+        if border is None or not border.is_step:
             return None
-        this = described[front]
-        other = described[back]
+        this = self.described[front]
+        that = self.described[back]
         covered = f"{100 * this.share:.2g} % of the view"
-        if encloses(front, back):
-            opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
-            return _probability(
-                0.5 / max(opening, 1e-6)
-            ), "a surface is seen through a large opening of another"
-        if ours.part >= SURROUNDED and ours.behind_m <= this.extent_m[1]:
+        if self.encloses(front, back):
+            opening = that.own.sum() / max(this.filled.sum(), 1)
+            why = "a surface is seen through a large opening of another"
+            return _probability(0.5 / max(opening, 1e-6)), why
+        if border.part >= SURROUNDED and border.behind_m <= this.extent_m[1]:
             why = f"an object that covers {covered} lies on a larger surface or close to it"
             return _probability(this.weight / LYING_WEIGHT), why
-        if other.cut_off < CUT_OFF:
-            ratio = (
-                this.extent_m[0]
-                * this.extent_m[1]
-                / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+        if that.cut_off < CUT_OFF:
+            area_m2 = this.extent_m[0] * this.extent_m[1]
+            ratio = area_m2 / max(that.extent_m[0] * that.extent_m[1], 1e-12)
+            why = (
+                f"an object that covers {covered} stands in front of a surface whose outline is"
+                " whole"
             )
-            why = f"an object that covers {covered} stands in front of a surface whose outline is whole"
             return _probability(ratio / OBSTACLE_AREA), why
-        return _probability(
-            this.weight / STANDING_WEIGHT
-        ), f"the nearer surface covers only {covered}"
+        why = f"the nearer surface covers only {covered}"
+        return _probability(this.weight / STANDING_WEIGHT), why
 
-    def judged(i: int, j: int) -> tuple[float, str]:
-        """Return the probability that surface i rather than j is the target, and the reason for a
-        doubt."""
-        if i == j:
-            return 1.0, ""
-        ahead = before(i, j)
-        behind = before(j, i)
-        if ahead is not None:
-            return ahead
-        if behind is not None:
-            return 1.0 - behind[0], behind[1]
-        # if the two only meet or are apart, weight, a frontal view and nearness decide
-        this = described[i]
-        other = described[j]
-        ratio = this.weight / max(other.weight, 1e-9)
-        facing = math.cos(math.radians(this.tilt_deg)) / max(
-            math.cos(math.radians(other.tilt_deg)), 1e-2
-        )
-        near = other.depths_m[1] / max(this.depths_m[1], 1e-6)
-        return _probability(
-            ratio**0.5 * facing**2 * near
-        ), "two surfaces are about as large and as near"
+    def outline(self, number: int) -> np.ndarray:
+        """Return a surface's outline (h, w) with holes that the edge cuts, without what stands in
+        front of it.
 
-    table = [[judged(i, j) for j in numbers] for i in numbers]
-    odds = [sum(math.log(probability) for probability, _ in row) for row in table]
-    order = sorted(numbers, key=lambda number: (-odds[number], number))
-    candidates = []
-    for number in order:
-        # The outline includes holes that the edge cuts. A surface in front of it that is a better
-        # target, or too far away to lie on it, is left out with all nearer pixels that join it
-        # (fingers of a hand);
-        # an object on it stays.
-        outline = described[number].outline
+        That is a surface which is a better target, or too far away to lie on it, with all nearer
+        pixels that join it (fingers of a hand); an object on it stays."""
+        surfaces = self.surfaces
+        outline = self.described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
-        for other in numbers:
-            border = borders[other].get(number)
-            stands = border and (
-                table[other][number][0] >= 0.5 or border.behind_m > described[other].extent_m[0]
-            )
-            if border and stands and border.is_step and encloses(number, other):
-                nearer = grid.points_m[..., 2] < described[other].depths_m[2] + border.behind_m / 2
+        for other in self.numbers:
+            border = self.borders[other].get(number)
+            if border is None or not border.is_step or not self.encloses(number, other):
+                continue
+            this = self.described[other]
+            probability, _ = self.judged(other, number)
+            if probability >= 0.5 or border.behind_m > this.extent_m[0]:
+                nearest_m = this.depths_m[2] + border.behind_m / 2
+                nearer = self.grid.points_m[..., 2] < nearest_m
                 joined = surfaces.filled[other] | (nearer & ~surfaces.own[number])
-                outline = outline & ~grown(
-                    parts_with(joined, surfaces.own[other]), surfaces.reach_px
-                )
-        candidates.append(replace(described[number], outline=outline))
-    against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]
-    close = [(place, why) for place, probability, why in against if probability < DOUBTFUL_BELOW]
-    doubts = [f"{why} (--target {place} takes the other)" for place, why in close]
-    doubts = [f"it is doubtful which surface is the target: {'; '.join(doubts)}"] if doubts else []
-    if (alike := sum(2 * each.share >= candidates[0].share for each in candidates[1:])) >= CROWD:
-        doubts.append(
-            f"{alike} other surfaces are half as large as target 1 or larger: the scene may hold no target"
-        )
-    further = [
-        str(n)
-        for n, each in enumerate(candidates[1:], 2)
-        if candidates[0].continues(each, surfaces.contact_m)
-    ]
-    if further:
-        also = "targets {} lie" if len(further) > 1 else "target {} lies"
-        part = f"{also.format(' and '.join(further))} in the plane of target 1 and may belong to it"
-        doubts.append(f"{part}: only target 1 is judged (--target takes another)")
-    return tuple(candidates), doubts
+                standing = parts_with(joined, surfaces.own[other])
+                outline = outline & ~grown(standing, surfaces.reach_px)
+        return outline
 
 
 def _probability(odds_base: float) -> float:
@@ -296,30 +342,59 @@ def _probability(odds_base: float) -> float:
     return min(max(odds / (1.0 + odds), 1e-4), 1.0 - 1e-4)
 
 
-def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]:
-    """Return the borders of this surface's outline on other surfaces, by their numbers."""
-    apart, nearest = nearest_pixel(surfaces.own[number])
-    ring = np.flatnonzero((apart <= surfaces.reach_px + 3) & ~surfaces.filled[number])
-    z = grid.points_m[..., 2].reshape(-1)
-    seeds = nearest.reshape(-1)
-    outline = len(np.unique(seeds[ring]))
-    found = {}
-    for other in range(len(surfaces.own)):
-        there = ring[surfaces.own[other].reshape(-1)[ring]]
-        part = len(np.unique(seeds[there])) / max(outline, 1)
-        if other != number and part >= BORDERING:
-            steps = z[there] - z[seeds[there]]
-            behind = steps[steps > surfaces.contact_m]
-            ahead = len(behind) / len(steps)
-            back = float((steps < -surfaces.contact_m).mean())
-            away = float(np.median(behind)) if len(behind) else 0.0
-            found[other] = _Border(part, ahead >= STEP_PART and ahead > 2.0 * back, away)
-    return found
+def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
+    """Return the candidates, best odds first, and warnings about taking the first."""
+    comparison = _Comparison(surfaces, grid)
+    numbers = comparison.numbers
+    odds = []
+    for number in numbers:
+        probabilities = [comparison.judged(number, other)[0] for other in numbers]
+        odds.append(sum(math.log(probability) for probability in probabilities))
+    order = sorted(numbers, key=lambda number: (-odds[number], number))
+    candidates = tuple(
+        replace(comparison.described[number], outline=comparison.outline(number))
+        for number in order
+    )
+    if not candidates:
+        return (), []
+    doubts = []
+    close = []
+    for rank, other in enumerate(order[1:], start=2):
+        probability, why = comparison.judged(order[0], other)
+        if probability < DOUBTFUL_BELOW:
+            close.append(f"{why} (--target {rank} takes the other)")
+    if close:
+        doubts.append(f"it is doubtful which surface is the target: {'; '.join(close)}")
+    doubts += _doubts_about_others(candidates, surfaces.contact_m)
+    return candidates, doubts
 
 
-RIM_PX = 3
-"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge
-crosses a third."""
+def _doubts_about_others(candidates: tuple[Candidate, ...], contact_m: float) -> list[str]:
+    """Return warnings about many large surfaces, and about some in the plane of the first."""
+    first = candidates[0]
+    doubts = []
+    large = sum(2 * candidate.share >= first.share for candidate in candidates[1:])
+    if large >= CROWD:
+        doubts.append(
+            f"{large} other surfaces are half as large as target 1 or larger: the scene may hold no"
+            " target"
+        )
+    in_plane = [
+        str(rank)
+        for rank, candidate in enumerate(candidates[1:], start=2)
+        if first.continues(candidate, contact_m)
+    ]
+    if in_plane:
+        ranks = " and ".join(in_plane)
+        lie = f"targets {ranks} lie" if len(in_plane) > 1 else f"target {ranks} lies"
+        doubts.append(
+            f"{lie} in the plane of target 1 and may belong to it: only target 1 is judged"
+            " (--target takes another)"
+        )
+    return doubts
+
+
+# --- settings ---
 
 
 class _Crop(Config):
@@ -358,21 +433,22 @@ class BoxCrop(_Crop):
 
 
 class PolygonCrop(_Crop):
-    """Takes pixels whose centre lies inside a polygon of sensor positions [u, v] (even-odd rule)."""
+    """Takes pixels whose centre lies in a polygon of sensor positions [u, v] (even-odd rule)."""
 
     kind: Literal["polygon"] = "polygon"
     vertices_px: tuple[tuple[float, float], ...] = Field(min_length=3)
 
 
 class AutoCrop(_Crop):
-    """Takes the nearest large smooth surface, or number ``target`` of the candidates that a run
-    lists.
+    """Takes the nearest large smooth surface.
 
-    Neighbours are joined if tilt and noise explain their step in z and the surface bends by at
-    most ``crease_deg`` over ``smooth_px``; then holes are filled, and ``inset_px`` is removed at
-    the rim. A background so near that blur leaves no crease counts as target (13 mm behind the
-    face, at 0.7 m with a 5 x 5 window). A cloud without a grid is treated as a raster of its
-    nearest points."""
+    - ``crease_deg``, ``smooth_px``: neighbours are joined if tilt and noise explain their step in z
+      and the surface bends by at most ``crease_deg`` over ``smooth_px``; then holes are filled, and
+      ``inset_px`` is removed at the rim.
+    - ``target``: number of another of the candidates that a run lists.
+
+    A background so near that blur leaves no crease counts as target (13 mm behind the face, at 0.7
+    m with a 5 x 5 window). A cloud without a grid is treated as a raster of its nearest points."""
 
     kind: Literal["auto"] = "auto"
     inset_px: int = Field(default=RIM_PX, ge=0, le=200)
@@ -385,6 +461,9 @@ AnyCrop = NoCrop | BoxCrop | PolygonCrop | AutoCrop
 CropConfig = Annotated[AnyCrop, Field(discriminator="kind")]
 """A crop as the user writes it: ``kind: none | box | polygon | auto`` and the fields of that kind.
 """
+
+
+# --- the crop of a cloud ---
 
 
 def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
@@ -403,28 +482,45 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
         mask = valid
     if cloud.organised and not isinstance(config, AutoCrop):
         mask = inset(mask, config.inset_px)
-    if mask.any():
-        return mask
-    points = cloud.points_m[valid]
-    (x0, y0, z0), (x1, y1, z1) = points.min(axis=0) / MM, points.max(axis=0) / MM
+    if not mask.any():
+        _refuse_empty(cloud, config)
+    return mask
+
+
+def _refuse_empty(cloud: Cloud, config: AnyCrop) -> NoReturn:
+    """Raise UserError because the crop leaves no point."""
+    points_m = cloud.points_m[cloud.valid]
+    x0, y0, z0 = points_m.min(axis=0) / MM
+    x1, y1, z1 = points_m.max(axis=0) / MM
     extent = f"x {x0:.0f} to {x1:.0f}, y {y0:.0f} to {y1:.0f}, z {z0:.0f} to {z1:.0f} mm"
     if isinstance(config, BoxCrop):
-        limits = zip("xyz", (config.x_mm, config.y_mm, config.z_mm), strict=True)
-        asked = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in limits)
-        asked += (
-            ""
-            if config.range_max_m is None
-            else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
+        unit = ""
+        if z1 > 50_000 or z1 < 5:
+            unit = "; the cloud's unit is probably not the metre"
+        raise UserError(
+            f"the crop box ({_box_text(config)} mm) holds none of the cloud's {len(points_m)}"
+            f" points{unit}",
+            legal=f"limits that contain points of the cloud: {extent}",
+            fix="change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto",
         )
-        unit = "; the cloud's unit is probably not the metre" if z1 > 50_000 or z1 < 5 else ""
-        what = f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}"
-        fix = "change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto"
-        raise UserError(what, legal=f"limits that contain points of the cloud: {extent}", fix=fix)
-    seen = cloud.region
-    where = f"columns {seen.col0} to {seen.col1 - 1}, rows {seen.row0} to {seen.row1 - 1}"
-    what = f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points"
-    legal = f"a crop that contains points of the cloud: {where}; {extent}"
-    raise UserError(what, legal=legal, fix="change the crop or lower crop.inset_px")
+    region = cloud.region
+    raise UserError(
+        f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's"
+        f" {len(points_m)} points",
+        legal=f"a crop that contains points of the cloud: columns {region.col0} to"
+        f" {region.col1 - 1}, rows {region.row0} to {region.row1 - 1}; {extent}",
+        fix="change the crop or lower crop.inset_px",
+    )
+
+
+def _box_text(config: BoxCrop) -> str:
+    limits = []
+    for name, (low, high) in (("x", config.x_mm), ("y", config.y_mm), ("z", config.z_mm)):
+        limits.append(f"{name} {low:g} to {high:g}")
+    text = ", ".join(limits)
+    if config.range_max_m is not None:
+        text += f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
+    return text
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
@@ -436,66 +532,80 @@ def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
 
 
 def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    grid = cloud
-    smooth_px = config.smooth_px
-    inset_px = config.inset_px
-    wanted = config.target
-    if not cloud.organised:
+    if cloud.organised:
+        surfaces = smooth_surfaces(cloud, config.crease_deg, config.smooth_px)
+        candidates, doubts = _candidates(surfaces, cloud)
+        taken = _taken(candidates, config.target)
+        grid = cloud
+        mask = inset(_inside(candidates, taken, cloud), config.inset_px)
+    else:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
-        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
+        smooth_px = max(3, 2 * round(config.smooth_px / spacings / 2) - 1)
+        candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
+        taken = _taken(candidates, config.target)
         # the cell of the rim, and all cells that may hold a point inset_px - 1 spacings farther
         # inside
-        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
-    candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
-    if wanted is not None and wanted > len(candidates):
-        known = "".join(
-            f"\n  --target {n}: {described_text(each)}"
-            for n, each in enumerate(candidates, start=1)
-        )
-        legal = f"1 to {len(candidates)}:{known}" if candidates else "none"
-        fix = "choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v"
-        raise UserError(
-            f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
-            legal=legal,
-            fix=fix,
-        )
-    taken = wanted or 1
-    mask = (
-        candidates[taken - 1].outline & grid.valid
-        if candidates
-        else np.zeros(grid.valid.shape, bool)
-    )
-    mask = inset(mask, inset_px)
-    if not cloud.organised:
-        kept = mask
+        inset_px = math.ceil((config.inset_px - 1) / spacings) + 1 if config.inset_px else 0
+        cells = inset(_inside(candidates, taken, grid), inset_px)
         mask = cloud.valid.copy()
-        mask[mask] = kept[rows, columns]
+        mask[mask] = cells[rows, columns]
     mask.flags.writeable = False
-    return Choice(candidates, taken, mask, grid, () if wanted else tuple(doubts))
+    return Choice(
+        candidates=candidates,
+        taken=taken,
+        mask=mask,
+        grid=grid,
+        warnings=() if config.target else tuple(doubts),
+    )
+
+
+def _taken(candidates: tuple[Candidate, ...], target: int | None) -> int:
+    """Return the number of the candidate to take: the target's, or the first. Raises UserError if
+    there is no such target."""
+    if target is None or target <= len(candidates):
+        return target or 1
+    legal = "none"
+    if candidates:
+        listed = [
+            f"\n  --target {number}: {described_text(candidate)}"
+            for number, candidate in enumerate(candidates, start=1)
+        ]
+        legal = f"1 to {len(candidates)}:{''.join(listed)}"
+    raise UserError(
+        f"--target {target}: there are {len(candidates)} large smooth surfaces",
+        legal=legal,
+        fix="choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v",
+    )
+
+
+def _inside(
+    candidates: tuple[Candidate, ...],
+    taken: int,
+    grid: Cloud,
+) -> np.ndarray:
+    """Return (h, w) bool: the valid pixels inside the outline of the candidate that is taken."""
+    if not candidates:
+        return np.zeros(grid.valid.shape, bool)
+    return candidates[taken - 1].outline & grid.valid
 
 
 def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
     x, y, z = np.moveaxis(cloud.points_m, -1, 0)
-    limits = [
-        (v, low * MM, high * MM)
-        for v, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm))
-    ]
+    inside = cloud.valid
     with np.errstate(invalid="ignore"):
-        inside = np.logical_and.reduce(
-            [cloud.valid, *((v > low) & (v < high) for v, low, high in limits)]
-        )
+        for values, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm)):
+            inside = inside & (values > low * MM) & (values < high * MM)
         if config.range_max_m is not None:
-            inside &= np.hypot(x, z) < config.range_max_m
-    return np.asarray(inside)
+            inside = inside & (np.hypot(x, z) < config.range_max_m)
+    return inside
 
 
 def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:
     if not cloud.organised:
-        what = "a polygon in pixels cannot crop a cloud without a pixel grid"
-        raise UserError(what, legal="crop.kind none, box or auto")
-    v, u = np.mgrid[
-        cloud.region.row0 : cloud.region.row1, cloud.region.col0 : cloud.region.col1
-    ].astype(float)
+        problem = "a polygon in pixels cannot crop a cloud without a pixel grid"
+        raise UserError(problem, legal="crop.kind none, box or auto")
+    region = cloud.region
+    v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1].astype(float)
     inside = np.zeros(u.shape, dtype=bool)
     corners = np.array(config.vertices_px)
     for (u0, v0), (u1, v1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

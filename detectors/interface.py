@@ -14,114 +14,138 @@ from harness.vocabulary.geometry import Cloud
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A detector's result for each pixel of a cloud, before any threshold is applied.
-
-    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector
-    does not judge. ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-)
-    the fitted surface, ``surface_z_m`` (h, w). ``scale_m``: standard deviation that corresponds to
-    one unit of score. ``warnings``: full sentences on reasons why these numbers are unreliable;
-    every program shows them first. ``behind`` (h, w) bool: whether the score indicates something
-    behind the surface; None: the residual's sign does. ``unit``: the unit of score in words, if
-    scores are not residuals over a deviation; ``scale_m`` is then its least value at a typical
-    point."""
+    """A detector's result for each pixel of a cloud, before any threshold is applied."""
 
     score: np.ndarray
+    """(h, w): the threshold below which the pixel counts as damage; NaN where the detector does
+    not judge."""
     residual_m: np.ndarray
+    """(h, w): distance along the viewing axis behind (+) or before (-) the fitted surface."""
     surface_z_m: np.ndarray
+    """(h, w): z of the fitted surface."""
     scale_m: float
+    """Standard deviation that corresponds to one unit of score."""
     notes: dict[str, Any] = field(default_factory=dict)
+    """Plain data on how the cloud was judged."""
     warnings: tuple[str, ...] = ()
+    """Full sentences on reasons why these numbers are unreliable; every program shows them
+    first."""
     behind: np.ndarray | None = None
+    """(h, w) bool: whether the score indicates something behind the surface; None: the residual's
+    sign does."""
     unit: str = ""
+    """The unit of score in words, if scores are not residuals over a deviation; ``scale_m`` is
+    then its least value at a typical point."""
 
 
 @dataclass(frozen=True)
 class Detection:
-    """A finding. ``score``: the lowest threshold at which it is no longer found. ``pixels`` (n,):
-    flat indices into the cloud's (h, w) grid, ascending. ``centre_m`` (3,): its place in the
-    cloud's frame, by which it is matched with damage. ``kind``: "depth" for points that depart
-    from the surface; "no return" for connected pixels without return (then invalid) inside the
-    target's outline; "object" for an object on the target."""
+    """A finding."""
 
     score: float
+    """The lowest threshold at which it is no longer found."""
     pixels: np.ndarray
+    """(n,): flat indices into the cloud's (h, w) grid, ascending."""
     centre_m: np.ndarray
+    """(3,): its position in the cloud's frame, by which it is matched with damage."""
     kind: Literal["depth", "no return", "object"] = "depth"
+    """Kinds: "depth" for points that depart from the surface; "no return" for connected pixels
+    without return (then invalid) inside the target's outline; "object" for an object on the
+    target."""
 
 
 @dataclass(frozen=True)
 class MissingReturns:
-    """Pixels without a return inside the target's ``outline`` (h, w) bool.
-
-    ``unseen`` (h, w): share of the frames (of a map: 0 or 1) in which a pixel returned nothing.
-    ``blind``: share of the outline's pixels without any return. ``dropouts``: rate of scattered
-    missing pixels. ``least_points``: smallest cluster that is a finding; ``expected``: number of
-    such clusters by chance. ``detections``: kind "no return", largest first. Their score is the
-    Gaussian deviation with the same probability as the expected number of chance clusters of that
-    size, at most 37."""
+    """Pixels without a return inside the target's outline."""
 
     outline: np.ndarray
+    """(h, w) bool."""
     unseen: np.ndarray
+    """(h, w): share of the frames (of a map: 0 or 1) in which a pixel returned nothing."""
     blind: float
+    """Share of the outline's pixels without any return."""
     dropouts: float
+    """Rate of scattered missing pixels."""
     least_points: int
+    """Smallest cluster that is a finding."""
     expected: float
+    """Number of such clusters by chance."""
     detections: tuple[Detection, ...]
+    """Kind "no return", largest first. Their score is the Gaussian deviation with the same
+    probability as the expected number of chance clusters of that size, at most 37."""
 
     @property
     def blind_text(self) -> str:
         """Return a sentence on the blind share of the target, and the part of it that chance
         explains."""
-        places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
-        chance = f"{self.expected:.1g} expected by chance; scattered dropouts {100 * self.dropouts:.2g} %"
-        places += f" of {self.least_points} connected pixels and more ({chance})"
-        return f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places}"
+        plural = "" if len(self.detections) == 1 else "s"
+        return (
+            f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing;"
+            f" {len(self.detections)} place{plural} of {self.least_points} connected pixels and"
+            f" more ({self.expected:.1g} expected by chance; scattered dropouts"
+            f" {100 * self.dropouts:.2g} %)"
+        )
 
     @property
     def facts(self) -> dict[str, float]:
         """Return these figures as plain data."""
-        facts = {"blind_share": self.blind, "scattered_dropouts": self.dropouts}
-        return {**facts, "least_points": self.least_points, "expected_by_chance": self.expected}
+        return {
+            "blind_share": self.blind,
+            "scattered_dropouts": self.dropouts,
+            "least_points": self.least_points,
+            "expected_by_chance": self.expected,
+        }
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Size and place of one detection, camera frame, metres; NaN where an estimate is impossible
-    (``model_note``).
-
-    ``length_m``, ``width_m``, ``along`` (3,): sides of the rectangle with the second moments of
-    the residual, less the camera's blur, and the direction of the longer one. For a slot these are
-    its sides; for a round hole of diameter d, 0.87 d each. ``extent_*``: the thesis' measure, from
-    the extreme points. ``model_*``: from the model of a blurred hole, with standard errors.
-    ``depth_m``: along the viewing axis from the fitted surface, positive behind it."""
+    """Size and position of one detection, camera frame, metres; NaN where an estimate is
+    impossible. ``extent_*`` is the thesis' measure, from the extreme points; ``model_*`` comes
+    from the model of a blurred hole, with standard errors."""
 
     u_px: float
+    """Column of its centre on the sensor."""
     v_px: float
+    """Row of its centre on the sensor."""
     points: int
+    """Number of its points."""
     score: float
+    """The detection's."""
     extent_diameter_m: float
+    """Mean of the distances between the extreme points in x and in y."""
     extent_centre_m: np.ndarray
+    """(3,): mean of these points."""
     model_diameter_m: float = np.nan
     model_diameter_se_m: float = np.nan
     model_depth_m: float = np.nan
+    """Along the viewing axis from the fitted surface, positive behind it."""
     model_depth_se_m: float = np.nan
     model_centre_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    """(3,): centre of the mouth, on the surface."""
     model_centre_se_m: float = np.nan
+    """Along one axis of the surface."""
     volume_m3: float = np.nan
+    """Volume between the surface and the points, positive behind it."""
     length_m: float = np.nan
+    """Longer side of the rectangle with the second moments of the residual, less the camera's
+    blur: a slot's length; for a round hole of diameter d, 0.87 d."""
     width_m: float = np.nan
+    """Shorter side of that rectangle."""
     along: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    """(3,): direction of the longer side."""
     model_note: str = ""
+    """Reason why an estimate is missing."""
 
 
 @dataclass(frozen=True)
 class TrueDamage:
-    """A true damage, given to detectors that test the harness: centre (3,) on the face in the
-    cloud's frame, diameter, and the flat indices of the pixels that see into it."""
+    """A true damage, given to detectors that test the harness."""
 
     centre_m: np.ndarray
+    """(3,): centre on the face in the cloud's frame."""
     diameter_m: float
     pixels: np.ndarray
+    """(n,): flat indices of the pixels that see into it."""
 
 
 @runtime_checkable
@@ -169,7 +193,12 @@ class Detector(Protocol):
         points)."""
         ...
 
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+    def find(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        threshold: float,
+    ) -> tuple[Detection, ...]:
         """Return the findings at a threshold, strongest first."""
         ...
 
@@ -177,6 +206,11 @@ class Detector(Protocol):
         """Return the lowest threshold at which `find` returns nothing."""
         ...
 
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+    def measure(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        detection: Detection,
+    ) -> Measurement:
         """Measure size and place of one detection."""
         ...

@@ -11,18 +11,24 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 from pydantic import Field
 
-from detectors.findings.clusters import nested_clusters
 from detectors.findings.measure import HoleModelConfig, centres_of, measure_detection
 from detectors.interface import Detection, Detector, Evidence, Measurement
-from detectors.masks import on_grid as on_grid
+from detectors.pixels.clusters import nested_clusters
+from detectors.pixels.masks import on_grid as on_grid
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud
 
+FIRST_TRIED = 64
+"""Highest scores in which a cluster is sought first, as a multiple of its fewest points."""
+
 
 class ScoreMapConfig(Config):
-    """Settings that turn a score map into detections. Pixels above the threshold form one
-    detection if a chain of steps of at most ``cluster_distance_mm`` joins them; groups of fewer
-    than ``min_points`` are dropped."""
+    """Settings that turn a score map into detections.
+
+    - ``min_points``: groups of fewer pixels are dropped.
+    - ``cluster_distance_mm``: pixels above the threshold form one detection if a chain of steps of
+      at most this length joins them.
+    - ``hole_model``: measures sizes."""
 
     min_points: int = Field(default=1, ge=1)
     cluster_distance_mm: float = Field(default=10.0, gt=0)
@@ -50,40 +56,45 @@ class ScoreMapDetector(ABC, Generic[S]):
         """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few
         points)."""
 
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+    def find(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        threshold: float,
+    ) -> tuple[Detection, ...]:
         """Return clusters of pixels whose score is above the threshold, strongest first."""
         return self.findings(cloud, evidence, [threshold])[0].detections
 
     def findings(
-        self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        thresholds: Sequence[float],
     ) -> list[Findings]:
         """Return the result of `find` at each of several rising thresholds."""
-        pixels = above(evidence, thresholds[0])
-        pixels = pixels[cloud.valid.reshape(-1)[pixels]]
-        points = cloud.points_m.reshape(-1, 3)[pixels]
+        pixels = _scored_pixels(cloud, evidence, thresholds[0])
+        points_m = cloud.points_m.reshape(-1, 3)[pixels]
         scores = evidence.score.reshape(-1)[pixels]
-        found = []
-        for labels, strengths in zip(
-            *self._clusters(self.places(points), scores, thresholds), strict=True
-        ):
+        all_labels, all_strengths = self._clusters(self.places(points_m), scores, thresholds)
+        findings = []
+        for labels, strengths in zip(all_labels, all_strengths, strict=True):
             count = int(labels.max(initial=-1)) + 1
-            found.append(
-                Findings(strengths[:count], pixels, labels, centres_of(points, labels, count))
-            )
-        return found
+            centres_m = centres_of(points_m, labels, count)
+            findings.append(Findings(strengths[:count], pixels, labels, centres_m))
+        return findings
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return the exact lowest threshold at which `find` returns nothing; 0 if it never returns
         anything."""
-        pixels = above(evidence, 0.0)
-        pixels = pixels[cloud.valid.reshape(-1)[pixels]]
+        pixels = _scored_pixels(cloud, evidence, 0.0)
         scores = evidence.score.reshape(-1)[pixels]
         least = self.settings.min_points
         if least == 1:
             return float(scores.max(initial=0.0))
         # try the highest scores first: they usually contain a cluster
-        for count in (64 * least, len(pixels)):
-            highest = np.argsort(-scores, kind="stable")[:count]
+        falling = np.argsort(-scores, kind="stable")
+        for count in (FIRST_TRIED * least, len(pixels)):
+            highest = falling[:count]
             places = self.places(cloud.points_m.reshape(-1, 3)[pixels[highest]])
             _, strengths = self._clusters(places, scores[highest], [0.0])
             if strengths.max(initial=0.0) > 0.0:
@@ -96,40 +107,54 @@ class ScoreMapDetector(ABC, Generic[S]):
         return points_m
 
     def _clusters(
-        self, places_m: np.ndarray, scores: np.ndarray, thresholds: Sequence[float]
+        self,
+        places_m: np.ndarray,
+        scores: np.ndarray,
+        thresholds: Sequence[float],
     ) -> tuple[np.ndarray, np.ndarray]:
         distance_m = self.settings.cluster_distance_mm * MM
         return nested_clusters(
-            places_m, scores, distance_m, self.settings.min_points, np.array(thresholds)
+            places_m,
+            scores,
+            distance_m,
+            self.settings.min_points,
+            np.array(thresholds),
         )
 
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+    def measure(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        detection: Detection,
+    ) -> Measurement:
         """Measure the thesis' extents and fit the model of a blurred hole."""
         return measure_detection(cloud, evidence, detection, self.settings.hole_model)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Detections at one threshold: ``scores`` (k,). ``pixels`` (n,): flat, ascending. ``labels``
-    (n,): the number of the detection that has each pixel, -1 for none. ``centres_m`` (k, 3)."""
+    """Detections at one threshold, as arrays."""
 
     scores: np.ndarray
+    """(k,): of each detection."""
     pixels: np.ndarray
+    """(n,): flat indices into the cloud's grid, ascending."""
     labels: np.ndarray
+    """(n,): the number of the detection that has each pixel, -1 for none."""
     centres_m: np.ndarray
+    """(k, 3): of each detection, in the cloud's frame."""
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Findings:
         """Convert detections to arrays."""
-        numbers = np.repeat(
-            np.arange(len(detections)), [len(detection.pixels) for detection in detections]
-        )
-        pixels = np.concatenate(
-            [np.zeros(0, np.int64), *(detection.pixels for detection in detections)]
-        )
-        centres = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
+        sizes = [len(detection.pixels) for detection in detections]
+        no_pixels = np.zeros(0, np.int64)
+        centres_m = np.array([detection.centre_m for detection in detections])
         return cls(
-            np.array([detection.score for detection in detections]), pixels, numbers, centres
+            scores=np.array([detection.score for detection in detections]),
+            pixels=np.concatenate([no_pixels, *(detection.pixels for detection in detections)]),
+            labels=np.repeat(np.arange(len(detections)), sizes),
+            centres_m=centres_m.reshape(-1, 3),
         )
 
     @property
@@ -138,20 +163,32 @@ class Findings:
         by_label = np.argsort(self.labels, kind="stable")
         counts = np.bincount(self.labels + 1, minlength=len(self.scores) + 1)
         _, *groups = np.split(self.pixels[by_label], np.cumsum(counts)[:-1])
-        of_each = zip(self.scores.tolist(), groups, self.centres_m, strict=True)
-        found = (Detection(score, pixels, centre) for score, pixels, centre in of_each)
-        return tuple(
-            sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0])))
-        )
+        detections = [
+            Detection(score, pixels, centre_m)
+            for score, pixels, centre_m in zip(
+                self.scores.tolist(),
+                groups,
+                self.centres_m,
+                strict=True,
+            )
+        ]
+        detections.sort(key=lambda detection: (-detection.score, int(detection.pixels[0])))
+        return tuple(detections)
 
 
 def findings_at(
-    detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    thresholds: Sequence[float],
 ) -> list[Findings]:
-    """Return a detector's detections at each of several rising thresholds."""
-    own = next(vars(each) for each in type(detector).__mro__ if "find" in vars(each))
-    if "findings" in own:
-        return list(own["findings"](detector, cloud, evidence, thresholds))
+    """Return a detector's detections at each of several rising thresholds.
+
+    A detector's own method ``findings`` does it at once, unless a subclass has overridden ``find``
+    without it."""
+    owner = next(vars(kind) for kind in type(detector).__mro__ if "find" in vars(kind))
+    if "findings" in owner:
+        return list(owner["findings"](detector, cloud, evidence, thresholds))
     return [Findings.of(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
 
 
@@ -159,3 +196,14 @@ def above(evidence: Evidence, threshold: float) -> np.ndarray:
     """Return the flat indices, ascending, of the pixels whose score exceeds the threshold."""
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(evidence.score.reshape(-1) > threshold)
+
+
+def _scored_pixels(
+    cloud: Cloud,
+    evidence: Evidence,
+    threshold: float,
+) -> np.ndarray:
+    """Return the flat indices, ascending, of the valid pixels whose score exceeds the
+    threshold."""
+    pixels = above(evidence, threshold)
+    return pixels[cloud.valid.reshape(-1)[pixels]]

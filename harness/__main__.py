@@ -165,7 +165,9 @@ def main(arguments: list[str] | None = None) -> int:
     if name in MODULES:
         sys.argv[1:] = program_arguments
         return int(
-            importlib.import_module(MODULES[name]).main(program_arguments if arguments is not None else None)
+            importlib.import_module(MODULES[name]).main(
+                program_arguments if arguments is not None else None
+            )
         )
     return exit_code_of(lambda: _run(name, program_arguments))
 
@@ -196,7 +198,7 @@ def _run(name: str, program_arguments: list[str]) -> int:
             end="",
         )
         return 0
-    from harness.vocabulary.declaration.diagnose import nearest
+    from harness.vocabulary.words import nearest
 
     names = [program.name for program in PROGRAMS]
     nearest_name = nearest(name, names)

@@ -39,7 +39,7 @@ from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import DEFAULT_DETECTOR
-from harness.inspection.run import analysed, judged, threshold_of
+from harness.inspection.judging import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_page import draw_overlay
 from harness.runs.options import EngineOptions
@@ -49,7 +49,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, FrameSource
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 
@@ -197,7 +198,10 @@ def sweep(
     loaded = load_experiment(Path(experiment), changes)
     out = Path(out)
     code = run_study(
-        loaded, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
+        loaded,
+        out,
+        EngineOptions(jobs=jobs, serial=jobs == 1),
+        f"tofpod.sweep({str(experiment)!r})",
     )
     if code == 130:
         raise KeyboardInterrupt

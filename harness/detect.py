@@ -1,5 +1,5 @@
-"""``tofpod detect``: finds the damage in a real capture, prints a table and, with
---out, writes files."""
+"""``tofpod detect``: finds the damage in a real capture, prints a table and, with --out, writes
+files."""
 
 import argparse
 from pathlib import Path
@@ -8,7 +8,8 @@ from harness.inspection import arguments as cli
 from harness.vocabulary.program import program, whole_number
 
 
-def _options(parser: argparse.ArgumentParser) -> None:
+def detect_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `tofpod detect`, which other programs that inspect a capture have too."""
     add = parser.add_argument
     formats = (
         "folder or list of depth .png, .ply, .pcd, .xyz; folder of .npy, .tiff; one .npy .npz .mat .tiff .pfm .mkv .r3d"
@@ -55,8 +56,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     flat = "subtract this unit's fixed pattern, measured by tofpod flatfield, from each capture"
     add("--flat-field", type=Path, metavar="FILE.npz", help=flat)
-    gauge = "find the boards of this gauge.json (tofpod gauge) by their marks; write hits and misses to gauge.csv"
-    add("--gauge", type=Path, metavar="FILE.json", help=gauge)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add = parser.add_argument_group(
@@ -85,7 +84,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 @program(
-    _options,
+    detect_options,
     "Find damage in a real capture: average its frames, fit the surface, and list what deviates from it."
     " With --register, each PATH is one view of the same target, and all views are merged into one cloud.",
     epilog="examples: tofpod detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
@@ -93,9 +92,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
-    from harness.inspection.run import inspect
+    from harness.inspection.run import inspected, print_inspection, write_inspection
 
-    return inspect(arguments)
+    run = inspected(arguments)
+    print_inspection(run)
+    if arguments.out is not None:
+        write_inspection(run, command)
+    return 0
 
 
 if __name__ == "__main__":

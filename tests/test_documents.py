@@ -70,7 +70,8 @@ def commands_in(path: Path) -> Iterator[list[str]]:
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
 def test_every_command_is_understood(path: Path):
     for name, *given in commands_in(path):
-        assert importlib.import_module(MODULES[name]).main.parser().parse_args(given), given
+        program, words = importlib.import_module(MODULES[name]).main.chosen_by(given)
+        assert program.parser().parse_args(words), given
 
 
 def block_of(document: str, first_line: str) -> str:

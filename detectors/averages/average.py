@@ -3,14 +3,14 @@ The first `REFERENCE_FRAMES` are the reference: mostly bad first frames, or a mo
 not corrected."""
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, combinations, islice
-from typing import Literal
+from itertools import combinations, islice
+from typing import Literal, NoReturn
 
 import numba
 import numpy as np
 from pydantic import Field
 
-from detectors.findings.clusters import PLAIN
+from detectors.pixels.clusters import PLAIN
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, LeftOut, Reason
@@ -21,24 +21,28 @@ frames."""
 SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to
 0.02 sigma."""
-CORRELATED_PIXELS = (
-    25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
-)
-
+CORRELATED_PIXELS = 25
+"""Pixels that share one noise value in the worst case: a depth engine with a 5x5 filter."""
+MEDIAN_ERROR = 1.2533  # standard error of a median over that of a mean
+FEW_SAMPLES = 6
+"""Samples up to which exchanges of neighbours sort in less time than NumPy."""
 NOT_FINITE = int(Reason.NOT_FINITE)
 
 
 class AverageConfig(Config):
     """Settings for averaging frames into one cloud, and for leaving frames out.
 
-    ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds z of all frames in memory);
-    ``clipped``: mean of the samples within ``clip_sigmas`` of the pixel's median over the first
-    five frames. ``frames``: largest number of frames to use. A frame *jumps* if the median over
-    pixels of its difference from the reference exceeds the larger of ``jump_sigmas`` standard
-    errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed* if
-    more than ``disturbed_fraction`` of its pixels (beyond 1.5 times the share in the reference
-    frames) lost their range, or changed by more than the larger of ``changed_sigmas`` of one
-    frame's noise and ``changed_mm``."""
+    - ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds z of all frames in memory);
+      ``clipped``: mean of the samples within ``clip_sigmas`` of the pixel's median over the first
+      five frames.
+    - ``frames``: largest number of frames to use.
+    - ``jump_mm``, ``jump_sigmas``: a frame *jumps* if the median over pixels of its difference from
+      the reference exceeds the larger of ``jump_sigmas`` standard errors and ``jump_mm`` (ten times
+      the wander of a static Azure Kinect).
+    - ``changed_mm``, ``changed_sigmas``: a pixel has changed if it differs by more than the larger
+      of ``changed_sigmas`` of one frame's noise and ``changed_mm``.
+    - ``disturbed_fraction``: a frame is *disturbed* if more than this share of its pixels (beyond
+      1.5 times the share in the reference frames) lost their range or changed."""
 
     method: Literal["mean", "median", "clipped"] = "mean"
     frames: int | None = Field(default=None, ge=1)
@@ -50,206 +54,218 @@ class AverageConfig(Config):
     disturbed_fraction: float = Field(default=0.05, gt=0, le=1)
     clip_sigmas: float = Field(default=5.0, ge=2)
     median_memory_mb: float = Field(
-        default=2000.0, gt=0, description="most memory that the median may use"
+        default=2000.0,
+        gt=0,
+        description="most memory that the median may use",
     )
 
 
-MOST_LEFT_OUT = 0.25  # largest share of frames left out that an accident explains
 RECORDED = AverageConfig(disturbed_fraction=0.01)
 """Settings for recordings, in which a camera may be knocked: a shift by 2 % of the picture's width
 changes some 2 % of the pixels; frames of static real cameras differ from the first by 0.3 % beyond
 what the reference frames show."""
+MOST_LEFT_OUT = 0.25  # largest share of frames left out that an accident explains
 
 
 def unsteadiness(cloud: Cloud) -> str:
     """Return a warning if too many frames are left out for a steady recording, else ""."""
     out = len(cloud.left_out)
-    frames = cloud.n_frames + len(cloud.left_out)
-    what = f"{out} of {frames} frames differ from the others and are left out: the camera or the scene moved"
-    return what if out > MOST_LEFT_OUT * frames else ""
+    frames = cloud.n_frames + out
+    if out <= MOST_LEFT_OUT * frames:
+        return ""
+    return (
+        f"{out} of {frames} frames differ from the others and are left out: the camera or the scene"
+        " moved"
+    )
+
+
+# --- averages of a source's frames ---
 
 
 def average(source: FrameSource, config: AverageConfig) -> Cloud:
     """Average a source's frames. Raises UserError if it has too few frames, frames of different
     sizes, no valid pixel, or more frames than the median's memory allows."""
-    (cloud,) = _averages(
-        source, None if config.frames is None else [config.frames], config
-    ).values()
+    counts = None if config.frames is None else [config.frames]
+    (cloud,) = _averages(source, counts, config).values()
     return cloud
 
 
 def prefix_averages(
-    source: FrameSource, counts: Sequence[int], config: AverageConfig
+    source: FrameSource,
+    counts: Sequence[int],
+    config: AverageConfig,
 ) -> dict[int, Cloud]:
     """Average the first ``n`` frames for each of ``counts`` in one pass, exactly like `average`.
     Raises UserError."""
-    wanted = sorted(set(counts))
-    if not wanted or wanted[0] < 1:
+    rising = sorted(set(counts))
+    if not rising or rising[0] < 1:
         raise UserError(
             f"numbers of frames to average: {list(counts)}",
             legal="one or more whole numbers from 1",
         )
-    return _averages(source, wanted, config)
+    return _averages(source, rising, config)
 
 
 def _averages(
-    source: FrameSource, wanted: list[int] | None, config: AverageConfig
+    source: FrameSource,
+    counts: list[int] | None,
+    config: AverageConfig,
 ) -> dict[int, Cloud]:
     """Return the averages at these numbers of frames, ascending; if None, the average of all
     frames."""
-    frames = _of_one_size(source, islice(source.frames(), wanted[-1] if wanted else None))
-    held = list(islice(frames, REFERENCE_FRAMES))
-    offered = len(held)
+    last_count = counts[-1] if counts else None
+    frames = _of_one_size(source, islice(source.frames(), last_count))
+    reference = list(islice(frames, REFERENCE_FRAMES))
+    offered = len(reference)
     clouds = {}
-    for n in (n for n in wanted or () if n < offered):
-        clouds[n] = FrameSums(source, held[:n], config).cloud()
-    if held:
-        sums = FrameSums(source, held, config)
-        for offered, frame in enumerate(chain([None], frames), start=len(held)):
-            if frame is not None:
-                sums.take(frame)
-            if wanted and offered in wanted:
+    if counts:
+        # shorter averages have a shorter reference
+        for count in [count for count in counts if count < offered]:
+            clouds[count] = FrameSums(source, reference[:count], config).cloud()
+    if reference:
+        sums = FrameSums(source, reference, config)
+        if counts and offered in counts:
+            clouds[offered] = sums.cloud()
+        for frame in frames:
+            sums.take(frame)
+            offered += 1
+            if counts and offered in counts:
                 clouds[offered] = sums.cloud()
-        clouds |= {} if wanted else {offered: sums.cloud()}
-    elif wanted is None:
+        if counts is None:
+            clouds[offered] = sums.cloud()
+    elif counts is None:
         raise UserError(f"{source.name}: no frames to average", fix="check the path")
-    if wanted and offered < wanted[-1]:
-        legal = f"1 to {offered} frames" if offered else None
-        fix = (
-            "ask for fewer frames, or leave the number out to use all"
-            if offered
-            else "check the path"
-        )
-        raise UserError(
-            f"{source.name}: {wanted[-1]} frames to average, but there are {offered}",
-            legal=legal,
-            fix=fix,
-        )
+    if last_count is not None and offered < last_count:
+        problem = f"{source.name}: {last_count} frames to average, but there are {offered}"
+        if not offered:
+            raise UserError(problem, fix="check the path")
+        fix = "ask for fewer frames, or leave the number out to use all"
+        raise UserError(problem, legal=f"1 to {offered} frames", fix=fix)
     return clouds
 
 
 def _of_one_size(source: FrameSource, frames: Iterator[Frame]) -> Iterator[Frame]:
+    """Yield the frames. Raises UserError if one has another size than the source or the first."""
     shape = None if source.slopes is None else source.slopes.shape[:2]
     for frame in frames:
         shape = shape or frame.z_m.shape
         if frame.z_m.shape != shape:
-            sizes = [
-                f"{w} x {h} pixels" if h > 1 else f"{w} points" for h, w in (frame.z_m.shape, shape)
-            ]
-            fix = "average only frames of one camera mode; average unorganised clouds one at a time"
             raise UserError(
-                f"{frame.name}: {sizes[0]}, but {sizes[1]} expected",
+                f"{frame.name}: {_size_text(frame.z_m.shape)}, but {_size_text(shape)} expected",
                 legal="frames of one size",
-                fix=fix,
+                fix="average only frames of one camera mode; average unorganised clouds one at a"
+                " time",
             )
         yield frame
 
 
-class FrameSums:
-    """Sums over the frames that belong, from which the mean cloud follows: float64 of z minus a
-    per-pixel offset. The first frames define a good frame: the median of those that agree.
-    ``sample``: flat indices of the judged pixels, all valid in it. The clipped mean uses no larger
-    deviation from the offset than ``gate``."""
+def _size_text(shape: tuple[int, ...]) -> str:
+    height, width = shape
+    return f"{width} x {height} pixels" if height > 1 else f"{width} points"
 
-    def __init__(self, source: FrameSource, frames: list[Frame], config: AverageConfig) -> None:
+
+class FrameSums:
+    """Sums over the frames that belong, from which the mean cloud follows.
+
+    Sums are float64, of z minus a per-pixel offset. The first frames define a good frame: the
+    median of those that agree."""
+
+    def __init__(
+        self,
+        source: FrameSource,
+        frames: list[Frame],
+        config: AverageConfig,
+    ) -> None:
         """Sum the ``frames``, at most `REFERENCE_FRAMES`, which are also the reference."""
-        self.source, self.config, self.shape, self.reference_frames = (
-            source,
-            config,
-            frames[0].z_m.shape,
-            len(frames),
-        )
-        n = self._refer(
-            np.stack([frame.z_m.ravel() for frame in frames]).astype(np.float32, copy=False)
-        )
-        self.count, self.total, self.squares = np.zeros(n, dtype=np.int32), np.zeros(n), np.zeros(n)
-        self.reasons = np.zeros((max(Reason) + 1, n), dtype=np.uint16)
+        self.source = source
+        self.config = config
+        self.shape = frames[0].z_m.shape
+        self.reference_frames = len(frames)
+        reference = np.stack([frame.z_m.ravel() for frame in frames])
+        self._refer(reference.astype(np.float32, copy=False))
+        pixels = self.offset.size
+        self.count = np.zeros(pixels, dtype=np.int32)
+        self.total = np.zeros(pixels)
+        self.squares = np.zeros(pixels)
+        self.reasons = np.zeros((max(Reason) + 1, pixels), dtype=np.uint16)
         self.frames = 0
-        self.stack: list[np.ndarray] = []
-        self.channels: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.stack: list[np.ndarray] = []  # z of all frames, for the median
+        self.channels: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # sums and numbers by name
         self.rgb_total: np.ndarray | None = None
         self.rgb_frames = 0
         self.left_out: list[LeftOut] = []
         for frame in frames:
             self.take(frame)
 
-    def _refer(self, stack: np.ndarray) -> int:
-        """Define a good frame from the first frames (r, n); returns n."""
+    def _refer(self, stack: np.ndarray) -> None:
+        """Define a good frame from the z of the first frames (r, n)."""
         config = self.config
         finite = np.isfinite(stack)
         usable = np.flatnonzero(2 * finite.sum(axis=0) > finite.any(axis=1).sum())
+        # flat indices of the judged pixels, all valid in the good frame
         self.sample = usable[:: max(1, -(-len(usable) // SAMPLED_PIXELS))]
         sampled = stack[:, self.sample]
-        # the frame closest in range to the others (the earliest on a tie), and each frame's shift
-        # against it
-        between = np.diag(np.where(np.isfinite(sampled).any(axis=1), 0.0, np.nan))
-        for i, j in combinations(range(len(sampled)), 2):
-            between[i, j] = _median_finite(sampled[i] - sampled[j])
-            between[j, i] = -between[i, j]
-        distances = np.sort(np.where(np.isfinite(between), np.abs(between), np.inf), axis=1)
-        middle = int(np.argmin(distances[:, len(sampled) // 2]))
-        # robust standard deviation of one frame's z, at least that of rounding
-        deviations = [row - sampled[middle] for i, row in enumerate(sampled) if i != middle]
-        spreads = [
-            _median_finite(np.abs(d - _median_finite(d))) / 0.6745 / np.sqrt(2.0)
-            for d in deviations
-        ]
-        sigma = max(
-            _median_finite(np.array(spreads)) if spreads else 0.0,
-            self.source.z_step_m / np.sqrt(12.0),
-            1e-9,
-        )
-        # the standard error of a median is 1.25 times that of a mean; two frames are compared
+        shifts = _shifts(sampled)
+        middle = _middle_frame(shifts)
+        sigma_m = max(_frame_sigma(sampled, middle), self.source.z_step_m / np.sqrt(12.0), 1e-9)
+        # two frames are compared
         shared = CORRELATED_PIXELS / max(len(self.sample), CORRELATED_PIXELS)
-        self.jump_m = max(
-            config.jump_sigmas * 1.2533 * sigma * np.sqrt(2.0 * shared), config.jump_mm * MM
-        )
-        self.change_m = max(config.changed_sigmas * sigma, config.changed_mm * MM)
-        agreeing = stack[np.abs(between[:, middle]) <= self.jump_m]
+        standard_error_m = MEDIAN_ERROR * sigma_m * np.sqrt(2.0 * shared)
+        # limits of a whole frame's shift, and of one pixel's change
+        self.jump_m = max(config.jump_sigmas * standard_error_m, config.jump_mm * MM)
+        self.change_m = max(config.changed_sigmas * sigma_m, config.changed_mm * MM)
+        agreeing = stack[np.abs(shifts[:, middle]) <= self.jump_m]
         # the median of two frames is their mean, which a fault in either of them spoils
-        z = pixel_medians(agreeing) if len(agreeing) > 2 else stack[middle]
-        self.sampled_z_m, self.offset = z[self.sample], z.astype(np.float64)
-        # the reference frames differ less than others, because they determined the judged pixels
-        usual = [self._change(row)[1] for row in agreeing]
-        self.fraction = min(
-            config.disturbed_fraction + 1.5 * float(np.median(usual)) if usual else 1.0, 1.0
-        )
-        self.gate = np.full(z.shape, np.inf, dtype=np.float32)
+        z_m = pixel_medians(agreeing) if len(agreeing) > 2 else stack[middle]
+        self.sampled_z_m = z_m[self.sample]
+        self.offset = z_m.astype(np.float64)
+        # limit of the changed fraction; the reference frames differ less than others, because they
+        # determined the judged pixels
+        self.fraction = 1.0
+        if len(agreeing):
+            usual = np.median([self._change(frame_z_m)[1] for frame_z_m in agreeing])
+            self.fraction = min(config.disturbed_fraction + 1.5 * float(usual), 1.0)
+        # the clipped mean uses no larger deviation from the offset
+        self.gate = np.full(z_m.shape, np.inf, dtype=np.float32)
         if config.method == "clipped" and len(agreeing) > 2:
             # some sigmas of the frame or, if larger, of the pixel itself
-            own = pixel_medians(np.abs(agreeing - z)) / np.float32(0.6745)
-            self.gate = (config.clip_sigmas * np.fmax(own, np.float32(sigma))).astype(np.float32)
-        return z.size
+            pixel_sigma_m = pixel_medians(np.abs(agreeing - z_m)) / np.float32(0.6745)
+            gate = config.clip_sigmas * np.fmax(pixel_sigma_m, np.float32(sigma_m))
+            self.gate = gate.astype(np.float32)
 
     def _change(self, z_m: np.ndarray) -> tuple[float, float]:
         """Return a frame's shift against the reference in metres (NaN for none) and its changed
         fraction."""
         differences = z_m[self.sample] - self.sampled_z_m
         differences = differences.astype(np.float32, copy=False)
-        if not np.isfinite(shift := _median_finite(differences)):
+        shift = _median_finite(differences)
+        if not np.isfinite(shift):
             return np.nan, 1.0
         # NaN is not within the limit
-        changed = len(self.sample) - np.count_nonzero(np.abs(differences - shift) <= self.change_m)
-        return shift, changed / len(self.sample)
+        unchanged = np.count_nonzero(np.abs(differences - shift) <= self.change_m)
+        return shift, (len(self.sample) - unchanged) / len(self.sample)
 
     def _fault(self, frame: Frame) -> str | None:
         """Return why this frame does not belong; None if it does."""
         if len(self.sample) == 0:
             return None
         shift, fraction = self._change(frame.z_m.ravel())
-        against = (
-            f"the first {self.reference_frames} frames"
-            if self.reference_frames > 2
-            else "the first frame"
-        )
+        against = "the first frame"
+        if self.reference_frames > 2:
+            against = f"the first {self.reference_frames} frames"
         if not np.isfinite(shift):
             return "no pixel has a range"
         if abs(shift) > self.jump_m:
-            allowed = f"(allowed {self.jump_m / MM:.1f} mm)"
-            return f"the whole range jumps by {shift / MM:+.1f} mm against {against} {allowed}"
+            return (
+                f"the whole range jumps by {shift / MM:+.1f} mm against {against}"
+                f" (allowed {self.jump_m / MM:.1f} mm)"
+            )
         if fraction > self.fraction:
-            changed = f"lost their range or changed by more than {self.change_m / MM:.1f} mm against {against}"
-            return f"disturbed: {100 * fraction:.1f} % of the pixels {changed} (allowed {100 * self.fraction:.1f} %)"
+            return (
+                f"disturbed: {100 * fraction:.1f} % of the pixels lost their range or changed by"
+                f" more than {self.change_m / MM:.1f} mm against {against}"
+                f" (allowed {100 * self.fraction:.1f} %)"
+            )
         return None
 
     def take(self, frame: Frame) -> None:
@@ -259,42 +275,57 @@ class FrameSums:
         if fault is not None:
             self.left_out.append(LeftOut(frame.name, fault))
             return
-        z = frame.z_m.ravel()
+        z_m = frame.z_m.ravel()
         if self.config.method == "median":
-            # when the median is taken, the stack is copied once into one block
-            kept = len(self.stack)
-            allowed = int(self.config.median_memory_mb * 1e6)
-            needed = 2 * 4 * z.size * (kept + 1)
-            if needed > allowed:
-                what = f"{frame.name}: the median of {kept + 1} frames of {z.size} pixels needs {needed / 1e6:.0f} MB,"
-                what += f" more than median_memory_mb = {allowed / 1e6:.0f}"
-                fix = (
-                    "use method clipped (constant memory), fewer frames, or raise median_memory_mb"
-                )
-                raise UserError(what, legal=f"up to {kept} frames", fix=fix)
-            self.stack.append(z.astype(np.float32))
+            self._refuse_memory(frame)
+            self.stack.append(z_m.astype(np.float32))
         self.frames += 1
-        sums = self.offset, self.count, self.total, self.squares, self.reasons
-        used = _added(z, frame.reason.ravel(), self.gate, *sums)
+        used = _added(
+            z_m,
+            frame.reason.ravel(),
+            self.gate,
+            self.offset,
+            self.count,
+            self.total,
+            self.squares,
+            self.reasons,
+        )
         # further channels, over the samples that depth uses
-        for name, values, width in (("xy", frame.xy_m, 2), ("amplitude", frame.amplitude, 1)):
-            if values is not None:
-                if name not in self.channels:
-                    self.channels[name] = (
-                        np.zeros(z.size * width),
-                        np.zeros(z.size * width, dtype=np.int32),
-                    )
-                _add_where(
-                    values.ravel(),
-                    used if width == 1 else np.repeat(used, width),
-                    *self.channels[name],
-                )
+        if frame.xy_m is not None:
+            self._take_channel("xy", frame.xy_m, np.repeat(used, 2))
+        if frame.amplitude is not None:
+            self._take_channel("amplitude", frame.amplitude, used)
         if frame.rgb is not None:
-            self.rgb_total = (
-                np.zeros(frame.rgb.shape, np.uint32) if self.rgb_total is None else self.rgb_total
-            )
+            if self.rgb_total is None:
+                self.rgb_total = np.zeros(frame.rgb.shape, np.uint32)
             self.rgb_total += frame.rgb
             self.rgb_frames += 1
+
+    def _take_channel(
+        self,
+        name: str,
+        values: np.ndarray,
+        used: np.ndarray,
+    ) -> None:
+        """Add a frame's further values where they are used (n,) bool."""
+        if name not in self.channels:
+            self.channels[name] = (np.zeros(used.size), np.zeros(used.size, dtype=np.int32))
+        total, count = self.channels[name]
+        _add_where(values.ravel(), used, total, count)
+
+    def _refuse_memory(self, frame: Frame) -> None:
+        """Raise UserError if the median of one more frame needs too much memory."""
+        kept = len(self.stack)
+        # when the median is taken, the stack is copied once into one block
+        needed = 2 * 4 * frame.z_m.size * (kept + 1)
+        allowed = int(self.config.median_memory_mb * 1e6)
+        if needed > allowed:
+            raise UserError(
+                f"{frame.name}: the median of {kept + 1} frames of {frame.z_m.size} pixels needs"
+                f" {needed / 1e6:.0f} MB, more than median_memory_mb = {allowed / 1e6:.0f}",
+                legal=f"up to {kept} frames",
+                fix="use method clipped (constant memory), fewer frames, or raise median_memory_mb",
+            )
 
     def cloud(self) -> Cloud:
         """Return the average of the frames so far; NaN where no sample was used. Raises UserError
@@ -302,53 +333,106 @@ class FrameSums:
         source = self.source
         count = self.count
         if not count.any():
-            named = "; ".join(f"{left.name}: {left.why}" for left in self.left_out[:3])
-            what = f"{source.name}: no pixel has a range in any frame" + (
-                f" ({named})" if named else ""
-            )
-            fix = "check the files, their unit and the camera's mode"
-            raise UserError(what, legal="at least one frame with valid depth", fix=fix)
+            self._refuse_nothing()
         with np.errstate(invalid="ignore", divide="ignore"):
-            means = {name: total / known for name, (total, known) in self.channels.items()}
+            means = {name: total / number for name, (total, number) in self.channels.items()}
         if source.slopes is None and "xy" not in means:
             raise ValueError("a source without slopes must give each frame its xy_m")
-        middle = (
-            pixel_medians(np.stack(self.stack)).astype(np.float64)
-            if self.config.method == "median"
-            else None
+        medians = None
+        if self.config.method == "median":
+            medians = pixel_medians(np.stack(self.stack)).astype(np.float64)
+        across = means["xy"] if source.slopes is None else source.slopes
+        points_m, variance_m2 = _points(
+            self.offset,
+            count,
+            self.total,
+            self.squares,
+            medians,
+            across.reshape(-1, 2),
+            source.slopes is not None,
         )
-        across = (
-            means["xy"].reshape(-1, 2) if source.slopes is None else source.slopes.reshape(-1, 2)
-        )
-        sums = self.offset, count, self.total, self.squares
-        points_m, variance = _points(*sums, middle, across, source.slopes is not None)
         never = np.flatnonzero(count == 0)
         reason = np.zeros(count.shape, dtype=np.uint8)
         reason[never] = np.argmax(self.reasons[:, never], axis=0)
+        rgb = None
+        if self.rgb_total is not None:
+            rgb = np.round(self.rgb_total / self.rgb_frames).astype(np.uint8)
+        amplitude = means.get("amplitude")
         return Cloud(
             points_m=points_m.reshape(*self.shape, 3),
             reason=reason.reshape(self.shape),
             count=count.reshape(self.shape).copy(),
-            variance_m2=variance.reshape(self.shape),
+            variance_m2=variance_m2.reshape(self.shape),
             region=source.region,
             z_step_m=source.z_step_m,
             n_frames=self.frames,
             organised=source.organised,
             lens=source.lens,
-            rgb=None
-            if self.rgb_total is None
-            else np.round(self.rgb_total / self.rgb_frames).astype(np.uint8),
-            amplitude=means["amplitude"].reshape(self.shape) if "amplitude" in means else None,
+            rgb=rgb,
+            amplitude=None if amplitude is None else amplitude.reshape(self.shape),
             left_out=tuple(self.left_out),
         )
+
+    def _refuse_nothing(self) -> NoReturn:
+        """Raise UserError because no sample was used."""
+        problem = f"{self.source.name}: no pixel has a range in any frame"
+        if self.left_out:
+            reasons = "; ".join(f"{frame.name}: {frame.why}" for frame in self.left_out[:3])
+            problem = f"{problem} ({reasons})"
+        raise UserError(
+            problem,
+            legal="at least one frame with valid depth",
+            fix="check the files, their unit and the camera's mode",
+        )
+
+
+# --- what a good frame is ---
+
+
+def _shifts(sampled: np.ndarray) -> np.ndarray:
+    """Return the median difference (r, r) of each of the frames (r, n) from each, metres; NaN for
+    frames without a range."""
+    shifts = np.diag(np.where(np.isfinite(sampled).any(axis=1), 0.0, np.nan))
+    for i, j in combinations(range(len(sampled)), 2):
+        shifts[i, j] = _median_finite(sampled[i] - sampled[j])
+        shifts[j, i] = -shifts[i, j]
+    return shifts
+
+
+def _middle_frame(shifts: np.ndarray) -> int:
+    """Return the frame closest in range to half of the frames, the earliest on a tie."""
+    distances = np.where(np.isfinite(shifts), np.abs(shifts), np.inf)
+    return int(np.argmin(np.sort(distances, axis=1)[:, len(shifts) // 2]))
+
+
+def _frame_sigma(sampled: np.ndarray, middle: int) -> float:
+    """Return the robust standard deviation of one frame's z, from its differences from the middle
+    one; 0 for a single frame."""
+    spreads = []
+    for number, frame_z_m in enumerate(sampled):
+        if number != middle:
+            difference = frame_z_m - sampled[middle]
+            size = _median_finite(np.abs(difference - _median_finite(difference)))
+            spreads.append(size / 0.6745 / np.sqrt(2.0))
+    return _median_finite(np.array(spreads)) if spreads else 0.0
+
+
+# --- compiled sums ---
 
 
 @numba.njit(**PLAIN)
 def _added(  # type: ignore[no-untyped-def]
-    z, reason, gate, offset, count, total, squares, reasons
+    z,
+    reason,
+    gate,
+    offset,
+    count,
+    total,
+    squares,
+    reasons,
 ):
     """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts:
-    within the ``gate``."""
+    within the ``gate``. A pixel without an offset takes its first z for it."""
     used = np.empty(len(z), np.bool_)
     for i in range(len(z)):
         deviation = z[i] - offset[i]
@@ -364,34 +448,46 @@ def _added(  # type: ignore[no-untyped-def]
         if not np.isfinite(z[i]):
             reasons[reason[i] if reason[i] > 0 else NOT_FINITE, i] += 1
         elif np.isnan(offset[i]):
-            offset[i], used[i] = z[i], True
+            offset[i] = z[i]
+            used[i] = True
             count[i] += 1
     return used
 
 
 @numba.njit(**PLAIN)
-def _points(offset, count, total, squares, middle, across, slopes):  # type: ignore[no-untyped-def]
+def _points(offset, count, total, squares, medians, across, slopes):  # type: ignore[no-untyped-def]
     """Return mean points (n, 3) and the variance (n,) of z, NaN where there are no samples or
-    fewer than two. Medians (n,) replace the mean z if ``middle`` is not None. ``across`` (n, 2): x
-    and y, or their ``slopes``."""
+    fewer than two. ``medians`` (n,) replace the mean z if not None. ``across`` (n, 2): x and y, or
+    their ``slopes``."""
     points = np.empty((len(count), 3))
     variance = np.empty(len(count))
     for i in range(len(count)):
         n = count[i]
         mean = total[i] / n if n > 0 else np.nan
-        z = offset[i] + mean if middle is None else middle[i]
+        z = offset[i] + mean if medians is None else medians[i]
         scale = z if slopes else 1.0
-        points[i, 0], points[i, 1], points[i, 2] = scale * across[i, 0], scale * across[i, 1], z
+        points[i, 0] = scale * across[i, 0]
+        points[i, 1] = scale * across[i, 1]
+        points[i, 2] = z
         variance[i] = max((squares[i] - total[i] ** 2 / n) / (n - 1), 0.0) if n > 1 else np.nan
     return points, variance
 
 
 @numba.njit(**PLAIN)
-def _add_where(values: np.ndarray, used: np.ndarray, total: np.ndarray, count: np.ndarray) -> None:
+def _add_where(
+    values: np.ndarray,
+    used: np.ndarray,
+    total: np.ndarray,
+    count: np.ndarray,
+) -> None:
+    """Add finite values (n,) where they are used to their total, and their numbers to the count."""
     for i in range(len(values)):
         counts = used[i] & np.isfinite(values[i])
         total[i] += values[i] if counts else 0.0
         count[i] += counts
+
+
+# --- medians ---
 
 
 def _median_finite(values: np.ndarray) -> float:
@@ -411,12 +507,19 @@ def pixel_medians(stack: np.ndarray) -> np.ndarray:
     finite = np.isfinite(stack)
     ordered = np.where(finite, stack, np.inf)
     count = finite.sum(axis=0)
-    if len(stack) > 6:  # exchanges of neighbours sort fewer samples in less time
+    if len(stack) > FEW_SAMPLES:
         ordered.sort(axis=0)
-    for place in range(len(stack) - 1 if len(stack) <= 6 else 0):
-        for row in range(len(stack) - 1 - place):
-            pair = ordered[row], ordered[row + 1]
-            ordered[row], ordered[row + 1] = np.minimum(*pair), np.maximum(*pair)
-    places = (np.maximum(count - 1, 0) // 2, count // 2)
-    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
+    else:
+        for last in range(len(stack) - 1, 0, -1):
+            for row in range(last):
+                low = np.minimum(ordered[row], ordered[row + 1])
+                ordered[row + 1] = np.maximum(ordered[row], ordered[row + 1])
+                ordered[row] = low
+    low = _sample_at(ordered, np.maximum(count - 1, 0) // 2)
+    high = _sample_at(ordered, count // 2)
     return np.where(count > 0, 0.5 * (low + high), np.nan)
+
+
+def _sample_at(ordered: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Return the sample (..) of each pixel at its ``index`` (..) in (r, ..)."""
+    return np.take_along_axis(ordered, index[None], axis=0)[0]

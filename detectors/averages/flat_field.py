@@ -6,14 +6,14 @@ capture. Not modelled: a pattern that changes with distance, temperature or brig
 engine's filter at the edge of a hole."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from detectors.averages.noise import LEAST_FRAMES, average_variance_m2
+from detectors.pixels.noise import LEAST_FRAMES, average_variance_m2
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, refuse_pixels
@@ -39,23 +39,25 @@ class FlatFieldConfig(Config):
 
 @dataclass(frozen=True)
 class FlatField:
-    """A unit's fixed pattern. ``error_m`` (h, w): how much farther along its ray each pixel of the
-    whole sensor sees a surface, without smooth parts; NaN where unknown. ``variance_m2`` (h, w) of
-    that error. ``distances_m``: the nearest and the farthest at which it was measured.
-    ``warnings``: full sentences on doubts about it."""
+    """A unit's fixed pattern."""
 
     error_m: np.ndarray
+    """(h, w): how much farther along its ray each pixel of the whole sensor sees a surface,
+    without smooth parts; NaN where unknown."""
     variance_m2: np.ndarray
+    """(h, w): of that error."""
     lens: Lens
+    """The lens of the camera in its mode."""
     distances_m: tuple[float, float]
+    """The nearest and the farthest at which it was measured."""
     warnings: tuple[str, ...] = ()
+    """Full sentences on doubts about it."""
 
     @property
     def rms_m(self) -> float:
         """Root mean square of the pattern without the map's own noise."""
-        return float(
-            np.sqrt(max(np.nanmean(self.error_m.astype(float) ** 2 - self.variance_m2), 0.0))
-        )
+        squares_m2 = self.error_m.astype(float) ** 2 - self.variance_m2
+        return float(np.sqrt(max(np.nanmean(squares_m2), 0.0)))
 
 
 def corrected(cloud: Cloud, field: FlatField) -> Cloud:
@@ -64,36 +66,46 @@ def corrected(cloud: Cloud, field: FlatField) -> Cloud:
     map's variance, or the pattern's mean square. Raises UserError if the cloud has no pixel grid
     or is of another camera, size or lens."""
     _refuse_other(cloud, field)
-    at = cloud.region.within(field.lens.whole)
-    error_m = field.error_m[at].astype(float)
-    variance_m2 = field.variance_m2[at].astype(float)
-    known = np.isfinite(error_m)
+    cut = cloud.region.within(field.lens.whole)
+    error_m = field.error_m[cut].astype(float)
+    variance_m2 = field.variance_m2[cut].astype(float)
+    is_known = np.isfinite(error_m)
     range_m = np.linalg.norm(cloud.points_m, axis=-1)
-    moved = cloud.points_m * (1 - np.where(known, error_m, 0.0) / range_m)[..., None]
+    moved = cloud.points_m * (1 - np.where(is_known, error_m, 0.0) / range_m)[..., None]
     noise_m2 = average_variance_m2(cloud, cloud.valid)
     if noise_m2 is not None:
         axial = (cloud.points_m[..., 2] / range_m) ** 2
-        noise_m2 = noise_m2 + axial * np.where(known, variance_m2, field.rms_m**2)
+        pattern_m2 = np.where(is_known, variance_m2, field.rms_m**2)
+        noise_m2 = noise_m2 + axial * pattern_m2
     return replace(cloud, points_m=moved, mean_variance_m2=noise_m2)
 
 
-def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
-    """Return full sentences on doubts about the correction of a cloud; ``name``: the flat field's."""
+def doubts(
+    cloud: Cloud,
+    field: FlatField,
+    name: str | Path,
+) -> tuple[str, ...]:
+    """Return full sentences on doubts about the correction of a cloud. ``name``: of the field."""
     notes = [f"the flat field {name}: {warning}" for warning in field.warnings]
-    known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
-    share = float(known[cloud.valid].mean()) if cloud.valid.any() else 1.0
+    is_known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
+    share = 1.0
+    distance_m = np.nan
+    if cloud.valid.any():
+        share = float(is_known[cloud.valid].mean())
+        distance_m = float(np.median(cloud.points_m[cloud.valid][:, 2]))
     if share < WELL_COVERED:
         notes.append(
-            f"the flat field {name} covers {100 * share:.0f} % of the valid pixels; others are not corrected"
+            f"the flat field {name} covers {100 * share:.0f} % of the valid pixels; others are not"
+            " corrected"
         )
-    distance_m = (
-        float(np.median(cloud.points_m[cloud.valid][:, 2])) if cloud.valid.any() else np.nan
-    )
-    near, far = field.distances_m
-    if distance_m * NEAR_ENOUGH < near or distance_m > far * NEAR_ENOUGH:
-        measured = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
+    nearest_m, farthest_m = field.distances_m
+    if distance_m * NEAR_ENOUGH < nearest_m or distance_m > farthest_m * NEAR_ENOUGH:
+        measured = f"{nearest_m:.2f} to {farthest_m:.2f} m"
+        if farthest_m < nearest_m * 1.01:
+            measured = f"{nearest_m:.2f} m"
         notes.append(
-            f"the flat field {name} was measured at {measured}, this capture is at {distance_m:.2f} m"
+            f"the flat field {name} was measured at {measured}, this capture is at"
+            f" {distance_m:.2f} m"
         )
     return tuple(notes)
 
@@ -103,36 +115,52 @@ def _refuse_other(cloud: Cloud, field: FlatField) -> None:
     if not cloud.organised or cloud.projection != "central":
         what = "a flat field corrects a camera's own pixels, and this cloud has no pixel grid"
         raise UserError(what, fix="leave out the flat field, or name the capture's depth images")
-    lens, (height, width) = field.lens, cloud.valid.shape
-    own = (width, height) if cloud.lens is None else (cloud.lens.width, cloud.lens.height)
-    if own != (lens.width, lens.height):
-        what = f"the flat field has {lens.width} x {lens.height} pixels, the capture has {own[0]} x {own[1]}"
-        raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
+    lens = field.lens
+    height, width = cloud.valid.shape
     if cloud.lens is not None:
-        pairs = [
-            (getattr(cloud.lens, name), getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")
-        ]
-        if any(abs(one - other) > SAME_LENS * max(lens.fx, lens.width) for one, other in pairs):
-            ours = f"fx {cloud.lens.fx:.1f}, fy {cloud.lens.fy:.1f}, centre {cloud.lens.cx:.1f}, {cloud.lens.cy:.1f}"
-            theirs = f"fx {lens.fx:.1f}, fy {lens.fy:.1f}, centre {lens.cx:.1f}, {lens.cy:.1f}"
-            what = f"the capture's lens ({ours}) is not that of the flat field ({theirs})"
-            raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
+        width = cloud.lens.width
+        height = cloud.lens.height
+    if (width, height) != (lens.width, lens.height):
+        raise UserError(
+            f"the flat field has {lens.width} x {lens.height} pixels, the capture has {width} x"
+            f" {height}",
+            legal="the same camera in the same mode",
+            fix=AGAIN,
+        )
+    if cloud.lens is not None and not _is_same_lens(cloud.lens, lens):
+        raise UserError(
+            f"the capture's lens ({_lens_text(cloud.lens)}) is not that of the flat field"
+            f" ({_lens_text(lens)})",
+            legal="the same camera in the same mode",
+            fix=AGAIN,
+        )
+
+
+def _is_same_lens(lens: Lens, other: Lens) -> bool:
+    """Return whether two lenses may belong to one camera and mode; the second sets the scale."""
+    limit = SAME_LENS * max(other.fx, other.width)
+    names = ("fx", "fy", "cx", "cy")
+    return all(abs(getattr(lens, name) - getattr(other, name)) <= limit for name in names)
+
+
+def _lens_text(lens: Lens) -> str:
+    return f"fx {lens.fx:.1f}, fy {lens.fy:.1f}, centre {lens.cx:.1f}, {lens.cy:.1f}"
 
 
 def save_flat_field(path: Path, field: FlatField) -> None:
     """Write the file, whole or not at all. Raises UserError if it cannot be written."""
     lens = field.lens
     numbers = [lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
-    held: dict[str, Any] = {
-        name: getattr(field, name).astype(np.float32) for name in ("error_m", "variance_m2")
-    }
-    held |= {"version": np.array(FLAT_FIELD_VERSION), "lens": np.array(numbers, float)}
-    held |= {
-        "distances_m": np.array(field.distances_m),
-        "warnings": np.array(json.dumps(field.warnings)),
-    }
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **held)
+        np.savez_compressed(
+            file,
+            error_m=field.error_m.astype(np.float32),
+            variance_m2=field.variance_m2.astype(np.float32),
+            version=np.array(FLAT_FIELD_VERSION),
+            lens=np.array(numbers, float),
+            distances_m=np.array(field.distances_m),
+            warnings=np.array(json.dumps(field.warnings)),
+        )
 
 
 def load_flat_field(path: Path) -> FlatField:
@@ -140,38 +168,49 @@ def load_flat_field(path: Path) -> FlatField:
     large or newer."""
     from detectors.recordings.arrays import load_npz
 
-    held = load_npz(path)
-    version = held.get("version")
-    check_version(
-        version.item() if version is not None and version.shape == () else None,
-        1,
-        path,
-        "a flat field",
-    )
+    arrays = load_npz(path)
+    version = arrays.get("version")
+    number = None
+    if version is not None and version.shape == ():
+        number = version.item()
+    check_version(number, 1, path, "a flat field")
     try:
-        width, height, fx, fy, cx, cy, *rest = held["lens"].astype(float).tolist()
-        lens = Lens(int(width), int(height), fx, fy, cx, cy, tuple(rest))
-        refuse_pixels(str(path), lens.width, lens.height)
-        maps: list[Any] = [held[name].astype(np.float32) for name in ("error_m", "variance_m2")]
-        near, far = held["distances_m"].astype(float).tolist()
-        warnings = json.loads(str(held["warnings"]))
-        error_m, variance_m2 = maps
-        known = np.isfinite(error_m)
-        sound = (
-            error_m.shape == variance_m2.shape == (lens.height, lens.width)
-            and len(lens.distortion) == 8
-        )
-        sound = (
-            sound
-            and known.any()
-            and bool((variance_m2[known] >= 0).all())
-            and 0 < near <= far < np.inf
-        )
-        if not (sound and all(isinstance(each, str) for each in warnings)):
-            raise ValueError("its arrays do not belong together")
+        field = _field_of(arrays, path)
     except (KeyError, ValueError, TypeError) as error:
         why = f"it has no {error}" if isinstance(error, KeyError) else str(error)[:200]
         raise UserError(
-            f"{path}: not a flat field ({why})", legal="a file of tofpod flatfield", fix=AGAIN
+            f"{path}: not a flat field ({why})",
+            legal="a file of tofpod flatfield",
+            fix=AGAIN,
         ) from error
-    return FlatField(error_m, variance_m2, lens, (near, far), tuple(warnings))
+    return field
+
+
+def _field_of(arrays: Mapping[str, np.ndarray], path: Path) -> FlatField:
+    """Return the flat field in a file's arrays. Raises KeyError, ValueError or TypeError if they
+    are not one."""
+    width, height, fx, fy, cx, cy, *distortion = arrays["lens"].astype(float).tolist()
+    lens = Lens(int(width), int(height), fx, fy, cx, cy, distortion=tuple(distortion))
+    refuse_pixels(str(path), lens.width, lens.height)
+    error_m = arrays["error_m"].astype(np.float32)
+    variance_m2 = arrays["variance_m2"].astype(np.float32)
+    nearest_m, farthest_m = arrays["distances_m"].astype(float).tolist()
+    warnings = json.loads(str(arrays["warnings"]))
+    is_known = np.isfinite(error_m)
+    is_sound = (
+        error_m.shape == variance_m2.shape == (lens.height, lens.width)
+        and len(lens.distortion) == 8
+        and is_known.any()
+        and bool((variance_m2[is_known] >= 0).all())
+        and 0 < nearest_m <= farthest_m < np.inf
+        and all(isinstance(warning, str) for warning in warnings)
+    )
+    if not is_sound:
+        raise ValueError("its arrays do not belong together")
+    return FlatField(
+        error_m,
+        variance_m2,
+        lens,
+        (nearest_m, farthest_m),
+        tuple(warnings),
+    )

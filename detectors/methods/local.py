@@ -18,11 +18,11 @@ import numba
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.averages.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.crop import AutoCrop, CropConfig, crop
-from detectors.findings.clusters import PLAIN, root_of
 from detectors.findings.measure import HoleModelConfig, measure_detection
 from detectors.interface import Detection, Evidence, Measurement
+from detectors.pixels.clusters import PLAIN, root_of
+from detectors.pixels.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.score_map import Findings, above, on_grid
 from detectors.surfaces.background import Background, background
 from detectors.surfaces.smooth_surfaces import raster
@@ -34,33 +34,33 @@ HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)
 """Half-widths of the filters in pixels: a tent of half-width h is as wide at half of its height as
 a hole of 2 h + 1 pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two
 of them."""
-SURROUNDINGS = 3
-WIDEST_SHARE = 6.0
-"""Number of steps by which a filter's surroundings are wider; the target's least width in widths
-of the widest filter."""
+SURROUNDINGS = 3  # steps by which a filter's surroundings are wider
+WIDEST_SHARE = 6.0  # the target's least width in widths of the widest filter
 FAINT = 0.02  # weight of the value 0 in every mean
 CLIP_SIGMAS = 6.0
-LEVEL_SIGMAS = 2.0
 """Clipping of single pixels in deviations of the local noise, because a flying pixel alone is no
-finding; and the same for the local level and for surroundings, which damage must not shift."""
+finding."""
+LEVEL_SIGMAS = 2.0  # the same for the local level and for surroundings, which damage must not shift
 STRONG = 4.0
 """Pixels with such scores are excluded from surroundings and noise; with twice as much, from
 others' wider means."""
-GATE_SHARE = 0.5
-GATE_SIGMAS = 1.5
-"""Share of a wider filter's signal that narrower filters must confirm, and the allowance for their
-noise."""
+GATE_SHARE = 0.5  # share of a wider filter's signal that narrower filters must confirm
+GATE_SIGMAS = 1.5  # allowance for their noise
+
+# --- the local noise ---
+
 WINDOW_WIDTHS = 6
 LEAST_WINDOW = 32
-SAMPLES_SIDE = 14
-LEAST_SAMPLES = 32
 """Half of the window of the local noise, in half-widths of the filter and at least in pixels: some
-200 independent means, which give a standard deviation to 8 %; samples from its middle to its edge,
-because neighbours in a mean add nothing new; and the fewest finite samples of a local median."""
-SADDLE = 0.75
-PROMINENCE = 1.5
-"""Two peaks are one if the saddle is higher than this share of the lower one, or fewer units of
-score below it."""
+200 independent means, which give a standard deviation to 8 %."""
+SAMPLES_SIDE = 14
+"""Samples from the window's middle to its edge, because neighbours in a mean add nothing new."""
+LEAST_SAMPLES = 32  # fewest finite samples of a local median
+
+# --- peaks ---
+
+SADDLE = 0.75  # two peaks are one if the saddle is higher than this share of the lower one
+PROMINENCE = 1.5  # or fewer units of score below it
 CORE = 0.5  # a finding's size is measured on the pixels with at least this share of its score
 
 
@@ -79,28 +79,34 @@ class LocalConfig(FilterConfig):
     @model_validator(mode="before")
     @classmethod
     def _chosen_shape(cls, data: Any) -> Any:
-        surface = data.get("surface", {}) if isinstance(data, dict) else None
-        if not isinstance(surface, dict) or surface.keys() & {"shape", "degree"}:
+        if not isinstance(data, dict):
+            return data
+        surface = data.get("surface", {})
+        if not isinstance(surface, dict) or "shape" in surface or "degree" in surface:
             return data
         return {**data, "surface": {"shape": "auto", **surface}}
 
 
 @dataclass(frozen=True, eq=False)
 class LocalEvidence(Evidence):
-    """``signed`` (r, c): score of each cell of a picture, negative in front of the surface.
-    ``cell`` (h, w): flat index of each point's cell, -1 where there is no score."""
+    """Evidence of a detector that scores a picture."""
 
     signed: np.ndarray = None  # type: ignore[assignment]
+    """(r, c): score of each cell of the picture, negative in front of the surface."""
     cell: np.ndarray = None  # type: ignore[assignment]
+    """(h, w): flat index of each point's cell, -1 where there is no score."""
 
 
 class LocalPicture(NamedTuple):
-    """Input of `LocalDetector.scored`: the surface, the cell (h, w) of each point, and the
-    arguments ``residuals``."""
+    """The residuals of a cloud on a grid of cells."""
 
     ground: Background
+    """The fitted surface."""
     cell: np.ndarray
+    """(h, w): flat index of each point's cell, -1 where there is none."""
     residuals: tuple[np.ndarray, np.ndarray, tuple[float, float]]
+    """Arguments of `LocalDetector.scored`: residuals (r, c), metres; their weights (r, c), 0 where
+    nothing is known; and the variances that rounding leaves (`rounding_variances`)."""
 
 
 class LocalDetector:
@@ -115,14 +121,14 @@ class LocalDetector:
         self.settings = settings
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
-        """Return the residuals of the crop on a grid; for an organised cloud, the means over
-        squares of ``pixels`` a side. Raises UserError on an empty crop, or if no surface can be
-        fitted."""
+        """Return the residuals of the crop on a grid: the cloud's own, cut to its judged part, or
+        a raster if it has none.
+
+        For an organised cloud, they are the means over squares of ``pixels`` a side. Raises
+        UserError on an empty crop, or if no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
         ground = background(cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
-        # the points are filtered on a grid: the cloud's own, cut to its judged part, or a raster
-        # if it has none
         if cloud.organised:
             rows, columns = np.nonzero(judged)
             rows = (rows - rows.min()) // pixels
@@ -130,16 +136,20 @@ class LocalDetector:
         else:
             _, rows, columns, _ = raster(cloud.points_m[judged], cloud)
         shape = int(rows.max()) + 1, int(columns.max()) + 1
-        cell = np.full(mask.shape, -1, dtype=np.int64)
-        cell[judged] = place = rows * shape[1] + columns
+        cells = rows * shape[1] + columns
         share = _shares(cloud, judged, ground.residual_m)
-        weights = np.bincount(place, share, shape[0] * shape[1])
-        typical = 1.0 if cloud.organised and pixels == 1 else median_of(weights[weights > 0])
+        weights = np.bincount(cells, share, shape[0] * shape[1])
+        typical = 1.0
+        if pixels > 1 or not cloud.organised:
+            typical = median_of(weights[weights > 0])
         share = share / typical
         weights = (weights / typical).reshape(shape).astype(np.float32)
-        sums = np.bincount(place, share * ground.residual_m[judged], weights.size).reshape(shape)
-        residuals = sums / np.maximum(weights, 1e-12), weights, rounding_variances(cloud, judged)
-        return LocalPicture(ground, cell, residuals)
+        sums = np.bincount(cells, share * ground.residual_m[judged], weights.size).reshape(shape)
+        residual_m = sums / np.maximum(weights, 1e-12)
+        cell = np.full(mask.shape, -1, dtype=np.int64)
+        cell[judged] = cells
+        rounding_m2 = rounding_variances(cloud, judged)
+        return LocalPicture(ground, cell, (residual_m, weights, rounding_m2))
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop. Raises UserError on an empty crop, or if no surface can
@@ -148,102 +158,117 @@ class LocalDetector:
         signed, typical_m, unit = self.scored(*residuals)
         judged = cell >= 0
         scores = on_grid(signed.ravel()[cell[judged]], judged)
-        notes = {**ground.notes, "surface": ground.description, "points": int(judged.sum())}
-        warnings = (ground.warning,) if ground.warning else ()
-        plain = (
-            np.abs(scores),
-            ground.residual_m,
-            ground.surface_z_m,
-            typical_m,
-            notes,
-            warnings,
-            scores > 0,
-            unit,
+        return LocalEvidence(
+            score=np.abs(scores),
+            residual_m=ground.residual_m,
+            surface_z_m=ground.surface_z_m,
+            scale_m=typical_m,
+            notes={**ground.notes, "surface": ground.description, "points": int(judged.sum())},
+            warnings=(ground.warning,) if ground.warning else (),
+            behind=scores > 0,
+            unit=unit,
+            signed=signed,
+            cell=cell,
         )
-        return LocalEvidence(*plain, signed, cell)
 
     def scored(
-        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+        self,
+        residual_m: np.ndarray,
+        weights: np.ndarray,
+        rounding_m2: tuple[float, float],
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c) of a picture of residuals with weights, 0 where nothing is
         known; the deviation in metres of the narrowest filter at a typical point; and the meaning
         of a unit of score, in words."""
         signed, widths, typical_m = _scored(residual_m, weights, rounding_m2)
-        text = f"the local noise of means over {widths[0]} to {widths[-1]} pixels"
-        return (
-            signed,
-            typical_m,
-            f"{text}, {1e3 * typical_m:.3g} mm for the narrowest at a typical point",
+        unit = (
+            f"the local noise of means over {widths[0]} to {widths[-1]} pixels,"
+            f" {1e3 * typical_m:.3g} mm for the narrowest at a typical point"
         )
+        return signed, typical_m, unit
 
-    def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
+    def find(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        threshold: float,
+    ) -> tuple[Detection, ...]:
         """Return peaks of the score, strongest first, each with the pixels above the threshold
         that belong to it. The centre is the mean of a finding's core, with pixels weighted by how
         far their score exceeds the core's least."""
         return self.findings(cloud, evidence, [threshold])[0].detections
 
     def findings(
-        self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        thresholds: Sequence[float],
     ) -> list[Findings]:
         """Return the results of `find` at each of the thresholds, which ascend."""
         assert isinstance(evidence, LocalEvidence)
-        sizes = np.abs(evidence.signed).ravel()
-        # saddles below a threshold also part or join peaks; otherwise a peak would be two at some
-        # thresholds. The lowest threshold's saddles do not affect peaks above a higher one
-        cells = np.flatnonzero(
-            sizes > max(min(SADDLE * thresholds[0], thresholds[0] - PROMINENCE), 0.0)
-        )
-        order = cells[np.argsort(-sizes[cells], kind="stable")]
-        peak_of = np.full(sizes.size, -1, dtype=np.int64)
-        peak_of[order] = _peaks(evidence.signed, order, SADDLE, PROMINENCE)
         pixels = above(evidence, thresholds[0])
         scores = evidence.score.reshape(-1)[pixels]
-        peaks = peak_of[evidence.cell.reshape(-1)[pixels]]
-        held = np.zeros(len(order), dtype=bool)
-        held[peaks] = True
-        labels = (np.cumsum(held) - 1)[peaks]
-        strengths = np.zeros(np.count_nonzero(held))
+        peaks = _peak_of_cells(evidence.signed, thresholds[0])[evidence.cell.reshape(-1)[pixels]]
+        # number the peaks that have pixels in the order of their heights
+        _, labels = np.unique(peaks, return_inverse=True)
+        strengths = np.zeros(int(labels.max(initial=-1)) + 1)
         np.maximum.at(strengths, labels, scores)
         # by level and peak, the sums over pixels above the level's threshold: first over those not
         # above the next one
         level = np.searchsorted(thresholds, scores) - 1
         shape = (len(thresholds), len(strengths))
+        cells = level * len(strengths) + labels
+
+        def sums_above(values: np.ndarray) -> np.ndarray:
+            sums = np.bincount(cells, values, shape[0] * shape[1]).reshape(shape)
+            return np.cumsum(sums[::-1], axis=0)[::-1]
+
         excess = np.maximum(scores - CORE * strengths[labels], 0.0)
-        points_m = cloud.points_m.reshape(-1, 3)[pixels]
-        by_level = level * len(strengths) + labels
-        sums = [
-            np.bincount(by_level, excess * each, shape[0] * shape[1]) for each in (1.0, *points_m.T)
-        ]
-        weights, *moments = (np.cumsum(each.reshape(shape)[::-1], axis=0)[::-1] for each in sums)
-        found = []
+        x, y, z = cloud.points_m.reshape(-1, 3)[pixels].T
+        weights = sums_above(excess)
+        moments = [sums_above(excess * coordinate) for coordinate in (x, y, z)]
+        findings = []
         for n, threshold in enumerate(thresholds):
             high = strengths > threshold
-            there = scores > threshold
-            centres_m = np.stack(
-                [moment[n, high] / weights[n, high] for moment in moments], axis=-1
-            )
+            exceeds = scores > threshold
+            centres_m = [moment[n, high] / weights[n, high] for moment in moments]
             number = np.cumsum(high) - 1
-            found.append(Findings(strengths[high], pixels[there], number[labels[there]], centres_m))
-        return found
+            findings.append(
+                Findings(
+                    scores=strengths[high],
+                    pixels=pixels[exceeds],
+                    labels=number[labels[exceeds]],
+                    centres_m=np.stack(centres_m, axis=-1),
+                )
+            )
+        return findings
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return the highest score."""
         return float(np.nanmax(evidence.score, initial=0.0))
 
-    def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
+    def measure(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        detection: Detection,
+    ) -> Measurement:
         """Measure the thesis' extents and the model of a blurred hole on the finding's core."""
         scores = evidence.score.reshape(-1)[detection.pixels]
         core = replace(detection, pixels=detection.pixels[scores >= CORE * detection.score])
-        return measure_detection(
-            cloud, evidence, core, self.settings.hole_model, self.correlation(evidence)
-        )
+        by_lag = self.correlation(evidence)
+        return measure_detection(cloud, evidence, core, self.settings.hole_model, by_lag)
 
     def correlation(self, evidence: Evidence) -> np.ndarray | None:
         """Return the noise's correlation (odd, odd) by lag, which weighs sizes; None if unknown."""
         return None
 
 
-def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray:
+def _shares(
+    cloud: Cloud,
+    judged: np.ndarray,
+    residual_m: np.ndarray,
+) -> np.ndarray:
     """Return the weight (n,) of each judged point: the median variance over its own, at most 4; 1
     if variances are unknown. They come from the cloud's maker, or from the scatter of frames
     nearby plus what is fixed in all frames."""
@@ -259,12 +284,17 @@ def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndar
     return np.minimum(median_of(variances) / variances, 4.0)
 
 
+# --- the score of all filters ---
+
+
 def _scored(
-    residual: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+    residual_m: np.ndarray,
+    weights: np.ndarray,
+    rounding_m2: tuple[float, float],
 ) -> tuple[np.ndarray, list[int], float]:
-    """Return signed scores (r, c) of a picture ``residual`` (r, c) metres with ``weights`` (r, c),
-    0 where nothing is known; the filters' widths in pixels; and the deviation of the narrowest at
-    a typical point, metres.
+    """Return signed scores (r, c) of a picture of residuals (r, c) with ``weights`` (r, c), 0 where
+    nothing is known; the filters' widths in pixels; and the deviation of the narrowest at a typical
+    point, metres.
 
     Filters are applied from the narrowest to the widest. A pixel that is sure in one filter, by a
     share from 0 to 1, is excluded from the wider means of other pixels; a strong pixel is excluded
@@ -272,23 +302,12 @@ def _scored(
     confirm it (`_strongest`)."""
     seen = weights > 0
     # in units of a typical pixel's noise, so that single precision is enough
-    unit_m = max(sigma_of(residual[seen]), float(np.sqrt(sum(rounding_m2))), 1e-9)
-    fixed, random = (variance / unit_m**2 for variance in rounding_m2)
-    extent = min(int(seen.any(axis=axis).sum()) for axis in (0, 1))
-    count = max(1, sum(WIDEST_SHARE * (2 * h + 1) <= extent for h in HALF_WIDTHS[:-SURROUNDINGS]))
-
-    # residuals minus their level, clipped to what the local noise allows filters, and minus their
-    # surroundings
-    widest = HALF_WIDTHS[count + SURROUNDINGS - 1]
-    values: np.ndarray = (residual / unit_m).astype(np.float32)
-    known = _tent(weights, widest) + FAINT
-    level = np.zeros_like(values)
-    for _ in range(3):
-        rest = values - level
-        sigma = local_sigma(np.where(seen, rest, np.nan), LEAST_WINDOW, 1e-3)
-        limit = LEVEL_SIGMAS * sigma
-        level = level + _tent(np.clip(rest, -limit, limit) * weights, widest) / known
-    rest = values - level
+    unit_m = max(sigma_of(residual_m[seen]), float(np.sqrt(sum(rounding_m2))), 1e-9)
+    fixed = rounding_m2[0] / unit_m**2
+    random = rounding_m2[1] / unit_m**2
+    count = _filter_count(seen)
+    values: np.ndarray = (residual_m / unit_m).astype(np.float32)
+    rest, sigma = _levelled(values, weights, HALF_WIDTHS[count + SURROUNDINGS - 1])
     clipped = np.clip(rest, -CLIP_SIGMAS * sigma, CLIP_SIGMAS * sigma)
     modest = np.clip(rest, -LEVEL_SIGMAS * sigma, LEVEL_SIGMAS * sigma)
 
@@ -296,7 +315,9 @@ def _scored(
     sure = np.zeros_like(best)
     quiet = np.ones_like(best)
     typical_m = 0.0
-    kept = []
+    means = []
+    surroundings = []
+    deviations = []
     for half, wide in zip(HALF_WIDTHS[:count], HALF_WIDTHS[SURROUNDINGS:], strict=False):
         width = 2 * half + 1
         # a tent's mean of white noise has 4/9 of the variance of a square's
@@ -314,18 +335,53 @@ def _scored(
         typical_m = typical_m or unit_m * float(np.median(sigma[seen]))
         best = np.where((sure < 1.0) & (np.abs(score) > np.abs(best)), score, best)
         sure = np.maximum(sure, np.clip(np.abs(best) / STRONG - 1.0, 0.0, 1.0))
+        # for sure pixels, the mean over all
         mean, covered = _mean(clipped, weights, half)
-        kept.append(
-            (mean, around, sigma / np.sqrt(np.maximum(_worth(weights, covered, half), FAINT)))
-        )
-    means, surroundings, deviations = (np.stack(images) for images in zip(*kept, strict=True))
-    grown = np.zeros_like(best)
-    grown[sure > 0] = _strongest(*(each[:, sure > 0] for each in (means, surroundings, deviations)))
-    signed = np.where(grown * np.sign(best) > np.abs(best), best + sure * (grown - best), best)
+        means.append(mean)
+        surroundings.append(around)
+        deviations.append(sigma / np.sqrt(np.maximum(_worth(weights, covered, half), FAINT)))
+    strongest = np.zeros_like(best)
+    strongest[sure > 0] = _strongest(
+        np.stack(means)[:, sure > 0],
+        np.stack(surroundings)[:, sure > 0],
+        np.stack(deviations)[:, sure > 0],
+    )
+    is_stronger = strongest * np.sign(best) > np.abs(best)
+    signed = np.where(is_stronger, best + sure * (strongest - best), best)
     return signed.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
 
 
-def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+def _filter_count(seen: np.ndarray) -> int:
+    """Return how many of the filters fit a target: those whose width is a sixth of its own."""
+    extent = min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum()))
+    narrow = [
+        half for half in HALF_WIDTHS[:-SURROUNDINGS] if WIDEST_SHARE * (2 * half + 1) <= extent
+    ]
+    return max(1, len(narrow))
+
+
+def _levelled(
+    values: np.ndarray,
+    weights: np.ndarray,
+    widest: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return values (r, c) minus their level over the widest surroundings, and their local noise
+    (r, c). Values count for the level only within `LEVEL_SIGMAS` of this noise."""
+    known = _tent(weights, widest) + FAINT
+    level = np.zeros_like(values)
+    for _ in range(3):
+        rest = values - level
+        sigma = local_sigma(np.where(weights > 0, rest, np.nan), LEAST_WINDOW, 1e-3)
+        limit = LEVEL_SIGMAS * sigma
+        level = level + _tent(np.clip(rest, -limit, limit) * weights, widest) / known
+    return values - level, sigma
+
+
+def _mean(
+    values: np.ndarray,
+    weights: np.ndarray,
+    half: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the weighted mean (r, c) of values, drawn towards 0 where little is known, and the
     mean of weights."""
     covered = _tent(weights, half)
@@ -335,62 +391,104 @@ def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarra
 def _tent(image: np.ndarray, half: int) -> np.ndarray:
     """Average over a square of 2 ``half`` + 1 pixels, twice; values beyond the edges count as 0."""
     size = (2 * half + 1, 2 * half + 1)
-    once = cv2.blur(np.ascontiguousarray(image, np.float32), size, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT))
+    once = cv2.blur(
+        np.ascontiguousarray(image, np.float32),
+        size,
+        borderType=cv2.BORDER_CONSTANT,
+    )
+    return cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT)
 
 
-def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
+def _worth(
+    weights: np.ndarray,
+    covered: np.ndarray,
+    half: int,
+) -> np.ndarray:
     """Return the variance (r, c) of a tent's mean of white noise with all weights 1, over that of
     its mean with ``weights``, whose own mean is ``covered``."""
     side = np.convolve(np.ones(2 * half + 1), np.ones(2 * half + 1)) ** 2
     side /= side.sum()
     # in double precision, so that the order of sums does not depend on the orientation of the
     # picture
-    squares = cv2.sepFilter2D(
-        weights.astype(np.float64), -1, side, side, borderType=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(
-        (covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)).astype(np.float32)
-    )
+    exact = weights.astype(np.float64)
+    squares = cv2.sepFilter2D(exact, -1, side, side, borderType=cv2.BORDER_CONSTANT)
+    worth = covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)
+    return worth.astype(np.float32)
+
+
+def _strongest(
+    means: np.ndarray,
+    around: np.ndarray,
+    deviation: np.ndarray,
+) -> np.ndarray:
+    """Return the largest (n,) (mean - around) / deviation by size, with its sign, over filters (k,
+    n) from narrow to wide; 0 where no filter counts.
+
+    A wide filter also covers what lies beside it. So it counts fully only if all narrower means
+    depart from the same surroundings by `GATE_SHARE` of its own departure, minus `GATE_SIGMAS` of
+    their deviations; it does not count if one departs by half as much."""
+    best = np.zeros(means.shape[1], np.float32)
+    for k in range(len(means)):
+        signal = means[k] - around[k]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            allowance = GATE_SIGMAS * deviation[:k] / np.abs(signal)
+            confirmed = (means[:k] - around[k]) / signal + allowance
+            say = np.maximum(2.0 * confirmed / GATE_SHARE - 1.0, 0.0).min(axis=0, initial=1.0)
+            score = signal / deviation[k] * say
+            best = np.where(np.abs(score) > np.abs(best), score, best)
+    return best
+
+
+# --- the local noise ---
 
 
 def local_sigma(
-    values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0, samples: int = SAMPLES_SIDE
+    values: np.ndarray,
+    half: int = LEAST_WINDOW,
+    floor: float = 0.0,
+    samples: int = SAMPLES_SIDE,
 ) -> np.ndarray:
     """Return the robust standard deviation (r, c) of the values' finite neighbours, from so many
     ``samples`` from the window's middle to its edge, interpolated between nodes ``half`` apart."""
-
-    def nodes_of(length: int) -> np.ndarray:
-        """Return the centres of equal parts, as `cv2.resize` assumes, moved to pixels
-        symmetrically about both ends."""
-        count = max(1, round(length / half))
-        count += (length - count) % 2 if length % 2 == 0 else 0
-        half_pixel = 0.5 if length % 2 == 0 else 0.0
-        from_middle = (np.arange(count) + 0.5) * length / count - 0.5 * length
-        moved = np.sign(from_middle) * (np.round(np.abs(from_middle) - half_pixel) + half_pixel)
-        return np.asarray(np.round(moved + 0.5 * (length - 1)).astype(np.int64))
-
-    rows, columns = (nodes_of(length) for length in values.shape)
+    height, width = values.shape
+    rows = _nodes(height, half)
+    columns = _nodes(width, half)
     nodes = _local_medians(values, rows, columns, half, max(1, half // samples)) / 0.6745
     known = np.isfinite(nodes)
     finite = nodes[known] if known.any() else np.abs(values[np.isfinite(values)]) / 0.6745
     everywhere = median_of(finite) if len(finite) else floor
     nodes = np.maximum(np.where(known, nodes, everywhere), floor).astype(np.float32)
-    h, w = values.shape
     even = cv2.blur(nodes, (3, 3), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.resize(even, (w, h), interpolation=cv2.INTER_LINEAR))
+    return cv2.resize(even, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _nodes(length: int, half: int) -> np.ndarray:
+    """Return the centres of equal parts of some ``half`` pixels, as `cv2.resize` assumes, moved to
+    pixels symmetrically about both ends."""
+    count = max(1, round(length / half))
+    half_pixel = 0.0
+    if length % 2 == 0:
+        count += count % 2
+        half_pixel = 0.5
+    from_middle = (np.arange(count) + 0.5) * length / count - 0.5 * length
+    moved = np.sign(from_middle) * (np.round(np.abs(from_middle) - half_pixel) + half_pixel)
+    return np.round(moved + 0.5 * (length - 1)).astype(np.int64)
 
 
 @numba.njit(**PLAIN)
 def _local_medians(
-    values: np.ndarray, rows: np.ndarray, columns: np.ndarray, half: int, stride: int
+    values: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    half: int,
+    stride: int,
 ) -> np.ndarray:
     """Return the medians (r, c) of finite sizes in windows of 2 ``half`` + 1 around nodes, every
     ``stride``-th."""
     h, w = values.shape
     medians = np.full((len(rows), len(columns)), np.nan)
     side = 2 * (half // stride) + 1
-    held = np.empty(side * side, np.float32)
+    sizes = np.empty(side * side, np.float32)
     reach = half // stride * stride
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
@@ -399,54 +497,60 @@ def _local_medians(
                 if 0 <= y < h:
                     for x in range(column - reach, column + reach + 1, stride):
                         if 0 <= x < w and np.isfinite(values[y, x]):
-                            held[n] = abs(values[y, x])
+                            sizes[n] = abs(values[y, x])
                             n += 1
             if n >= LEAST_SAMPLES:
-                medians[i, j] = np.median(held[:n])
+                medians[i, j] = np.median(sizes[:n])
     return medians
 
 
-def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Return the largest (n,) (mean - around) / deviation by size, with its sign, over filters (k,
-    n) from narrow to wide; 0 where no filter counts. A wide filter also covers what lies beside
-    it. So it counts fully only if all narrower means depart from the same surroundings by
-    `GATE_SHARE` of its own departure, minus `GATE_SIGMAS` of their deviations; it does not count
-    if one departs by half as much."""
-    best = np.zeros(means.shape[1], np.float32)
-    for k in range(len(means)):
-        signal = means[k] - around[k]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            confirmed = (means[:k] - around[k]) / signal + GATE_SIGMAS * deviation[:k] / np.abs(
-                signal
-            )
-            say = np.maximum(2.0 * confirmed / GATE_SHARE - 1.0, 0.0).min(axis=0, initial=1.0)
-            score = signal / deviation[k] * say
-            best = np.where(np.abs(score) > np.abs(best), score, best)
-    return best
+# --- peaks ---
+
+
+def _peak_of_cells(signed: np.ndarray, threshold: float) -> np.ndarray:
+    """Return for each cell of the signed scores (r, c), flat, the number of its peak, which counts
+    cells by falling score; -1 for cells far below the threshold.
+
+    Saddles below a threshold also part or join peaks; otherwise a peak would be two at some
+    thresholds. A lower threshold's saddles do not affect peaks above a higher one."""
+    sizes = np.abs(signed).ravel()
+    lowest_saddle = max(min(SADDLE * threshold, threshold - PROMINENCE), 0.0)
+    cells = np.flatnonzero(sizes > lowest_saddle)
+    order = cells[np.argsort(-sizes[cells], kind="stable")]
+    peak_of = np.full(sizes.size, -1, dtype=np.int64)
+    peak_of[order] = _peaks(signed, order, SADDLE, PROMINENCE)
+    return peak_of
 
 
 @numba.njit(**PLAIN)
-def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: float) -> np.ndarray:
+def _peaks(
+    score: np.ndarray,
+    order: np.ndarray,
+    saddle: float,
+    prominence: float,
+) -> np.ndarray:
     """Return (n,), for each of the pixels ``order`` (n,), flat indices in falling size of the
-    score (h, w), the index in ``order`` of the peak that it belongs to. Pixels join the highest
-    neighbouring peak of their sign; two peaks that meet become one by the rules of `SADDLE` and
-    `PROMINENCE`."""
+    score (h, w), the index in ``order`` of the peak that it belongs to.
+
+    Pixels join the highest neighbouring peak of their sign; two peaks that meet become one by the
+    rules of `SADDLE` and `PROMINENCE`."""
     h, w = score.shape
-    place = np.full(h * w, -1, np.int64)
+    index_of = np.full(h * w, -1, np.int64)
     parents = np.empty(len(order), np.int64)
     met = np.empty(8, np.int64)
     flat = score.ravel()
     for n in range(len(order)):
         pixel = order[n]
         parents[n] = n
-        place[pixel] = n
+        index_of[pixel] = n
         row = pixel // w
         column = pixel % w
+        is_behind = flat[pixel] > 0
         count = 0
         for y in range(max(row - 1, 0), min(row + 2, h)):
             for x in range(max(column - 1, 0), min(column + 2, w)):
-                neighbour = place[y * w + x]
-                if neighbour >= 0 and neighbour != n and (flat[y * w + x] > 0) == (flat[pixel] > 0):
+                neighbour = index_of[y * w + x]
+                if neighbour >= 0 and neighbour != n and (flat[y * w + x] > 0) == is_behind:
                     met[count] = root_of(parents, neighbour)
                     count += 1
         if count == 0:
@@ -455,10 +559,10 @@ def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: floa
         highest = met[:count].min()
         parents[n] = highest
         height = abs(flat[pixel])
-        for other in met[:count]:
-            top = abs(flat[order[other]])
-            if other != highest and (height > saddle * top or top - height < prominence):
-                parents[other] = highest
+        for peak in met[:count]:
+            top = abs(flat[order[peak]])
+            if peak != highest and (height > saddle * top or top - height < prominence):
+                parents[peak] = highest
     for n in range(len(order)):
         parents[n] = root_of(parents, n)
     return parents

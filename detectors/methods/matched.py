@@ -5,12 +5,12 @@ capture itself, without strong residuals, or learned from hole-free clouds. Each
 of several radii through a camera's window or lens, slots at several angles, dents) is then
 compared with the residuals r of the known pixels under that covariance C:
 
-score = t' C^-1 r / sqrt(t' C^-1 t)
+    score = t' C^-1 r / sqrt(t' C^-1 t)
 
 C^-1 r is solved for by conjugate gradients, so missing pixels and borders add nothing and need no
 filling. The scores of each template are then divided by their own deviation, separately for each
-distance from the outline. Wide templates have few independent places, so their scores are raised
-(`detectors.findings.whitening.Worth`).
+distance from the outline (`detectors.methods.scatter`). Wide templates have few independent
+positions, so their scores are raised (`detectors.findings.templates.Worth`).
 
 Strong findings are removed (their pixels count as unknown) and the rest is judged again, so that
 no filter sees the shoulder of a neighbouring hole. What pixels along the target's outline share
@@ -21,83 +21,62 @@ Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and
 findings; distortion of templates on steep surfaces; missing returns, except the few that are not
 findings by themselves (`detectors.findings.missing`). The denominator takes the share of a
 template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely; a
-template does not judge places where less than `LEAST_SEEN` of it is visible. Slots are scored on
+template does not judge pixels where less than `LEAST_SEEN` of it is visible. Slots are scored on
 every second pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numba
 import numpy as np
-from scipy import special
 
-from detectors.averages.noise import median_of
-from detectors.findings import whitening
-from detectors.findings.clusters import PLAIN
+from detectors.findings import templates, whitening
 from detectors.findings.missing import missing_evidence
 from detectors.interface import Evidence
-from detectors.masks import grown
 from detectors.methods import local
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
+from detectors.methods.scatter import FAINT, WIDE_PX, evened, tail_of, zones_of
+from detectors.pixels.clusters import PLAIN
+from detectors.pixels.masks import grown
+from detectors.pixels.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
-LEAST_SEEN = 0.6
-# width over which noise is compared between places: wider filters count there as much as elsewhere
+# --- residuals in deviations ---
+
 SHORT_PX = 13
+"""Width over which noise is compared between pixels: wider filters count there as much as
+elsewhere."""
 QUIET_SIGMAS = 4.0  # larger residuals and their neighbours do not count for the covariance
 CLIP_SIGMAS = 5.0
 """Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a
 finding."""
-STRONG = 6.0
-LOUD_SIGMAS = 3.0
-MARGIN_PX = 2
-"""A peak with this score, the loud pixels connected to it, and those around are removed; the rest
-is judged again."""
-LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
-ALONE_PX = 7  # half of the square in which a peak is the highest
 RIM_PX = 6  # depth of the target's rim, to which the camera's window and lens reach over its edge
-LAYER_PX = 4
-MODEST_SIGMAS = local.LEVEL_SIGMAS
-"""Side of the squares in which what the rim shares is averaged, and the limit to which residuals
-are clipped there."""
-RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
-"""Distances from the outline up to which scores have their own scatter; farther inside, all scores
-share one."""
-N_ZONES = len(RIM_ENDS_PX) + 1
-ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
-WINDOW_RADII = 6
-PART_PX = 8
-UNEVEN = 1.25
-"""Half of the window of the local scatter in radii, the side of its squares, and scatter that
-chance explains."""
-# largest score that counts in the scatter, and the fewest scores that determine it
-CAP = 2.0
-FEWEST = 200
-DEVIATIONS = np.geomspace(0.2, 50.0, 200)
-CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (
-    1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)
-) + 2.0 * CAP * special.ndtr(-CAP / DEVIATIONS)
-STEPS = 4096
-DEVIATION_OF = np.interp(np.arange(STEPS * CAP + 2) / STEPS, CAPPED, DEVIATIONS)
-"""Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`; and the
-inverse, by `STEPS`."""
-FAINT = 3.5  # scores below this are all raised by the same factor, because `Worth` counts maxima
+LAYER_PX = 4  # side of the squares in which what the rim shares is averaged
+MODEST_SIGMAS = local.LEVEL_SIGMAS  # limit to which residuals are clipped there
+
+# --- strong findings, which are removed before the rest is judged again ---
+
+STRONG = 6.0  # least score of their peaks
+LOUD_SIGMAS = 3.0  # least residual of the pixels that are connected to such a peak
+LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
+MARGIN_PX = 2  # what is removed around loud pixels
+ALONE_PX = 7  # half of the square in which a peak is the highest
+ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
+
+# --- scores ---
+
+LEAST_SEEN = 0.6  # least visible share of a template
 LOBE_SHARE = 0.5
 """A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the
 whitening."""
-WIDE_PX = 5.0  # radius from which noise may split a template's finding into several peaks
-ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
 TAIL_PX = 1.5
-TAIL_SHARE = 0.0005
-TAIL_SIGMAS = 3.29
-"""Largest radius at which a template's own scores show their tail; the share of pixels beyond it
-on either side; and where a Gaussian has it. Wider means are near Gaussian, and too few of them are
-independent."""
+"""Largest radius at which a template's own scores show their tail. Wider means are near Gaussian,
+and too few of them are independent."""
 
 
 class MatchedConfig(FilterConfig):
@@ -122,49 +101,56 @@ class MatchedDetector(LocalDetector):
         logarithms of the two likelihoods add up. Raises UserError on an empty crop, or if no
         surface can be fitted."""
         evidence = super().analyse(cloud)
-        lost = missing_evidence(cloud, evidence)
-        if lost is None:
+        missing = missing_evidence(cloud, evidence)
+        if missing is None:
             return evidence
-        score = np.sqrt(evidence.score**2 + lost)
+        score = np.sqrt(evidence.score**2 + missing)
+        scored = evidence.cell >= 0
+        cells = evidence.cell[scored]
         signed = evidence.signed.copy()
-        there = evidence.cell >= 0
-        signed.ravel()[evidence.cell[there]] = np.copysign(
-            score[there], signed.ravel()[evidence.cell[there]]
-        )
+        flat = signed.ravel()
+        flat[cells] = np.copysign(score[scored], flat[cells])
         return replace(evidence, score=score, signed=signed)
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
         """Return the residuals on a grid in which noise reaches no farther than a camera's own
         window."""
-        return super().picture(
-            cloud, max(pixels, round(cloud.noise_reach_px / max(whitening.WINDOWS_PX)))
-        )
+        windows = round(cloud.noise_reach_px / max(templates.WINDOWS_PX))
+        return super().picture(cloud, max(pixels, windows))
 
     def scored(
-        self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
+        self,
+        residual_m: np.ndarray,
+        weights: np.ndarray,
+        rounding_m2: tuple[float, float],
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and
         the unit of score."""
-        values, known, depth_px, unit_m = _in_deviations(residual_m, weights, rounding_m2)
-        signed, narrowest = _judged(values, known, depth_px, self._covariance)
-        depth_m = narrowest * float(np.median(unit_m[known]))
-        text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the narrowest"
-        return signed, depth_m, text
+        residuals = _in_deviations(residual_m, weights, rounding_m2)
+        signed, narrowest = _judged(residuals, self._covariance)
+        depth_m = narrowest * float(np.median(residuals.unit_m[residuals.known]))
+        unit = (
+            f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the"
+            " narrowest"
+        )
+        return signed, depth_m, unit
 
     def correlation(self, evidence: Evidence) -> np.ndarray:
         """Return the correlation of the noise by lag, learned or from the residuals."""
-        return (
-            _own_correlation(evidence)
-            if self._covariance is None
-            else whitening.correlation(self._covariance)
-        )
+        if self._covariance is None:
+            return _own_correlation(evidence)
+        return whitening.correlation(self._covariance)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the
         local noise."""
-        pictures = (self.picture(cloud) for cloud in hole_free)
-        seen = [_covariance(*_in_deviations(*picture.residuals)[:3]) for picture in pictures]
-        return {"covariance": np.mean(seen, axis=0)} if seen else {}
+        covariances = []
+        for cloud in hole_free:
+            residual_m, weights, rounding_m2 = self.picture(cloud).residuals
+            covariances.append(_covariance(_in_deviations(residual_m, weights, rounding_m2)))
+        if not covariances:
+            return {}
+        return {"covariance": np.mean(covariances, axis=0)}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
         """Return the detector that whitens with the learned covariance instead of the capture's
@@ -172,408 +158,52 @@ class MatchedDetector(LocalDetector):
         return type(self)(self.settings, learned.get("covariance"))
 
 
+# --- residuals in deviations of the local noise ---
+
+
+class _Residuals(NamedTuple):
+    """A picture of residuals in units of the local noise."""
+
+    values: np.ndarray
+    """(r, c) float32: residuals in units of the noise nearby, reduced where a point's own variance
+    is larger, minus what they share along the outline."""
+    known: np.ndarray
+    """(r, c) bool."""
+    depth_px: np.ndarray
+    """(r, c): distance of each pixel from the outline of the known ones."""
+    unit_m: np.ndarray
+    """(r, c): the unit, metres."""
+
+
 def _in_deviations(
-    residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return residuals (r, c) in units of the noise nearby, increased where a point's own variance
-    is larger, and minus what they share along the outline; (r, c) bool, the known pixels; their
-    distances (r, c) from the outline; and that unit (r, c) in metres."""
+    residual_m: np.ndarray,
+    weights: np.ndarray,
+    rounding_m2: tuple[float, float],
+) -> _Residuals:
+    """Return residuals (r, c) with weights (r, c), 0 where unknown, in units of the noise nearby,
+    which is at least that of rounding."""
     known = weights > 0
     floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
     values = np.where(known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
     # structure wider than a filter's window, objects and the surface's misfit are not noise of
     # pixels
     side = (SHORT_PX, SHORT_PX)
-    around = (
-        cv2.blur(each, side, borderType=cv2.BORDER_REFLECT)
-        for each in (values, known.astype(np.float32))
-    )
-    short = values - next(around) / np.maximum(next(around), np.float32(1e-6))
+    total = cv2.blur(values, side, borderType=cv2.BORDER_REFLECT)
+    count = cv2.blur(known.astype(np.float32), side, borderType=cv2.BORDER_REFLECT)
+    short = values - total / np.maximum(count, np.float32(1e-6))
     short[~known] = np.nan
-    some = slice(None, None, max(1, np.count_nonzero(known) // 65536))
-    share = median_of(np.abs(short[known][some])) / max(
-        median_of(np.abs(values[known][some])), 1e-12
-    )
+    step = max(1, np.count_nonzero(known) // 65536)
+    short_size = median_of(np.abs(short[known][::step]))
+    size = median_of(np.abs(values[known][::step]))
+    share = short_size / max(size, 1e-12)
     unit_m = np.maximum(local.local_sigma(short) / max(share, 1e-3), floor_m)
     depth_px = _depth_px(known)
-    return _without_rim(values / unit_m, depth_px * known), known, depth_px, unit_m
-
-
-@lru_cache(maxsize=1)
-def _own_correlation(evidence: Evidence) -> np.ndarray:
-    """Return the correlation of a cloud's residuals by lag, once for all findings of the cloud."""
-    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
-    residual_m = evidence.residual_m[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-    weights = np.isfinite(residual_m).astype(np.float32)
-    return whitening.correlation(
-        _covariance(*_in_deviations(np.nan_to_num(residual_m), weights, (0.0, 0.0))[:3])
+    return _Residuals(
+        _without_rim(values / unit_m, depth_px * known),
+        known,
+        depth_px,
+        unit_m,
     )
-
-
-def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
-    """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
-    inner = known & (depth_px > RIM_PX)
-    inner = inner if 2 * inner.sum() > known.sum() else known
-    loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
-    return whitening.noise_covariance(noise, inner & (loud == 0), whitening.grid_of(noise.shape))
-
-
-def _judged(
-    values: np.ndarray, known: np.ndarray, depth_px: np.ndarray, covariance: np.ndarray | None
-) -> tuple[np.ndarray, float]:
-    """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest
-    template's height."""
-    covariance = _covariance(values, known, depth_px) if covariance is None else covariance
-    window_px = whitening.window_of(covariance)
-    worths = whitening.worths(
-        whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px
-    )
-    noise = whitening.filters(covariance, values.shape), window_px, worths
-    tamed = _tamed(values)
-    heard = np.zeros(known.shape, np.uint8)
-    signed, by, solved, _ = _scored(tamed, known, noise)
-    radius_px = np.array([each.radius_px for each in whitening.bank(window_px)], np.float32)
-    size = np.abs(signed)
-    peaks = np.argwhere((size > STRONG) & _highest(size))
-    peaks = peaks[np.argsort(size[tuple(peaks.T)], kind="stable")]
-    strong = size[tuple(peaks.T)]
-    strong_by = by[tuple(peaks.T)]
-    for (row, column), radius in zip(peaks.tolist(), radius_px[strong_by].tolist(), strict=True):
-        cv2.circle(heard, (column, row), round(radius), 1, cv2.FILLED)
-    core, heights, peak_of = _cores(peaks, radius_px[strong_by], values, known)
-    seen = known & ~grown(core, MARGIN_PX) if core.any() else known
-    # where much is removed, the first solution is a poor start
-    signed, by, _, spread = _scored(
-        tamed * seen, seen, noise, heard > 0, None if core.any() else solved
-    )
-    # only now are deviations known; that of the narrowest template is known best
-    strong = strong / spread
-    _fill_discs(signed, radius_px[by])
-    signed *= known
-    signed[core] = heights[core] * strong[peak_of[core]]
-    reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    low = np.asarray(cv2.erode(signed, reach))
-    high = np.asarray(cv2.dilate(signed, reach))
-    lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
-    return (signed * ~lobe).astype(np.float64), worths[0].energy ** -0.5
-
-
-def _tamed(values: np.ndarray) -> np.ndarray:
-    """Return values (r, c) clipped so that none exceeds both `CLIP_SIGMAS` and its eight
-    neighbours."""
-    ring = np.ones((3, 3), np.uint8)
-    ring[1, 1] = 0
-    low = np.asarray(cv2.erode(values, ring))
-    high = np.asarray(cv2.dilate(values, ring))
-    return np.clip(values, np.minimum(low, -CLIP_SIGMAS), np.maximum(high, CLIP_SIGMAS))
-
-
-def _scored(
-    values: np.ndarray,
-    seen: np.ndarray,
-    noise: tuple[whitening.Filters, int, Sequence[whitening.Worth]],
-    heard: np.ndarray | None = None,
-    start: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return each pixel's strongest score (r, c) with its sign, the index of its template, and
-    C^-1 r, from the pixels ``seen`` (r, c); and the deviation of the narrowest template.
-    ``noise``: its `whitening.filters`, the window's side, and each template's `Worth`. ``heard``
-    (r, c) bool: strong findings, which the scatter of scores ignores; None to seek them, at the
-    centres of pixels and with deviations of 1. ``start``: an approximate solution."""
-    (filters, window_px, worths), rough = noise, heard is None
-    solved = whitening.inverse_times(
-        values, seen, filters, start, ROUGH if rough else whitening.CONVERGED
-    )
-    spectra = [whitening.transformed(solved, filters[0].shape)]
-    visible = {}
-    tail = 1.0
-    views = [(seen.astype(np.float32), _depth_px(seen))]
-    spectra.append(whitening.halved(spectra[0]))
-    views.append((_halved(views[0][0]), _halved(views[0][1])))
-    louds = () if heard is None else (heard, np.ascontiguousarray(heard[::2, ::2]))
-    zones = [_zones(*view, loud) for view, loud in zip(views, louds, strict=False)]
-    scores = [np.empty_like(there) for there, _ in views]
-    products = [np.empty_like(each) for each in spectra]
-    # of fine, coarse and slots' scores
-    best = [
-        (np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in (*views, views[1])
-    ]
-    templates = whitening.bank(window_px)
-    spread = 1.0
-    for pair, numbers in whitening.spectra(filters[0].shape, window_px):
-        wanted = [not rough or not any(templates[number].halves) for number in numbers]
-        if not any(wanted):
-            continue
-        coarse = templates[numbers[0]].coarse
-        (there, depth_px), score = views[coarse], scores[coarse]
-        both = whitening.responses(spectra[coarse], pair, products[coarse])[
-            : len(score), : score.shape[1]
-        ]
-        for channel, number in [each for each in enumerate(numbers) if wanted[each[0]]]:
-            template = templates[number]
-            worth = worths[number]
-            key = coarse, template.slot, worth.sides
-            if key not in visible:
-                share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
-                # errors along outlines, from light and flying pixels, look like slots
-                visible[key] = _visible(
-                    share, there * (depth_px > RIM_PX) if template.slot else there
-                )
-            cv2.extractChannel(both, channel, dst=score)
-            cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
-            deviation = 1.0
-            if heard is not None:
-                deviation = _evened(score, template, zones[coarse])
-                if template.radius_px <= TAIL_PX:
-                    tail = tail if any(template.halves) else _tail(score, deviation)
-                    deviation *= tail
-            spread = spread if number else deviation
-            _keep_stronger(
-                *best[coarse + template.slot],
-                score,
-                1 / deviation,
-                worth.raised,
-                *template.halves,
-                number,
-            )
-    signed, by = best[0]
-    # linear interpolation would lower the narrow ridges of slots' scores by a seventh
-    for (half, half_by), smooth in zip(
-        best[1:], (cv2.INTER_LINEAR, cv2.INTER_NEAREST), strict=True
-    ):
-        wide, wide_by = (
-            np.ascontiguousarray(
-                cv2.resize(each, None, fx=2, fy=2, interpolation=how)[: len(seen), : seen.shape[1]]
-            )
-            for each, how in ((half, smooth), (half_by, cv2.INTER_NEAREST))
-        )
-        wider = (np.abs(wide) > np.abs(signed)).view(np.uint8)
-        cv2.copyTo(wide, wider, signed)
-        cv2.copyTo(wide_by, wider, by)
-    return signed * seen, by, solved, spread
-
-
-@numba.njit(**PLAIN)
-def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
-    """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible,
-    0 elsewhere."""
-    found = np.empty(share.shape, np.float32)
-    least = np.float32(LEAST_SEEN)
-    for i in range(share.shape[0]):
-        shares = share[i]
-        is_judged = judged[i]
-        factors = found[i]
-        for j in range(len(factors)):
-            factor = np.float32(1.0) / np.sqrt(max(shares[j], least))
-            factors[j] = factor if (shares[j] > least) & (is_judged[j] > 0) else np.float32(0.0)
-    return found
-
-
-def _zones(
-    there: np.ndarray, depth_px: np.ndarray, loud: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ``loud`` (r, c) bool, the scores that do not count for the scatter; the flat indices
-    (n,) of the known pixels outside the last zone, in the order of their zones; and where each
-    zone ends (z,) among them."""
-    zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.uint8)]
-    zone[there == 0] = N_ZONES - 1
-    order = np.argsort(zone, axis=None, kind="stable")
-    ends = np.cumsum(np.bincount(zone.ravel(), minlength=N_ZONES))[:-1]
-    return loud, order[: ends[-1]], ends
-
-
-def _halved(image: np.ndarray) -> np.ndarray:
-    """Return the means (r / 2, c / 2) of 2 x 2 pixels; an odd last row or column is repeated."""
-    even = cv2.copyMakeBorder(
-        image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE
-    )
-    return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-
-
-def _evened(
-    score: np.ndarray, template: whitening.Template, zones: tuple[np.ndarray, ...]
-) -> float:
-    """Return the deviation of the scores (r, c) in the last zone, and divide the scores where
-    others scatter more: in other zones, and where the squares around scatter by more than `UNEVEN`
-    deviations because the noise there differs from elsewhere. Loud scores do not count, nor strong
-    ones of wide templates, nor those next to them."""
-    step, (loud, *rim) = 1 + template.coarse, zones
-    if template.radius_px >= WIDE_PX and not template.slot:
-        most = FAINT * _scatter(score, np.zeros_like(loud), *rim)[0][-1]
-        strong = loud | (np.abs(score) > most) if cv2.norm(score, cv2.NORM_INF) > most else loud
-        loud = grown(strong, round(template.radius_px / step)) if strong.any() else loud
-    found, sums, counts = _scatter(score, loud, *rim)
-    if counts.sum() <= FEWEST:
-        found = _scatter(score, np.zeros_like(loud), *rim)[0]
-    deviation = float(found[-1])
-    half_px = max(WINDOW_RADII * template.radius_px, local.LEAST_WINDOW) / step
-    window = (2 * round(half_px / PART_PX) + 1,) * 2
-    size = cv2.blur(sums, window) / np.maximum(cv2.blur(counts, window), 0.05 * PART_PX**2)
-    if DEVIATION_OF[int(STEPS * size.max())] > UNEVEN * deviation:
-        more = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / (UNEVEN * deviation), 1.0).astype(
-            np.float32
-        )
-        score /= cv2.resize(more, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    _even(score, *rim, (deviation / found).astype(np.float32))
-    return deviation
-
-
-@numba.njit(**PLAIN)
-def _even(score: np.ndarray, rim: np.ndarray, ends: np.ndarray, factors: np.ndarray) -> None:
-    flat = score.ravel()
-    start = 0
-    for zone in range(len(ends)):
-        for k in range(start, ends[zone]):
-            flat[rim[k]] *= factors[zone]
-        start = ends[zone]
-
-
-@numba.njit(**PLAIN)
-def _scatter(
-    score: np.ndarray, loud: np.ndarray, rim: np.ndarray, ends: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the deviations (z,) of the scores (r, c) that are neither 0 nor ``loud`` in each
-    zone, at least that of the last, from sizes up to `CAP`; and the sums of these sizes in squares
-    of `PART_PX`, and their numbers."""
-    (h, w), most, last = score.shape, np.float32(CAP), N_ZONES - 1
-    rows = max(1, h // PART_PX)
-    columns = max(1, w // PART_PX)
-    sums = np.zeros((rows, columns))
-    counts = np.zeros((rows, columns))
-    whole = 0.0
-    number = 0.0
-    for row in range(rows):
-        sizes = np.zeros(w, np.float32)
-        numbers = np.zeros(w, np.int32)
-        for i in range(row * h // rows, (row + 1) * h // rows):
-            values = score[i]
-            hidden = loud[i]
-            for j in range(w):
-                value = np.float32(0.0) if hidden[j] else values[j]
-                sizes[j] += min(abs(value), most)
-                numbers[j] += value != 0
-        for part in range(columns):
-            for j in range(part * w // columns, (part + 1) * w // columns):
-                sums[row, part] += sizes[j]
-                counts[row, part] += numbers[j]
-            whole += sums[row, part]
-            number += counts[row, part]
-    totals = np.zeros(N_ZONES)
-    known = np.zeros(N_ZONES)
-    found = np.zeros(N_ZONES)
-    flat = score.ravel()
-    hides = loud.ravel()
-    start = 0
-    for zone in range(last):
-        size = 0.0
-        count = 0
-        for k in range(start, ends[zone]):
-            value = np.float32(0.0) if hides[rim[k]] else flat[rim[k]]
-            size += min(abs(value), most)
-            count += value != 0
-        totals[zone], known[zone], start = size, count, ends[zone]
-    totals[last], known[last] = whole - totals.sum(), number - known.sum()
-    if known[last] < FEWEST:
-        totals[last], known[last] = whole, number
-    for zone in range(last, -1, -1):
-        if zone == last or known[zone] >= FEWEST:
-            found[zone] = DEVIATION_OF[int(STEPS * max(totals[zone], 0.0) / max(known[zone], 1.0))]
-        found[zone] = max(found[zone], found[last])
-    return found, sums, counts
-
-
-@numba.njit(**PLAIN)
-def _keep_stronger(  # type: ignore[no-untyped-def]
-    signed, by, score, per_deviation, raised, down, right, number
-):
-    """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``.
-    Scores are scaled by ``per_deviation`` and raised: their squares grow by ``raised``, in
-    proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around.
-    """
-    scale = np.float32(per_deviation)
-    more = np.float32(raised)
-    faint = np.float32(per_deviation * np.sqrt(1.0 + raised / FAINT**2))
-    height, width = score.shape
-    for y in range(down + 1):
-        for x in range(right + 1):
-            for i in range(height - y):
-                of = score[i]
-                most = signed[i + y][x:]
-                most_by = by[i + y][x:]
-                for j in range(width - x):
-                    size = min(abs(of[j]) * faint, np.sqrt((of[j] * scale) ** 2 + more))
-                    stronger = size > abs(most[j])
-                    most[j] = np.copysign(size, of[j]) if stronger else most[j]
-                    most_by[j] = number if stronger else most_by[j]
-
-
-def _tail(scores: np.ndarray, deviation: float) -> float:
-    """Return how much farther the tail of scores (r, c) over their ``deviation`` reaches than a
-    Gaussian's, on its shorter side; at least 1."""
-    count = int(TAIL_SHARE * np.count_nonzero(scores))
-    limit = TAIL_SIGMAS * deviation
-    sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > limit, scores < -limit)]
-    if count == 0 or min(map(len, sides)) < count:
-        return 1.0
-    return float(min(side[-count] for side in sides)) / limit
-
-
-def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
-    """Raise the scores (r, c) inside the disc of each wide template that peaks, so that it is one
-    finding."""
-    size = np.abs(signed)
-    peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
-    for row, column in np.argwhere(peaks).tolist():
-        radius = int(radius_px[row, column])
-        least = local.SADDLE * 1.01 * signed[row, column]
-        cut = np.s_[
-            max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1
-        ]
-        rows, columns = np.ogrid[: size[cut].shape[0], : size[cut].shape[1]]
-        inside = (rows - min(row, radius)) ** 2 + (columns - min(column, radius)) ** 2 <= radius**2
-        signed[cut][inside & (size[cut] < abs(least))] = least
-
-
-def _highest(size: np.ndarray) -> np.ndarray:
-    """Return (r, c) bool: pixels that are the largest within `ALONE_PX`."""
-    return np.asarray(size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
-
-
-def _cores(
-    peaks: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (r, c) bool: the loud pixels under ``peaks`` (n, 2), weakest first, and what lies
-    between them, where they fill a disc of the template's ``radius_px`` (n,). Also return their
-    signed heights (r, c), up to 1, in proportion to the values over 3 x 3 pixels, so that two
-    holes that touch keep two peaks; and each pixel's peak (r, c)."""
-    core = np.zeros(known.shape, bool)
-    signed = np.zeros(known.shape)
-    peak_of = np.zeros(known.shape, np.intp)
-    loud = known & (np.abs(values) > LOUD_SIGMAS)
-    around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))
-    smooth = next(around) / np.maximum(next(around), 0.1)
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
-    highest = np.full(count, -1)
-    for peak, (row, column) in enumerate(peaks.tolist()):
-        for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):
-            if (
-                number > 0
-                and stats[number, cv2.CC_STAT_AREA] > LOUD_SHARE * np.pi * radius_px[peak] ** 2
-            ):
-                highest[number] = peak
-    for number in np.flatnonzero(highest >= 0):
-        left, top, width, height = stats[number, :4]
-        cut = np.s_[top : top + height, left : left + width]
-        part = (parts[cut] == number) & known[cut]
-        heights = smooth[cut][part].astype(np.float64)
-        # quiet pixels between loud ones are not a finding of the other sign
-        side = np.sign(heights[np.abs(heights).argmax()])
-        heights = np.where(
-            np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0)
-        )
-        signed[cut][part], peak_of[cut][part] = heights / np.abs(heights).max(), highest[number]
-        core[cut] |= part
-    return core, signed, peak_of
 
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
@@ -588,30 +218,437 @@ def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the
     same distance from the outline, beyond what those next to the rim share: subtracting a mean
     would leave a step there. Pixels whose ``depth_px`` (r, c) is 0 are unknown."""
-    noise, sums = (
-        noise.astype(np.float32),
-        np.zeros((2, *(-(-side // LAYER_PX) for side in noise.shape), RIM_PX + 1)),
-    )
-    _layers(noise, depth_px, sums, True)
+    noise = noise.astype(np.float32)
+    rows = -(-noise.shape[0] // LAYER_PX)
+    columns = -(-noise.shape[1] // LAYER_PX)
+    total = np.zeros((rows, columns, RIM_PX + 1))
+    count = np.zeros((rows, columns, RIM_PX + 1))
+    _sum_layers(noise, depth_px, total, count)
     side = 2 * (local.LEAST_WINDOW // LAYER_PX) + 1
-    total, count = (cv2.blur(each, (side, side), borderType=cv2.BORDER_CONSTANT) for each in sums)
-    sums[0] = total / np.maximum(count, 1e-6)
-    sums[0] -= sums[0, ..., RIM_PX:]
-    _layers(noise, depth_px, sums, False)
+    total = cv2.blur(total, (side, side), borderType=cv2.BORDER_CONSTANT)
+    count = cv2.blur(count, (side, side), borderType=cv2.BORDER_CONSTANT)
+    shared = total / np.maximum(count, 1e-6)
+    shared -= shared[..., RIM_PX:]
+    _subtract_layers(noise, depth_px, shared)
     return noise
 
 
 @numba.njit(**PLAIN)
-def _layers(noise: np.ndarray, depth_px: np.ndarray, sums: np.ndarray, summed: bool) -> None:
-    """Add clipped residuals to ``sums``, and their numbers (2, r, c, `RIM_PX` + 1), in squares of
-    `LAYER_PX`, for each distance from the outline within the rim, and for those next to it
-    together; or subtract from the rim's residuals the first of the sums there."""
+def _sum_layers(
+    noise: np.ndarray,
+    depth_px: np.ndarray,
+    total: np.ndarray,
+    count: np.ndarray,
+) -> None:
+    """Add clipped residuals to ``total``, and their numbers to ``count`` (r, c, `RIM_PX` + 1), in
+    squares of `LAYER_PX`, for each distance from the outline within the rim, and for those next to
+    it together."""
     for i in range(noise.shape[0]):
         for j in range(noise.shape[1]):
-            if 0 < depth_px[i, j] <= (2 * RIM_PX if summed else RIM_PX):
-                at = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
-                if summed:
-                    sums[0][at] += min(max(noise[i, j], -MODEST_SIGMAS), MODEST_SIGMAS)
-                    sums[1][at] += 1
-                else:
-                    noise[i, j] -= np.float32(sums[0][at])
+            if 0 < depth_px[i, j] <= 2 * RIM_PX:
+                layer = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
+                total[layer] += min(max(noise[i, j], -MODEST_SIGMAS), MODEST_SIGMAS)
+                count[layer] += 1
+
+
+@numba.njit(**PLAIN)
+def _subtract_layers(
+    noise: np.ndarray,
+    depth_px: np.ndarray,
+    shared: np.ndarray,
+) -> None:
+    """Subtract from the rim's residuals what they share (r, c, `RIM_PX` + 1) in their square and
+    at their distance."""
+    for i in range(noise.shape[0]):
+        for j in range(noise.shape[1]):
+            if 0 < depth_px[i, j] <= RIM_PX:
+                layer = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
+                noise[i, j] -= np.float32(shared[layer])
+
+
+@lru_cache(maxsize=1)
+def _own_correlation(evidence: Evidence) -> np.ndarray:
+    """Return the correlation of a cloud's residuals by lag, once for all findings of the cloud."""
+    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
+    residual_m = evidence.residual_m[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    weights = np.isfinite(residual_m).astype(np.float32)
+    residuals = _in_deviations(np.nan_to_num(residual_m), weights, (0.0, 0.0))
+    return whitening.correlation(_covariance(residuals))
+
+
+def _covariance(residuals: _Residuals) -> np.ndarray:
+    """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
+    inner = residuals.known & (residuals.depth_px > RIM_PX)
+    if 2 * inner.sum() <= residuals.known.sum():
+        inner = residuals.known
+    loud = (np.abs(residuals.values) > QUIET_SIGMAS).astype(np.uint8)
+    quiet = inner & (cv2.dilate(loud, np.ones((5, 5), np.uint8)) == 0)
+    grid = whitening.grid_of(residuals.values.shape)
+    return whitening.noise_covariance(residuals.values, quiet, grid)
+
+
+# --- two passes: strong findings, and the rest without them ---
+
+
+class _Noise(NamedTuple):
+    """The noise of a picture, and what it makes of the templates."""
+
+    filters: whitening.Filters
+    window_px: int
+    """Side of the camera's window that the noise indicates."""
+    worths: tuple[templates.Worth, ...]
+    """Worth of each template."""
+
+
+class _Scores(NamedTuple):
+    """The strongest template at each pixel."""
+
+    signed: np.ndarray
+    """(r, c): its score, negative in front of the surface."""
+    template: np.ndarray
+    """(r, c): its number in the bank."""
+    solved: np.ndarray
+    """(r, c): C^-1 r."""
+    spread: float
+    """Deviation of the narrowest template's scores."""
+
+
+def _judged(residuals: _Residuals, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest
+    template's height."""
+    known = residuals.known
+    if covariance is None:
+        covariance = _covariance(residuals)
+    window_px = templates.window_of(covariance)
+    power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
+    noise = _Noise(
+        whitening.filters(covariance, known.shape),
+        window_px,
+        templates.worths(power, window_px),
+    )
+    tamed = _tamed(residuals.values)
+    radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
+
+    # the strong findings, weakest first
+    first = _scored(tamed, known, noise)
+    size = np.abs(first.signed)
+    peaks = np.argwhere((size > STRONG) & _highest(size))
+    peaks = peaks[np.argsort(size[tuple(peaks.T)], kind="stable")]
+    strong = size[tuple(peaks.T)]
+    strong_radius_px = radius_px[first.template[tuple(peaks.T)]]
+    discs = np.zeros(known.shape, np.uint8)
+    for (row, column), radius in zip(peaks.tolist(), strong_radius_px.tolist(), strict=True):
+        cv2.circle(discs, (column, row), round(radius), 1, cv2.FILLED)
+    core, heights, peak_of = _cores(peaks, strong_radius_px, residuals.values, known)
+
+    # the rest; where much is removed, the first solution is a poor start
+    if core.any():
+        rest = known & ~grown(core, MARGIN_PX)
+        second = _scored(tamed * rest, rest, noise, discs > 0, None)
+    else:
+        second = _scored(tamed * known, known, noise, discs > 0, first.solved)
+    signed = second.signed
+    # only now are deviations known; that of the narrowest template is known best
+    strong = strong / second.spread
+    _fill_discs(signed, radius_px[second.template])
+    signed *= known
+    signed[core] = heights[core] * strong[peak_of[core]]
+    scores = (signed * ~_side_lobes(signed)).astype(np.float64)
+    return scores, noise.worths[0].energy ** -0.5
+
+
+def _tamed(values: np.ndarray) -> np.ndarray:
+    """Return values (r, c) clipped so that none exceeds both `CLIP_SIGMAS` and its eight
+    neighbours."""
+    ring = np.ones((3, 3), np.uint8)
+    ring[1, 1] = 0
+    low = cv2.erode(values, ring)
+    high = cv2.dilate(values, ring)
+    return np.clip(values, np.minimum(low, -CLIP_SIGMAS), np.maximum(high, CLIP_SIGMAS))
+
+
+def _side_lobes(signed: np.ndarray) -> np.ndarray:
+    """Return (r, c) bool: scores that are less than `LOBE_SHARE` of one of the other sign within
+    `RIM_PX`."""
+    reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    low = cv2.erode(signed, reach)
+    high = cv2.dilate(signed, reach)
+    return (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
+
+
+def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
+    """Raise the scores (r, c) inside the disc of each wide template that peaks, so that it is one
+    finding."""
+    size = np.abs(signed)
+    peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
+    for row, column in np.argwhere(peaks).tolist():
+        radius = int(radius_px[row, column])
+        least = local.SADDLE * 1.01 * signed[row, column]
+        top = max(row - radius, 0)
+        left = max(column - radius, 0)
+        cut = np.s_[top : row + radius + 1, left : column + radius + 1]
+        rows, columns = np.ogrid[: size[cut].shape[0], : size[cut].shape[1]]
+        inside = (rows - (row - top)) ** 2 + (columns - (column - left)) ** 2 <= radius**2
+        signed[cut][inside & (size[cut] < abs(least))] = least
+
+
+def _highest(size: np.ndarray) -> np.ndarray:
+    """Return (r, c) bool: pixels that are the largest within `ALONE_PX`."""
+    return size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8))
+
+
+def _cores(
+    peaks: np.ndarray,
+    radius_px: np.ndarray,
+    values: np.ndarray,
+    known: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pixels of strong findings.
+
+    These are the loud pixels under ``peaks`` (n, 2), weakest first, and what lies between them,
+    where they fill half of a disc of the template's ``radius_px`` (n,).
+
+    Returns:
+        (r, c) bool, these pixels; their signed heights (r, c), up to 1, in proportion to the
+        ``values`` over 3 x 3 pixels, so that two holes that touch keep two peaks; and each pixel's
+        peak (r, c)."""
+    core = np.zeros(known.shape, bool)
+    signed = np.zeros(known.shape)
+    peak_of = np.zeros(known.shape, np.intp)
+    loud = known & (np.abs(values) > LOUD_SIGMAS)
+    smooth = cv2.blur(values, (3, 3))
+    smooth = smooth / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 0.1)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
+    areas = stats[:, cv2.CC_STAT_AREA]
+    highest = np.full(count, -1)
+    for peak, (row, column) in enumerate(peaks.tolist()):
+        least_area = LOUD_SHARE * np.pi * radius_px[peak] ** 2
+        beside = parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        for number in np.unique(beside):
+            if number > 0 and areas[number] > least_area:
+                highest[number] = peak
+    for number in np.flatnonzero(highest >= 0):
+        left, top, width, height = stats[number, :4]
+        cut = np.s_[top : top + height, left : left + width]
+        part = (parts[cut] == number) & known[cut]
+        heights = smooth[cut][part].astype(np.float64)
+        # quiet pixels between loud ones are not a finding of the other sign
+        side = np.sign(heights[np.abs(heights).argmax()])
+        one_sided = side * np.maximum(side * heights, 0.0)
+        heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, one_sided)
+        signed[cut][part] = heights / np.abs(heights).max()
+        peak_of[cut][part] = highest[number]
+        core[cut] |= part
+    return core, signed, peak_of
+
+
+# --- the scores of all templates ---
+
+
+class _View:
+    """The seen pixels, all or halved to every second one, as templates are compared with them.
+
+    ``seen`` (r, c) float32: 1 where seen, a share where halved. ``depth_px`` (r, c): distance from
+    the outline of the seen pixels. ``spectrum``: of C^-1 r on the grid of transforms. ``score`` (r,
+    c) and ``products``: memory for one template's scores and one pair's transform."""
+
+    def __init__(
+        self,
+        seen: np.ndarray,
+        depth_px: np.ndarray,
+        spectrum: np.ndarray,
+    ) -> None:
+        self.seen = seen
+        self.depth_px = depth_px
+        self.spectrum = spectrum
+        self.score = np.empty_like(seen)
+        self.products = np.empty_like(spectrum)
+        self._factors: dict[tuple[bool, tuple[int, int]], np.ndarray] = {}
+
+    def factors(self, template: templates.Template, worth: templates.Worth) -> np.ndarray:
+        """Return 1 / sqrt(visible share) (r, c) of a template, 0 where it does not judge."""
+        key = template.slot, worth.sides
+        if key not in self._factors:
+            share = cv2.blur(self.seen, worth.sides, borderType=cv2.BORDER_CONSTANT)
+            judged = self.seen
+            if template.slot:
+                # errors along outlines, from light and flying pixels, look like slots
+                judged = judged * (self.depth_px > RIM_PX)
+            self._factors[key] = _visible(share, judged)
+        return self._factors[key]
+
+
+class _Best:
+    """The strongest score (r, c) at each pixel so far, with its sign, and its template's number."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.signed = np.zeros(shape, np.float32)
+        self.template = np.zeros(shape, np.uint8)
+
+
+def _scored(
+    values: np.ndarray,
+    seen: np.ndarray,
+    noise: _Noise,
+    strong: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+) -> _Scores:
+    """Return each pixel's strongest score.
+
+    Args:
+        values: (r, c), residuals in deviations.
+        seen: (r, c) bool, the pixels that count.
+        noise: of the picture.
+        strong: (r, c) bool, strong findings, which the scatter of scores ignores. None in the
+            first pass, which looks for them: at the centres of pixels, with deviations of 1.
+        start: (r, c), an approximate C^-1 r."""
+    error = ROUGH if strong is None else whitening.CONVERGED
+    solved = whitening.inverse_times(values, seen, noise.filters, start, error)
+    fine = _View(
+        seen.astype(np.float32),
+        _depth_px(seen),
+        templates.transformed(solved, noise.filters.power.shape),
+    )
+    coarse = _View(_halved(fine.seen), _halved(fine.depth_px), templates.halved(fine.spectrum))
+    zones = []
+    if strong is not None:
+        zones.append(zones_of(fine.seen, fine.depth_px, strong))
+        coarse_strong = np.ascontiguousarray(strong[::2, ::2])
+        zones.append(zones_of(coarse.seen, coarse.depth_px, coarse_strong))
+    best = _Best(fine.seen.shape)
+    coarse_best = _Best(coarse.seen.shape)
+    slot_best = _Best(coarse.seen.shape)
+    spread = 1.0
+    tail = 1.0
+    for view, number, response in _responses(fine, coarse, noise, strong is None):
+        template = templates.bank(noise.window_px)[number]
+        worth = noise.worths[number]
+        score = view.score
+        factors = view.factors(template, worth)
+        cv2.multiply(response, factors, dst=score, scale=worth.energy**-0.5)
+        deviation = 1.0
+        if strong is not None:
+            deviation = evened(score, template, zones[template.coarse])
+            if template.radius_px <= TAIL_PX:
+                if not any(template.halves):
+                    tail = tail_of(score, deviation)
+                deviation *= tail
+        if number == 0:
+            spread = deviation
+        kept = best
+        if template.coarse:
+            kept = slot_best if template.slot else coarse_best
+        down, right = template.halves
+        _keep_stronger(
+            kept.signed,
+            kept.template,
+            score,
+            1 / deviation,
+            worth.raised,
+            down,
+            right,
+            number,
+        )
+    # linear interpolation would lower the narrow ridges of slots' scores by a seventh
+    _merge(best, coarse_best, cv2.INTER_LINEAR)
+    _merge(best, slot_best, cv2.INTER_NEAREST)
+    return _Scores(best.signed * seen, best.template, solved, spread)
+
+
+def _responses(
+    fine: _View,
+    coarse: _View,
+    noise: _Noise,
+    only_centred: bool,
+) -> Iterator[tuple[_View, int, np.ndarray]]:
+    """Yield for each template the view on which it is scored, its number, and its response t' C^-1
+    r (r, c), which the next one overwrites."""
+    bank = templates.bank(noise.window_px)
+    for pair, numbers in templates.spectra(noise.filters.power.shape, noise.window_px):
+        if only_centred and all(any(bank[number].halves) for number in numbers):
+            continue
+        view = coarse if bank[numbers[0]].coarse else fine
+        height, width = view.seen.shape
+        pair_response = templates.responses(view.spectrum, pair, view.products)[:height, :width]
+        for channel, number in enumerate(numbers):
+            if only_centred and any(bank[number].halves):
+                continue
+            cv2.extractChannel(pair_response, channel, dst=view.score)
+            yield view, number, view.score
+
+
+def _halved(image: np.ndarray) -> np.ndarray:
+    """Return the means (r / 2, c / 2) of 2 x 2 pixels; an odd last row or column is repeated."""
+    odd_rows = image.shape[0] % 2
+    odd_columns = image.shape[1] % 2
+    even = cv2.copyMakeBorder(image, 0, odd_rows, 0, odd_columns, cv2.BORDER_REPLICATE)
+    return cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+def _merge(best: _Best, halved: _Best, interpolation: int) -> None:
+    """Keep the stronger of scores at all pixels and those of the halved picture."""
+    height, width = best.signed.shape
+    signed = cv2.resize(halved.signed, None, fx=2, fy=2, interpolation=interpolation)
+    signed = np.ascontiguousarray(signed[:height, :width])
+    template = cv2.resize(
+        halved.template,
+        None,
+        fx=2,
+        fy=2,
+        interpolation=cv2.INTER_NEAREST,
+    )
+    template = np.ascontiguousarray(template[:height, :width])
+    stronger = (np.abs(signed) > np.abs(best.signed)).view(np.uint8)
+    cv2.copyTo(signed, stronger, best.signed)
+    cv2.copyTo(template, stronger, best.template)
+
+
+@numba.njit(**PLAIN)
+def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible,
+    0 elsewhere."""
+    factors = np.empty(share.shape, np.float32)
+    least = np.float32(LEAST_SEEN)
+    for i in range(share.shape[0]):
+        share_row = share[i]
+        judged_row = judged[i]
+        row = factors[i]
+        for j in range(len(row)):
+            factor = np.float32(1.0) / np.sqrt(max(share_row[j], least))
+            is_judged = (share_row[j] > least) & (judged_row[j] > 0)
+            row[j] = factor if is_judged else np.float32(0.0)
+    return factors
+
+
+@numba.njit(**PLAIN)
+def _keep_stronger(  # type: ignore[no-untyped-def]
+    signed,
+    by,
+    score,
+    per_deviation,
+    raised,
+    down,
+    right,
+    number,
+):
+    """Keep the larger of each pixel's scores (r, c) by size in ``signed``, and that template's
+    ``number`` in ``by``.
+
+    Scores are scaled by ``per_deviation`` and raised: their squares grow by ``raised``, in
+    proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around.
+    """
+    scale = np.float32(per_deviation)
+    more = np.float32(raised)
+    faint = np.float32(per_deviation * np.sqrt(1.0 + raised / FAINT**2))
+    height, width = score.shape
+    for y in range(down + 1):
+        for x in range(right + 1):
+            for i in range(height - y):
+                row = score[i]
+                kept = signed[i + y][x:]
+                kept_by = by[i + y][x:]
+                for j in range(width - x):
+                    size = min(abs(row[j]) * faint, np.sqrt((row[j] * scale) ** 2 + more))
+                    stronger = size > abs(kept[j])
+                    kept[j] = np.copysign(size, row[j]) if stronger else kept[j]
+                    kept_by[j] = number if stronger else kept_by[j]

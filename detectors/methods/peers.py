@@ -20,10 +20,10 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from detectors.averages.average import AverageConfig, average
-from detectors.averages.noise import median_of, rounding_floor, sigma_of
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detector, Evidence
 from detectors.open3d_library import open3d_on_one_thread
+from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.recordings import open_capture
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surfaces.background import background
@@ -40,9 +40,12 @@ MOST_ALONE = 0.01  # share of the target without a counterpart that gives a warn
 
 
 class PlaneRansacConfig(ScoreMapConfig):
-    """``inlier_mm``: distance up to which a point supports the plane; the default is about three
-    deviations of a single frame of a continuous-wave camera. ``iterations``: largest number of
-    triples of points; ``seed``: draws them."""
+    """Settings of the plane by random sampling.
+
+    - ``inlier_mm``: distance up to which a point supports the plane; the default is about three
+      deviations of a single frame of a continuous-wave camera.
+    - ``iterations``: largest number of triples of points.
+    - ``seed``: draws them."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     inlier_mm: float = Field(default=2.0, gt=0)
@@ -68,43 +71,48 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
         points = cloud.points_m[mask]
         # sorted by z, so that the triples do not depend on the orientation of the grid
         ordered = np.ascontiguousarray(points[np.argsort(points[:, 2], kind="stable")])
-        a, b, c, d = self._plane(ordered) if len(points) > 2 else (0.0, 0.0, 0.0, 0.0)
+        plane = self._plane(ordered) if len(points) > 2 else (0.0, 0.0, 0.0, 0.0)
+        a, b, c, d = plane
         if abs(c) < 1e-3:
-            fix = "widen the crop, or choose another detector"
             raise UserError(
-                f"{len(points)} points determine no plane that is seen from the front", fix=fix
+                f"{len(points)} points determine no plane that is seen from the front",
+                fix="widen the crop, or choose another detector",
             )
-        fitted = -(a * points[:, 0] + b * points[:, 1] + d) / c
-        residual = points[:, 2] - fitted
-        scale = max(sigma_of(residual), rounding_floor(cloud, mask))
-        score = on_grid(np.abs(residual) / scale, mask)
-        residual_m = on_grid(residual, mask)
-        z_m = on_grid(fitted, mask)
-        return Evidence(score, residual_m, z_m, scale, {"surface": "plane", "points": len(points)})
+        fitted_m = -(a * points[:, 0] + b * points[:, 1] + d) / c
+        residual_m = points[:, 2] - fitted_m
+        scale_m = max(sigma_of(residual_m), rounding_floor(cloud, mask))
+        return Evidence(
+            score=on_grid(np.abs(residual_m) / scale_m, mask),
+            residual_m=on_grid(residual_m, mask),
+            surface_z_m=on_grid(fitted_m, mask),
+            scale_m=scale_m,
+            notes={"surface": "plane", "points": len(points)},
+        )
 
     def _plane(self, points: np.ndarray) -> tuple[float, ...]:
         """Return (a, b, c, d) of the plane a x + b y + c z + d = 0, of least squares over its
         supporting points."""
+        settings = self.settings
+        seed = int(random_stream(settings.seed, self.name).integers(2**31))
         with open3d_on_one_thread() as o3d:
-            o3d.utility.random.seed(
-                int(random_stream(self.settings.seed, self.name).integers(2**31))
-            )
-            listed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-            plane, _ = listed.segment_plane(
-                self.settings.inlier_mm * MM, 3, self.settings.iterations
-            )
+            o3d.utility.random.seed(seed)
+            cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+            plane, _ = cloud.segment_plane(settings.inlier_mm * MM, 3, settings.iterations)
         return tuple(plane.tolist())
 
 
 class M3c2Config(ScoreMapConfig):
-    """``reference``: a capture of the same target without damage, in any format that
-    ``tofpod detect`` reads and in the frame of the clouds; without it, distances are to
-    ``surface``, fitted to the cloud itself. ``registration_error_mm``: the error between both;
-    null: estimated from the scatter of the distances. ``cylinder_radius_mm``: half of the scale
-    over which points are averaged; 4 mm holds some 20 pixels of an Azure Kinect at 0.7 m, as Lague
-    et al. recommend. ``normal_radius_mm``: radius of the neighbourhood for a normal, 20 times a
-    noise of 1 mm. ``reach_mm``: half of a cylinder's length; points deeper than it have no
-    counterpart."""
+    """Settings of M3C2.
+
+    - ``reference``: a capture of the same target without damage, in any format that
+      ``tofpod detect`` reads and in the frame of the clouds; without it, distances are to
+      ``surface``, fitted to the cloud itself.
+    - ``registration_error_mm``: the error between both; null: estimated from the scatter of the
+      distances.
+    - ``cylinder_radius_mm``: half of the scale over which points are averaged; 4 mm holds some 20
+      pixels of an Azure Kinect at 0.7 m, as Lague et al. recommend.
+    - ``normal_radius_mm``: radius of the neighbourhood for a normal, 20 times a noise of 1 mm.
+    - ``reach_mm``: half of a cylinder's length; points deeper than it have no counterpart."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -132,55 +140,73 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         """Score |distance| / deviation in the crop. Raises UserError if no point has a
         counterpart."""
         mask = crop(cloud, self.settings.crop)
-        settings = self.settings
         points = cloud.points_m[mask]
-        if settings.reference is None:
-            ground = background(cloud, mask, settings.surface)
-            notes = {**ground.notes, "surface": ground.description}
-            warnings = [ground.warning]
-            feet = np.column_stack([points[:, :2], ground.surface_z_m[mask]])
-        else:
-            notes = {"surface": f"reference scan {settings.reference}"}
-            warnings = []
-            feet = self._below(points, cloud.projection == "central")
-        known = np.isfinite(feet[:, 2])
-        before = feet[known] if settings.reference is None else self._reference_m
-        distance_m, deviation_m = np.full((2, len(points)), np.nan)
-        if known.any():
-            distance_m[known], deviation_m[known] = self._distances(feet[known], before, points)
+        notes, warnings, feet = self._feet(cloud, mask, points)
+        compared = notes["surface"]
+        has_foot = np.isfinite(feet[:, 2])
+        distance_m = np.full(len(points), np.nan)
+        deviation_m = np.full(len(points), np.nan)
+        if has_foot.any():
+            before = feet[has_foot] if self.settings.reference is None else self._reference_m
+            distances = self._distances(feet[has_foot], before, points)
+            distance_m[has_foot], deviation_m[has_foot] = distances
         judged = np.isfinite(distance_m)
         alone = 1.0 - float(judged.mean())
         if not judged.any():
-            what = f"no point of the target has {LEAST_SAMPLES} neighbours there and in {notes['surface']}"
             raise UserError(
-                what,
+                f"no point of the target has {LEAST_SAMPLES} neighbours there and in {compared}",
                 fix="check that both are in one frame, or enlarge cylinder_radius_mm or reach_mm",
             )
-        if settings.registration_error_mm is None:
-            scatter_m = sigma_of(distance_m[judged] - median_of(distance_m[judged]))
-            error_m = float(np.sqrt(max(scatter_m**2 - median_of(deviation_m[judged]) ** 2, 0.0)))
-        else:
-            error_m = settings.registration_error_mm * MM
+        error_m = self._registration_error(distance_m[judged], deviation_m[judged])
         deviation_m = np.maximum(deviation_m + error_m, rounding_floor(cloud, mask))
         signed = on_grid(distance_m / deviation_m, mask)
-        if settings.reference is not None and np.nanmedian(np.abs(signed)) > LOD_SIGMAS:
-            off = f"{median_of(np.abs(distance_m[judged])) / MM:.2g} mm"
+        if self.settings.reference is not None and np.nanmedian(np.abs(signed)) > LOD_SIGMAS:
             warnings.append(
-                f"the target lies {off} off its reference scan: it moved, or is not registered to it"
+                f"the target lies {median_of(np.abs(distance_m[judged])) / MM:.2g} mm off its"
+                " reference scan: it moved, or is not registered to it"
             )
         if alone > MOST_ALONE:
-            share = f"{100 * alone:.0f} % of the target"
-            warnings.append(f"{share} has no counterpart in {notes['surface']} and is not judged")
-        notes |= {
-            "points": len(points),
-            "registration_error_m": error_m,
-            "without_counterpart": alone,
-        }
-        residual_m = on_grid(points[:, 2] - feet[:, 2], mask)
-        z_m = on_grid(feet[:, 2], mask)
-        scale_m = median_of(deviation_m[judged])
-        doubts = tuple(filter(None, warnings))
-        return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, doubts, behind=signed > 0)
+            warnings.append(
+                f"{100 * alone:.0f} % of the target has no counterpart in {compared} and is not"
+                " judged"
+            )
+        notes["points"] = len(points)
+        notes["registration_error_m"] = error_m
+        notes["without_counterpart"] = alone
+        return Evidence(
+            score=np.abs(signed),
+            residual_m=on_grid(points[:, 2] - feet[:, 2], mask),
+            surface_z_m=on_grid(feet[:, 2], mask),
+            scale_m=median_of(deviation_m[judged]),
+            notes=notes,
+            warnings=tuple(warnings),
+            behind=signed > 0,
+        )
+
+    def _feet(
+        self,
+        cloud: Cloud,
+        mask: np.ndarray,
+        points: np.ndarray,
+    ) -> tuple[dict[str, Any], list[str], np.ndarray]:
+        """Return notes and warnings on the surface or the reference, and where the rays through
+        points (n, 3) meet it (n, 3)."""
+        reference = self.settings.reference
+        if reference is not None:
+            feet = self._below(points, cloud.projection == "central")
+            return {"surface": f"reference scan {reference}"}, [], feet
+        ground = background(cloud, mask, self.settings.surface)
+        notes = {**ground.notes, "surface": ground.description}
+        warnings = [ground.warning] if ground.warning else []
+        return notes, warnings, np.column_stack([points[:, :2], ground.surface_z_m[mask]])
+
+    def _registration_error(self, distance_m: np.ndarray, deviation_m: np.ndarray) -> float:
+        """Return the registration error in metres, stated or estimated from the scatter of
+        distances (n,) beyond their deviations (n,)."""
+        if self.settings.registration_error_mm is not None:
+            return self.settings.registration_error_mm * MM
+        scatter_m = sigma_of(distance_m - median_of(distance_m))
+        return float(np.sqrt(max(scatter_m**2 - median_of(deviation_m) ** 2, 0.0)))
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
         """Return the places across the view, so that a rim and the points deep behind it are one
@@ -197,10 +223,9 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
     def _below(self, points: np.ndarray, central: bool) -> np.ndarray:
         """Return where the rays through points (n, 3) meet the reference (n, 3), by linear
         interpolation."""
-        (plan, reference), z = (
-            (each[:, :2] for each in (points, self._reference_m)),
-            self._reference_m[:, 2],
-        )
+        plan = points[:, :2]
+        reference = self._reference_m[:, :2]
+        z = self._reference_m[:, 2]
         if central:
             plan = plan / points[:, 2:]
             reference = reference / z[:, None]
@@ -208,28 +233,32 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         return np.column_stack([plan * feet_z[:, None] if central else plan, feet_z])
 
     def _distances(
-        self, feet: np.ndarray, before: np.ndarray, after: np.ndarray
+        self,
+        feet: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance (n,) of points ``after`` (m, 3) behind points ``before`` (k, 3) at
         each foot (n, 3), and its deviation; NaN if a cylinder holds too few points."""
         py4dgeo = _py4dgeo()
         with threadpoolctl.threadpool_limits(1, user_api="openmp"):
-            epochs = tuple(
-                py4dgeo.Epoch(np.ascontiguousarray(points)) for points in (before, after)
+            epochs = (
+                py4dgeo.Epoch(np.ascontiguousarray(before)),
+                py4dgeo.Epoch(np.ascontiguousarray(after)),
             )
-            normal_m = self.settings.normal_radius_mm * MM
-            radius_m = self.settings.cylinder_radius_mm * MM
-            sizes = {
-                "normal_radii": (normal_m,),
-                "cyl_radius": radius_m,
-                "max_distance": self.settings.reach_mm * MM,
-            }
-            core = np.ascontiguousarray(feet)
-            distance, uncertainty = py4dgeo.M3C2(
-                epochs=epochs, corepoints=core, registration_error=0.0, **sizes
-            ).run()
-        few = np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
-        return np.where(few, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
+            algorithm = py4dgeo.M3C2(
+                epochs=epochs,
+                corepoints=np.ascontiguousarray(feet),
+                registration_error=0.0,
+                normal_radii=(self.settings.normal_radius_mm * MM,),
+                cyl_radius=self.settings.cylinder_radius_mm * MM,
+                max_distance=self.settings.reach_mm * MM,
+            )
+            distance, uncertainty = algorithm.run()
+        is_sparse = (
+            np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
+        )
+        return np.where(is_sparse, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
 
 
 def _py4dgeo() -> Any:
@@ -247,10 +276,13 @@ def _py4dgeo() -> Any:
 
 
 class FpfhMemoryConfig(ScoreMapConfig):
-    """``normal_neighbours``, ``feature_neighbours``: typical number of points in the sphere of a
-    normal and of a feature. ``pool_px``: side of the square over which features are averaged. The
-    paper's program has 30, 100 and 8. ``memory``: number of features of undamaged targets that are
-    kept. ``surface``: the reference of sizes."""
+    """Settings of the memory of shape features. The paper's program has 30, 100 and 8.
+
+    - ``normal_neighbours``: typical number of points in the sphere of a normal.
+    - ``feature_neighbours``: typical number of points in the sphere of a feature.
+    - ``pool_px``: side of the square over which features are averaged.
+    - ``memory``: number of features of undamaged targets that are kept.
+    - ``surface``: the reference of sizes."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -275,7 +307,9 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     version = 2
 
     def __init__(
-        self, settings: FpfhMemoryConfig, learned: Mapping[str, np.ndarray] | None = None
+        self,
+        settings: FpfhMemoryConfig,
+        learned: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         super().__init__(settings)
         self._learned = learned
@@ -285,15 +319,12 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         for a single cloud."""
         if len(hole_free) < 2:
             raise UserError(f"the detector {self.name!r} learns from at least two hole-free clouds")
+        pool_px = self.settings.pool_px
         of_clouds = []
         for cloud in hole_free:
             features, rows, columns = self._features(cloud, crop(cloud, self.settings.crop))
             # only windows that hardly overlap
-            of_clouds.append(
-                features[
-                    (rows % self.settings.pool_px == 0) & (columns % self.settings.pool_px == 0)
-                ]
-            )
+            of_clouds.append(features[(rows % pool_px == 0) & (columns % pool_px == 0)])
         memory = coreset(np.concatenate(of_clouds[:-1]), self.settings.memory)
         return {"memory": memory, "unit": np.array(np.median(nearest(of_clouds[-1], memory)))}
 
@@ -305,28 +336,36 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         """Score the distance from the memory in the crop. Raises UserError without a memory, and
         for few points."""
         if self._learned is None:
-            what = f"the detector {self.name!r} has no memory of hole-free targets to compare this cloud with"
-            fix = "use it in a study, which has hole-free boards, or call its `calibrate` with clouds of your own"
-            raise UserError(what, fix=fix)
+            raise UserError(
+                f"the detector {self.name!r} has no memory of hole-free targets to compare this"
+                " cloud with",
+                fix="use it in a study, which has hole-free boards, or call its `calibrate` with"
+                " clouds of your own",
+            )
         mask = crop(cloud, self.settings.crop)
+        memory = self._learned["memory"]
         features, _, _ = self._features(cloud, mask)
-        score = nearest(features, self._learned["memory"]) / max(float(self._learned["unit"]), 1e-9)
+        score = nearest(features, memory) / max(float(self._learned["unit"]), 1e-9)
         ground = background(cloud, mask, self.settings.surface)
-        scale_m = max(
-            sigma_of(ground.residual_m[np.isfinite(ground.residual_m)]), rounding_floor(cloud, mask)
-        )
-        notes = {
-            "surface": ground.description,
-            "points": len(score),
-            "memory": len(self._learned["memory"]),
-        }
-        unit = "the median distance of an undamaged target's features from the memory, which is not a length"
+        sigma_m = sigma_of(ground.residual_m[np.isfinite(ground.residual_m)])
         return Evidence(
-            on_grid(score, mask), ground.residual_m, ground.surface_z_m, scale_m, notes, unit=unit
+            score=on_grid(score, mask),
+            residual_m=ground.residual_m,
+            surface_z_m=ground.surface_z_m,
+            scale_m=max(sigma_m, rounding_floor(cloud, mask)),
+            notes={
+                "surface": ground.description,
+                "points": len(score),
+                "memory": len(memory),
+            },
+            unit="the median distance of an undamaged target's features from the memory, which is"
+            " not a length",
         )
 
     def _features(
-        self, cloud: Cloud, mask: np.ndarray
+        self,
+        cloud: Cloud,
+        mask: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the averaged features (n, 33) of the masked points, and their rows and columns
         (n,)."""
@@ -338,42 +377,45 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
             )
         # one radius everywhere: two points at a rim may share their nearest points, and only
         # rounding would distinguish their normals
-        wanted = [settings.normal_neighbours, settings.feature_neighbours]
-        radii_m = np.median(cKDTree(points).query(points, k=wanted)[0], axis=0)
+        neighbours = [settings.normal_neighbours, settings.feature_neighbours]
+        distances_m, _ = cKDTree(points).query(points, k=neighbours)
+        normal_m, feature_m = np.median(distances_m, axis=0).tolist()
         with open3d_on_one_thread() as o3d:
+            sphere = o3d.geometry.KDTreeSearchParamRadius
             listed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-            of_normals, of_features = map(o3d.geometry.KDTreeSearchParamRadius, radii_m.tolist())
-            listed.estimate_normals(of_normals)
+            listed.estimate_normals(sphere(normal_m))
             listed.orient_normals_to_align_with_direction([0.0, 0.0, -1.0])
-            features = np.asarray(
-                o3d.pipelines.registration.compute_fpfh_feature(listed, of_features).data
-            ).T
-        rows, columns = np.nonzero(mask) if cloud.organised else raster(points, cloud)[1:3]
+            registration = o3d.pipelines.registration
+            by_point = registration.compute_fpfh_feature(listed, sphere(feature_m))
+            features = np.asarray(by_point.data).T
+        if cloud.organised:
+            rows, columns = np.nonzero(mask)
+        else:
+            _, rows, columns, _ = raster(points, cloud)
         rows = rows - rows.min()
         columns = columns - columns.min()
         # the last channel counts points
         image = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1, features.shape[1] + 1))
         np.add.at(image, (rows, columns), np.column_stack([features, np.ones(len(features))]))
-        pooled = cv2.blur(
-            image, (settings.pool_px, settings.pool_px), borderType=cv2.BORDER_CONSTANT
-        )[rows, columns]
+        side = (settings.pool_px, settings.pool_px)
+        pooled = cv2.blur(image, side, borderType=cv2.BORDER_CONSTANT)[rows, columns]
         return pooled[:, :-1] / pooled[:, -1:], rows, columns
 
 
 def coreset(features: np.ndarray, size: int) -> np.ndarray:
     """Return at most ``size`` of the features (n, k): the most central one, then always the one
     farthest from these."""
-    apart = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
-    taken = [int(apart.argmin())]
-    apart = np.full(len(features), np.inf)
+    squares = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
+    taken = [int(squares.argmin())]
+    squares = np.full(len(features), np.inf)
     while len(taken) < size:
-        apart = np.minimum(apart, ((features - features[taken[-1]]) ** 2).sum(axis=1))
-        if apart.max() == 0.0:
+        squares = np.minimum(squares, ((features - features[taken[-1]]) ** 2).sum(axis=1))
+        if squares.max() == 0.0:
             break
-        taken.append(int(apart.argmax()))
+        taken.append(int(squares.argmax()))
     return features[taken]
 
 
 def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of each feature (n, k) to the nearest in the memory (m, k)."""
-    return np.asarray(cKDTree(memory).query(features)[0])
+    return cKDTree(memory).query(features)[0]

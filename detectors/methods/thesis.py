@@ -8,9 +8,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from detectors.averages.noise import median_of, rounding_floor, sigma_of
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
+from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surfaces.background import background
 from detectors.surfaces.surface import SurfaceConfig, fit_surface
@@ -18,11 +18,14 @@ from harness.vocabulary.geometry import Cloud
 
 
 class ThesisConfig(ScoreMapConfig):
-    """``scale``: the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``,
-    ``raw_z_std``, or ``highest_before``, the cloud's largest residual towards the camera, where no
-    hole can be; k = 1 then requires a residual behind the surface to exceed it. With a shape other
-    than ``polynomial``, the unit is the local noise. ``use_variance``: whether a map's stated
-    variance scales the unit at each point (not with ``raw_z_std``)."""
+    """Settings of the thesis' detector.
+
+    - ``scale``: the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``,
+      ``raw_z_std``, or ``highest_before``, the cloud's largest residual towards the camera, where
+      no hole can be; k = 1 then requires a residual behind the surface to exceed it. With a shape
+      other than ``polynomial``, the unit is the local noise.
+    - ``use_variance``: whether a map's stated variance scales the unit at each point (not with
+      ``raw_z_std``)."""
 
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -49,54 +52,68 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         mask = crop(cloud, self.settings.crop)
         if self.settings.surface.shape != "polynomial":
             return self._before_background(cloud, mask)
-        x, y, z = (cloud.points_m[..., axis][mask] for axis in range(3))
+        x = cloud.points_m[..., 0][mask]
+        y = cloud.points_m[..., 1][mask]
+        z = cloud.points_m[..., 2][mask]
         surface = fit_surface(x, y, z, self.settings.surface)
         fitted = surface.evaluate(x, y)
-        residual = z - fitted
-        floor = rounding_floor(cloud, mask)
+        residual_m = z - fitted
+        floor_m = rounding_floor(cloud, mask)
         deviation = self._stated_deviation(cloud, mask)
-        off = residual if deviation is None else residual / deviation
+        if deviation is None:
+            deviation = np.ones(len(z))
+        spread = self._spread(residual_m / deviation, z)
+        scale_m = np.maximum(spread * deviation, floor_m)
+        return Evidence(
+            score=on_grid(np.abs(residual_m) / scale_m, mask),
+            residual_m=on_grid(residual_m, mask),
+            surface_z_m=on_grid(fitted, mask),
+            scale_m=float(np.median(scale_m)),
+            notes={
+                "surface": surface.note,
+                "points": len(z),
+                "spread_m": spread * median_of(deviation),
+                "floor_m": floor_m,
+            },
+        )
+
+    def _spread(self, residuals: np.ndarray, z_m: np.ndarray) -> float:
+        """Return the spread that makes one unit of score, from residuals (n,), in metres or over
+        their stated deviations, or from z (n,)."""
         kind = self.settings.scale
         if kind == "mad":
-            spread = sigma_of(off)
-        elif kind == "highest_before":
-            spread = max(0.0, -float(off.min()))
-        else:  # MATLAB's std divides by n - 1
-            spread = float(np.std(z if kind == "raw_z_std" else off, ddof=min(1, len(z) - 1)))
-        typical = 1.0 if deviation is None else median_of(deviation)
-        scale = max(spread, floor) if deviation is None else np.maximum(spread * deviation, floor)
-        notes = {
-            "surface": surface.note,
-            "points": len(z),
-            "spread_m": spread * typical,
-            "floor_m": floor,
-        }
-        score = on_grid(np.abs(residual) / scale, mask)
-        residual_m = on_grid(residual, mask)
-        z_m = on_grid(fitted, mask)
-        return Evidence(score, residual_m, z_m, float(np.median(scale)), notes)
+            return sigma_of(residuals)
+        if kind == "highest_before":
+            return max(0.0, -float(residuals.min()))
+        # MATLAB's std divides by n - 1
+        values = z_m if kind == "raw_z_std" else residuals
+        return float(np.std(values, ddof=min(1, len(values) - 1)))
 
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
         """Analyse with a surface whose shape is chosen. One unit of score is the noise around each
         pixel."""
-        behind = background(cloud, mask, self.settings.surface)
-        unit = np.maximum(behind.noise_m, rounding_floor(cloud, mask))
-        stated = self._stated_deviation(cloud, mask)
-        if stated is not None:
-            deviation = on_grid(stated, mask)
-            known = np.isfinite(behind.residual_m)
-            unit = np.maximum(
-                unit, sigma_of(behind.residual_m[known] / deviation[known]) * deviation
-            )
-        score = np.abs(behind.residual_m) / unit
-        notes = {"surface": behind.description, **behind.notes}
-        warnings = (behind.warning,) if behind.warning else ()
+        ground = background(cloud, mask, self.settings.surface)
+        unit_m = np.maximum(ground.noise_m, rounding_floor(cloud, mask))
+        stated_m = self._stated_deviation(cloud, mask)
+        if stated_m is not None:
+            deviation_m = on_grid(stated_m, mask)
+            is_known = np.isfinite(ground.residual_m)
+            ratio = sigma_of(ground.residual_m[is_known] / deviation_m[is_known])
+            unit_m = np.maximum(unit_m, ratio * deviation_m)
         return Evidence(
-            score, behind.residual_m, behind.surface_z_m, float(np.nanmedian(unit)), notes, warnings
+            score=np.abs(ground.residual_m) / unit_m,
+            residual_m=ground.residual_m,
+            surface_z_m=ground.surface_z_m,
+            scale_m=float(np.nanmedian(unit_m)),
+            notes={"surface": ground.description, **ground.notes},
+            warnings=(ground.warning,) if ground.warning else (),
         )
 
     def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray | None:
         """Return the standard deviation (n,) that the cloud states of each point, metres."""
-        wanted = self.settings.use_variance and self.settings.scale != "raw_z_std"
-        known = cloud.mean_variance_m2 if wanted else None
-        return None if known is None else np.asarray(np.sqrt(known[mask]))
+        variance_m2 = cloud.mean_variance_m2
+        if variance_m2 is None or not self.settings.use_variance:
+            return None
+        if self.settings.scale == "raw_z_std":
+            return None
+        return np.sqrt(variance_m2[mask])

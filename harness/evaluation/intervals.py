@@ -25,7 +25,9 @@ class Interval:
     """A closed interval; both ends are NaN if the data cannot support one."""
 
     low: float
+    """Lower end."""
     high: float
+    """Upper end."""
 
     @property
     def known(self) -> bool:
@@ -43,7 +45,9 @@ class Interval:
     def over(self, value: float) -> bool | None:
         """Return whether the estimated quantity certainly exceeds ``value``; None if the interval
         includes both."""
-        return True if self.low > value else False if self.high <= value else None
+        if self.low > value:
+            return True
+        return False if self.high <= value else None
 
     def within(self, low: float, high: float) -> bool:
         """Return whether the whole interval lies in [low, high]; False if it is unknown."""
@@ -90,12 +94,12 @@ def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.
 def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN
     below two values."""
-    m, s, k = np.broadcast_arrays(
+    centre, deviation, count = np.broadcast_arrays(
         np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float)
     )
-    size = np.where(k >= 2, k, np.nan)
-    half = special.stdtrit(size - 1, UPPER) * s / np.sqrt(size)
-    return m - half, m + half
+    size = np.where(count >= 2, count, np.nan)
+    half = special.stdtrit(size - 1, UPPER) * deviation / np.sqrt(size)
+    return centre - half, centre + half
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
@@ -108,7 +112,8 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     if min(len(a), len(b)) < 2:
         return UNKNOWN
     if np.ptp(a) == np.ptp(b) == 0:
-        return Interval(float(a[0] - b[0]), float(a[0] - b[0]))
+        difference = float(a[0] - b[0])
+        return Interval(difference, difference)
     ends = stats.ttest_ind(a, b, equal_var=False).confidence_interval(CONFIDENCE)
     return Interval(float(ends.low), float(ends.high))
 
@@ -143,12 +148,11 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
     """Return the central interval of bootstrap draws (B,); infinite ends remain. NaN draws (such
     as differences of two infinities) are left out; if they are more than half, the interval is
     unknown."""
-    known = draws[~np.isnan(draws)]
-    if len(known) < 2 or len(known) < 0.5 * len(draws):
+    numbers = draws[~np.isnan(draws)]
+    if len(numbers) < 2 or len(numbers) < 0.5 * len(draws):
         return UNKNOWN
-    low, high = np.quantile(
-        known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf"
-    )
+    shares = [(1 - confidence) / 2, (1 + confidence) / 2]
+    low, high = np.quantile(numbers, shares, method="inverted_cdf")
     return Interval(float(low), float(high))
 
 
@@ -157,12 +161,16 @@ SITES_PER_TARGET = 3  # fewest unflawed sites per flawed one, by MIL-HDBK-1823A
 
 @dataclass(frozen=True)
 class FalseCallRate:
-    """False calls per square metre: estimate and Garwood's interval."""
+    """False calls per square metre."""
 
     rate_per_m2: float
+    """Estimate."""
     interval_per_m2: Interval
+    """Garwood's interval."""
     calls: int
+    """Number of false calls."""
     area_m2: float
+    """Unflawed surface inspected."""
 
 
 def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
@@ -178,16 +186,20 @@ def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold of scores: findings *above* ``value`` are calls (-inf: every finding is).
-    ``rate_per_m2``: expected false calls on new runs. ``upper_per_m2``: bound on the true rate at
-    one-sided ``confidence``."""
+    """A threshold of scores that keeps to a rate of false calls."""
 
     value: float
+    """Findings *above* it are calls (-inf: every finding is)."""
     rate_per_m2: float
+    """Expected false calls on new runs."""
     upper_per_m2: float
+    """Bound on the true rate at one-sided ``confidence``."""
     confidence: float
+    """Of that bound."""
     runs: int
+    """Number of hole-free runs that set the threshold."""
     calling_runs: int
+    """Number of these with a score above it."""
 
 
 def threshold_for_rate(
@@ -212,13 +224,23 @@ def threshold_for_rate(
     # the margin is for rounding where (n + 1) * wanted is a whole number
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
-        what = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
-        fix = "simulate more hole-free boards, or ask for a higher rate"
+        runs = f"{n} hole-free runs of {area_m2:.2g} m²"
+        fewest = int(np.ceil(1 / wanted * (1 - 1e-12))) - 1
         raise UserError(
-            what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix
+            f"{runs} are too few for a rate of {rate_per_m2:g} per m² of false calls",
+            legal=f"at least {fewest} runs",
+            fix="simulate more hole-free boards, or ask for a higher rate",
         )
     value = float(np.sort(scores)[n - 1 - k])
     above = int(np.sum(scores > value))
     bound = float(special.betaincinv(above + 1, n - above, confidence))
-    rate, upper = -np.log1p(-np.array([(above + 1) / (n + 1), bound])) / area_m2
-    return Threshold(value, float(rate), float(upper), confidence, n, above)
+    probabilities = np.array([(above + 1) / (n + 1), bound])
+    rate, upper = -np.log1p(-probabilities) / area_m2
+    return Threshold(
+        value=value,
+        rate_per_m2=float(rate),
+        upper_per_m2=float(upper),
+        confidence=confidence,
+        runs=n,
+        calling_runs=above,
+    )

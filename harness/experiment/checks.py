@@ -18,13 +18,15 @@ from harness.experiment.schema import (
     splices_of,
 )
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
+from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.words import nearest
 from scenes.optics import Optics
 from scenes.perspectives import AnyViews, check_in_view, poses_of, view_count
-from scenes.sensor.camera import CameraConfig, camera_names, camera_of, is_camera_path, load_camera
+from scenes.sensor.camera import camera_names, camera_of, is_camera_path, load_camera
+from scenes.sensor.common.config import CameraConfig
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
@@ -102,7 +104,9 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     if calibrate is not None and calibrate.boards is None:
         position = source.place_of(("threshold", "calibrate"))
         yield Problem(
-            "a study calibrates its threshold on separate boards", position, fix="write `boards: 60`"
+            "a study calibrates its threshold on separate boards",
+            position,
+            fix="write `boards: 60`",
         )
     elif calibrate is not None and calibrate.boards is not None:
         # the number of boards bounds the rate that they can show, even if their whole face is
@@ -168,7 +172,9 @@ def _unseen(
         return _unseen_pose(optics, views, target)
     for pose in declared.extreme_poses():
         posed = target.model_copy(update={"pose": pose})
-        message = _unseen_pose(optics, None, posed) or (views and _unseen_pose(optics, views, posed))
+        message = _unseen_pose(optics, None, posed) or (
+            views and _unseen_pose(optics, views, posed)
+        )
         if message:
             path, first = message
             aside = f"{pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off the axis"

@@ -28,13 +28,8 @@ from harness.vocabulary.declaration.yaml_source import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import (
-    CameraConfig,
-    camera_names,
-    is_camera_path,
-    load_camera,
-    numbers_of_lens,
-)
+from scenes.sensor.camera import camera_names, is_camera_path, load_camera, numbers_of_lens
+from scenes.sensor.common.config import CameraConfig
 
 # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 EXPERIMENT_VERSION = 1
@@ -131,7 +126,8 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     named_paths: list[KeyPath] = [checks.CAMERA_NAME]
     named_paths += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
     files = [
-        (*checks.TARGET, *part, "file") for part in ((), ("board", "shape"), ("material", "texture"))
+        (*checks.TARGET, *part, "file")
+        for part in ((), ("board", "shape"), ("material", "texture"))
     ]
     if shape.get(data, ("source", "kind")) == "capture":
         files += [

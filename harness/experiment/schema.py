@@ -27,7 +27,8 @@ from harness.vocabulary.files import file_digest, inside
 from harness.vocabulary.seeds import digest
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews
-from scenes.sensor.camera import CameraConfig, camera_of, lens_named, lens_names, load_camera
+from scenes.sensor.camera import camera_of, lens_named, lens_names, load_camera
+from scenes.sensor.common.config import CameraConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
 

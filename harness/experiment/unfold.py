@@ -12,7 +12,7 @@ from typing import Any
 from harness.experiment import checks
 from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of, point_of
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
+from harness.vocabulary.declaration.diagnose import dotted, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import (
     DeclarationError,
     KeyPath,
@@ -24,6 +24,7 @@ from harness.vocabulary.declaration.yaml_source import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json, random_stream
+from harness.vocabulary.words import nearest
 
 OPTION = "--set"
 NOT_VARIED = ("sweep", "sensitivity")  # Keys that hold dotted paths themselves
@@ -295,7 +296,8 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
     switches = shape.get(config.to_data(), key_path(path))
     names = (
         [*switches]
-        if isinstance(switches, dict) and all(isinstance(value, bool) for value in switches.values())
+        if isinstance(switches, dict)
+        and all(isinstance(value, bool) for value in switches.values())
         else []
     )
     if len(names) < 2:
@@ -314,11 +316,18 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
 
     def label(switched_on: frozenset[str]) -> str:
         words = {0: "none", len(all_names): "all", 1: f"{''.join(switched_on)} alone"}
-        return words.get(len(switched_on), f"all but {''.join(all_names - switched_on)}").replace("_", " ")
+        return words.get(len(switched_on), f"all but {''.join(all_names - switched_on)}").replace(
+            "_", " "
+        )
 
-    chosen = dict.fromkeys([frozenset[str](), *alone, *(all_names - switch for switch in alone), all_names])
+    chosen = dict.fromkeys(
+        [frozenset[str](), *alone, *(all_names - switch for switch in alone), all_names]
+    )
     return [
-        Setting(path, {name: name in switched_on for name in names}, (SWITCHES,), label(switched_on)) for switched_on in chosen
+        Setting(
+            path, {name: name in switched_on for name in names}, (SWITCHES,), label(switched_on)
+        )
+        for switched_on in chosen
     ], problems
 
 
@@ -382,7 +391,11 @@ def _resolved(
         if problems
         else ()
     )
-    own_spots = {spot for written_at, spot in written if any(written_at[: len(start)] == start for start in starts)}
+    own_spots = {
+        spot
+        for written_at, spot in written
+        if any(written_at[: len(start)] == start for start in starts)
+    }
     elsewhere = f"with {draft.label}: " if draft.settings else ""
     return config, [
         problem
@@ -481,7 +494,9 @@ def _points(
             reference = set_ups.get(canonical_json(placed), "")
         else:
             set_ups.setdefault(canonical_json(placed), draft.variant)
-        twin = drafts_by_name.setdefault((point.digest, draft.variant if draft.is_variation else ""), draft)
+        twin = drafts_by_name.setdefault(
+            (point.digest, draft.variant if draft.is_variation else ""), draft
+        )
         if twin is not draft and experiment.draws is not None:
             continue
         if twin is not draft:

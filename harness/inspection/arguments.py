@@ -91,10 +91,14 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
         if given_options:
             message = f"--{given_options[0]}: concerns several views, but without --register all PATHs are one capture"
             raise UserError(message, legal=several)
-        whole_captures = [path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
+        whole_captures = [
+            path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES
+        ]
         if len(paths) > 1 and whole_captures:
             fix = f"run each separately, or register them as views of one target: {several}"
-            raise UserError(f"{len(paths)} PATHs, but {whole_captures[0]} is a whole capture", fix=fix)
+            raise UserError(
+                f"{len(paths)} PATHs, but {whole_captures[0]} is a whole capture", fix=fix
+            )
         return
     if len(paths) < 2:
         fix = "name the other views, or leave out --register"

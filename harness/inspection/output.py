@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.crop import AutoCrop, Choice, choice_of, described_text
+from harness.records.examples import Circle3d, Scene3d
 from harness.report.findings import Finding, Judged, save_targets
-from harness.report.view3d import Circle3d, Scene3d
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.text import Grid, show
 

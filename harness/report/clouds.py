@@ -7,15 +7,13 @@ blue before it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 
-from harness.evaluation.profile import ExampleCloud
+from harness.records.examples import ExampleCloud, StudyExample, Where
 from harness.report.blocks import DAMAGE, INK, svg
-from harness.report.view3d import Scene3d
 from harness.vocabulary.text import many
 
 if TYPE_CHECKING:
@@ -24,47 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import SymLogNorm
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.image import AxesImage
-
-Where = Literal["below", "at", "above"]
-
-
-@dataclass(frozen=True, eq=False)
-class StudyExample:
-    """A crop (h, w) of a run's pixel grid around a damage. ``where`` compares its size with the
-    set-up's limit. ``diameter_mm`` and ``depth_mm`` are true values; ``pod`` is the curve's at
-    that size. ``score`` is NaN if no pixel there was judged; ``threshold`` has the same units.
-    ``residual_mm`` and ``detected`` are as in `ExampleCloud`. ``outline_px`` (k, 2) is the true
-    rim as (column, row) from the first pixel, ``pitch_mm`` a pixel on the board."""
-
-    variant: str
-    frames: int
-    board: int
-    hole: str
-    where: Where
-    diameter_mm: float
-    depth_mm: float
-    pod: float
-    hit: bool
-    score: float
-    threshold: float
-    residual_mm: np.ndarray
-    detected: np.ndarray
-    outline_px: np.ndarray
-    pitch_mm: float
-
-
-@dataclass(frozen=True)
-class MappedExample:
-    """A merged cloud of a variant with the true holes and the findings, in the board's true frame."""
-
-    variant: str
-    frames: int
-    views: int
-    registration: str
-    merge: str
-    scene: Scene3d
-    is_variation: bool = False
-
 
 NOTHING = "#b9bec4"  # grey, for pixels without a valid point
 LEAST_MM = 10.0

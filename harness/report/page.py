@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from harness.evaluation.set_ups import LIMIT_RULE, set_ups_of
-from harness.evaluation.summary import MAIN, fit_floor, found_holes, hole_list
-from harness.programs.thesis.claims import Verdict
-from harness.programs.thesis.inference import SET_UP, borne_out_if
+from harness.evaluation.summary import MAIN, fit_floor, found_holes
 from harness.records import trials
+from harness.records.examples import ExampleCloud, MappedExample
 from harness.records.outputs import REPORT
 from harness.records.trials import (
     ERRORS,
@@ -24,12 +23,14 @@ from harness.records.trials import (
     SET_UPS,
     SUMMARY,
     ResultTables,
+    hole_list,
 )
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
-from harness.report.clouds import ExampleCloud, MappedExample, residual_figure
+from harness.report.claims import Verdict, claim_set_of
+from harness.report.clouds import residual_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
-from harness.report.summaries import Summaries, is_thesis, of_set_ups, summaries, verdicts_of
+from harness.report.summaries import Summaries, of_set_ups, summaries, verdicts_of
 from harness.report.view3d import write_view3d
 from harness.tables.study import axis_value
 from harness.vocabulary.files import write_text
@@ -43,45 +44,6 @@ if TYPE_CHECKING:
 
 GUIDE = "#cfd6dd"
 MOST_ROWS = 4  # Most rows of set-ups that the answer lists individually
-LIKELIEST = 10  # set-ups that the posterior's table shows
-
-
-def _posterior_section(posterior: pd.DataFrame) -> list[Any]:
-    """Return a heading, a small diagram for each axis, and the likeliest set-ups, from the result
-    of `posterior_of`."""
-    axes = posterior[posterior["axis"] != SET_UP]
-    names = list(dict.fromkeys(axes["axis"]))
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(
-            -(-len(names) // 4), min(4, len(names)), squeeze=False, sharey=True
-        ).ravel()
-        for panel, name in zip(panels, names, strict=False):
-            rows = axes[axes["axis"] == name]
-            panel.bar(rows["value"], rows["posterior_share"], color=blocks.BLUE, label="posterior")
-            panel.step(
-                rows["value"], rows["prior_share"], where="mid", color=blocks.GREY, label="prior"
-            )
-            panel.set_title(fill(name, 24), fontsize=8)
-            panel.tick_params(axis="x", labelsize=8)
-            panel.set(ylim=(0, 1))
-        for panel in panels[len(names) :]:
-            panel.set_axis_off()
-        panels[0].legend()
-
-    figures = {
-        "posterior": blocks.svg(
-            "posterior", (9, 2.4 * -(-len(names) // 4)), "posterior of each fact", draw
-        )
-    }
-    best = posterior[posterior["axis"] == SET_UP].head(LIKELIEST)
-    return [
-        blocks.heading("What would make the thesis true"),
-        blocks.figure(
-            figures, "posterior", "Posterior (bars) and prior (line) probability of each fact."
-        ),
-        trials.POSTERIOR.grid(sections.records(best)).html(),
-    ]
 
 
 def rates_figure(main: pd.DataFrame) -> str:
@@ -342,11 +304,11 @@ def set_ups_html(
     found: Summaries | None = None,
 ) -> str:
     """Return the page of several set-ups as text; see `write_report`."""
-    found = found or summaries(tables, examples, with_claims=about.with_claims)
+    found = found or summaries(tables, examples, about.claim_set)
     compared = of_set_ups(found[SET_UPS], tables)
     costs = found[trials.EFFECTS]
     posterior = found.get(trials.POSTERIOR)
-    verdict = next(iter(verdicts_of(found)), None)
+    verdicts = verdicts_of(found)
     layout = Layout.of(tables)
     frames = sections.shown_frames(compared)
     figures: dict[str, str] = {}
@@ -357,34 +319,38 @@ def set_ups_html(
     calls = of_set_ups(found[FALSE_CALLS], tables)
     calls = calls[(calls["role"] == "damaged") & calls["frames"].isin(frames)]
     rule = "Each set-up has its own hole-free runs and threshold."
+    answer = set_ups_answer(compared, layout, costs, verdicts)
+    section: str | Markup = ""
+    if posterior is not None and about.claim_set is not None:
+        answer = about.claim_set.posterior_answer(posterior)
+        section = blocks.joined(about.claim_set.posterior_section(posterior))
+    title = "" if about.claim_set is None else about.claim_set.title_of_set_ups
     return sections.sweep_page(
         "set_ups.html",
         tables,
         about,
-        set_ups_answer(compared, layout, costs, verdict)
-        if posterior is None
-        else borne_out_if(posterior),
+        answer,
         figures,
         rule=sections.rule_note(
             int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule
         ),
-        posterior=blocks.joined(_posterior_section(posterior)) if posterior is not None else "",
+        posterior=section,
         found=sections.set_ups_grid(compared).html(),
         rows=len(shown),
         costs="" if costs.empty else _costs_grid(costs).html(),
         errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
         cameras=SET_UPS.grid(shown, only=CAMERA).html(),
-        claims=sections.claims_section("The thesis' claim", [verdict] if verdict else []),
+        claims=sections.claims_section(title, verdicts),
         varied=sections.varied_section(tables, found[SET_UPS], frames),
         calls=FALSE_CALLS.grid(sections.records(calls)).html(),
     )
 
 
 def set_ups_answer(
-    compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdict: Verdict | None
+    compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdicts: Sequence[Verdict] = ()
 ) -> str:
     """State each row's holes found with the most frames, the effect with the largest loss, and the
-    verdict on C11."""
+    verdicts."""
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
     frames = sections.shown_frames(compared)
@@ -422,7 +388,7 @@ def set_ups_answer(
             else ""
         )
         parts.append(f"With {place}{_averaged(count)}, {moved}{alone}.")
-    if verdict:
+    for verdict in verdicts:
         parts.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
     return " ".join(parts)
 
@@ -470,10 +436,11 @@ def write_report(
     """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups,
     or of maps, with a page for each map of ``examples`` beside it. `harness.report.blocks.closing`
     describes ``provenance``; ``facts`` is the resolved experiment as plain data, ``found`` the
-    result of `summaries`. Claims need the thesis' target. The same input gives the same bytes.
+    result of `summaries`. Claims are judged for a target that has
+    some. The same input gives the same bytes.
     Raises UserError if the folder cannot be written."""
     about = sections.About(
-        provenance, experiment_yaml_text, title, is_thesis(facts or {}), facts or {}
+        provenance, experiment_yaml_text, title, claim_set_of(facts or {}), facts or {}
     )
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
@@ -497,7 +464,7 @@ def report_html(
     found: Summaries | None = None,
 ) -> str:
     """Return the page of an experiment with one set-up as text; see `write_report`."""
-    found = found or summaries(tables, examples, with_claims=about.with_claims)
+    found = found or summaries(tables, examples, about.claim_set)
     main = found[SUMMARY][found[SUMMARY]["variant"] == MAIN]
     noise = found[NOISE_BY_FRAMES][found[NOISE_BY_FRAMES]["variant"] == MAIN]
     calls = found[FALSE_CALLS][found[FALSE_CALLS]["variant"] == MAIN]
@@ -512,6 +479,7 @@ def report_html(
         if len(noise) and (noise["temporal_rms_mm"] > 0).all()
         else {}
     )
+    title = "" if about.claim_set is None else about.claim_set.title
     return sections.sweep_page(
         "sweep.html",
         tables,
@@ -522,7 +490,7 @@ def report_html(
         holes=sections.holes_grid(main).html(),
         sizes=SUMMARY.grid(sections.records(last)).html(),
         noise=NOISE_BY_FRAMES.grid(sections.records(noise)).html(),
-        claims=sections.claims_section("The thesis' claims", verdicts),
+        claims=sections.claims_section(title, verdicts),
         varied=sections.varied_section(
             tables, found[SET_UPS], (*frames[:1], *frames[-1:]), of=MAIN
         ),

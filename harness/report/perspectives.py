@@ -13,12 +13,12 @@ from markupsafe import Markup
 
 from harness.evaluation import maps
 from harness.evaluation.set_ups import set_ups_of
-from harness.programs.thesis.claims import Verdict
+from harness.records.examples import MappedExample
 from harness.records.outputs import MAPS
 from harness.records.schema import Table
 from harness.records.trials import REGISTRATION_ERRORS, SET_UPS, SUMMARY, ResultTables
 from harness.report import blocks, sections
-from harness.report.clouds import MappedExample
+from harness.report.claims import ClaimSet, Verdict
 from harness.report.summaries import Summaries, summaries, verdicts_of
 from harness.vocabulary.text import many
 
@@ -26,11 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-LEADS = {
-    "borne out": "Yes",
-    "not borne out": "Not in every respect",
-    "undecided": "That is undecided",
-}
 MAPS_SHOWN = (
     *(
         "registration",
@@ -53,7 +48,7 @@ def perspectives_html(
     found: Summaries | None = None,
 ) -> str:
     """Return the page as text; see `harness.report.page.write_report`."""
-    found = found or summaries(tables, with_claims=about.with_claims)
+    found = found or summaries(tables, claim_set=about.claim_set)
     compared = found[SET_UPS]
     errors = found[REGISTRATION_ERRORS]
     verdicts = verdicts_of(found)
@@ -78,14 +73,15 @@ def perspectives_html(
         ]
         return blocks.joined(blocks.folded([(maps.frames_text(n), grid) for n, grid in grids]))
 
+    title = "" if about.claim_set is None else about.claim_set.title_of_views
     return sections.sweep_page(
         "views.html",
         tables,
         about,
-        answer_sentence(cases, verdicts),
+        answer_sentence(cases, about.claim_set, verdicts),
         figures,
         rule=sections.rule_note(int(set_ups["repeats"].max()) if len(set_ups) else 0, rule),
-        claims=sections.claims_section("The thesis' claims and its proposal", verdicts),
+        claims=sections.claims_section(title, verdicts),
         ways=sections.ways_grid(compared).html(),
         errors=by_frames(REGISTRATION_ERRORS, errors),
         maps=[(name, map_text(example)) for name, example in map_files(examples).items()],
@@ -120,7 +116,11 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
     )
 
 
-def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
+def answer_sentence(
+    cases: Sequence[maps.MapCase],
+    claim_set: ClaimSet | None = None,
+    verdicts: Sequence[Verdict] = (),
+) -> str:
     """State how many holes one view finds, how many the most views find by the best method, and
     the verdicts."""
     sentences = []
@@ -150,15 +150,12 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
             counts.append(
                 f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}"
             )
-        where = f"{case.place}: " if len(cases) > 1 else ""
+        where = f"{case.conditions}: " if len(cases) > 1 else ""
         sentences.append(f"{where}With {maps.frames_text(alone.frames)} {', '.join(counts)}.")
     if not sentences:
         return "No trial of any set-up finished, so there is no answer."
-    if verdicts:
-        leads = dict.fromkeys(
-            LEADS[verdict.verdict] for verdict in verdicts if verdict.claim == "H1"
-        )
-        sentences.insert(0, f"Are several views better than one? {' / '.join(leads)}.")
+    if verdicts and claim_set is not None:
+        sentences.insert(0, claim_set.lead_of_views(verdicts))
         sentences.append(
             f"{', '.join(f'{verdict.claim} is {verdict.verdict}' for verdict in verdicts)}."
         )

@@ -108,7 +108,7 @@ MODELS = Table(
             "",
             "model",
             lambda row: (
-                f"{row.name}{' (used)' if row.chosen else ' (compared)' if row.near else ''}"
+                f"{row.name}{' (used)' if row.chosen else ' (compared)' if row.in_bound else ''}"
             ),
         ),
         Column("", "deviance", lambda row: f"{row.deviance:.2f}"),

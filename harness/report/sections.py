@@ -11,10 +11,10 @@ from harness.evaluation.maps import label_of
 from harness.evaluation.set_ups import set_ups_of
 from harness.evaluation.study.result import conditions_of
 from harness.evaluation.summary import MAIN, found_rule
-from harness.programs.thesis.claims import Verdict
 from harness.records.schema import Column, Table
 from harness.records.trials import CLAIMS, MARKS, SET_UPS, SUMMARY, ResultTables
 from harness.report.blocks import closing, fold, heading, joined, note, paragraph, template
+from harness.report.claims import ClaimSet, Verdict
 from harness.report.scene import scene_svg
 from harness.report.summaries import Summaries, of_set_ups
 from harness.vocabulary.path_names import in_words
@@ -25,13 +25,13 @@ Row = Mapping[str, Any]
 
 class About(NamedTuple):
     """Title and origin of a report. ``provenance`` is as in `harness.report.blocks.closing`;
-    ``facts`` is the resolved experiment as plain data. ``with_claims`` says whether the target is
-    that of the thesis."""
+    ``facts`` is the resolved experiment as plain data. ``claim_set`` are the claims about its
+    target."""
 
     provenance: Mapping[str, Any]
     experiment_yaml_text: str
     title: str
-    with_claims: bool = False
+    claim_set: ClaimSet | None = None
     facts: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -281,10 +281,10 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
     rows = [row for row in records(compared) if not row["is_variation"]]
     frames = shown_frames(compared)
     views = sorted({row["views"] for row in rows})
-    several = len({row["place"] for row in rows}) > 1
+    several = len({row["conditions"] for row in rows}) > 1
     by_way: dict[str, dict[tuple[int, int], Row]] = {}
     for row in rows:
-        way = label_of(row["registration"], row["merge"], row["place"] if several else "")
+        way = label_of(row["registration"], row["merge"], row["conditions"] if several else "")
         by_way.setdefault(way, {})[row["views"], row["frames"]] = row
 
     def count(row: Row | None) -> str:

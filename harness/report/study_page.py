@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.study.curves import PRO_LIMIT
-from harness.evaluation.study.limit import SetUpLimit, depth_varies
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import SetUpResult, StudyResult
+from harness.evaluation.study.surface import depth_varies
 from harness.records.schema import Table
 from harness.report.blocks import COLOURS, GREY, MARKERS, PALE, closing, joined, svg, template
 from harness.report.clouds import StudyExample, examples_figure
@@ -166,7 +167,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
         for result, colour in zip(results, COLOURS, strict=False):
             if (roc := result.roc) is not None:
                 left.plot(roc.false, roc.true, color=colour, lw=1.5, label=f"{roc.area:.3f}")
-                left.plot(*roc.at, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
+                left.plot(*roc.in_use, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
             if (curve := result.free_response) is not None:
                 # thresholds without false calls have no place on a logarithmic axis; they are
                 # drawn at its left end
@@ -176,8 +177,8 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
                     calls, curve.found_low, curve.found_high, color=colour, alpha=0.13, lw=0
                 )
                 name = plain(fill(name_of(result.limit), LONGEST_NAME))
-                middle.plot(calls, curve.found, color=colour, lw=1.6, label=name)
-                at = (max(curve.at[0], least), curve.at[1])
+                middle.plot(calls, curve.found_share, color=colour, lw=1.6, label=name)
+                at = (max(curve.in_use[0], least), curve.in_use[1])
                 middle.plot(*at, "o", color=colour, ms=6.5, mec="white", mew=0.9, zorder=5)
             if (pixels := result.pixels) is not None:
                 kept = pixels.false <= PRO_LIMIT

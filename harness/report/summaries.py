@@ -7,12 +7,10 @@ import pandas as pd
 
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
-from harness.evaluation.summary import MAIN, false_calls, noise_against_frames, summarise_holes
-from harness.programs.thesis.claims import Verdict, claim_c11, score_claims
-from harness.programs.thesis.inference import posterior_of
-from harness.programs.thesis.views import score_views
+from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
 from harness.records import trials
 from harness.records.schema import Table
+from harness.report.claims import ClaimSet, Verdict
 from harness.vocabulary.provenance import RESULTS_VERSION
 
 Summaries = Mapping[Table, pd.DataFrame]
@@ -23,17 +21,13 @@ LISTS = (
 )  # columns whose values are lists in memory and text in files
 
 
-def is_thesis(facts: Mapping[str, Any]) -> bool:
-    """Return whether the resolved experiment ``facts`` has the target of the thesis, whose claims
-    are scored."""
-    return (facts.get("source", {}).get("target") or {}).get("name") == "thesis"
-
-
 def summaries(
-    tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True
+    tables: trials.ResultTables,
+    examples: Sequence[Any] = (),
+    claim_set: ClaimSet | None = None,
 ) -> Summaries:
-    """Return all tables for a page; claims, which use the pictures ``examples``, and posterior
-    only ``with_claims``."""
+    """Return all tables for a page. Claims, which use the pictures ``examples``, and the
+    posterior need a ``claim_set``."""
     paths = [str(path) for path in tables.axes["path"]]
     set_ups = set_ups_of(tables)
     summary = summarise_holes(tables.holes, paths)
@@ -47,7 +41,8 @@ def summaries(
         found[trials.REGISTRATION_ERRORS] = by_views(
             own, sorted({set_up.views for set_up in maps_of(tables)})
         )
-        verdicts = score_views(map_cases(tables, summary)) if with_claims else ()
+        if claim_set is not None:
+            verdicts = claim_set.judge_views(map_cases(tables, summary))
     else:
         several = len(set_ups) > 1
         compared = compare_set_ups(tables, summary, everything, half_sizes=several)
@@ -55,13 +50,13 @@ def summaries(
             compared["is_variation"] = ~compared["variant"].isin(set_ups)
         found[trials.SET_UPS] = compared
         found[trials.EFFECTS] = effect_costs(tables)
-        if with_claims and several:
-            verdict = claim_c11(summary, paths)
-            posterior = posterior_of(of_set_ups(summary, tables), paths)
-            verdicts = [verdict] if verdict else ()
-            found |= {} if posterior is None else {trials.POSTERIOR: posterior}
-        elif with_claims:
-            verdicts = score_claims(tables, MAIN, examples, summary)
+        if claim_set is not None and several:
+            verdicts = claim_set.judge_set_ups(summary, paths)
+            posterior = claim_set.posterior_of(of_set_ups(summary, tables), paths)
+            if posterior is not None:
+                found[trials.POSTERIOR] = posterior
+        elif claim_set is not None:
+            verdicts = claim_set.judge_sweep(tables, examples, summary)
     return {**found, trials.CLAIMS: trials.CLAIMS.frame(map(vars, verdicts))}
 
 

@@ -2,12 +2,12 @@
 true damage."""
 
 import base64
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from harness.records.examples import CircleKind, Scene3d
 from harness.report.blocks import BLUE, DAMAGE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, template
 from harness.vocabulary.files import write_text
 
@@ -19,46 +19,12 @@ SEVERAL_CODE = 255
 RESIDUAL_STEP_MM = 0.01
 NO_RESIDUAL = -32768
 
-Kind = Literal["found", "missed", "finding", "false call"]
-KINDS: dict[Kind, tuple[str, str]] = {
+KINDS: dict[CircleKind, tuple[str, str]] = {
     "found": ("damage, found", "#00a651"),
     "missed": ("damage, missed", ORANGE),
     "finding": ("finding", DAMAGE),
     "false call": ("finding that matches no damage", "#e0201b"),
 }
-
-
-@dataclass(frozen=True)
-class Circle3d:
-    """A damage or a finding (by the thesis' measure); ``centre_mm`` (3,), unit ``normal`` (3,) in
-    the scene's frame."""
-
-    centre_mm: np.ndarray
-    normal: np.ndarray
-    diameter_mm: float
-    label: str
-    kind: Kind
-
-
-@dataclass(frozen=True)
-class Scene3d:
-    """The cloud to show. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN if
-    not judged; ``view_of`` (n,), an index into ``view_names`` or -1 for several; ``detected`` (n,)
-    bool. ``frame`` is "board" (x right, y up, z to the viewer) or "camera" (x right, y down, z
-    away). ``facts`` are (name, value) beside the picture. ``shown`` says what ``rgb`` represents;
-    ``key`` explains its colours as (words, colour)."""
-
-    points_mm: np.ndarray
-    frame: Literal["board", "camera"]
-    rgb: np.ndarray | None = None
-    residual_mm: np.ndarray | None = None
-    view_of: np.ndarray | None = None
-    view_names: tuple[str, ...] = ()
-    detected: np.ndarray | None = None
-    circles: tuple[Circle3d, ...] = ()
-    facts: tuple[tuple[str, str], ...] = ()
-    shown: str = "camera's colours"
-    key: tuple[tuple[str, str], ...] = ()
 
 
 def write_view3d(path: Path, scene: Scene3d, title: str) -> Path:

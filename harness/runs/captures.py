@@ -6,6 +6,7 @@ from detectors import load_detector
 from detectors.averages.average import prefix_averages
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import CaptureSource, Experiment, recording_of
+from harness.inspection.judging import judged
 from harness.inspection.output import (
     capture_facts,
     choice_by,
@@ -13,7 +14,6 @@ from harness.inspection.output import (
     pictures,
     print_warnings,
 )
-from harness.inspection.run import judged
 from harness.records.outputs import EXPERIMENT, PROVENANCE
 from harness.records.schema import write_table
 from harness.records.trials import POINTS_OF_CAPTURES

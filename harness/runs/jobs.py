@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 from harness.vocabulary.errors import DiskFull, UserError
 
 if TYPE_CHECKING:
-    from harness.report.clouds import ExampleCloud, MappedExample
+    from harness.records.examples import ExampleCloud, MappedExample
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
 """The ends of a job. Failed: it raised; crashed: its process died; skipped: something that it

@@ -451,7 +451,8 @@ def render_into_cache(
     and the seconds."""
     from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
-    from scenes.sensor.camera import CameraConfig, camera_of
+    from scenes.sensor.camera import camera_of
+    from scenes.sensor.common.config import CameraConfig
     from scenes.target.custom import TargetConfig
 
     target = TargetConfig.from_data(target_data)

@@ -151,7 +151,9 @@ def _best_candidate(
         return np.array([1 / np.nanmedian(z_m[free]), 0.0, 0.0])
     candidates = np.linalg.solve(rays[usable], 1 / z[usable][..., None])[..., 0]
     row, column = points[rng.integers(0, len(points), SCREENED)].T
-    is_close = _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column]) < tolerance_m
+    is_close = (
+        _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column]) < tolerance_m
+    )
     return np.asarray(candidates[int(is_close.sum(axis=1).argmax())])
 
 
@@ -260,7 +262,9 @@ def fixed_pattern(
         of_noise = covariance(noise, good, lag_x, lag_y)[0] / (len(z_m) - 1)
         return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
 
-    correlation_left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(axis=1)
+    correlation_left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(
+        axis=1
+    )
     return FixedPattern(float(np.sqrt(max(correlation_left[0], 0))), correlation_left)
 
 
@@ -297,7 +301,8 @@ def edge_widths(
     within_reach = np.abs(from_edge_px) <= reach_px
     z = z_m[:, within_reach]
     on_surface = np.any(
-        [np.abs(z - surface[within_reach]) <= tolerance_m for surface in (front_z_m, back_z_m)], axis=0
+        [np.abs(z - surface[within_reach]) <= tolerance_m for surface in (front_z_m, back_z_m)],
+        axis=0,
     )
     lines = np.asarray(within_reach.any(axis=across - 1))
     flying = np.zeros(z_m.shape, bool)

@@ -455,7 +455,9 @@ def _sound_findings(look: Look, *thresholds: float) -> None:
 
 def _pixels_of(findings: tuple[Detection, ...]) -> np.ndarray:
     return np.unique(
-        np.concatenate([np.zeros(0, np.int64), *(np.asarray(finding.pixels) for finding in findings)])
+        np.concatenate(
+            [np.zeros(0, np.int64), *(np.asarray(finding.pixels) for finding in findings)]
+        )
     )
 
 
@@ -484,7 +486,9 @@ def _same(a: Any, b: Any) -> bool:
 def _with_arrays(value: T, change: Callable[[np.ndarray], np.ndarray]) -> T:
     """Return a copy of a dataclass with changed arrays."""
     values = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
-    changed = {name: change(array) for name, array in values.items() if isinstance(array, np.ndarray)}
+    changed = {
+        name: change(array) for name, array in values.items() if isinstance(array, np.ndarray)
+    }
     return cast(T, replace(cast(Any, value), **changed))
 
 
@@ -571,9 +575,12 @@ def _compare(
     require(of_before.keys() == of_after.keys(), f"{motion}, {lost}, and there are {len(of_after)}")
     for key, finding in of_before.items():
         moved_to = transform_points(T_after_before, finding.centre_m)
-        distance_m = float(np.linalg.norm(np.asarray(moved_to) - np.asarray(of_after[key].centre_m)))
+        distance_m = float(
+            np.linalg.norm(np.asarray(moved_to) - np.asarray(of_after[key].centre_m))
+        )
         require(
-            distance_m <= PLACE_TOLERANCE_M, f"{motion}, a finding's centre moved by {1e3 * distance_m:.2f} mm"
+            distance_m <= PLACE_TOLERANCE_M,
+            f"{motion}, a finding's centre moved by {1e3 * distance_m:.2f} mm",
         )
         sizes = (
             before.measured(finding).extent_diameter_m,
@@ -581,5 +588,6 @@ def _compare(
         )
         grown = abs(sizes[1] - sizes[0])
         require(
-            grown <= PLACE_TOLERANCE_M, f"{motion}, a finding's extent changed by {1e3 * grown:.2f} mm"
+            grown <= PLACE_TOLERANCE_M,
+            f"{motion}, a finding's extent changed by {1e3 * grown:.2f} mm",
         )

@@ -149,7 +149,10 @@ class Lens:
                 if slopes is not None and joint.area <= 2 * (kept_region.area + region.area)
                 else region
             )
-            v, u = np.mgrid[kept_region.row0 : kept_region.row1, kept_region.col0 : kept_region.col1] + shift_px
+            v, u = (
+                np.mgrid[kept_region.row0 : kept_region.row1, kept_region.col0 : kept_region.col1]
+                + shift_px
+            )
             slopes = self.slopes(u, v)
         _slopes[self, shift_px] = kept_region, slopes
         if len(_slopes) > MOST_LENSES:

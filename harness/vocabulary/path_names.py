@@ -106,7 +106,11 @@ def differing(value: Any, siblings: Iterable[Any]) -> Any:
     sibling_values = list(siblings)
     if not all(isinstance(item, dict) for item in (value, *sibling_values)):
         return value
-    return {key: part for key, part in value.items() if any(item.get(key) != part for item in sibling_values)}
+    return {
+        key: part
+        for key, part in value.items()
+        if any(item.get(key) != part for item in sibling_values)
+    }
 
 
 def _is_number(value: Any) -> bool:

@@ -57,7 +57,7 @@ class PlugIns:
         name) or taken twice."""
         offers = [offer for offer in self.offers() if offer.name == name]
         if not offers:
-            from harness.vocabulary.declaration.diagnose import nearest
+            from harness.vocabulary.words import nearest
 
             nearest_name = nearest(name, self.names())
             message = f"there is no {self.noun} {name!r}" + (

@@ -1,13 +1,15 @@
 """The frame of all programs: the parser, one message for a user's mistake, exit codes, and types
 of arguments."""
 
+from __future__ import annotations
+
 import argparse
 import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError, exit_code_of
@@ -22,10 +24,15 @@ class Program:
     and runs it."""
 
     name: str
+    """The words after ``tofpod``."""
     options: Options
+    """Adds its arguments to a parser."""
     run: Run
+    """Does its work; takes the parsed arguments and the whole command, and returns the exit code."""
     description: str
-    epilog: str | None
+    epilog: str | None = None
+    further: Mapping[str, Program] = field(default_factory=dict)
+    """Programs that a first word of the arguments names: ``tofpod gauge read``."""
 
     @property
     def command(self) -> str:
@@ -42,28 +49,39 @@ class Program:
         self.options(parser)
         return parser
 
+    def chosen_by(self, words: list[str]) -> tuple[Program, list[str]]:
+        """Return the program that the arguments name, this or a further one, and its arguments."""
+        if words and words[0] in self.further:
+            return self.further[words[0]], words[1:]
+        return self, words
+
     def __call__(self, arguments: list[str] | None = None) -> int:
         """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after
         Ctrl-C."""
-        words = sys.argv[1:] if arguments is None else arguments
-        parsed = self.parser().parse_args(words)
+        program, words = self.chosen_by(sys.argv[1:] if arguments is None else arguments)
+        parsed = program.parser().parse_args(words)
         if arguments is None:
             # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C
             # does
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return exit_code_of(
-            lambda: self.run(parsed, f"{self.command} {shlex.join(words)}".rstrip())
-        )
+        command = f"{program.command} {shlex.join(words)}".rstrip()
+        return exit_code_of(lambda: program.run(parsed, command))
 
 
 def program(
-    options: Options, description: str, epilog: str | None = None
+    options: Options,
+    description: str,
+    epilog: str | None = None,
+    further: Mapping[str, Program] | None = None,
 ) -> Callable[[Run], Program]:
     """Return a decorator that turns a function into a program, which is named after the function's
     module."""
-    return lambda run: Program(
-        Path(run.__code__.co_filename).stem, options, run, description, epilog
-    )
+
+    def decorated(run: Run) -> Program:
+        name = Path(run.__code__.co_filename).stem
+        return Program(name, options, run, description, epilog, further or {})
+
+    return decorated
 
 
 def whole_number(largest: int) -> Callable[[str], int]:

@@ -193,9 +193,7 @@ def _content(path: Path) -> bytes:
 def _source_of(name: str) -> Path | None:
     """Return the file of a module of the project, or None if there is no such module."""
     base = ROOT.joinpath(*name.split("."))
-    files = (
-        (base / "__init__.py", base.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
-    )
+    files = (base / "__init__.py", base.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
     return next((path for path in files if path.is_file()), None)
 
 

@@ -112,7 +112,11 @@ def inches(diameter_mm: float) -> str:
 
 
 def _number(value: float, digits: int, largest: float) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) and not value > largest else size(value, largest)
+    return (
+        f"{value:.{digits}f}"
+        if np.isfinite(value) and not value > largest
+        else size(value, largest)
+    )
 
 
 Tone = Literal["", "good", "key", "bad", "open", "changed"]
@@ -197,7 +201,9 @@ class Grid:
         rows = []
         for row in self.rows:
             cells = [Markup('<th scope="row">{}</th>').format(row[0].text)]
-            cells += [_data_cell(cell, column >= self.left) for column, cell in enumerate(row[1:], 1)]
+            cells += [
+                _data_cell(cell, column >= self.left) for column, cell in enumerate(row[1:], 1)
+            ]
             rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
         table = '<div class="scroll"><table class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
         return Markup(table).format(self.kind, heads, Markup("\n").join(rows))

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from detectors import load_detector
 from detectors.crop import AutoCrop, BoxCrop, CropConfig, NoCrop, PolygonCrop, choice_of, crop
-from detectors.masks import holes_filled
+from detectors.pixels.masks import holes_filled
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region
 from tests.support.target_scenes import SCENES, Scene
@@ -23,7 +23,16 @@ def cloud_of(z_m: np.ndarray, region: Region | None = None, z_step_m: float = 0.
     points = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
     nothing = np.full(z_m.shape, np.nan)
     zeros = np.zeros(z_m.shape, dtype=np.uint8)
-    return Cloud(points, zeros, zeros.astype(int) + 1, nothing, region, z_step_m, 1, lens=LENS)
+    return Cloud(
+        points,
+        zeros,
+        zeros.astype(int) + 1,
+        nothing,
+        region,
+        z_step_m,
+        1,
+        lens=LENS,
+    )
 
 
 def board_before_wall(noise_m: float = 5e-4) -> tuple[Cloud, np.ndarray]:
@@ -43,7 +52,8 @@ def test_none_keeps_every_valid_pixel() -> None:
     cloud, _ = board_before_wall()
     cloud.points_m[3, 4] = np.nan
     mask = crop(cloud, NoCrop())
-    assert mask.sum() == mask.size - 1 and not mask[3, 4]
+    assert mask.sum() == mask.size - 1
+    assert not mask[3, 4]
 
 
 def test_the_default_box_is_the_thesis() -> None:
@@ -89,28 +99,31 @@ def test_the_target_is_the_board_and_not_the_wall() -> None:
     within = np.zeros_like(board)
     within[33:117, 43:167] = True
     np.testing.assert_array_equal(crop(cloud, AutoCrop()), within)
-    near = cloud_of(np.where(board, cloud.points_m[..., 2], np.nan))
-    np.testing.assert_array_equal(crop(near, AutoCrop()), within)
+    nearer = cloud_of(np.where(board, cloud.points_m[..., 2], np.nan))
+    np.testing.assert_array_equal(crop(nearer, AutoCrop()), within)
 
 
 def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
     cloud, board = board_before_wall()
     choice = choice_of(cloud, AutoCrop(target=2, inset_px=0))
     first, second = choice.candidates
-    assert choice.taken == 2 and not choice.warnings
-    assert first.depths_m[1] == pytest.approx(0.7, abs=0.01) and second.depths_m[
-        1
-    ] == pytest.approx(1.2, abs=0.001)
+    assert choice.taken == 2
+    assert not choice.warnings
+    assert first.depths_m[1] == pytest.approx(0.7, abs=0.01)
+    assert second.depths_m[1] == pytest.approx(1.2, abs=0.001)
     # 130 x 90 pixels of 2.8 mm, and 200 x 150 of 4.8 mm
     assert first.extent_m == pytest.approx((0.364, 0.252), abs=0.01)
     assert second.extent_m == pytest.approx((0.96, 0.72), abs=0.01)
     assert first.share == pytest.approx(board.mean(), abs=0.01)
     slope = np.degrees(np.arctan(np.hypot(2e-4, 1e-4) * 250 / 0.7))
-    assert first.tilt_deg == pytest.approx(slope, abs=0.5) and second.tilt_deg < 0.5
-    assert not (choice.mask & board).any() and choice.mask.sum() > 0.8 * (~board).sum()
+    assert first.tilt_deg == pytest.approx(slope, abs=0.5)
+    assert second.tilt_deg < 0.5
+    assert not (choice.mask & board).any()
+    assert choice.mask.sum() > 0.8 * (~board).sum()
     with pytest.raises(UserError, match="--target 3: there are 2") as caught:
         crop(cloud, AutoCrop(target=3))
-    assert "--target 1: 0.70 m" in str(caught.value) and "--target 2: 1.20 m" in str(caught.value)
+    assert "--target 1: 0.70 m" in str(caught.value)
+    assert "--target 2: 1.20 m" in str(caught.value)
 
 
 # ---------------------------------------------------------------- scenes of all kinds
@@ -129,16 +142,20 @@ def judged(kind: str, seed: int, camera: str, flat: bool = False) -> tuple[bool,
     noise_m = float(np.exp(random.uniform(np.log(3e-4), np.log(3e-3))))
     dropouts = float(random.choice([0.0, random.uniform(0.0, 0.3)]))
     cloud = scene.cloud(
-        random, noise_m, dropouts, random.choice([0.0, 1e-4, 1e-3]), int(random.choice([1, 3, 5]))
+        random,
+        noise_m,
+        dropouts,
+        random.choice([0.0, 1e-4, 1e-3]),
+        int(random.choice([1, 3, 5])),
     )
     choice = choice_of(without_grid(cloud.points_m.reshape(-1, 3)) if flat else cloud, AutoCrop())
     mask = np.zeros(cloud.valid.shape, dtype=bool)
     mask[cloud.valid] = choice.mask[0] if flat else choice.mask[cloud.valid]
     target = scene.name == 1
-    whole = holes_filled(target).astype(np.uint8)
+    full_mask = holes_filled(target).astype(np.uint8)
     kernel = np.ones((3, 3), np.uint8)
-    outside = cv2.dilate(whole, kernel, iterations=2) == 0
-    inside = target & (cv2.erode(whole, kernel, iterations=10 if flat else 6) > 0) & cloud.valid
+    outside = cv2.dilate(full_mask, kernel, iterations=2) == 0
+    inside = target & (cv2.erode(full_mask, kernel, iterations=10 if flat else 6) > 0) & cloud.valid
     right = (mask & outside).sum() <= 0.03 * mask.sum() and (
         mask & inside
     ).sum() >= 0.8 * inside.sum()
@@ -171,7 +188,8 @@ def test_the_target_of_a_random_scene_is_taken(kind: str) -> None:
 )
 def test_the_target_is_taken_without_a_pixel_grid_too(kind: str) -> None:
     right, warned, _ = judged(kind, 4, "phone", flat=True)
-    assert right and not warned
+    assert right
+    assert not warned
 
 
 def test_two_boards_side_by_side_are_a_doubt() -> None:
@@ -179,7 +197,13 @@ def test_two_boards_side_by_side_are_a_doubt() -> None:
         assert judged("two_boards", seed, "phone")[1]
 
 
-@pytest.mark.parametrize(("squares", "is_told"), [(4, False), (5, True)])
+@pytest.mark.parametrize(
+    ("squares", "is_told"),
+    [
+        (4, False),
+        (5, True),
+    ],
+)
 def test_a_crowd_of_like_surfaces_may_hold_no_target(squares: int, is_told: bool) -> None:
     """Squares side by side, each 20 cm farther than the one before, so that the first is preferred
     to all others."""
@@ -212,12 +236,14 @@ def test_the_fingers_of_a_hand_before_the_board_leave_with_it() -> None:
     bump = (np.arange(200) - 65) ** 2 + (np.arange(150)[:, None] - 75) ** 2 < 64
     z[bump] -= 0.02
     mask = crop(cloud_of(z), AutoCrop())
-    assert mask[fingers].mean() < 0.02 and mask[bump].all()
+    assert mask[fingers].mean() < 0.02
+    assert mask[bump].all()
 
 
 def test_what_lies_on_a_plate_stays_in_its_outline() -> None:
     right, _, scene = judged("object_on_plate", 1, "phone")
-    assert right and (scene.name == 1).all()
+    assert right
+    assert (scene.name == 1).all()
 
 
 def test_the_board_is_found_before_a_broken_background_with_its_damage_inside() -> None:
@@ -263,7 +289,8 @@ def test_a_crease_ends_the_surface() -> None:
     ).copy()
     noisy = floor_and_wall + 3e-4 * np.random.default_rng(2).standard_normal((150, 200))
     mask = crop(cloud_of(noisy), AutoCrop(inset_px=0))
-    assert mask[:, :115].all() and not mask[:, 126:].any()
+    assert mask[:, :115].all()
+    assert not mask[:, 126:].any()
 
 
 def test_inset_takes_the_rim_but_leaves_holes_and_the_image_edge() -> None:
@@ -297,10 +324,10 @@ def drilled_board_before_a_wall(
     z = np.where(target, 0.7, 0.9)
     hole = np.zeros(z.shape, dtype=int)
     for number, centre_x, diameter in ((1, 0.1, 0.014), (2, 0.19, 0.025)):
-        apart = np.stack([x - centre_x, y - 0.02], axis=-1)
+        from_axis_m = np.stack([x - centre_x, y - 0.02], axis=-1)
         a = (slopes**2).sum(-1)
-        b = (apart * slopes).sum(-1)
-        c = (apart**2).sum(-1) - diameter**2 / 4
+        b = (from_axis_m * slopes).sum(-1)
+        c = (from_axis_m**2).sum(-1) - diameter**2 / 4
         inside = c < 0
         wall = (np.sqrt(np.where(inside, b * b - a * c, 0.0)) - b) / a
         hole[inside] = number
@@ -344,22 +371,24 @@ def test_without_a_grid_holes_with_a_backing_are_found_and_the_wall_past_the_rim
     evidence = detector.analyse(flat)
     kept = np.isfinite(evidence.score[0])
     # of 85 x 86 pixels at most 6 on each side go: 3 of rim, 3 for the raster's cells
-    assert not kept[~target].any() and kept[target].mean() > 0.73
-    found = np.zeros(len(points), dtype=bool)
+    assert not kept[~target].any()
+    assert kept[target].mean() > 0.73
+    in_findings = np.zeros(len(points), dtype=bool)
     for detection in detector.find(flat, evidence, 5.0):
-        found[detection.pixels] = True
-    assert not found[hole == 0].any()
-    assert found[hole == 1].mean() > 0.8 and found[hole == 2].mean() > 0.8
+        in_findings[detection.pixels] = True
+    assert not in_findings[hole == 0].any()
+    assert in_findings[hole == 1].mean() > 0.8
+    assert in_findings[hole == 2].mean() > 0.8
 
 
 def test_without_a_grid_the_crop_is_the_grids_but_for_the_rim() -> None:
     cloud, target, _ = drilled_board_before_a_wall()
     flat = without_grid(cloud.points_m.reshape(-1, 3))
-    whole = crop(flat, AutoCrop(inset_px=0))[0]
-    assert whole[target[cloud.valid]].all()
+    full_mask = crop(flat, AutoCrop(inset_px=0))[0]
+    assert full_mask[target[cloud.valid]].all()
     # a cell on the rim may hold a point of the wall too
-    near = cv2.dilate(target.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    assert not whole[~near[cloud.valid]].any()
+    nearer = cv2.dilate(target.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not full_mask[~nearer[cloud.valid]].any()
     for inset in (1, 2, 3, 5, 8):
         mask = crop(flat, AutoCrop(inset_px=inset))[0]
         assert not (mask & ~crop(cloud, AutoCrop(inset_px=inset))[cloud.valid]).any()
@@ -374,7 +403,8 @@ def test_points_in_no_order_at_all_still_make_a_surface() -> None:
     )
     clutter = np.column_stack([random.uniform(0.5, 0.9, (400, 2)), random.uniform(1.2, 1.4, 400)])
     mask = crop(without_grid(np.concatenate([clutter, plate])), AutoCrop(inset_px=0))[0]
-    assert mask[400:].mean() > 0.99 and not mask[:400].any()
+    assert mask[400:].mean() > 0.99
+    assert not mask[:400].any()
 
 
 def test_the_pixel_grids_of_several_views_over_one_another_make_a_surface() -> None:
@@ -392,7 +422,8 @@ def test_the_pixel_grids_of_several_views_over_one_another_make_a_surface() -> N
     assert crop(without_grid(points), AutoCrop(inset_px=0)).all()
     kept = crop(without_grid(points), AutoCrop())[0]
     inner = (np.abs(points[:, :2]) < [0.145, 0.045]).all(axis=1)
-    assert kept[inner].all() and not kept.all()
+    assert kept[inner].all()
+    assert not kept.all()
 
 
 def test_a_polygon_needs_a_grid() -> None:
@@ -408,7 +439,8 @@ def test_an_empty_crop_names_the_box_and_the_cloud() -> None:
     cloud = cloud_of(np.full((150, 200), 1.5))
     with pytest.raises(UserError) as caught:
         crop(cloud, BoxCrop())
-    assert "z 0 to 1100" in str(caught.value) and "z 1500 to 1500 mm" in str(caught.value)
+    assert "z 0 to 1100" in str(caught.value)
+    assert "z 1500 to 1500 mm" in str(caught.value)
     with pytest.raises(UserError, match="unit"):
         crop(cloud_of(np.full((150, 200), 250.0)), BoxCrop())
     with pytest.raises(UserError, match="polygon"):
@@ -420,7 +452,8 @@ def test_an_empty_crop_names_the_box_and_the_cloud() -> None:
 def test_the_kind_chooses_the_declaration() -> None:
     adapter: TypeAdapter[NoCrop | BoxCrop | PolygonCrop | AutoCrop] = TypeAdapter(CropConfig)
     assert isinstance(adapter.validate_json('{"kind": "auto", "inset_px": 2}'), AutoCrop)
-    assert adapter.validate_json('{"kind": "auto"}').inset_px == 3 and NoCrop().inset_px == 0
+    assert adapter.validate_json('{"kind": "auto"}').inset_px == 3
+    assert NoCrop().inset_px == 0
     assert adapter.validate_json('{"kind": "box", "x_mm": [-10, 20]}') == BoxCrop(
         x_mm=(-10.0, 20.0)
     )

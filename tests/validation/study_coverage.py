@@ -24,7 +24,7 @@ from scipy import optimize, special
 
 from harness.evaluation.intervals import percentiles
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
-from harness.evaluation.study.limit import design_effect, refitted_sizes, targets_of
+from harness.evaluation.study.boards import design_effect, refitted_sizes, targets_of
 from harness.vocabulary.errors import UserError
 
 A50_MM = 6.0
@@ -115,11 +115,11 @@ def main(arguments: list[str] | None = None) -> int:
     )
     for boards in (20, 60):
         for shift_mm in (0.0, 1.0, 2.0):
-            one = coverage(boards, shift_mm, options.studies, options.seed)
+            result = coverage(boards, shift_mm, options.studies, options.seed)
             print(
-                f"{boards:6d}  {shift_mm:8.1f}  {one.true_mm:6.2f}  {one.by_ratio:14.3f}  {one.over_boards:11.3f}  "
-                f"{one.by_percentile:10.3f}  {one.median_ratio_mm:16.2f}  {one.median_boards_mm:11.2f}  "
-                f"{one.median_effect:6.2f}",
+                f"{boards:6d}  {shift_mm:8.1f}  {result.true_mm:6.2f}  {result.by_ratio:14.3f}  {result.over_boards:11.3f}  "
+                f"{result.by_percentile:10.3f}  {result.median_ratio_mm:16.2f}  {result.median_boards_mm:11.2f}  "
+                f"{result.median_effect:6.2f}",
                 flush=True,
             )
     return 0

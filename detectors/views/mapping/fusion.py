@@ -26,7 +26,7 @@ from scipy.optimize import nnls
 from scipy.special import gammaincinv
 
 from detectors.averages.average import pixel_medians
-from detectors.averages.noise import rounding_left_m2
+from detectors.pixels.noise import rounding_left_m2
 from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from detectors.views.mapping import placing
 from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert, transform_points

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from detectors.averages.average import CORRELATED_PIXELS
-from detectors.averages.noise import median_of, sigma_of
+from detectors.pixels.noise import median_of, sigma_of
 from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from detectors.views.marks.blobs import (
     Blob,

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from detectors.open3d_library import open3d_on_one_thread
-from detectors.views.marks.pairing import kabsch
+from detectors.rigid_motion import displacement_jacobian, kabsch
 from detectors.views.registration import registered
 from detectors.views.registration.settings import CpdRegistration, IcpRegistration
 from detectors.views.view import PreparedView
@@ -116,7 +116,7 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
     within cubes of 5 pixels whose errors are common. It ignores that the iteration may stop at one
     of many near minima. NaN if a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
-    jacobian = registered.displacement_jacobian(arm, np.zeros(3))
+    jacobian = displacement_jacobian(arm, np.zeros(3))
     scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
 
     def half_cost(motion: np.ndarray) -> float:
@@ -280,7 +280,7 @@ def drift_covariance(
     scores = np.einsum("nij,nj->ni", linear, moments[:, :, 3]) / variance
     within = (linear @ moments @ np.swapaxes(linear, 1, 2)).sum(axis=0) / variance**2
     # the complete information is the weighted sum of J'J, with J linear in (y, 1) too
-    parts = registered.displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
+    parts = displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
     parts[:3] -= parts[3]
     complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
     information = complete - (within - scores.T @ scores)

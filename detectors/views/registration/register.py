@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from detectors.averages.average import CORRELATED_PIXELS
-from detectors.averages.noise import sigma_of
+from detectors.pixels.noise import sigma_of
 from detectors.views.registration import registered
 from detectors.views.registration.by_marks import register_by_marks, register_jointly
 from detectors.views.registration.by_points import (

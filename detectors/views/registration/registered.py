@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from detectors.averages.average import CORRELATED_PIXELS
-from detectors.averages.noise import sigma_of
+from detectors.pixels.noise import sigma_of
+from detectors.rigid_motion import displacement_jacobian
 from detectors.views.view import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
@@ -68,28 +68,6 @@ def guess_of(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
         if reference_guess is None or view_guess is None
         else invert(reference_guess) @ view_guess
     )
-
-
-def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n, 3, 6) of points (n, 3), reference frame, by the error (w, t) of
-    `Registration`."""
-    arm = np.asarray(points_m) - centre_m
-    jacobian = np.zeros((len(arm), 3, 6))
-    # w x r = -[r]x w
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = arm[:, 2], -arm[:, 1]
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -arm[:, 2], arm[:, 0]
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = arm[:, 1], -arm[:, 0]
-    jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
-    return jacobian
-
-
-def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-    """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a rotation by the vector
-    w, then a shift."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
-    T[:3, 3] = centre_m - T[:3, :3] @ centre_m + motion[3:]
-    return T
 
 
 def predicted_error_m(

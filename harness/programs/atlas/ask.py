@@ -204,8 +204,8 @@ def _answer(
     ]
     rows = []
     whose = dict[str, set[str]]()
-    for place in places:
-        found, why = rows_at(chosen, titles, place, size_mm)
+    for position in places:
+        found, why = rows_at(chosen, titles, position, size_mm)
         rows += found
         for reason, title in why:
             whose.setdefault(reason, set()).add(title)
@@ -245,7 +245,7 @@ def _chosen(
     options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str
 ) -> list[LimitSurface]:
     """Return the surfaces for a question. Raises UserError if a name is not in the atlas."""
-    from harness.vocabulary.declaration.diagnose import nearest
+    from harness.vocabulary.words import nearest
 
     detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
     detector = options.detector or (BEST if BEST in detectors else detectors[0])

@@ -46,7 +46,7 @@ def atlas_html(
     lines = {"curves": list(curves.values()), "colours": PALETTE, "dashes": list(DASHES.values())}
     data = json.dumps(lines, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     worst = max((row.surface.error for row in rows), default=float("nan"))
-    return template("atlas.html").render(
+    return template("atlas.html", Path(__file__).parent).render(
         title="Which camera finds it, how far away, with how many frames?",
         answer="",
         data=Markup(data),

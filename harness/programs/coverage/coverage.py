@@ -136,8 +136,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if options.goal:
         ways = (
             way
-            for each in surveys
-            for way in _ways(each, size_mm or each.found.sizes_mm[1], options.share)
+            for survey in surveys
+            for way in _ways(survey, size_mm or survey.found.sizes_mm[1], options.share)
         )
         order = {True: "capture_s", False: "missing_share"}
         goals = sorted(ways, key=lambda way: (not way["reached"], way[order[way["reached"]]]))
@@ -167,7 +167,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     rows |= {POSES: poses, GOALS: goals}
     provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
-    write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
+    write_tables(folder, {table: table.frame(row) for table, row in rows.items()}, provenance)
     warnings = warnings_of(found, chosen.seen)
     sentence = answer(found, patches, limits_mm, wanted, len(poses))
     if (added := len(poses) - len(given)) < options.suggest:
@@ -184,7 +184,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     config = chosen.point.config
     scene = scene_of(patches, limits_mm, found)
     camera = config.simulated.camera
-    detector = f"the detector {config.detector.name} at a threshold of {chosen.task.threshold:.3g}"
+    detector = f"the detector {config.detector.name} at a threshold of {chosen.task.criteria.threshold:.3g}"
     unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
     first = f"Simulated, for {unit}, {detector}. {found.statement}"
     html = coverage_html(name, sentence, first, scene, poses, goals, warnings, command)
@@ -219,7 +219,7 @@ def _rows(
     limits_mm = [seen.found.limits_mm(seen.seen[pose]) for pose in poses]
     rows = list[dict[str, Any]]()
     for which, gain, total in in_turn(
-        seen.patches, [each <= size_mm for each in limits_mm], given, further
+        seen.patches, [limit_mm <= size_mm for limit_mm in limits_mm], given, further
     ):
         row = {"number": len(rows) + 1, "pose": poses[which], "limits_mm": limits_mm[which]}
         row |= dict(zip(("distance_m", "tilt_x_deg", "tilt_y_deg"), poses[which], strict=True))

@@ -21,11 +21,12 @@ from harness.runs.estimate import progress_display
 from harness.runs.job_batches import render_missing, values_of
 from harness.runs.jobs import JobEngine
 from harness.runs.journal import Journal
-from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
+from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, trial_point
 from harness.runs.run import run_plan
+from harness.trials.board import load_board
+from harness.trials.clouds import TrialPoint
 from harness.trials.judge import detector_of
-from harness.trials.setup import load_set_up
-from harness.trials.trial import PointTask, TrialTask, cloud_of
+from harness.trials.trial import Trial, cloud_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
 from scenes.target.custom import BoardConfig, PoseConfig
@@ -59,7 +60,7 @@ class Survey:
     ``seen``: by pose."""
 
     point: Point
-    task: PointTask
+    task: TrialPoint
     patches: Patches
     found: Findable
     seen: dict[Pose, Seen]
@@ -104,12 +105,12 @@ def survey(
                     (failure.in_short for failure in outcome.failures), "no hole-free run ended"
                 )
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
-            task = point_task(
+            task = trial_point(
                 point, outcome.thresholds[point.digest], group.learned.get(point.digest)
             )
             pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
             boards = values_of(_board_seen, pairs, engine)
-            inspections = _inspections([each for each in boards if each is not None], point, scores)
+            inspections = _inspections([board for board in boards if board is not None], point, scores)
             found = findable(inspections, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = values_of(
@@ -196,10 +197,11 @@ def _widened(group: Group, poses: Sequence[Pose]) -> Group:
 
 def _bare(batch: Batch) -> Batch:
     """Return a damaged batch's board without its damage."""
-    (job,), (ref,) = batch.renders, batch.set_ups
+    (job,) = batch.renders
+    (ref,) = batch.views
     job = replace(job, target=job.target.hole_free())
     ref = replace(ref, view_path=str(job.path), damaged=False)
-    return replace(batch, role="hole_free", renders=(job,), set_ups=(ref,))
+    return replace(batch, role="hole_free", renders=(job,), views=(ref,))
 
 
 def _inspections(
@@ -226,18 +228,23 @@ def _inspections(
     return ScoredDamage(word, numbers, size_mm, Seen(*seen), score)
 
 
-def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
+def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
     """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over
     score, rms around each pixel; larger if some pixels or averages are not judged, infinite if
     most are not."""
     fields = []
     for repeat in range(DRAWS):
-        task = TrialTask(
-            batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board
+        task = Trial(
+            views=batch.before(repeat),
+            seed=seed,
+            role="hole_free",
+            repeat=repeat,
+            points=(point,),
+            board=batch.board,
         )
-        evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(
-            cloud_of(task, point)
-        )
+        criteria = point.criteria
+        detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
+        evidence = detector.analyse(cloud_of(task, point))
         known = np.isfinite(evidence.score)
         fields.append(
             [
@@ -258,11 +265,11 @@ def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
 
 
 def _board_seen(
-    batch: Batch, whole: Batch, point: PointTask, seed: int
+    batch: Batch, whole: Batch, point: TrialPoint, seed: int
 ) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
     """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board
     without damage."""
-    set_up = load_set_up(batch.set_ups[0])
+    set_up = load_board(batch.views[0])
     unit_m = _unit_m(whole, point, seed)
     found = []
     for damage in set_up.truth:
@@ -273,9 +280,9 @@ def _board_seen(
     return batch.board or 0, found
 
 
-def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
+def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> Seen:
     """Return the view and the noise of the patches of an undamaged part."""
-    set_up = load_set_up(view.set_ups[0])
+    set_up = load_board(view.views[0])
     deviation_m = _unit_m(view, point, seed)
     points_m = transform_points(set_up.T_camera_board, patches.points_m)
     range_m = np.linalg.norm(points_m, axis=1)

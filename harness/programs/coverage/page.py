@@ -8,8 +8,9 @@ import numpy as np
 
 from harness.programs.coverage.statistics import Findable, Patches, Seen
 from harness.programs.coverage.tables import GOALS, POSES
+from harness.records.examples import Scene3d
 from harness.report.blocks import command_of, heading, note, page, tag
-from harness.report.view3d import Scene3d, view3d_html
+from harness.report.view3d import view3d_html
 from harness.vocabulary.text import many, percent
 
 COLOURS = (
@@ -67,7 +68,7 @@ def answer(
     """State the shares of the face on which damage of a size is found, on which no size is, and
     that is not judged."""
     groups = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
-    share, blind, unknown = (f"{percent(patches.share(each))} %" for each in groups)
+    share, blind, unknown = (f"{percent(patches.share(group))} %" for group in groups)
     return (
         f"Damage with a {found.size_of} of {size_mm:.3g} mm is found nine times in ten on {share} of the face in "
         f"{many(poses, 'pose')}. On {blind} nothing up to {found.sizes_mm[1]:.3g} mm is found so often; {unknown} is "

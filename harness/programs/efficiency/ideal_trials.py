@@ -21,12 +21,13 @@ from harness.programs.efficiency.ideal_observer import (
 from harness.runs.job_batches import carried_out, render_missing
 from harness.runs.jobs import Job, JobEngine
 from harness.runs.plan import Batch, RenderJob, SweepPlan
-from harness.trials.setup import SetUp, load_set_up
-from harness.trials.trial import averages_of
+from harness.trials.averages import averages_of
+from harness.trials.board import Board, load_board
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import random_stream
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 
 UNITS_A_BOARD = 10  # units, drawn anew for every board, whose noise is measured there
@@ -84,9 +85,9 @@ def _undamaged(batch: Batch) -> RenderJob:
 def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]:
     """Return a damaged board as the ideal observer sees it, by the numbers of frames of the
     points."""
-    set_up = load_set_up(batch.set_ups[0])
-    undamaged = load_set_up(
-        replace(batch.set_ups[0], view_path=str(_undamaged(batch).path), damaged=False)
+    set_up = load_board(batch.views[0])
+    undamaged = load_board(
+        replace(batch.views[0], view_path=str(_undamaged(batch).path), damaged=False)
     )
     clear_z_m = noise_free_z_m(set_up)
     intact = set_up.intact & np.isfinite(clear_z_m)
@@ -125,7 +126,7 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     return views
 
 
-def noise_free_z_m(set_up: SetUp) -> np.ndarray:
+def noise_free_z_m(set_up: Board) -> np.ndarray:
     """Return z (h, w) of the camera without noise, unit errors and rounding; NaN where it shows
     nothing."""
     config = set_up.unit.config
@@ -139,14 +140,14 @@ def noise_free_z_m(set_up: SetUp) -> np.ndarray:
     return np.asarray(next(iter(capture.frames())).z_m, dtype=np.float64)
 
 
-def _unit(set_up: SetUp, **changes: object) -> SimulatedUnit:
+def _unit(set_up: Board, **changes: object) -> SimulatedUnit:
     """Return the unit of a set-up with a changed declaration, in front of the same view."""
     config = CameraConfig.model_validate(set_up.unit.config.model_dump() | changes)
     return SimulatedUnit(camera_of(config), config, set_up.unit.view)
 
 
 def _noise_m(
-    set_up: SetUp, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
+    set_up: Board, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the noise (k, h, w) of `UNITS_A_BOARD` units, each minus its cubic fit, and where it
     is known."""

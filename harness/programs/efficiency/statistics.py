@@ -14,14 +14,14 @@ import numpy as np
 from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
 from harness.evaluation.pod.curve import HitsAndMisses, PodCurve, maxima
 from harness.evaluation.pod.hit_miss import fit_hit_miss
-from harness.evaluation.study.limit import (
+from harness.evaluation.study.boards import (
     DRAWS,
-    SetUpLimit,
     Targets,
     crossings,
     refitted_sizes,
     weights_in_blocks,
 )
+from harness.evaluation.study.limit import SetUpLimit
 from harness.programs.efficiency.ideal_observer import SHARES, IdealDamages
 from harness.vocabulary.errors import UserError
 

@@ -86,7 +86,7 @@ EFFICIENCY = Table(
 
 
 @dataclass(frozen=True)
-class DamageRow:
+class EfficiencyRow:
     """One damage of a set-up: the entry with the index ``number`` of every array of ``of``."""
 
     of: Efficiency
@@ -127,7 +127,7 @@ DAMAGES = Table(
 EFFICIENCY_TABLES = (EFFICIENCY, DAMAGES)
 
 
-def damage_rows(rows: Sequence[Efficiency]) -> Iterator[DamageRow]:
+def damage_rows(rows: Sequence[Efficiency]) -> Iterator[EfficiencyRow]:
     """Yield every damage of all set-ups."""
     for row in rows:
-        yield from (DamageRow(row, number) for number in range(len(row.index)))
+        yield from (EfficiencyRow(row, number) for number in range(len(row.index)))

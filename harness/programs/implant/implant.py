@@ -154,7 +154,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.evaluation.study.result import evaluate_study
     from harness.inspection.arguments import opened_as
-    from harness.inspection.run import analysed, refuse_thresholds, threshold_of
+    from harness.inspection.judging import analysed, refuse_thresholds, threshold_of
     from harness.programs.implant.scans import Judging, Scan, judge_scans, placements
     from harness.records.outputs import PROVENANCE, REPORT, STUDY
     from harness.report.study_page import study_html, study_parts
@@ -273,7 +273,8 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     """Return the damage as a family of boards as large as the largest scan. Raises UserError for
     illegal options."""
     from harness.vocabulary.declaration.diagnose import settings_of
-    from scenes.sensor.camera import CameraConfig, camera_of
+    from scenes.sensor.camera import camera_of
+    from scenes.sensor.common.config import CameraConfig
     from scenes.target.drawn import DrawnTargetConfig
 
     width_mm, height_mm = (max(float(scan.size_m[axis]) for scan in scans) / MM for axis in (0, 1))

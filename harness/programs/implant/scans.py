@@ -7,7 +7,6 @@ frames, its noise."""
 
 import math
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,14 +17,16 @@ import pandas as pd
 from scipy import ndimage
 
 from detectors.averages.average import RECORDED, average
-from detectors.averages.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
+from harness.records.rows import Origin, TrialRecord
 from harness.records.trials import ResultTables
 from harness.runs.study_record import set_up_of
 from harness.runs.tables import columns_of
-from harness.trials.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
-from harness.trials.setup import INTACT_MARGIN_PX, KnownCloud, far_from, outlined, pixel_areas
+from harness.trials import judge
+from harness.trials.board import INTACT_MARGIN_PX, LabelledCloud, far_from, outlined, pixel_areas
+from harness.trials.record import add_judgement
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, invert, transform_points
 from harness.vocabulary.seeds import digest, random_stream
@@ -72,7 +73,7 @@ class Scan:
         self.frames = list(recording.frames())
         self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES], recording.z_step_m)
         self.whole = self.averaged(self.frames)
-        evidence = detector_of(judging.detector, judging.settings_json).analyse(self.whole)
+        evidence = judge.detector_of(judging.detector, judging.settings_json).analyse(self.whole)
         self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
         self.surface_z_m = np.where(self.judged, evidence.surface_z_m, np.nan)
         points_m = self.rays[self.judged] * self.surface_z_m[self.judged][:, None]
@@ -90,7 +91,7 @@ class Scan:
         self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
         self.size_m: np.ndarray = np.ptp(places, axis=0)
         # no damage is placed where the undamaged recording has findings, which would count as hits
-        detector = detector_of(judging.detector, judging.settings_json)
+        detector = judge.detector_of(judging.detector, judging.settings_json)
         threshold = judging.threshold
         found = detector.find(
             self.whole, evidence, threshold or judging.threshold_of(self.whole)[0]
@@ -196,13 +197,21 @@ class Scan:
         ray = np.array([*(point[:2] / point[2]), 1.0])
         return ray * (middle @ normal) / (ray @ normal), normal
 
-    def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
+    def known(self, cloud: Cloud, target: TargetConfig, *, damaged: bool) -> LabelledCloud:
         """Return a cloud of this scan with the truth of the implanted damage."""
         truth = truth_of(target, self.T_camera_board)
         intact = self.judged & far_from(truth, self.places_m, INTACT_MARGIN_PX * self.pitch_m)
-        of_truth = (target, truth, outlined(truth, self.places_m), self.places_m)
-        depths = {damage.id: damage.depth_m for damage in truth}
-        return KnownCloud(cloud, invert(self.T_camera_board), *of_truth, intact, depths)
+        return LabelledCloud(
+            cloud=cloud,
+            damaged=damaged,
+            T_board_cloud=invert(self.T_camera_board),
+            target=target,
+            truth=truth,
+            outlines=outlined(truth, self.places_m),
+            places_m=self.places_m,
+            undamaged=intact,
+            seen_depth_m={damage.id: damage.depth_m for damage in truth},
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +278,7 @@ def damages_placed(
     them."""
     drawn = family.drawn(purpose, number)
     rim_px = scan.rim_px(family)
-    kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
+    kept = {damage.id for damage in drawn.damages if scan.place(*damage.centre_m, rim_px) is not None}
     left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
     return drawn.model_copy(update=left)
 
@@ -282,7 +291,7 @@ def judge_scans(
     all placements. Return tables, a set-up for each number of frames, and warnings. If a recording
     has two groups of that many frames or more, every second group sets the threshold; otherwise
     the same frames do both, and a warning says so."""
-    rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
+    record = TrialRecord()
     warnings, calibrated = [text for scan in scans if (text := scan.left_out(family))], {}
     for count in frames:
         groups = [
@@ -309,33 +318,25 @@ def judge_scans(
 
         for number, (scan, group) in enumerate(quiet):
             sites = damages_placed(scan, family, camera, "hole_free", number)
-            known = scan.known(scan.averaged(scan.frames[group]), sites)
-            _add(
-                rows,
-                judging,
-                known,
-                threshold,
-                {"frames": count, "board": number, "role": "hole_free"},
-            )
+            cloud = scan.averaged(scan.frames[group])
+            known = scan.known(cloud, sites, damaged=False)
+            _add(record, judging, known, threshold, frames=count, board=number)
         for at, placement in enumerate(made):
             slices = [group for scan, group in judged if scan is placement.scan]
             slices = slices or [group for scan, group in groups if scan is placement.scan]
-            known = placement.scan.known(
-                placement.cloud(slices[at % len(slices)]), placement.target
-            )
-            _add(
-                rows,
-                judging,
-                known,
-                threshold,
-                {"frames": count, "board": placement.number, "role": "damaged"},
-            )
+            cloud = placement.cloud(slices[at % len(slices)])
+            known = placement.scan.known(cloud, placement.target, damaged=True)
+            _add(record, judging, known, threshold, frames=count, board=placement.number)
             print(f"frames averaged {count}: placement {at + 1} of {len(made)}", file=sys.stderr)
     tables = ResultTables(
-        **{name: pd.DataFrame(columns_of(lines, {}) if lines else {}) for name, lines in rows.items()},
-        probes=pd.DataFrame(), variants=pd.DataFrame(), noise=pd.DataFrame(), axes=pd.DataFrame(),
-    )  # fmt: skip
-    detector = detector_of(judging.detector, judging.settings_json)
+        **{
+            name: pd.DataFrame(columns_of(rows, {}) if rows else {})
+            for name, rows in record.to_data().items()
+        },
+        variants=pd.DataFrame(),
+        axes=pd.DataFrame(),
+    )
+    detector = judge.detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
     set_ups = []
     files = [str(path) for scan in scans for path in scan.recording.files]
@@ -359,17 +360,29 @@ def judge_scans(
 
 
 def _add(
-    rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]
+    record: TrialRecord,
+    judging: Judging,
+    known: LabelledCloud,
+    threshold: float,
+    *,
+    frames: int,
+    board: int,
 ) -> None:
-    """Judge one cloud and add its rows. ``named``: its frames, board and role."""
-    began = time.perf_counter()
-    hole_free = named["role"] == "hole_free"
-    radius_m = judging.radius_m
-    judged = judge(
-        known, judging.detector, judging.settings_json, threshold, radius_m, hole_free=hole_free
+    """Judge one cloud and add its rows."""
+    judgement = judge.judge(
+        known,
+        judge.Criteria(
+            detector=judging.detector,
+            settings_json=judging.settings_json,
+            threshold=threshold,
+            radius_m=judging.radius_m,
+        ),
     )
-    found = study_rows(known, judged, radius_m, hole_free=hole_free)
-    for run in found["runs"]:
-        run["seconds_detect"] = time.perf_counter() - began
-    for name, added in found.items():
-        rows[name] += [{"variant": VARIANT, "repeat": 0, **named, **row} for row in added]
+    add_judgement(
+        record,
+        judgement,
+        point="",
+        origin=Origin(variant=VARIANT, frames=frames, repeat=0, board=board),
+        role="damaged" if known.damaged else "hole_free",
+        seconds_frames=0.0,
+    )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from harness.programs.inspections.gauge_read import READ
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, span
 
@@ -90,9 +91,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the limit that "
     "tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG for each board, and "
-    "gauge.json, the truth that tofpod detect --gauge reads.",
+    "gauge.json, the truth that tofpod gauge read needs.",
     epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
-    "gauge, then drill, record, and tofpod detect captures/gauge --gauge gauge/gauge.json --out found",
+    "gauge, then drill, record, and tofpod gauge read captures/gauge --gauge gauge/gauge.json --out "
+    "found",
+    further={"read": READ},
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

@@ -147,7 +147,7 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
     try:
         defaults = settings_type().to_data()
     except ValidationError as error:
-        lacking = ", ".join(".".join(map(str, each["loc"])) for each in error.errors())
+        lacking = ", ".join(".".join(map(str, error["loc"])) for error in error.errors())
         raise UserError(f"detector {name!r} has settings without a default: {lacking}") from error
     declared = Declared(settings_type, defaults, {})
 
@@ -241,7 +241,7 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
             continue
         runs = folders_in(parent, DIGEST_NAME)
         settings = {run: _settings(run) for run in runs} if len(runs) > 1 else {}
-        known = [own for own in settings.values() if own]
+        known = [setting for setting in settings.values() if setting]
         paths = dict.fromkeys(path for own in known for path in own)
         apart = [
             path for path in paths if len({canonical_json(own.get(path)) for own in known}) > 1

@@ -59,9 +59,9 @@ def _list_offers(options: argparse.Namespace) -> int:
     """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown
     name."""
     from harness.programs.keeping.listing import SETTABLE, grid_of, offered, plug_ins, shown
-    from harness.vocabulary.declaration.diagnose import nearest
     from harness.vocabulary.seeds import canonical_json
     from harness.vocabulary.text import Grid, show
+    from harness.vocabulary.words import nearest
 
     word = options.what
     name = options.name
@@ -81,7 +81,7 @@ def _list_offers(options: argparse.Namespace) -> int:
         names = (
             []
             if name is not None
-            else [each for kind in SETTABLE for each in plug_ins(kind).names()]
+            else [name for kind in SETTABLE for name in plug_ins(kind).names()]
         )
         legal = [*SETTABLE, "results", "cache", "keys", *names]
         near = nearest(word, legal)

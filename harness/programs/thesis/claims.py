@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,30 +23,17 @@ from harness.evaluation.profile import hole_shapes
 from harness.evaluation.summary import (
     MAIN,
     found_holes,
-    hole_list,
     noise_law,
     summarise_holes,
     with_columns,
 )
-from harness.records.trials import ResultTables
+from harness.records.trials import ResultTables, hole_list
+from harness.report.claims import Answer, Verdict
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.path_names import value_text
 
-Answer = Literal["borne out", "not borne out", "undecided"]
 # the smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger
 FEW = 1
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A claim with its verdict, the numbers that support it, and the criterion, which was fixed in
-    advance."""
-
-    claim: str
-    text: str
-    verdict: Answer
-    evidence: str
-    rule: str
 
 
 @lru_cache

@@ -13,15 +13,14 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation import intervals, maps
-from harness.evaluation.summary import hole_list
 from harness.programs.thesis.claims import (
     FEWEST_PAIRS,
     FEWEST_UNITS,
-    Answer,
-    Verdict,
     decide,
     verdict_of,
 )
+from harness.records.trials import hole_list
+from harness.report.claims import Answer, Verdict
 from harness.vocabulary.text import many
 
 Standing = Literal["ahead", "behind", "level", "open"]
@@ -161,7 +160,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         if what == "surface noise" or values[0].size:
             gaps = [gap(values[0], value) for value in values[1:]]
             parts += [interval.over(0) for interval in gaps]
-            sizes = [size(each) for each in values]
+            sizes = [size(value) for value in values]
             more = " and ".join(map(maps.span, gaps))
             texts.append(
                 f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})"
@@ -318,14 +317,14 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
         if len(cases) > 1:
             judged = [
-                (case, replace(result, evidence=f"{case.place}: {result.evidence}"))
+                (case, replace(result, evidence=f"{case.conditions}: {result.evidence}"))
                 for case, result in judged
             ]
         if claim in OVER_UNITS:
             places = dict.fromkeys(case.without_unit for case in cases)
             verdicts += [
-                _over_units([result for case, result in judged if case.without_unit == at])
-                for at in places
+                _over_units([result for case, result in judged if case.without_unit == position])
+                for position in places
             ]
         else:
             verdicts += [result for _, result in judged]

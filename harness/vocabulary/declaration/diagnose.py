@@ -1,7 +1,6 @@
 """Translates pydantic's errors into problems with a place, the legal values and the nearest legal
 word."""
 
-import difflib
 import json
 import re
 from collections import defaultdict
@@ -22,16 +21,10 @@ from harness.vocabulary.declaration.yaml_source import (
     Source,
 )
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.words import nearest
 
-YES_AND_NO = {
-    "yes": "true",
-    "on": "true",
-    "no": "false",
-    "off": "false",
-}  # Booleans of YAML 1.1, text in YAML 1.2
-LEAST_HELD = (
-    3  # Least letters of a word that is searched for within others; shorter words match too often
-)
+YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
+"""Booleans of YAML 1.1, which are text in YAML 1.2."""
 WORDS = {
     "Input should be": "it should be",
     "an object": "a mapping",
@@ -87,7 +80,9 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
     position = source.place_of((key,))
     if name is None:
         problems = [
-            Problem(f"the file lacks the key `{key}`", position, legal="one of " + ", ".join(models))
+            Problem(
+                f"the file lacks the key `{key}`", position, legal="one of " + ", ".join(models)
+            )
         ]
     elif not isinstance(name, str) or name not in models:
         problems = [wrong_choice((key,), name, list(models), position)]
@@ -109,7 +104,9 @@ def settings_of(model: type[C], data: Mapping[str, Any], noun: str, within: str 
         base: KeyPath = () if within is None else (within,)
         document = data if within is None else {within: data}
         source = Source(noun, "", document, {(): Place(noun, 0, 1, "")}, {})
-        declared = shape.Declared(Config if base else model, document, {base: model} if base else {})
+        declared = shape.Declared(
+            Config if base else model, document, {base: model} if base else {}
+        )
         problems = [
             replace(problem, place=None) for problem in problems_of(error, declared, source, base)
         ]
@@ -228,20 +225,6 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     )
 
 
-def nearest(word: object, words: Iterable[object]) -> str | None:
-    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most
-    similar spelling, else the shortest that contains the word (three letters or more), as
-    realsense_l515 contains l515; None if neither."""
-    folded = {str(word).lower().replace("-", "_"): str(word) for word in words}
-    sought = str(word).lower().replace("-", "_")
-    matches = difflib.get_close_matches(sought, folded, n=1)
-    if not matches and len(sought) >= LEAST_HELD:
-        matches = sorted(
-            (candidate for candidate in folded if sought in candidate), key=lambda candidate: (len(candidate), candidate)
-        )
-    return folded[matches[0]] if matches else None
-
-
 def dotted(path: Sequence[str | int]) -> str:
     """Return a path as it is written in ``sweep:``, with dots between keys and indices."""
     return ".".join(map(str, path))
@@ -273,7 +256,11 @@ def wrong_choice(
 
 
 def unknown_key(
-    name: str, where: KeyPath, legal: Sequence[str], position: Place | None, taken: Iterable[str] = ()
+    name: str,
+    where: KeyPath,
+    legal: Sequence[str],
+    position: Place | None,
+    taken: Iterable[str] = (),
 ) -> Problem:
     """Return the problem for an illegal key in the mapping at ``where``, which already has the
     keys ``taken``."""

@@ -93,7 +93,8 @@ def _branches(
     if get_origin(annotation) is Annotated:
         inner, *further_arguments = get_args(annotation)
         yield from _branches(
-            inner, (*metadata, *(m for x in further_arguments for m in getattr(x, "metadata", (x,))))
+            inner,
+            (*metadata, *(m for x in further_arguments for m in getattr(x, "metadata", (x,)))),
         )
     elif get_origin(annotation) in (Union, UnionType):
         for member in get_args(annotation):
@@ -120,7 +121,11 @@ def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[
             get_args(f.annotation) if f and get_origin(f.annotation) is Literal else ()
             for f in fields
         ]
-        models_by_tag = {str(tag): model for model, model_tags in zip(models, tags, strict=True) for tag in model_tags}
+        models_by_tag = {
+            str(tag): model
+            for model, model_tags in zip(models, tags, strict=True)
+            for tag in model_tags
+        }
         if all(tags) and len(models_by_tag) == sum(map(len, tags)):
             return key, models_by_tag
     return None
@@ -153,7 +158,11 @@ def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
             return slot
         if isinstance(key, int) and get_origin(kind) in (tuple, list):
             is_list = get_origin(kind) is list or arguments[-1] is Ellipsis
-            return slot_of(arguments[0 if is_list else key]) if is_list or key < len(arguments) else None
+            return (
+                slot_of(arguments[0 if is_list else key])
+                if is_list or key < len(arguments)
+                else None
+            )
         if isinstance(key, str) and get_origin(kind) is dict:
             return slot_of(arguments[1])
     return None
@@ -227,7 +236,9 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
         inner = legal_at(slot_of(arguments[1]))
         return f"a mapping of names to {inner}" if inner else "a mapping"
     if origin is tuple and arguments[-1] is not Ellipsis:
-        return "a list of " + ", ".join(legal_at(slot_of(argument)) or "a value" for argument in arguments)
+        return "a list of " + ", ".join(
+            legal_at(slot_of(argument)) or "a value" for argument in arguments
+        )
     if origin in (tuple, list):
         least = limits.get("min_length")
         longest = limits.get("max_length")

@@ -104,7 +104,9 @@ class DeclarationError(UserError):
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         lines = [*map(str, self.problems[:MAX_PROBLEMS])]
         lines += (
-            [f"and {hidden_count} more"] if (hidden_count := len(self.problems) - MAX_PROBLEMS) > 0 else []
+            [f"and {hidden_count} more"]
+            if (hidden_count := len(self.problems) - MAX_PROBLEMS) > 0
+            else []
         )
         super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(lines))
 
@@ -119,7 +121,11 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
 
     def position(problem: Problem) -> tuple[int, int]:
         position = problem.place
-        return (-1, 0) if position is None else (position.line, position.column if position.line else 0)
+        return (
+            (-1, 0)
+            if position is None
+            else (position.line, position.column if position.line else 0)
+        )
 
     return tuple(sorted(unique, key=position))
 
@@ -167,10 +173,18 @@ class Source:
         depth = len(donor_path)
         merged = []
         for own_positions, donated in ((self.values, donor.values), (self.keys, donor.keys)):
-            kept = {path_there: position for path_there, position in own_positions.items() if path_there[: len(path)] != path}
+            kept = {
+                path_there: position
+                for path_there, position in own_positions.items()
+                if path_there[: len(path)] != path
+            }
             merged.append(
                 kept
-                | {path + path_there[depth:]: p for path_there, p in donated.items() if path_there[:depth] == donor_path}
+                | {
+                    path + path_there[depth:]: p
+                    for path_there, p in donated.items()
+                    if path_there[:depth] == donor_path
+                }
             )
         merged[1][path] = donor.place_of(donor_path)
         return Source(self.origin, self.text, data, *merged)
@@ -325,7 +339,9 @@ class _Builder:
             return None
         if self._nodes > MAX_NODES:
             return self._refuse(
-                "too many values", position, f"at most {MAX_NODES} values after aliases are expanded"
+                "too many values",
+                position,
+                f"at most {MAX_NODES} values after aliases are expanded",
             )
         if any(node is outer for outer in within):
             return self._refuse("an alias refers to a value that contains it", position)
@@ -362,7 +378,11 @@ class _Builder:
                 message = f"duplicate key `{key}`"
                 self.problems.append(
                     Problem(
-                        message, key_place, other=first, other_says="already written at", fix="keep one"
+                        message,
+                        key_place,
+                        other=first,
+                        other_says="already written at",
+                        fix="keep one",
                     )
                 )
             elif len(self.problems) == before:

@@ -13,8 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors.averages.average import (
+    CORRELATED_PIXELS,
     RECORDED,
+    SAMPLED_PIXELS,
     AverageConfig,
+    FrameSums,
     average,
     prefix_averages,
     unsteadiness,
@@ -47,11 +50,19 @@ class Stack:
         for i, z in enumerate(self.z_m):
             reason = (~np.isfinite(z)).astype(np.uint8) if self.reason is None else self.reason[i]
             names = self.names or [f"frame {k}" for k in range(len(self.z_m))]
-            yield Frame(names[i], z, reason, **{key: value[i] for key, value in self.extra.items()})
+            yield Frame(
+                names[i],
+                z,
+                reason,
+                **{key: value[i] for key, value in self.extra.items()},
+            )
 
 
 def noisy(
-    frames: int = 12, shape: tuple[int, int] = (40, 50), sigma_m: float = 1e-3, seed: int = 1
+    frames: int = 12,
+    shape: tuple[int, int] = (40, 50),
+    sigma_m: float = 1e-3,
+    seed: int = 1,
 ) -> Stack:
     random = np.random.default_rng(seed)
     slopes = np.stack(
@@ -70,13 +81,24 @@ def test_mean_count_and_variance_equal_numpy() -> None:
     stack = with_gaps(noisy())
     cloud = average(stack, AverageConfig())
     z = stack.z_m.astype(np.float64)
-    np.testing.assert_allclose(cloud.points_m[..., 2], np.nanmean(z, axis=0), rtol=1e-13)
-    np.testing.assert_array_equal(cloud.count, np.isfinite(z).sum(axis=0))
-    np.testing.assert_allclose(cloud.variance_m2, np.nanvar(z, axis=0, ddof=1), rtol=1e-9)
     np.testing.assert_allclose(
-        cloud.points_m[..., :2], stack.slopes * cloud.points_m[..., 2:], rtol=1e-15
+        cloud.points_m[..., 2],
+        np.nanmean(z, axis=0),
+        rtol=1e-13,
     )
-    assert cloud.n_frames == 12 and cloud.left_out == ()
+    np.testing.assert_array_equal(cloud.count, np.isfinite(z).sum(axis=0))
+    np.testing.assert_allclose(
+        cloud.variance_m2,
+        np.nanvar(z, axis=0, ddof=1),
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(
+        cloud.points_m[..., :2],
+        stack.slopes * cloud.points_m[..., 2:],
+        rtol=1e-15,
+    )
+    assert cloud.n_frames == 12
+    assert cloud.left_out == ()
 
 
 def test_variance_keeps_its_digits_far_from_the_camera() -> None:
@@ -84,7 +106,11 @@ def test_variance_keeps_its_digits_far_from_the_camera() -> None:
     steps = np.arange(12) % 2 * np.float32(2**-20)
     z = np.float32(3.0) + np.broadcast_to(steps[:, None, None], stack.z_m.shape).astype(np.float32)
     cloud = average(replace(stack, z_m=z), AverageConfig())
-    np.testing.assert_allclose(cloud.variance_m2, np.var(steps.astype(float), ddof=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        cloud.variance_m2,
+        np.var(steps.astype(float), ddof=1),
+        rtol=1e-9,
+    )
 
 
 @pytest.mark.parametrize("frames", [3, 8, 31])
@@ -110,7 +136,8 @@ def test_prefixes_of_one_pass_equal_separate_averages(method: str) -> None:
         alone = average(stack, AverageConfig.from_data({"method": method, "frames": n}))
         np.testing.assert_array_equal(cloud.points_m, alone.points_m)
         np.testing.assert_array_equal(cloud.variance_m2, alone.variance_m2)
-        assert cloud.left_out == alone.left_out and cloud.n_frames == n - (n >= 8)
+        assert cloud.left_out == alone.left_out
+        assert cloud.n_frames == n - (n >= 8)
 
 
 @settings(max_examples=10, deadline=None)
@@ -131,11 +158,14 @@ def test_a_frame_that_jumps_is_left_out_and_named_wherever_it_stands(bad: int) -
     good = np.delete(stack.z_m, bad, axis=0)
     stack.z_m[bad] += np.float32(0.018)
     cloud = average(stack, AverageConfig())
-    assert [left.name for left in cloud.left_out] == [f"frame {bad}"]
-    assert (
-        "jumps by +18.0 mm" in cloud.left_out[0].why and "allowed 3.0 mm" in cloud.left_out[0].why
+    assert [skipped.name for skipped in cloud.left_out] == [f"frame {bad}"]
+    assert "jumps by +18.0 mm" in cloud.left_out[0].why
+    assert "allowed 3.0 mm" in cloud.left_out[0].why
+    np.testing.assert_allclose(
+        cloud.points_m[..., 2],
+        good.astype(float).mean(axis=0),
+        rtol=1e-12,
     )
-    np.testing.assert_allclose(cloud.points_m[..., 2], good.astype(float).mean(axis=0), rtol=1e-12)
 
 
 def test_a_step_below_the_allowance_is_no_jump() -> None:
@@ -144,11 +174,68 @@ def test_a_step_below_the_allowance_is_no_jump() -> None:
     assert average(stack, AverageConfig()).left_out == ()
 
 
+@pytest.mark.parametrize(
+    ("frames", "shape"),
+    [
+        (5, (40, 50)),
+        (3, (100, 130)),
+        (1, (40, 50)),
+    ],
+)
+def test_the_limit_of_jumps_is_that_of_the_difference_of_two_medians(frames, shape) -> None:
+    """Six standard errors of the difference of two frames' medians, each 1.2533 times that of a
+    mean, where 25 pixels share one value; the noise is known to some per cent."""
+    stack = noisy(frames, shape, sigma_m=2e-3)
+    config = AverageConfig(jump_mm=1e-3, changed_mm=1e-3)
+    sums = FrameSums(stack, list(stack.frames()), config)
+    pixels = len(sums.sample)
+    assert SAMPLED_PIXELS / 2 < pixels <= SAMPLED_PIXELS or pixels == shape[0] * shape[1]
+    if frames == 1:
+        # one frame shows no noise
+        assert sums.jump_m == pytest.approx(1e-6)
+        return
+    standard_error_m = 1.2533 * 2e-3 * np.sqrt(2 * CORRELATED_PIXELS / pixels)
+    assert sums.jump_m == pytest.approx(6.0 * standard_error_m, rel=0.05)
+    assert sums.change_m == pytest.approx(6.0 * 2e-3, rel=0.05)
+
+
+def test_rounding_sets_the_least_noise() -> None:
+    stack = replace(noisy(5, sigma_m=0.0), z_step_m=0.012)
+    sums = FrameSums(
+        stack,
+        list(stack.frames()),
+        AverageConfig(jump_mm=1e-3, changed_mm=1e-3),
+    )
+    assert sums.change_m == pytest.approx(6.0 * 0.012 / np.sqrt(12), rel=1e-6)
+
+
+def test_changes_beyond_the_usual_count() -> None:
+    """A tenth of the pixels flicker: the allowed share is the setting's and half as much again as
+    the reference frames have."""
+    stack = noisy(5)
+    flicker = np.random.default_rng(5).random(stack.z_m.shape) < 0.1
+    stack.z_m[flicker] = np.nan
+    sums = FrameSums(stack, list(stack.frames()), AverageConfig())
+    assert sums.fraction == pytest.approx(0.05 + 1.5 * 0.1, abs=0.02)
+
+
+def test_the_clipped_mean_allows_sigmas_of_the_frame_or_of_the_pixel() -> None:
+    stack = noisy(5, (60, 80), sigma_m=1e-3)
+    stack.z_m[:, 0, 0] = np.float32(0.8) + np.float32(0.05) * np.array([-1, -0.5, 0, 0.5, 1], "f4")
+    config = AverageConfig(method="clipped", changed_mm=200.0)
+    gate = FrameSums(stack, list(stack.frames()), config).gate.reshape(60, 80)
+    assert gate[0, 0] == pytest.approx(5.0 * 0.025 / 0.6745, rel=1e-4)
+    # a pixel's own median deviation of five frames is seldom above the frame's
+    assert np.median(gate) == pytest.approx(5e-3, rel=0.2)
+    assert gate.min() == pytest.approx(5e-3, rel=0.05)
+
+
 def test_of_two_frames_that_disagree_the_first_is_kept() -> None:
     stack = noisy(2)
     stack.z_m[1] -= np.float32(0.018)
     cloud = average(stack, AverageConfig())
-    assert [left.name for left in cloud.left_out] == ["frame 1"] and cloud.n_frames == 1
+    assert [skipped.name for skipped in cloud.left_out] == ["frame 1"]
+    assert cloud.n_frames == 1
     np.testing.assert_array_equal(cloud.points_m[..., 2].astype(np.float32), stack.z_m[0])
 
 
@@ -156,8 +243,9 @@ def test_of_two_frames_that_disagree_the_first_is_kept() -> None:
 def test_a_disturbed_frame_is_left_out_with_its_fraction(bad: int) -> None:
     stack = noisy()
     stack.z_m[bad, :, :10] = 0.4  # a hand over a fifth of the picture
-    [left] = average(stack, AverageConfig()).left_out
-    assert left.name == f"frame {bad}" and left.why.startswith("disturbed: 20.0 %")
+    [skipped] = average(stack, AverageConfig()).left_out
+    assert skipped.name == f"frame {bad}"
+    assert skipped.why.startswith("disturbed: 20.0 %")
 
 
 def test_a_frame_that_lost_its_range_is_left_out() -> None:
@@ -165,8 +253,10 @@ def test_a_frame_that_lost_its_range_is_left_out() -> None:
     stack.z_m[8, :20] = np.nan
     stack.z_m[9] = np.nan
     half, none = average(stack, AverageConfig()).left_out
-    assert half.name == "frame 8" and half.why.startswith("disturbed: 50.0 %")
-    assert none.name == "frame 9" and none.why == "no pixel has a range"
+    assert half.name == "frame 8"
+    assert half.why.startswith("disturbed: 50.0 %")
+    assert none.name == "frame 9"
+    assert none.why == "no pixel has a range"
 
 
 def test_flickering_validity_is_usual_and_no_disturbance() -> None:
@@ -182,7 +272,8 @@ def test_a_knocked_camera_is_told() -> None:
     z_m = stack.z_m + 0.3 * (np.arange(50) > 30).astype(np.float32)
     z_m[8:] = np.roll(z_m[8:], 2, axis=2)
     cloud = average(replace(stack, z_m=z_m), RECORDED)
-    assert len(cloud.left_out) == 4 and unsteadiness(cloud).startswith("4 of 12 frames differ")
+    assert len(cloud.left_out) == 4
+    assert unsteadiness(cloud).startswith("4 of 12 frames differ")
     assert unsteadiness(average(stack, RECORDED)) == ""
 
 
@@ -190,7 +281,8 @@ def test_judging_can_be_switched_off() -> None:
     stack = noisy()
     stack.z_m[3] += np.float32(0.018)
     cloud = average(stack, AverageConfig(judge_frames=False))
-    assert cloud.left_out == () and cloud.n_frames == 12
+    assert cloud.left_out == ()
+    assert cloud.n_frames == 12
 
 
 def test_clipped_mean_ignores_samples_wrong_by_metres() -> None:
@@ -221,12 +313,11 @@ def test_never_valid_pixels_carry_the_commonest_reason() -> None:
     reason = np.where(np.isfinite(stack.z_m), Reason.VALID, Reason.EDGE).astype(np.uint8)
     reason[:3, 0, 0] = Reason.UNWRAP
     cloud = average(replace(stack, reason=reason), AverageConfig())
-    assert cloud.reason[0, 0] == Reason.UNWRAP and not cloud.valid[0, 0]
-    assert (
-        cloud.reason[0, 1] == Reason.VALID
-        and cloud.count[0, 1] == 1
-        and np.isnan(cloud.variance_m2[0, 1])
-    )
+    assert cloud.reason[0, 0] == Reason.UNWRAP
+    assert not cloud.valid[0, 0]
+    assert cloud.reason[0, 1] == Reason.VALID
+    assert cloud.count[0, 1] == 1
+    assert np.isnan(cloud.variance_m2[0, 1])
 
 
 def test_colour_amplitude_and_xy_are_averaged() -> None:
@@ -241,9 +332,15 @@ def test_colour_amplitude_and_xy_are_averaged() -> None:
     cloud = average(replace(stack, slopes=None, extra=extra), AverageConfig())
     np.testing.assert_array_equal(cloud.rgb, np.round(extra["rgb"].mean(axis=0)).astype(np.uint8))
     np.testing.assert_allclose(
-        cloud.amplitude, extra["amplitude"].astype(float).mean(axis=0), rtol=1e-6
+        cloud.amplitude,
+        extra["amplitude"].astype(float).mean(axis=0),
+        rtol=1e-6,
     )
-    np.testing.assert_allclose(cloud.points_m[..., :2], extra["xy_m"].mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(
+        cloud.points_m[..., :2],
+        extra["xy_m"].mean(axis=0),
+        rtol=1e-12,
+    )
 
 
 def test_mistakes_are_named() -> None:
@@ -264,7 +361,8 @@ def test_mistakes_are_named() -> None:
 
 def test_frames_of_different_size_are_refused() -> None:
     stack = noisy(2, (4, 5))
-    stack.slopes, stack.z_m = None, [stack.z_m[0], np.ones((4, 6), np.float32)]  # type: ignore[assignment]
+    stack.slopes = None
+    stack.z_m = [stack.z_m[0], np.ones((4, 6), np.float32)]  # type: ignore[assignment]
     with pytest.raises(UserError, match=r"frame 1: 6 x 4 pixels, but 5 x 4 pixels expected"):
         average(stack, AverageConfig())
 
@@ -273,17 +371,24 @@ def read_pngs(folder: Path) -> Stack:
     files = sorted(path for path in folder.glob("*.png") if "mask" not in path.name)
     raw = np.stack([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in files])
     z = np.where(raw == 0, np.nan, raw * 1e-3).astype(np.float32)
-    return Stack(z, np.zeros((*z.shape[1:], 2)), 1e-3, names=[path.name for path in files])
+    return Stack(
+        z,
+        np.zeros((*z.shape[1:], 2)),
+        1e-3,
+        names=[path.name for path in files],
+    )
 
 
 def test_the_jump_of_a_real_capture_is_named(shared_data: Path) -> None:
     stack = read_pngs(shared_data / "azure_drilled_board" / "depth")
     cloud = average(stack, AverageConfig())
-    assert [left.name for left in cloud.left_out] == ["00003.png"] and cloud.n_frames == 17
+    assert [skipped.name for skipped in cloud.left_out] == ["00003.png"]
+    assert cloud.n_frames == 17
     assert "+17.0 mm" in cloud.left_out[0].why
 
 
 def test_a_clean_real_capture_loses_no_frame(shared_data: Path) -> None:
     cloud = average(read_pngs(shared_data / "azure_nfov_walls"), AverageConfig(method="clipped"))
-    assert cloud.left_out == () and cloud.n_frames == 22
+    assert cloud.left_out == ()
+    assert cloud.n_frames == 22
     assert 0.5e-3 < np.sqrt(np.nanmedian(cloud.variance_m2)) < 3e-3

@@ -25,7 +25,7 @@ from harness import detect
 from harness.experiment.load import load_experiment
 from harness.programs.camera import flatfield
 from harness.runs.plan import plan_of
-from harness.trials.trial import flat_field_of
+from harness.trials.averages import flat_field_of
 from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens, Region
@@ -48,9 +48,16 @@ Places = tuple[tuple[float, float, float], ...]
 
 
 def smooth(
-    rng: np.random.Generator, shape: tuple[int, int], length: float, rms_m: float
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    length: float,
+    rms_m: float,
 ) -> np.ndarray:
-    field = ndimage.gaussian_filter(rng.standard_normal(shape, np.float32), length, mode="wrap")
+    field = ndimage.gaussian_filter(
+        rng.standard_normal(shape, np.float32),
+        length,
+        mode="wrap",
+    )
     return rms_m * field / field.std()
 
 
@@ -59,7 +66,10 @@ def pattern() -> np.ndarray:
     """(h, w): as an imager's, filtered over pixels and smooth, 0.5 mm."""
     rng = np.random.default_rng(1)
     return smooth(rng, (LENS.height, LENS.width), 3.0, 0.4 * MM) + smooth(
-        rng, (128, 160), 1.0, 0.3 * MM
+        rng,
+        (128, 160),
+        1.0,
+        0.3 * MM,
     )
 
 
@@ -75,24 +85,35 @@ def wall(rms_m: float) -> np.ndarray:
 def capture(
     number: int,
     shape_m: np.ndarray,
-    place: tuple[float, float, float] = (0.8, 0.0, 0.0),
+    pose_m: tuple[float, float, float] = (0.8, 0.0, 0.0),
     fixed_m: np.ndarray | None = None,
     noise_m: float = NOISE_M,
 ) -> Cloud:
     """An average of a wall with a shape, seen from a place, each frame's z with white noise."""
-    distance_m, x_m, y_m = place
+    distance_m, x_m, y_m = pose_m
     slopes = LENS.region_slopes(LENS.whole)
     rng = np.random.default_rng([3, number])
-    at = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
+    position = (slopes[..., ::-1] * distance_m + [y_m, x_m]) / SIDE_M + 600
     length = np.sqrt(1 + (slopes**2).sum(axis=-1))
-    z_m = distance_m + ndimage.map_coordinates(shape_m, np.moveaxis(at, -1, 0), order=1)
+    z_m = distance_m + ndimage.map_coordinates(
+        shape_m,
+        np.moveaxis(position, -1, 0),
+        order=1,
+    )
     z_m = z_m + (pattern() if fixed_m is None else fixed_m) / length
     z_m = z_m + rng.standard_normal(z_m.shape) * noise_m / np.sqrt(FRAMES)
     scatter_m2 = noise_m**2 * rng.chisquare(FRAMES - 1, z_m.shape) / (FRAMES - 1)
     points = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
     count = np.full(z_m.shape, FRAMES)
     return Cloud(
-        points, np.zeros(z_m.shape, np.uint8), count, scatter_m2, LENS.whole, 0.0, FRAMES, lens=LENS
+        points,
+        np.zeros(z_m.shape, np.uint8),
+        count,
+        scatter_m2,
+        LENS.whole,
+        0.0,
+        FRAMES,
+        lens=LENS,
     )
 
 
@@ -105,7 +126,12 @@ def found(
 ) -> Separated:
     captures = []
     for number, (distance_m, x_m, y_m) in enumerate(shifts):
-        cloud = capture(number, shape_m, (distance_m, x_m, y_m), patterns and patterns[number])
+        cloud = capture(
+            number,
+            shape_m,
+            (distance_m, x_m, y_m),
+            patterns and patterns[number],
+        )
         pose = np.eye(4)
         pose[:3, 3] = x_m, y_m, shifts[0][0] - distance_m
         captures.append(flattened(cloud, cloud.valid, f"capture {number}", pose if poses else None))
@@ -127,7 +153,6 @@ def errors(result: Separated, truth_m: np.ndarray) -> tuple[float, float]:
 
 
 # ---- the pattern and the surface
-# -------------------------------------------------------------------------------------
 
 
 def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
@@ -142,7 +167,13 @@ def test_the_pattern_is_found_within_its_stated_deviation(truth_m):
     assert result.field.distances_m == pytest.approx((0.55, 1.0), rel=0.01)
 
 
-@pytest.mark.parametrize(("rough_mm", "gain", "most_ratio"), [(0.1, 0.85, 1.15), (0.25, 0.6, 1.35)])
+@pytest.mark.parametrize(
+    ("rough_mm", "gain", "most_ratio"),
+    [
+        (0.1, 0.85, 1.15),
+        (0.25, 0.6, 1.35),
+    ],
+)
 def test_the_surface_is_parted_from_the_pattern(truth_m, rough_mm, gain, most_ratio):
     """Walls rough by a fifth and by half of the pattern: with poses the map is better than
     without, and says nothing; the stated deviation is too small by no more than
@@ -153,14 +184,16 @@ def test_the_surface_is_parted_from_the_pattern(truth_m, rough_mm, gain, most_ra
     error_mm, ratio = errors(solved, truth_m)
     assert error_mm < gain * errors(averaged, truth_m)[0]
     assert 0.85 < ratio < most_ratio
-    assert solved.separated and solved.field.warnings == ()
+    assert solved.separated
+    assert solved.field.warnings == ()
     assert solved.surface_m / MM == pytest.approx(rough_mm, rel=0.1)
 
 
 def test_without_poses_a_rough_surface_counts_as_noise_and_is_told(truth_m):
     result = found(wall(0.4 * MM), poses=False)
     (warning,) = result.field.warnings
-    assert "is not stable" in warning and "or the surface is not flat (state --poses" in warning
+    assert "is not stable" in warning
+    assert "or the surface is not flat (state --poses" in warning
     assert errors(result, truth_m)[1] < 1.0
     assert found(wall(0.4 * MM), poses=True).field.warnings == ()
 
@@ -183,14 +216,17 @@ def test_a_pattern_that_drifts_or_depends_on_distance_is_told_with_its_size(trut
     result = found(wall(0.0), poses=False, patterns=by_range)
     assert result.in_range is not None
     assert result.in_range.excess_m == pytest.approx(0.8 * float(np.nanstd(truth_m)), rel=0.1)
-    assert (
-        "with distance by" in result.field.warnings[0]
-        and "from the first" not in result.field.warnings[0]
-    )
+    assert "with distance by" in result.field.warnings[0]
+    assert "from the first" not in result.field.warnings[0]
 
 
 @pytest.mark.parametrize(
-    "shifts", [((0.8, 0.0, 0.0),), ((0.8, 0.0, 0.0),) * 2, ((0.8, 0.0, 0.0), (0.8, 0.01, 0.0))]
+    "shifts",
+    [
+        ((0.8, 0.0, 0.0),),
+        ((0.8, 0.0, 0.0),) * 2,
+        ((0.8, 0.0, 0.0), (0.8, 0.01, 0.0)),
+    ],
 )
 @pytest.mark.parametrize("poses", [True, False])
 def test_one_place_cannot_part_surface_and_pattern(shifts, poses):
@@ -205,21 +241,22 @@ def test_few_frames_cannot_tell_their_noise():
 
 
 # ---- the correction
-# --------------------------------------------------------------------------------------------------
 
 
 def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
     field = found(wall(0.0), poses=False).field
     cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
-    made = corrected(cloud, field)
-    residual_m = flattened(made, made.valid, "corrected").residual_m
-    assert made.mean_variance_m2 is not None
+    cleaned = corrected(cloud, field)
+    residual_m = flattened(cleaned, cleaned.valid, "corrected").residual_m
+    assert cleaned.mean_variance_m2 is not None
     axial_m = residual_m * cloud.points_m[..., 2] / np.linalg.norm(cloud.points_m, axis=-1)
     assert np.nanstd(axial_m) == pytest.approx(
-        float(np.sqrt(made.mean_variance_m2.mean())), rel=0.03
+        float(np.sqrt(cleaned.mean_variance_m2.mean())), rel=0.03
     )
     np.testing.assert_allclose(
-        np.cross(made.points_m, cloud.points_m), 0.0, atol=1e-15
+        np.cross(cleaned.points_m, cloud.points_m),
+        0.0,
+        atol=1e-15,
     )  # along the rays
     part = Region(10, 90, 30, 120)
     rows, columns = part.within(LENS.whole)
@@ -228,7 +265,8 @@ def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
         for name in ("points_m", "reason", "count", "variance_m2")
     }
     np.testing.assert_array_equal(
-        corrected(replace(cloud, region=part, **cut), field).points_m, made.points_m[rows, columns]
+        corrected(replace(cloud, region=part, **cut), field).points_m,
+        cleaned.points_m[rows, columns],
     )
     single = corrected(replace(cloud, n_frames=1), field)
     assert single.mean_variance_m2 is None
@@ -240,10 +278,10 @@ def test_pixels_without_a_pattern_stay_and_are_told():
     error_m = field.error_m.copy()
     error_m[:, :40] = np.nan
     holed = replace(field, error_m=error_m, warnings=("it drifts",))
-    made = corrected(cloud, holed)
-    np.testing.assert_array_equal(made.points_m[:, :40], cloud.points_m[:, :40])
-    assert made.mean_variance_m2 is not None
-    assert made.mean_variance_m2[:, :40].mean() > 10 * made.mean_variance_m2[:, 40:].mean()
+    cleaned = corrected(cloud, holed)
+    np.testing.assert_array_equal(cleaned.points_m[:, :40], cloud.points_m[:, :40])
+    assert cleaned.mean_variance_m2 is not None
+    assert cleaned.mean_variance_m2[:, :40].mean() > 10 * cleaned.mean_variance_m2[:, 40:].mean()
     assert doubts(cloud, holed, "unit.npz") == (
         "the flat field unit.npz: it drifts",
         "the flat field unit.npz covers 75 % of the valid pixels; others are not corrected",
@@ -273,19 +311,22 @@ def test_another_camera_s_cloud_is_refused(changes, message):
 
 
 # ---- files and programs
-# ----------------------------------------------------------------------------------------------
 
 
 def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
     flat = FlatField(
-        np.full((128, 160), 2e-4), np.full((128, 160), 1e-8), LENS, (0.5, 1.0), ("it drifts",)
+        np.full((128, 160), 2e-4),
+        np.full((128, 160), 1e-8),
+        LENS,
+        (0.5, 1.0),
+        ("it drifts",),
     )
     flat.error_m[0, 0] = np.nan
     path = tmp_path / "unit.npz"
     save_flat_field(path, flat)
-    held = load_flat_field(path)
-    np.testing.assert_array_equal(held.error_m, flat.error_m.astype(np.float32))
-    assert (held.lens, held.distances_m, held.warnings) == (LENS, (0.5, 1.0), ("it drifts",))
+    stored = load_flat_field(path)
+    np.testing.assert_array_equal(stored.error_m, flat.error_m.astype(np.float32))
+    assert (stored.lens, stored.distances_m, stored.warnings) == (LENS, (0.5, 1.0), ("it drifts",))
     arrays = dict(np.load(path))
     for changes, message in (
         ({"version": np.array(2)}, "was written by a newer tofpod"),
@@ -312,8 +353,8 @@ def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three captures of 8 frames each as .npy in metres, with a lens."""
     folder = tmp_path_factory.mktemp("walls")
-    for number, place in enumerate(SHIFTS[:3]):
-        z_m = capture(number, wall(0.0), place, noise_m=0.0).points_m[..., 2]
+    for number, pose_m in enumerate(SHIFTS[:3]):
+        z_m = capture(number, wall(0.0), pose_m, noise_m=0.0).points_m[..., 2]
         noise = np.random.default_rng([4, number]).standard_normal((8, *z_m.shape)) * NOISE_M
         np.save(folder / f"wall{number}.npy", (z_m + noise).astype(np.float32))
     stated = {name: getattr(LENS, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
@@ -324,23 +365,23 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures("unpictured")
 def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_path, capsys, truth_m):
     walls = [str(path) for path in sorted(recorded.glob("*.npy"))]
-    given = ["--unit", "m"]
-    given += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
+    options = ["--unit", "m"]
+    options += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
     unit = tmp_path / "unit.npz"
-    assert flatfield.main([*walls, *given, "--out", str(unit)]) == 0
-    first, *rest = capsys.readouterr().out.splitlines()
+    assert flatfield.main([*walls, *options, "--out", str(unit)]) == 0
+    first, *remainder = capsys.readouterr().out.splitlines()
     assert first.startswith("warning: nothing shows that the camera moved")
-    assert rest[0].startswith("fixed pattern 0.4")
-    told = json.loads(unit.with_suffix(".json").read_text())
-    assert told["warnings"] == list(load_flat_field(unit).warnings)
-    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    assert remainder[0].startswith("fixed pattern 0.4")
+    facts = json.loads(unit.with_suffix(".json").read_text())
+    assert facts["warnings"] == list(load_flat_field(unit).warnings)
+    figures = {row["figure"]: row["value"] for row in facts["figures"]}
     assert figures["noise of the map"] == pytest.approx(NOISE_M / MM / np.sqrt(24), rel=0.05)
     assert figures["pattern"] == pytest.approx(float(np.nanstd(truth_m)) / MM, rel=0.03)
     assert figures["change, near and far captures"] is None
-    assert len(told["captures"]) == 3
+    assert len(facts["captures"]) == 3
     assert unit.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 
-    judged = [walls[0], *given, "--threshold", "5"]
+    judged = [walls[0], *options, "--threshold", "5"]
     assert detect.main([*judged, "--flat-field", str(unit), "--out", str(tmp_path / "with")]) == 0
     assert capsys.readouterr().out.startswith(f"warning: the flat field {unit}: nothing shows that")
     assert detect.main(judged) == 0
@@ -353,15 +394,15 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
 
 
 def test_the_program_refuses_what_makes_no_flat_field(recorded, tmp_path, capsys):
-    one = str(recorded / "wall0.npy")
+    lone = str(recorded / "wall0.npy")
     lens = ["--unit", "m", "--intrinsics", str(recorded / "lens.json")]
     single = tmp_path.parent / "single.npy"
-    np.save(single, np.load(one)[:1])
+    np.save(single, np.load(lone)[:1])
     for arguments, message in (
-        ([one, "--unit", "m", "--out", "unit.npz"], "the lens of these depth images is unknown"),
-        ([one, *lens, "--out", "unit.png"], "a name that ends in .npz"),
-        ([one, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
-        ([one, one, *lens, "--out", "unit.npz"], "is named twice"),
+        ([lone, "--unit", "m", "--out", "unit.npz"], "the lens of these depth images is unknown"),
+        ([lone, *lens, "--out", "unit.png"], "a name that ends in .npz"),
+        ([lone, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
+        ([lone, lone, *lens, "--out", "unit.npz"], "is named twice"),
         ([str(single), *lens, "--out", "unit.npz"], "record 50 frames"),
     ):
         assert flatfield.main(arguments) == 2
@@ -375,12 +416,12 @@ def test_a_lone_capture_is_judged_by_its_halves(recorded, tmp_path, capsys):
         flatfield.main([str(recorded / "wall0.npy"), *lens, "--out", str(tmp_path / "unit.npz")])
         == 0
     )
-    told = json.loads((tmp_path / "unit.json").read_text())
-    assert [row["capture"] for row in told["captures"]] == [
+    facts = json.loads((tmp_path / "unit.json").read_text())
+    assert [row["capture"] for row in facts["captures"]] == [
         "wall0.npy, first half",
         "wall0.npy, second half",
     ]
-    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    figures = {row["figure"]: row["value"] for row in facts["figures"]}
     # 4 frames in each half
     signal = figures["pattern"] ** 2
     noise = (NOISE_M / MM) ** 2 / 4
@@ -401,17 +442,16 @@ def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path,
         flatfield.main([str(walls), "--intrinsics", "azure_kinect_nfov", "--out", str(unit)]) == 0
     )
     assert "is assumed to be flat" in capsys.readouterr().out.splitlines()[0]
-    told = json.loads(unit.with_suffix(".json").read_text())
-    figures = {row["figure"]: row["value"] for row in told["figures"]}
+    facts = json.loads(unit.with_suffix(".json").read_text())
+    figures = {row["figure"]: row["value"] for row in facts["figures"]}
     assert figures["pattern"] > 2 * figures["noise of the map"]
     assert figures["change, first and last captures"] < 0.1
-    noise_mm = told["captures"][0]["noise_mm"]
+    noise_mm = facts["captures"][0]["noise_mm"]
     expected = figures["pattern"] ** 2 / (figures["pattern"] ** 2 + noise_mm**2)
     assert figures["correlation, first and last captures"] == pytest.approx(expected, abs=0.05)
 
 
 # ---- experiments
-# -----------------------------------------------------------------------------------------------------
 
 BINNED = "source.camera.name=azure_kinect_nfov_binned"  # a quarter of the pixels
 FLAT = "capture.flat_field={frames: 20, distance_m: 1.0}"

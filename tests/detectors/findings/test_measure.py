@@ -11,9 +11,14 @@ import pytest
 from pydantic import ValidationError
 
 from detectors.findings.hole_model import HolePatch, pictures, sight
-from detectors.findings.measure import HoleModelConfig, extents, measure_detection
+from detectors.findings.measure import (
+    HoleModelConfig,
+    blur_in_cells,
+    extents,
+    measure_detection,
+)
 from detectors.interface import Detection, Evidence, Measurement
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud, MapViews, Region
 
 FOCAL_PX = 504.0
 HEIGHT = 60
@@ -42,7 +47,12 @@ def test_of_equal_extremes_the_first_counts() -> None:
 
 
 def brute_disc(
-    u: float, v: float, radius: float, metric: np.ndarray, blur: int, over: int = 24
+    u: float,
+    v: float,
+    radius: float,
+    metric: np.ndarray,
+    blur: int,
+    over: int = 24,
 ) -> np.ndarray:
     fine_v, fine_u = np.mgrid[: 30 * over, : 34 * over]
     offset = np.stack([(fine_u + 0.5) / over - 0.5 - u, (fine_v + 0.5) / over - 0.5 - v], axis=-1)
@@ -57,10 +67,19 @@ def test_blurred_disc_equals_brute_force(blur: int, radius_px: float) -> None:
     pitch = 1.5e-3
     metric = pitch**2 * np.array([[1.0, 0.15], [0.15, 1.3]])
     blank = np.zeros((30, 34))
-    patch = HolePatch(blank, blank == 0, metric, (float(blur), float(blur)), 1e-4, np.ones((1, 8)))
+    patch = HolePatch(
+        blank,
+        blank == 0,
+        metric,
+        (float(blur), float(blur)),
+        1e-4,
+        np.ones((1, 8)),
+    )
     image = -pictures(patch, np.array([[16.3, 14.8, radius_px * pitch, -1.0, 0.0]]))[0]
     np.testing.assert_allclose(
-        image, brute_disc(16.3, 14.8, radius_px * pitch, metric, blur), atol=0.012
+        image,
+        brute_disc(16.3, 14.8, radius_px * pitch, metric, blur),
+        atol=0.012,
     )
     area_px = np.pi * radius_px**2 * pitch**2 / np.sqrt(np.linalg.det(metric))
     assert image.sum() == pytest.approx(area_px, rel=1e-9)
@@ -126,8 +145,8 @@ class Board:
         return residual
 
     def within(self, points: np.ndarray, depth: float) -> np.ndarray:
-        apart = points - self.centre - depth * self.normal
-        return (apart**2).sum(axis=-1) < self.radius**2
+        from_axis = points - self.centre - depth * self.normal
+        return (from_axis**2).sum(axis=-1) < self.radius**2
 
     def passes(self, points: np.ndarray, rim: float, depth: float) -> np.ndarray:
         """Whether light from the emitter to points at a depth passes the circle at the depth
@@ -137,22 +156,35 @@ class Board:
         return self.within(points + part * (self.emitter - points), rim)
 
     def surface(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        place = np.stack([u + REGION.col0, v + REGION.row0], axis=-1)
-        slopes = (place - np.array(self.middle)) / FOCAL_PX
+        position = np.stack([u + REGION.col0, v + REGION.row0], axis=-1)
+        slopes = (position - np.array(self.middle)) / FOCAL_PX
         z = 0.75 / (1 - slopes @ self.tilt)
         return np.concatenate([slopes * z[..., None], z[..., None]], axis=-1)
 
     def seen(self, sigma_mm: float, seed: int) -> tuple[Cloud, Evidence]:
         white = np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH))
-        noise = cv2.blur(white, (self.blur, self.blur), borderType=cv2.BORDER_REFLECT)
+        noise = cv2.blur(
+            white,
+            (self.blur, self.blur),
+            borderType=cv2.BORDER_REFLECT,
+        )
         residual = self.image + sigma_mm * 1e-3 * self.blur * noise
         points = self.plane * (1 + residual / self.plane[..., 2])[..., None]
         flat = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
         cloud = Cloud(
-            points, flat, flat.astype(int) + 1, np.full(flat.shape, np.nan), REGION, 0.0, 1
+            points,
+            flat,
+            flat.astype(int) + 1,
+            np.full(flat.shape, np.nan),
+            REGION,
+            0.0,
+            1,
         )
         return cloud, Evidence(
-            np.abs(residual) / (sigma_mm * 1e-3), residual, self.plane[..., 2], sigma_mm * 1e-3
+            np.abs(residual) / (sigma_mm * 1e-3),
+            residual,
+            self.plane[..., 2],
+            sigma_mm * 1e-3,
         )
 
 
@@ -168,13 +200,20 @@ def strongest(cloud: Cloud, evidence: Evidence, threshold: float) -> Detection:
 
 
 def detection_of(cloud: Cloud, score: float, pixels: np.ndarray) -> Detection:
-    return Detection(score, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1])
+    return Detection(
+        score,
+        pixels,
+        extents(cloud.points_m.reshape(-1, 3)[pixels])[1],
+    )
 
 
 def measured(board: Board, sigma_mm: float, seed: int, threshold: float = 5.0) -> Measurement:
     cloud, evidence = board.seen(sigma_mm, seed)
     return measure_detection(
-        cloud, evidence, strongest(cloud, evidence, threshold), HoleModelConfig()
+        cloud,
+        evidence,
+        strongest(cloud, evidence, threshold),
+        HoleModelConfig(),
     )
 
 
@@ -195,7 +234,12 @@ def patch_of(board: Board) -> tuple[HolePatch, np.ndarray]:
     used = np.ones((HEIGHT, WIDTH), dtype=bool)
     sights = sight(board.centre, per_px, board.emitter)[None]
     patch = HolePatch(
-        board.image, used, per_px @ per_px.T, (float(board.blur), float(board.blur)), 1e-4, sights
+        board.image,
+        used,
+        per_px @ per_px.T,
+        (float(board.blur), float(board.blur)),
+        1e-4,
+        sights,
     )
     return patch, np.array([u, v, board.radius, board.depth_m, 0.6])
 
@@ -206,9 +250,18 @@ OBLIQUE = (60.0, 200.0)
 
 
 @pytest.mark.parametrize("middle", [MIDDLE, OBLIQUE])
-@pytest.mark.parametrize(("diameter_mm", "depth_mm"), [(6.35, 33.0), (19.05, 12.7), (25.4, 33.0)])
+@pytest.mark.parametrize(
+    ("diameter_mm", "depth_mm"),
+    [
+        (6.35, 33.0),
+        (19.05, 12.7),
+        (25.4, 33.0),
+    ],
+)
 def test_the_image_of_a_hole_is_that_of_rays_in_space(
-    diameter_mm: float, depth_mm: float, middle: tuple[float, float]
+    diameter_mm: float,
+    depth_mm: float,
+    middle: tuple[float, float],
 ) -> None:
     at = tuple((np.array([235.2, 130.4]) - middle) / FOCAL_PX * 0.75)
     board = Board(diameter_mm, depth_mm, wall=0.6, middle=middle, at=at)
@@ -259,7 +312,13 @@ def test_an_oblique_hole_has_the_diameter_and_the_place_of_its_mouth(
     np.testing.assert_allclose(m.model_centre_m, board.centre, atol=0.15e-3)
 
 
-@pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "count",
+    [
+        50,
+        pytest.param(200, marks=pytest.mark.slow),
+    ],
+)
 def test_standard_errors_cover_the_truth(count: int) -> None:
     """Draws of correlated noise, over walls of every length as the prior has it. The deviation of
     200 standard scores with some 20 degrees of freedom each has a standard error of 0.055, so 1 -+
@@ -283,9 +342,17 @@ def test_standard_errors_cover_the_truth(count: int) -> None:
     assert np.all(np.abs(scores.std(axis=0) - 1.02) < 0.2 * wider)
 
 
-@pytest.mark.parametrize(("reach_px", "low_mm", "high_mm"), [(5.0, 8.0, 10.5), (0.0, 0.0, 7.5)])
+@pytest.mark.parametrize(
+    ("reach_px", "low_mm", "high_mm"),
+    [
+        (5.0, 8.0, 10.5),
+        (0.0, 0.0, 7.5),
+    ],
+)
 def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise(
-    reach_px, low_mm, high_mm
+    reach_px,
+    low_mm,
+    high_mm,
 ) -> None:
     board = Board(9.0, 9.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
     cloud, evidence = board.seen(0.5, 3)
@@ -294,7 +361,11 @@ def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise(
     )  # 0: no recording, so that the model's own blur of 5 pixels is taken
     white = np.pad([[1.0]], 10)
     m = measure_detection(
-        cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig(), white
+        cloud,
+        evidence,
+        strongest(cloud, evidence, 5.0),
+        HoleModelConfig(),
+        white,
     )
     assert low_mm * 1e-3 < m.model_diameter_m < high_mm * 1e-3
 
@@ -304,27 +375,33 @@ def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     # a cap 48 mm wide; half of its depth lies within 34 mm
     board.image = 7e-3 * np.clip(
-        1 - ((u - WIDTH / 2) ** 2 + (v - HEIGHT / 2) ** 2) / 16.0**2, 0, None
+        1 - ((u - WIDTH / 2) ** 2 + (v - HEIGHT / 2) ** 2) / 16.0**2,
+        0,
+        None,
     )
     cloud, evidence = board.seen(0.05, 3)
     lag = np.abs(np.arange(-28, 29))
-    short, long = (
-        np.outer(row, row)
-        for row in (np.clip(1 - lag / 4, 0, None), np.exp(-(lag**2) / (2 * 6.3**2)))
-    )
+    triangle = np.clip(1 - lag / 4, 0, None)
+    wave = np.exp(-(lag**2) / (2 * 6.3**2))
+    by_lag = 0.3 * np.outer(triangle, triangle) + 0.7 * np.outer(wave, wave)
     core = detection_of(cloud, 9.0, np.flatnonzero(board.image > 6.3e-3))
-    m = measure_detection(cloud, evidence, core, HoleModelConfig(), 0.3 * short + 0.7 * long)
+    m = measure_detection(
+        cloud,
+        evidence,
+        core,
+        HoleModelConfig(),
+        by_lag,
+    )
     assert m.model_depth_m == pytest.approx(7e-3, abs=1.5e-3)
     assert m.model_diameter_m == pytest.approx(34e-3, abs=5e-3)
 
 
 def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
     m = measured(Board(2.0, 12.7, wall=0.3), 0.15, 3, threshold=4.0)
-    assert (
-        m.model_note.startswith("the blur hides the difference")
-        and "half-depth contour" in m.model_note
-    )
-    assert m.model_diameter_m > 2.0e-3 and np.isnan(m.model_diameter_se_m)
+    assert m.model_note.startswith("the blur hides the difference")
+    assert "half-depth contour" in m.model_note
+    assert m.model_diameter_m > 2.0e-3
+    assert np.isnan(m.model_diameter_se_m)
 
 
 def test_a_deep_hole_falls_back_to_its_contour() -> None:
@@ -349,7 +426,8 @@ def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_thr
     )
     through_m = np.sqrt((board.image > 0.25).sum() / (board.image > 0).sum()) * 19.0e-3
     m = measured(board, 0.2, 3)
-    assert through_m < 11.0e-3 and "deeper than 75 mm" in m.model_note
+    assert through_m < 11.0e-3
+    assert "deeper than 75 mm" in m.model_note
     assert 14.0e-3 < m.model_diameter_m < 20.0e-3
 
 
@@ -361,19 +439,30 @@ def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
     cloud.points_m[inside] = np.nan
     evidence.residual_m[inside] = np.nan
     rim = np.setdiff1d(detection.pixels, np.flatnonzero(inside))
-    m = measure_detection(cloud, evidence, detection_of(cloud, 9.0, rim), HoleModelConfig())
+    m = measure_detection(
+        cloud,
+        evidence,
+        detection_of(cloud, 9.0, rim),
+        HoleModelConfig(),
+    )
     assert "no range" in m.model_note
     assert m.model_diameter_m == pytest.approx(19.0e-3, abs=1.0e-3)
-    assert np.isnan(m.model_depth_m) and np.isnan(m.model_diameter_se_m)
+    assert np.isnan(m.model_depth_m)
+    assert np.isnan(m.model_diameter_se_m)
 
 
 def test_a_neighbour_is_masked() -> None:
     board = Board(12.7, 12.7)
-    other = Board(12.7, 12.7, at=(24e-3, 2e-3))
+    neighbour = Board(12.7, 12.7, at=(24e-3, 2e-3))
     cloud, evidence = board.seen(0.1, 3)
-    alone = measure_detection(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig())
+    alone = measure_detection(
+        cloud,
+        evidence,
+        strongest(cloud, evidence, 5.0),
+        HoleModelConfig(),
+    )
     pixels = strongest(cloud, evidence, 5.0)
-    evidence.residual_m[:] += other.image
+    evidence.residual_m[:] += neighbour.image
     m = measure_detection(cloud, evidence, pixels, HoleModelConfig())
     assert m.model_note == ""
     assert m.model_diameter_m == pytest.approx(alone.model_diameter_m, abs=0.15e-3)
@@ -391,16 +480,84 @@ def test_without_a_grid_only_extents_are_given() -> None:
     }
     flat = Cloud(**{**cloud.__dict__, **row})
     m = measure_detection(flat, evidence, detection, HoleModelConfig())
-    assert m.model_note == "no pixel grid: extents only" and m.points == len(detection.pixels)
-    assert m.extent_diameter_m > 12.7e-3 and np.isnan(m.model_diameter_m) and np.isnan(m.u_px)
+    assert m.model_note == "no pixel grid: extents only"
+    assert m.points == len(detection.pixels)
+    assert m.extent_diameter_m > 12.7e-3
+    assert np.isnan(m.model_diameter_m)
+    assert np.isnan(m.u_px)
+
+
+def frontal(height: int, width: int, pitch_m: float = 1e-3, **changes: object) -> Cloud:
+    """A map of equal cells of a plane at z = 0."""
+    v, u = np.mgrid[:height, :width] * pitch_m
+    flat = np.zeros((height, width), np.uint8)
+    cloud = Cloud(
+        points_m=np.stack([u, v, np.zeros(u.shape)], axis=-1),
+        reason=flat,
+        count=flat.astype(int) + 1,
+        variance_m2=np.full(u.shape, np.nan),
+        region=Region(0, height, 0, width),
+        z_step_m=0.0,
+        n_frames=1,
+        projection="parallel",
+    )
+    return replace(cloud, **changes)
+
+
+def test_volume_and_sides_are_those_of_a_box() -> None:
+    """A box of 20 x 8 mm, 3 mm deep, on a map that nothing blurs, along a diagonal too."""
+    cloud = frontal(60, 70)
+    v, u = np.mgrid[:60, :70]
+    for turn_deg in (0.0, 30.0):
+        turned = ((u - 34.5) + 1j * (v - 29.5)) * np.exp(-1j * np.radians(turn_deg))
+        inside = (np.abs(turned.real) < 10) & (np.abs(turned.imag) < 4)
+        residual_m = np.where(inside, -3e-3, 0.0) + 2e-4
+        evidence = Evidence(np.abs(residual_m), residual_m, np.zeros((60, 70)), 1e-4)
+        detection = detection_of(cloud, 9.0, np.flatnonzero(inside))
+        m = measure_detection(cloud, evidence, detection, HoleModelConfig(blur_px=1))
+        assert m.volume_m3 == pytest.approx(-3e-3 * inside.sum() * 1e-6, rel=1e-6)
+        assert m.length_m == pytest.approx(20e-3, rel=0.03)
+        assert m.width_m == pytest.approx(8e-3, rel=0.04)
+        along = np.array([np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg)), 0.0])
+        assert abs(m.along @ along) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_sides_are_without_the_blur() -> None:
+    """A filter of 5 x 5 pixels adds 25 / 12 to the second moments, which the sides leave out."""
+    board = Board(25.4, -3.0, blur=5)
+    blurred = measured(board, 0.005, 1, threshold=50.0)
+    sharp = Board(25.4, -3.0, blur=1)
+    cloud, evidence = sharp.seen(0.005, 1)
+    detection = strongest(cloud, evidence, 50.0)
+    plain = measure_detection(cloud, evidence, detection, HoleModelConfig(blur_px=1))
+    assert blurred.length_m == pytest.approx(plain.length_m, rel=0.015)
+    assert blurred.width_m == pytest.approx(plain.width_m, rel=0.015)
+    assert plain.length_m == pytest.approx(np.sqrt(3) / 2 * 25.4e-3, rel=0.03)
+
+
+def test_the_blur_of_a_map_counts_in_its_cells() -> None:
+    """Cells of 1 mm; the views' pixels are 1.5 mm across and 0.4 mm down, so that a cell holds
+    several of these."""
+    views = MapViews(np.eye(4)[None], np.ones(1), pixel_m=(1.5e-3, 0.4e-3))
+    cloud = frontal(8, 9, map_views=views)
+    along_u, along_v = blur_in_cells(cloud, HoleModelConfig(blur_px=5))
+    assert along_u == pytest.approx(1.5 * np.sqrt(27))
+    assert along_v == pytest.approx(np.sqrt(0.4**2 * 27 + 1.0))
+    assert blur_in_cells(frontal(8, 9), HoleModelConfig(blur_px=3)) == (3.0, 3.0)
+    assert blur_in_cells(frontal(8, 9, noise_reach_px=4.0), HoleModelConfig()) == (4.0, 4.0)
 
 
 def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
     cloud, evidence = Board(12.7, 0.0).seen(0.2, 7)
     m = measure_detection(
-        cloud, evidence, detection_of(cloud, 4.0, np.array([17])), HoleModelConfig()
+        cloud,
+        evidence,
+        detection_of(cloud, 4.0, np.array([17])),
+        HoleModelConfig(),
     )
-    assert m.points == 1 and m.extent_diameter_m == 0.0 and m.model_note != ""
+    assert m.points == 1
+    assert m.extent_diameter_m == 0.0
+    assert m.model_note != ""
 
 
 def test_an_even_blur_is_refused() -> None:

@@ -4,17 +4,24 @@ what is refused."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage, stats
+from scipy.stats import poisson
 
 from detectors import load_detector
 from detectors.findings.null import (
+    EXPONENTS,
     FEWEST_PEAKS,
     MOST,
+    PRIOR,
     Tail,
+    _fitting_tail,
+    _floor_among,
+    behind,
     each_object_once,
     own_threshold,
     skew_of,
@@ -48,7 +55,15 @@ def plane(offset_m: np.ndarray) -> Cloud:
         [(u - w / 2) * PITCH_M, (v - h / 2) * PITCH_M, DISTANCE_M + offset_m], axis=-1
     )
     empty = np.zeros((h, w), np.uint8)
-    return Cloud(points, empty, empty + 1, np.full((h, w), np.nan), Region(0, h, 0, w), 0.0, 1)
+    return Cloud(
+        points,
+        empty,
+        empty + 1,
+        np.full((h, w), np.nan),
+        Region(0, h, 0, w),
+        0.0,
+        1,
+    )
 
 
 def noise(kind: str, seed: int, shape: tuple[int, int] = (110, 150)) -> np.ndarray:
@@ -78,11 +93,12 @@ def test_as_many_false_calls_as_expected(name: str, kind: str) -> None:
     for seed in range(BOARDS):
         cloud = plane(noise(kind, seed))
         evidence = detector.analyse(cloud)
-        own = own_threshold(detector, cloud, evidence, wanted)
-        assert own.low < wanted < own.high and (own.threshold > MOST) == bool(own.doubts)
-        assert all("noise with heavy tails" in doubt for doubt in own.doubts)
-        assert own.expected == pytest.approx(wanted, rel=1e-6)
-        count += len(detector.find(cloud, own.evidence, own.threshold))
+        result = own_threshold(detector, cloud, evidence, wanted)
+        assert result.low < wanted < result.high
+        assert (result.threshold > MOST) == bool(result.doubts)
+        assert all("noise with heavy tails" in doubt for doubt in result.doubts)
+        assert result.expected == pytest.approx(wanted, rel=1e-6)
+        count += len(detector.find(cloud, result.evidence, result.threshold))
     beyond = stats.norm.isf(ALPHA / (2 * len(CASES)))
     low = wanted * BOARDS * (1 / 1.5)
     high = wanted * BOARDS * 1.5
@@ -102,21 +118,23 @@ def test_as_many_false_calls_as_stated_on_rendered_boards(camera: str, tmp_path:
     for number in range(10):
         for frames, board in boards(camera, "hole-free", number, tmp_path).items():
             evidence = detector.analyse(board.cloud)
-            own = own_threshold(detector, board.cloud, evidence, 3.0)
+            result = own_threshold(detector, board.cloud, evidence, 3.0)
             # the average of 50 frames of the L515 leaves little but its fixed pattern: the
             # threshold is up to 13 there, which the capture says
-            assert bool(own.doubts) == (own.threshold > MOST)
-            assert not own.doubts or (camera, frames) == ("realsense_l515", 50)
-            count[frames] += len(detector.find(board.cloud, own.evidence, own.threshold))
-            low = low + own.low
-            high = high + own.high
+            assert bool(result.doubts) == (result.threshold > MOST)
+            assert not result.doubts or (camera, frames) == ("realsense_l515", 50)
+            count[frames] += len(detector.find(board.cloud, result.evidence, result.threshold))
+            low = low + result.low
+            high = high + result.high
     assert low < sum(count.values()) < high
-    assert all(15 - 3 * np.sqrt(15) < each < 60 + 3 * np.sqrt(60) for each in count.values())
+    assert all(
+        15 - 3 * np.sqrt(15) < detection < 60 + 3 * np.sqrt(60) for detection in count.values()
+    )
 
 
 def test_the_interval_holds_the_truth() -> None:
     """Peaks whose tail is known: exponential in the square of the score."""
-    held = 0
+    inside_count = 0
     expected = []
     captures = 150
     for seed in range(captures):
@@ -126,11 +144,104 @@ def test_the_interval_holds_the_truth() -> None:
         threshold = tail.threshold(0.5)
         true = 50.0 * np.exp(-(threshold**2 - 9.0) / 2.0)
         low, high = tail.interval(threshold)
-        held += low < true < high
+        inside_count += low < true < high
         expected.append(true)
     # an interval over exponents that are not this one's is wider than it need be
-    assert stats.binom.sf(held, captures, 0.95 - 0.02) < 1.0 and held / captures > 0.90
+    assert stats.binom.sf(inside_count, captures, 0.95 - 0.02) < 1.0
+    assert inside_count / captures > 0.90
     assert 0.5 / 1.5 < np.mean(expected) < 0.5 * 1.5
+
+
+def test_the_interval_and_the_expectation_are_those_of_both_sides() -> None:
+    """Twice those of the peaks in front of the surface, whose tail is computed here again."""
+    cloud = plane(noise("smooth", 5))
+    evidence = analysed(cloud)
+    result = own_threshold(DETECTOR, cloud, evidence, 2.0)
+    before = replace(evidence, score=np.where(behind(evidence), np.nan, evidence.score))
+    scores = [call.score for call in DETECTOR.find(cloud, before, result.floor)]
+    assert len(scores) == result.peaks
+    tail = Tail.of(np.array(scores), result.floor)
+    low, high = tail.interval(result.threshold)
+    assert result.expected == pytest.approx(2.0 * tail.expected(result.threshold), rel=1e-9)
+    assert (result.low, result.high) == pytest.approx((2.0 * low, 2.0 * high), rel=1e-9)
+    assert result.threshold == pytest.approx(max(tail.threshold(1.0), 3.0), rel=1e-9)
+
+
+def test_a_tail_of_normal_peaks_is_the_closed_form() -> None:
+    """One exponent alone: the expected number is n (1 + E / S)^-(n + 10) with E and S of the excess
+    f^2 ((r^2 - 1) / 2 - ln r / f^2) of ratios r to the floor f."""
+    floor = 3.0
+    peaks = np.array([3.2, 3.4, 3.5, 4.1, 3.05, 3.3, 3.9, 3.6])
+
+    def excess(scores: np.ndarray) -> np.ndarray:
+        ratios = scores / floor
+        return floor**2 * ((ratios**2 - 1) / 2 - np.log(ratios) / floor**2)
+
+    tail = Tail.of(peaks, floor)
+    normal = replace(tail, weights=np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+    total = excess(peaks).sum() + 10.0
+    expected = 8 * (1 + excess(np.array([5.0]))[0] / total) ** -18.0
+    assert normal.expected(5.0) == pytest.approx(expected, rel=1e-12)
+    assert normal.expected(normal.threshold(0.3)) == pytest.approx(0.3, rel=1e-9)
+    assert tail.weights.sum() == pytest.approx(1.0)
+    # as many as there are, or more, are expected at the floor
+    assert tail.threshold(8.0) == tail.threshold(20.0) == floor
+
+
+def test_the_exponents_are_weighed_by_their_likelihood() -> None:
+    """The marginal likelihood of the excesses E_i of n peaks, whose scale has a Gamma prior of ten
+    peaks: product of dE_i/ds over (10 + sum E_i)^(n + 10)."""
+    floor = 4.0
+    peaks = 4.0 + np.random.default_rng(3).exponential(0.8, 40)
+    ratios = peaks / floor
+    logs = []
+    for exponent in EXPONENTS:
+        power = np.log(ratios) if exponent == 0 else (ratios**exponent - 1) / exponent
+        total = 10.0 + (floor**2 * (power - np.log(ratios) / floor**2)).sum()
+        slope = ratios ** (exponent - 1) - 1 / floor**2 / ratios
+        logs.append(np.log(slope).sum() - 50 * np.log(total))
+    weights = PRIOR * np.exp(np.array(logs) - max(logs))
+    np.testing.assert_allclose(
+        Tail.of(peaks, floor).weights,
+        weights / weights.sum(),
+        rtol=1e-9,
+    )
+
+
+@pytest.mark.parametrize(
+    ("counts", "floor"),
+    [
+        ([10, 90, 150, 100, 85, 70, 61, 50, 20], 6),  # the last with sixty, below 60 % of the most
+        ([10, 40, 50, 45, 29, 12], 4),  # too few everywhere: the first below 60 %
+        ([10, 40, 50, 45, 40], 2),  # never below: where most are found
+        ([150, 90, 60, 59], 2),
+    ],
+)
+def test_the_floor_has_enough_peaks_that_do_not_join(counts: list[int], floor: int) -> None:
+    assert _floor_among(counts) == floor
+
+
+def test_a_tail_that_too_many_peaks_exceed_is_that_of_the_higher_half() -> None:
+    """Two hundred peaks of noise and twenty of a pattern twice as high."""
+    random = np.random.default_rng(6)
+    low = 3.0 + random.exponential(0.15, 200)
+    high = 8.0 + random.exponential(0.5, 20)
+    alone = _fitting_tail(low, 3.0, 0.5)
+    assert (alone.peaks, alone.floor) == (200, 3.0)
+    peaks = np.append(low, high)
+    mixed = _fitting_tail(peaks, 3.0, 0.5)
+    assert mixed.peaks == 110
+    assert mixed.floor == np.sort(peaks)[-111]
+    # of all together, more exceed the threshold than a Poisson number of mean 0.5 has in a tenth
+    together = Tail.of(peaks, 3.0).threshold(0.5)
+    assert poisson.sf((peaks > together).sum() - 1, 0.5) < 0.1
+
+
+def test_skewness_is_that_of_the_quartiles() -> None:
+    cloud = plane(np.zeros((4, 5)))
+    evidence = analysed(cloud)
+    residual_m = np.array([0.0, 1.0, 2.0, 4.0, 8.0] * 4).reshape(4, 5)
+    assert skew_of(replace(evidence, residual_m=residual_m)) == pytest.approx((4 + 1 - 4) / 3)
 
 
 def test_an_object_on_the_target_does_not_raise_the_threshold_and_is_reported() -> None:
@@ -141,7 +252,9 @@ def test_an_object_on_the_target_does_not_raise_the_threshold_and_is_reported() 
     with_object = plane(offset_m - 15e-3 * inside)
     alone = own_threshold(DETECTOR, bare, analysed(bare), 1.0)
     beside = own_threshold(DETECTOR, with_object, analysed(with_object), 1.0)
-    assert beside.objects == 1 and alone.objects == 0 and not beside.doubts
+    assert beside.objects == 1
+    assert alone.objects == 0
+    assert not beside.doubts
     assert beside.threshold == pytest.approx(alone.threshold, rel=0.25)
     strongest = DETECTOR.find(with_object, beside.evidence, beside.threshold)[0]
     assert len(strongest.pixels) > 27 * 39 * 0.9
@@ -166,31 +279,31 @@ def test_a_rim_that_mixes_in_the_background_is_not_judged() -> None:
     offset_m[10, 20:60] += 12e-3
     offset_m[10, 80:100] += 12e-3
     cloud = plane(offset_m)
-    own = own_threshold(DETECTOR, cloud, analysed(cloud), 1.0)
-    assert own.rim_pixels >= 150
-    assert (
-        not np.isfinite(own.evidence.score[10]).any()
-        and np.isfinite(own.evidence.score[-1, :-11]).all()
-    )
-    assert len(DETECTOR.find(cloud, own.evidence, own.threshold)) <= 4
+    result = own_threshold(DETECTOR, cloud, analysed(cloud), 1.0)
+    assert result.rim_pixels >= 150
+    assert not np.isfinite(result.evidence.score[10]).any()
+    assert np.isfinite(result.evidence.score[-1, :-11]).all()
+    assert len(DETECTOR.find(cloud, result.evidence, result.threshold)) <= 4
     # a hole at the rim is no rim: it reaches deeper, and it is alone
     offset_m = noise("smooth", 3)
     offset_m[:10] = np.nan
     offset_m[10:16, 60:66] += 12e-3
     hole = plane(offset_m)
-    own = own_threshold(DETECTOR, hole, analysed(hole), 1.0)
-    assert own.rim_pixels == 0
-    assert DETECTOR.find(hole, own.evidence, own.threshold)[0].score > 5.0
+    result = own_threshold(DETECTOR, hole, analysed(hole), 1.0)
+    assert result.rim_pixels == 0
+    assert DETECTOR.find(hole, result.evidence, result.threshold)[0].score > 5.0
 
 
 def test_it_says_what_it_cannot_know() -> None:
-    few = own_threshold(
+    result = own_threshold(
         DETECTOR,
         plane(noise("smooth", 4)[:12, :12]),
         analysed(plane(noise("smooth", 4)[:12, :12])),
         1.0,
     )
-    assert few.peaks < FEWEST_PEAKS and np.isnan(few.threshold) and "too few" in few.doubts[0]
+    assert result.peaks < FEWEST_PEAKS
+    assert np.isnan(result.threshold)
+    assert "too few" in result.doubts[0]
     skewed = plane(SIGMA_M * np.random.default_rng(4).exponential(size=(110, 150)))
     evidence = analysed(skewed)
     assert skew_of(evidence) > 0.15
@@ -209,8 +322,9 @@ def test_bumps_that_raise_the_threshold_are_told() -> None:
         8e-3 * 2 * np.pi * 4
     )
     cloud = plane(noise("normal", 4) - ndimage.gaussian_filter(bumps, 2.0))
-    own = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
-    assert own.threshold > MOST and "bumps or structure of the surface" in own.doubts[0]
+    result = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
+    assert result.threshold > MOST
+    assert "bumps or structure of the surface" in result.doubts[0]
 
 
 def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
@@ -218,21 +332,29 @@ def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:
     offset[40:80, 60:110] -= 0.03  # an object of 50 x 40 pixels, 30 mm high
     offset[80:84, 60:110] += 0.004  # the shadow along its edge
     v, u = np.mgrid[:160, :200]
-    for at in ((120, 50), (60, 150)):
-        offset[np.hypot(v - at[0], u - at[1]) < 5] += 0.02
+    for centre in ((120, 50), (60, 150)):
+        offset[np.hypot(v - centre[0], u - centre[1]) < 5] += 0.02
     cloud = plane(offset)
     detector = load_detector("local", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
     evidence = detector.analyse(cloud)
-    found = each_object_once(cloud, evidence, detector.find(cloud, evidence, 8.0))
-    assert [each.kind for each in found].count("object") == 1
-    (thing,) = (each for each in found if each.kind == "object")
+    detections = each_object_once(
+        cloud,
+        evidence,
+        detector.find(cloud, evidence, 8.0),
+    )
+    objects = [detection for detection in detections if detection.kind == "object"]
+    assert len(objects) == 1
     # the square that residuals are smoothed over adds two pixels at each side
-    assert len(thing.pixels) == pytest.approx(54 * 44, rel=0.05)
-    holes = [np.unravel_index(each.pixels, offset.shape) for each in found if each.kind == "depth"]
-    places = [(float(np.mean(rows)), float(np.mean(columns))) for rows, columns in holes]
-    assert len(places) == 2
-    for place in ((120, 50), (60, 150)):
-        assert min(np.hypot(place[0] - r, place[1] - c) for r, c in places) < 3
+    assert len(objects[0].pixels) == pytest.approx(54 * 44, rel=0.05)
+    holes = [
+        np.unravel_index(detection.pixels, offset.shape)
+        for detection in detections
+        if detection.kind == "depth"
+    ]
+    centres = [(float(np.mean(rows)), float(np.mean(columns))) for rows, columns in holes]
+    assert len(centres) == 2
+    for centre in ((120, 50), (60, 150)):
+        assert min(np.hypot(centre[0] - r, centre[1] - c) for r, c in centres) < 3
 
 
 def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
@@ -241,5 +363,6 @@ def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
     offset -= 0.006 * np.exp(-0.5 * (np.hypot(v - 60, u - 70) / 5.0) ** 2)
     cloud = plane(offset)
     evidence = analysed(cloud)
-    found = DETECTOR.find(cloud, evidence, 8.0)
-    assert len(found) == 1 and each_object_once(cloud, evidence, found) == found
+    detections = DETECTOR.find(cloud, evidence, 8.0)
+    assert len(detections) == 1
+    assert each_object_once(cloud, evidence, detections) == detections

@@ -10,35 +10,40 @@ import numpy as np
 import pytest
 
 from detectors.findings.hole_model import (
-    HoleFit,
     HolePatch,
     fit_hole,
     pictures,
     straight_sight,
     whitened,
 )
-from detectors.findings.whitening import (
-    CONVERGED,
-    GRID,
-    LONGEST_LAG_PX,
+from detectors.findings.templates import (
     bank,
-    covariance_factor,
-    filters,
-    grid_of,
     halved,
-    inverse_times,
-    noise_covariance,
     responses,
     spectra,
-    spectrum,
     transformed,
-    window_of,
     worths,
 )
+from detectors.findings.whitening import (
+    GRID,
+    LONGEST_LAG_PX,
+    grid_of,
+)
 from detectors.interface import Detection
-from detectors.masks import grown
 from detectors.methods.local import LocalDetector
-from detectors.methods.matched import MatchedDetector
+from detectors.methods.matched import (
+    CLIP_SIGMAS,
+    RIM_PX,
+    WIDE_PX,
+    MatchedDetector,
+    _cores,
+    _fill_discs,
+    _in_deviations,
+    _side_lobes,
+    _tamed,
+    _without_rim,
+)
+from detectors.pixels.masks import grown
 from harness.testing.synthetic_clouds import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
 
@@ -66,141 +71,88 @@ def hole(u: float, v: float, radius_px: float, depth_m: float) -> np.ndarray:
     return np.asarray(depth_m * cv2.blur(disc, (BLUR_PX, BLUR_PX)))
 
 
-def found(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
+def detections_in(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
     return DETECTOR.find(cloud, DETECTOR.analyse(cloud), threshold)
-
-
-def test_a_score_is_the_likelihoods_where_pixels_are_missing() -> None:
-    """Beside the dense covariance of the known pixels alone, for each template that the picture
-    holds: closely if solved to a small error, and within twice the error that `CONVERGED` states.
-    """
-    noise = blurred(1, (26, 30)).astype(np.float32)
-    known = np.random.default_rng(2).random(noise.shape) > 0.1
-    grid = grid_of(noise.shape)
-    lags = noise_covariance(blurred(3).astype(np.float32), np.ones(SHAPE, bool), grid_of(SHAPE))
-    power = spectrum(lags, grid)
-    covariance = np.fft.irfft2(power, grid)
-    places = np.argwhere(known)
-    apart = places[:, None] - places
-    dense = covariance[apart[..., 0], apart[..., 1]]
-    assert window_of(lags) == BLUR_PX
-    seen = np.where(known, noise, np.float32(0.0))
-    by = filters(lags, noise.shape)
-    solved = inverse_times(seen, known, by, error=0.01)
-    rough = inverse_times(seen, known, by)
-    for drawn, worth in zip(
-        bank(BLUR_PX)[:10], worths(spectrum(lags, (GRID, GRID)), BLUR_PX), strict=False
-    ):
-        half = len(drawn.image) // 2
-        template = np.pad(drawn.image, 20)[half + 7 : half + 33, half + 5 : half + 35]
-        exact = template[known] @ np.linalg.solve(dense, noise[known])
-        energy = template[known] @ np.linalg.solve(dense, template[known])
-        assert (template * solved).sum() == pytest.approx(
-            exact, rel=0.02, abs=0.02 * float(energy) ** 0.5
-        )
-        assert abs((template * rough).sum() - exact) < 2.0 * CONVERGED * energy**0.5
-        assert 0.6 * worth.energy < energy < 1.02 * worth.energy
-
-
-def test_a_factor_is_that_of_the_covariance_of_the_used_pixels() -> None:
-    random = np.random.default_rng(4)
-    used = random.random((9, 11)) > 0.2
-    lags = np.abs(np.arange(-8, 9))
-    correlation = np.outer(0.6**lags, 0.7**lags)
-    error = np.where(used, 2e-4 * random.random(used.shape), np.nan)
-    factor = covariance_factor(used, correlation, 3e-4, error)
-    assert factor is not None
-    apart = np.abs(np.argwhere(used)[:, None] - np.argwhere(used))
-    alike = 0.6 ** apart[..., 0] * 0.7 ** apart[..., 1] * (apart <= 8).all(axis=-1)
-    dense = alike * (3e-4**2 + np.outer(error[used], error[used]))
-    np.testing.assert_allclose(np.tril(factor) @ np.tril(factor).T, dense, atol=1e-14 * dense.max())
-    assert covariance_factor(used, None, 3e-4, error) is None
-    assert covariance_factor(used, 0.0 * correlation, 3e-4, error) is None
 
 
 def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
     """A hundred blind holes of 10 mm and 6 mm: scatter and stated errors are those of the
     Cramér-Rao bound, where plain least squares scatter half as widely again, and the far pixels
     that are left out would add next to nothing."""
-    pitch = 1.4e-3
+    pitch_m = 1.4e-3
     shape = (31, 31)
     noise_m = 4e-4
-    per_px = np.array([[pitch, 0.0, 0.0], [0.0, pitch, 0.0]])
+    per_px_m = np.array([[pitch_m, 0.0, 0.0], [0.0, pitch_m, 0.0]])
     lags = BLUR_PX - np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
     correlation = np.outer(np.maximum(lags, 0), np.maximum(lags, 0)) / BLUR_PX**2
     correlation[LONGEST_LAG_PX, LONGEST_LAG_PX] += 0.1
     blank = HolePatch(
-        np.zeros(shape),
-        np.ones(shape, bool),
-        per_px @ per_px.T,
-        (5.0, 5.0),
-        noise_m,
-        straight_sight(per_px)[None],
+        residual_m=np.zeros(shape),
+        used=np.ones(shape, bool),
+        metric_m2=per_px_m @ per_px_m.T,
+        blur_px=(5.0, 5.0),
+        noise_m=noise_m,
+        sights=straight_sight(per_px_m)[None],
     )
     truth = np.array([15.2, 14.7, 5e-3, 6e-3, 0.5])
-    image = pictures(blank, truth[None])[0]
-    near = grown(image > 0.5 * truth[3], 7)
-    fits: dict[str, list[HoleFit]] = {}
+    image_m = pictures(blank, truth[None])[0]
+    near = grown(image_m > 0.5 * truth[3], 7)
     everywhere = np.ones(shape, bool)
-    for name, given, kept in (
-        ("all", correlation, everywhere),
-        ("thinned", correlation, near),
-        ("plain", None, near),
+    radii_m: dict[str, np.ndarray] = {}
+    errors_m: dict[str, np.ndarray] = {}
+    for name, by_lag, kept, draws in (
+        ("all", correlation, everywhere, 10),
+        ("thinned", correlation, near, 100),
+        ("plain", None, near, 100),
     ):
-        fits[name] = []
-        for seed in range(100):
+        fits = []
+        for seed in range(draws):
             rough = 0.3 * np.random.default_rng(100 + seed).standard_normal(shape)
-            seen = image + noise_m * (blurred(seed, shape) + rough)
-            patch = whitened(replace(blank, residual_m=seen), given, 0.0, kept)
-            fits[name].append(fit_hole(patch, 15.0, 15.0, 4e-3, 5e-3, 0.0))
-    scatter = {name: np.std([each.radius_m for each in some]) for name, some in fits.items()}
-    assert scatter["thinned"] < 0.7 * scatter["plain"]
-    errors = {
-        name: np.sqrt([each.covariance[2, 2] for each in some]) for name, some in fits.items()
-    }
-    assert np.median(errors["thinned"] / errors["all"]) < 1.04
-    assert 0.6 < scatter["thinned"] / np.median(errors["thinned"]) < 1.3
-    assert abs(np.mean([each.radius_m for each in fits["thinned"]]) - 5e-3) < 1e-4
+            seen_m = image_m + noise_m * (blurred(seed, shape) + rough)
+            patch = whitened(replace(blank, residual_m=seen_m), by_lag, 0.0, kept)
+            fits.append(fit_hole(patch, 15.0, 15.0, 4e-3, 5e-3, 0.0))
+        radii_m[name] = np.array([fit.radius_m for fit in fits])
+        errors_m[name] = np.sqrt([fit.covariance[2, 2] for fit in fits])
+    thinned_m = radii_m["thinned"]
+    assert thinned_m.std() < 0.7 * radii_m["plain"].std()
+    assert np.median(errors_m["thinned"][:10] / errors_m["all"]) < 1.04
+    assert 0.6 < thinned_m.std() / np.median(errors_m["thinned"]) < 1.3
+    assert thinned_m.mean() == pytest.approx(5e-3, abs=1e-4)
 
 
 def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
     deep = hole(40, 45, 3.0, 0.03) + 3e-4 * blurred(5)
-    assert len(found(cloud_of(deep), 5.0)) == 1
+    assert len(detections_in(cloud_of(deep), 5.0)) == 1
     touching = hole(40, 45, 3.0, 0.03) + hole(50, 45, 3.0, 0.03) + 3e-4 * blurred(6)
-    assert len(found(cloud_of(touching), 5.0)) == 2
+    assert len(detections_in(cloud_of(touching), 5.0)) == 2
 
 
 def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
     """A slot 2 pixels wide and 20 long under white noise, at an angle that no template has: found
     at a score of 5.5 at a depth at which the best disc or dent would have less."""
     finer = 4
-    places = (np.indices((SHAPE[0] * finer, SHAPE[1] * finer)) + 0.5) / finer - 0.5
-    along = (places[1] - 60.4 + 1j * (places[0] - 45.2)) * np.exp(-1j * np.radians(50.0))
+    height, width = SHAPE
+    v, u = (np.indices((height * finer, width * finer)) + 0.5) / finer - 0.5
+    along = (u - 60.4 + 1j * (v - 45.2)) * np.exp(-1j * np.radians(50.0))
     inside = (np.abs(along.real) < 10.0) & (np.abs(along.imag) < 1.0)
-    slot = inside.reshape(SHAPE[0], finer, SHAPE[1], finer).mean(axis=(1, 3))
+    slot = inside.reshape(height, finer, width, finer).mean(axis=(1, 3))
     grid = grid_of(SHAPE)
-    views = [transformed(slot, grid)]
-    views.append(halved(views[0]))
+    fine = transformed(slot, grid)
+    coarse = halved(fine)
     scores: dict[bool, list[float]] = {False: [], True: []}
     energies = [worth.energy for worth in worths(np.ones((GRID, GRID // 2 + 1), np.float32), 1)]
     for pair, numbers in spectra(grid, 1):
-        fields = responses(views[bank(1)[numbers[0]].coarse], pair)
+        fields = responses(coarse if bank(1)[numbers[0]].coarse else fine, pair)
         for channel, number in enumerate(numbers):
-            scores[bank(1)[number].slot].append(
-                float(fields[..., channel].max()) / energies[number] ** 0.5
-            )
-    discs = max(scores[False])
-    slots = max(scores[True])
-    depth = 7.5 / slots
-    assert depth * discs < 5.5
+            score = float(fields[..., channel].max()) / energies[number] ** 0.5
+            scores[bank(1)[number].slot].append(score)
+    depth = 7.5 / max(scores[True])
+    assert depth * max(scores[False]) < 5.5
     for seed in (20, 21, 22):
         noise = np.random.default_rng(seed).standard_normal(SHAPE)
-        places_found = found(cloud_of(3e-4 * (noise + depth * slot)), 5.5)
-        assert len(places_found) == 1
-        assert (
-            np.hypot(*(np.array(np.unravel_index(places_found[0].pixels[0], SHAPE)) - (45.2, 60.4)))
-            < 8.0
-        )
+        (detection,) = detections_in(cloud_of(3e-4 * (noise + depth * slot)), 5.5)
+        row, column = np.unravel_index(detection.pixels[0], SHAPE)
+        assert np.hypot(row - 45.2, column - 60.4) < 8.0
 
 
 def test_a_hole_that_the_model_does_not_fit_is_measured_by_its_contour() -> None:
@@ -212,10 +164,10 @@ def test_a_hole_that_the_model_does_not_fit_is_measured_by_its_contour() -> None
     for image in (sharp, hole(60, 45, 4.0, 0.01)):
         cloud = cloud_of(image + 1e-4 * blurred(17))
         evidence = DETECTOR.analyse(cloud)
-        notes.append(
-            DETECTOR.measure(cloud, evidence, DETECTOR.find(cloud, evidence, 6.0)[0]).model_note
-        )
-    assert "does not fit" in notes[0] and not notes[1]
+        detection = DETECTOR.find(cloud, evidence, 6.0)[0]
+        notes.append(DETECTOR.measure(cloud, evidence, detection).model_note)
+    assert "does not fit" in notes[0]
+    assert not notes[1]
 
 
 def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
@@ -228,38 +180,48 @@ def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
     with_depth = without(faint, gone)
     alone = without(noise, gone)
     shown = np.flatnonzero(hole(60, 44.5, 2.5, 1.0) > 0)
+
+    def is_found(cloud: Cloud, threshold: float) -> bool:
+        detections = detections_in(cloud, threshold)
+        return any(np.isin(detection.pixels, shown).any() for detection in detections)
+
     without_channel = LocalDetector.analyse(DETECTOR, with_depth).score.ravel()[shown]
     assert np.nanmax(without_channel) < 4.2
-    assert any(np.isin(each.pixels, shown).any() for each in found(with_depth, 4.5))
-    assert not any(np.isin(each.pixels, shown).any() for each in found(alone, 4.2))
+    assert is_found(with_depth, 4.5)
+    assert not is_found(alone, 4.2)
     scattered = without(noise, np.random.default_rng(16).random(SHAPE) < 0.01)
     depth_only = np.nanmax(LocalDetector.analyse(DETECTOR, scattered).score)
-    assert abs(DETECTOR.quiet_threshold(scattered, DETECTOR.analyse(scattered)) - depth_only) < 0.3
+    highest = DETECTOR.quiet_threshold(scattered, DETECTOR.analyse(scattered))
+    assert highest == pytest.approx(depth_only, abs=0.3)
 
 
 def test_light_along_the_rim_is_no_finding() -> None:
     """The outer three rows stand three deviations before the surface, as where a floor's light
     comes back."""
     rim = np.where(np.arange(SHAPE[0])[:, None] >= SHAPE[0] - 3, -9e-4, 0.0) + 3e-4 * blurred(7)
-    assert not found(cloud_of(rim), 5.5)
+    assert not detections_in(cloud_of(rim), 5.5)
 
 
 def test_the_learned_covariance_is_that_of_the_noise_and_is_used() -> None:
     """On a cloud too small to measure its own."""
     clouds = [cloud_of(3e-4 * blurred(seed)) for seed in range(8, 12)]
     learned = dict(DETECTOR.calibrate(clouds))
-    lags = (
-        learned["covariance"][LONGEST_LAG_PX, LONGEST_LAG_PX : LONGEST_LAG_PX + 6]
-        / learned["covariance"].max()
+    covariance = learned["covariance"]
+    middle_row = covariance[LONGEST_LAG_PX, LONGEST_LAG_PX:]
+    np.testing.assert_allclose(
+        middle_row[1:4] / covariance.max(),
+        [0.8, 0.6, 0.4],
+        atol=0.08,
     )
-    np.testing.assert_allclose(lags[1:4], [0.8, 0.6, 0.4], atol=0.08)
+    # in squared deviations
+    assert covariance.max() == pytest.approx(1.0, abs=0.1)
     cloud = cloud_of(3e-4 * blurred(13) + hole(60, 45, 2.0, 0.002))
     taught = DETECTOR.calibrated(learned)
     assert (taught.name, taught.version) == (DETECTOR.name, DETECTOR.version)
-    own = DETECTOR.analyse(cloud).score
-    by_others = taught.analyse(cloud).score
-    assert not np.array_equal(own, by_others)
-    assert abs(np.log(np.nanmax(by_others) / np.nanmax(own))) < 0.2
+    by_itself = DETECTOR.analyse(cloud).score
+    by_learning = taught.analyse(cloud).score
+    assert not np.array_equal(by_itself, by_learning)
+    assert abs(np.log(np.nanmax(by_learning) / np.nanmax(by_itself))) < 0.2
     assert not DETECTOR.calibrate([])
 
 
@@ -267,11 +229,130 @@ def test_heavy_tails_raise_single_pixels_no_farther_than_they_reach() -> None:
     """One pixel in 300 has five times the noise: the narrow templates' scores are scaled by their
     own tail, so that the highest (5.4 without) is little above that of Gaussian noise (4.7), and a
     hole of many pixels is found beside."""
-    rng = np.random.default_rng(14)
-    sizes = np.where(rng.random(SHAPE) < 1 / 300, 5.0, 1.0)
-    noise = 3e-4 * sizes * rng.standard_normal(SHAPE)
-    cloud = cloud_of(noise)
+    random = np.random.default_rng(14)
+    sizes = np.where(random.random(SHAPE) < 1 / 300, 5.0, 1.0)
+    noise_m = 3e-4 * sizes * random.standard_normal(SHAPE)
+    cloud = cloud_of(noise_m)
     quiet = DETECTOR.quiet_threshold(cloud, DETECTOR.analyse(cloud))
     assert quiet < 5.0
-    places = found(cloud_of(noise + hole(60, 45, 4.0, 0.0015)), quiet + 1.0)
-    assert len(places) == 1
+    assert len(detections_in(cloud_of(noise_m + hole(60, 45, 4.0, 0.0015)), quiet + 1.0)) == 1
+
+
+# ---- the parts of a score
+
+
+def test_a_hole_in_correlated_noise_leaves_no_score_of_the_other_sign_beside_it() -> None:
+    """Whitening makes rings of the other sign round a hole, of 4 deviations round this one: they
+    are lobes, up to half of its score. A bump as strong as a hole is none."""
+    evidence = DETECTOR.analyse(cloud_of(hole(60, 45, 1.5, 0.006) + 3e-4 * blurred(5)))
+    rows, columns = np.indices(SHAPE)
+    around = np.hypot(columns - 60, rows - 45) < 9.0
+    score = np.where(evidence.behind, evidence.score, -evidence.score)[around]
+    assert score.max() > 8.0
+    assert score.min() > -1.0
+    hole_and_bump = hole(60, 45, 3.0, 0.006) - hole(68, 45, 3.0, 0.006) + 3e-4 * blurred(5)
+    assert len(detections_in(cloud_of(hole_and_bump), 6.0)) == 2
+
+
+@pytest.mark.parametrize(
+    ("score", "is_lobe"),
+    [
+        (-4.9, True),
+        (-5.1, False),
+        (1.0, False),
+    ],
+)
+def test_a_side_lobe_is_weaker_than_half_of_a_score_of_the_other_sign(score, is_lobe) -> None:
+    for sign in (1.0, -1.0):
+        for offset, is_near in ((RIM_PX, True), (RIM_PX + 1, False)):
+            signed = np.zeros((30, 30))
+            signed[15, 10] = sign * 10.0
+            signed[15, 10 + offset] = sign * score
+            assert _side_lobes(signed)[15, 10 + offset] == (is_lobe and is_near)
+            assert not _side_lobes(signed)[15, 10]
+
+
+def test_a_pixel_is_clipped_to_its_neighbours_but_not_below_the_limit() -> None:
+    values = np.zeros((9, 9), np.float32)
+    values[4, 4] = 40.0
+    values[1, 1:3] = (-30.0, -20.0)
+    tamed = _tamed(values)
+    assert tamed[4, 4] == CLIP_SIGMAS
+    assert tamed[1, 1:3].tolist() == [-20.0, -20.0]
+    weak = np.full((9, 9), 4.9, np.float32)
+    np.testing.assert_array_equal(_tamed(weak), weak)
+
+
+def test_residuals_are_in_units_of_the_noise_and_weights() -> None:
+    """White noise of 0.3 mm, weights of 4 on one half: there a residual counts twice."""
+    noise_m = 3e-4 * np.random.default_rng(1).standard_normal(SHAPE)
+    weights = np.ones(SHAPE, np.float32)
+    result = _in_deviations(noise_m, weights, (0.0, 0.0))
+    assert result.values[10:-10, 10:-10].std() == pytest.approx(1.0, abs=0.05)
+    assert np.median(result.unit_m) == pytest.approx(3e-4, rel=0.06)
+    # the wave is wider than a filter's window: the unit stays that of the noise
+    wave_m = 2e-3 * np.sin(np.arange(SHAPE[1]) / 12.0)
+    waved = _in_deviations(noise_m + wave_m, weights, (0.0, 0.0))
+    ratio = np.median(waved.unit_m) / np.median(result.unit_m)
+    size = np.median(np.abs(noise_m + wave_m)) / np.median(np.abs(noise_m))
+    assert ratio == pytest.approx(size, rel=0.15)
+    # rounding sets the least unit
+    rounded = _in_deviations(noise_m, weights, (4e-6, 5e-6))
+    np.testing.assert_allclose(rounded.unit_m, 3e-3)
+    weights[::3, ::3] = 4.0
+    weighed = _in_deviations(noise_m, weights, (0.0, 0.0))
+    gain = weighed.values[20:60:3, 21:90:3] / result.values[20:60:3, 21:90:3]
+    assert np.median(weighed.values[21:60:3, 21:90:3] / result.values[21:60:3, 21:90:3]) > 1.7
+    assert np.median(gain) < 1.0
+
+
+def test_what_the_rim_shares_is_taken_out_at_each_distance() -> None:
+    noise = np.random.default_rng(2).standard_normal((100, 140)).astype(np.float32)
+    depth_px = np.full(noise.shape, 20.0, np.float32)
+    for distance in range(1, 2 * RIM_PX + 1):
+        depth_px[:, distance - 1] = distance
+    shared = np.zeros_like(noise)
+    shared[:, 0] = 1.5
+    shared[:, 2] = -1.0
+    result = _without_rim(noise + shared, depth_px)
+    remainder = result.mean(axis=0)
+    # 100 pixels, of which some 65 count at each
+    assert np.abs(remainder[:RIM_PX]).max() < 0.35
+    np.testing.assert_array_equal(result[:, RIM_PX:], noise[:, RIM_PX:])
+
+
+def test_wide_templates_fill_their_discs() -> None:
+    signed = np.zeros((40, 50))
+    signed[20, 25] = -8.0
+    signed[20, 22] = -7.0
+    radius_px = np.full(signed.shape, WIDE_PX)
+    _fill_discs(signed, radius_px)
+    inside = np.hypot(*(np.indices(signed.shape) - np.array([20, 25])[:, None, None])) <= WIDE_PX
+    least = -8.0 * 0.75 * 1.01
+    assert (signed[inside] <= least).all()
+    assert signed[20, 25] == -8.0
+    assert signed[20, 22] == -7.0
+    assert not signed[~inside].any()
+    # a narrow one does not
+    narrow = np.zeros((40, 50))
+    narrow[20, 25] = 8.0
+    _fill_discs(narrow, radius_px - 0.1)
+    assert np.count_nonzero(narrow) == 1
+
+
+def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
+    values = np.zeros((40, 50), np.float32)
+    inside = np.hypot(*(np.indices(values.shape) - np.array([20, 25])[:, None, None])) < 4.5
+    values[inside] = 9.0
+    values[20, 25] = 0.5
+    is_known = np.ones(values.shape, bool)
+    peaks = np.array([[20, 25]])
+    core, heights, peak_of = _cores(peaks, np.array([4.5]), values, is_known)
+    assert core[inside].all()
+    assert not core[~grown(inside, 1)].any()
+    assert heights[inside].min() > 0.3
+    assert heights.max() == 1.0
+    assert (peak_of[core] == 0).all()
+    # loud pixels that fill less than half of the template's disc are not its finding
+    core, _, _ = _cores(peaks, np.array([9.0]), values, is_known)
+    assert not core.any()

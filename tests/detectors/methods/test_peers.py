@@ -32,7 +32,11 @@ def part(cloud: Cloud, rows: slice, columns: slice) -> Cloud:
         name: getattr(cloud, name)[rows, columns]
         for name in ("points_m", "reason", "count", "variance_m2")
     }
-    return replace(cloud, region=Region(rows.start, rows.stop, columns.start, columns.stop), **cut)
+    return replace(
+        cloud,
+        region=Region(rows.start, rows.stop, columns.start, columns.stop),
+        **cut,
+    )
 
 
 def undamaged(seed: int) -> Cloud:
@@ -47,9 +51,9 @@ def learned() -> FpfhMemoryDetector:
     blank = FpfhMemoryDetector(
         FpfhMemoryConfig.from_data({**WHOLE, "feature_neighbours": 40, "memory": 60})
     )
-    found = blank.calibrated(blank.calibrate([undamaged(seed) for seed in (11, 12, 13)]))
-    assert isinstance(found, FpfhMemoryDetector)
-    return found
+    detections = blank.calibrated(blank.calibrate([undamaged(seed) for seed in (11, 12, 13)]))
+    assert isinstance(detections, FpfhMemoryDetector)
+    return detections
 
 
 def made(name: str, **settings: Any) -> Detector:
@@ -57,7 +61,12 @@ def made(name: str, **settings: Any) -> Detector:
 
 
 @pytest.mark.parametrize(
-    "name", ["plane_ransac", "m3c2", pytest.param("fpfh_memory", marks=pytest.mark.slow)]
+    "name",
+    [
+        "plane_ransac",
+        "m3c2",
+        pytest.param("fpfh_memory", marks=pytest.mark.slow),
+    ],
 )
 def test_they_keep_the_contract(name: str) -> None:
     """On a part of a plane with a hole of 20 mm, some of whose pixels have no range."""
@@ -76,9 +85,10 @@ def test_they_find_dents_and_nothing_else(name: str) -> None:
     apart_m = np.linalg.norm(quiet.points_m[..., None, :2] - centres, axis=-1)
     dents = 6e-3 * np.exp(-0.5 * (apart_m / 5e-3) ** 2).sum(axis=-1)
     cloud = replace(quiet, points_m=quiet.points_m + dents[..., None] * [0.0, 0.0, 1.0])
-    found = detector.find(cloud, detector.analyse(cloud), threshold)
-    places = np.array(sorted(one.centre_m[:2].tolist() for one in found))
-    assert places.shape == (2, 2) and np.abs(places - centres).max() < 3e-3
+    detections = detector.find(cloud, detector.analyse(cloud), threshold)
+    found_centres = np.array(sorted(detection.centre_m[:2].tolist() for detection in detections))
+    assert found_centres.shape == (2, 2)
+    assert np.abs(found_centres - centres).max() < 3e-3
 
 
 def test_a_rim_and_what_lies_deep_behind_it_are_one_finding_of_m3c2_and_none_of_fpfh() -> None:
@@ -103,9 +113,13 @@ def test_a_plane_is_that_of_its_supporting_points() -> None:
     y = plane(1).points_m[..., 1]
     z = evidence.surface_z_m
     slope_x, slope_y, level = np.linalg.lstsq(
-        np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1), z.ravel(), rcond=None
+        np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1),
+        z.ravel(),
+        rcond=None,
     )[0]
-    assert abs(slope_x - 0.2) < 1e-3 and abs(slope_y) < 1e-3 and abs(level - 0.7) < 1e-4
+    assert abs(slope_x - 0.2) < 1e-3
+    assert abs(slope_y) < 1e-3
+    assert abs(level - 0.7) < 1e-4
     # some 8 % of the pixels are damaged: the deviation of the rest, a little more
     assert 3.0e-4 < evidence.scale_m < 3.6e-4
 
@@ -130,12 +144,14 @@ def test_m3c2_is_the_formula_of_its_paper() -> None:
     surface = evidence.surface_z_m.ravel()
     for row, column in ((45, 60), (20, 31), (37, 20), (59, 81)):
         place = row * 120 + column
-        near = np.hypot(*(points[:, :2] - points[place, :2]).T) < 4e-3
-        behind_m = points[near, 2] - surface[near]
-        error_m = behind_m.std(ddof=1) / np.sqrt(near.sum()) + 2e-4
+        vicinity = np.hypot(*(points[:, :2] - points[place, :2]).T) < 4e-3
+        behind_m = points[vicinity, 2] - surface[vicinity]
+        error_m = behind_m.std(ddof=1) / np.sqrt(vicinity.sum()) + 2e-4
         # the plane's normal is the optical axis to a thousandth
         assert evidence.score.ravel()[place] == pytest.approx(
-            abs(behind_m.mean()) / error_m, rel=0.03, abs=0.02
+            abs(behind_m.mean()) / error_m,
+            rel=0.03,
+            abs=0.02,
         )
 
 
@@ -172,10 +188,12 @@ def test_a_reference_scan_of_any_shape(tmp_path: Path) -> None:
         int(np.nanargmax(np.where(np.abs(np.arange(60) - 30) > 5, evidence.score, np.nan))),
         (40, 60),
     )
-    assert 11 <= best[0] <= 20 and 9 <= best[1] <= 18 and evidence.warnings == ()
+    assert 11 <= best[0] <= 20
+    assert 9 <= best[1] <= 18
+    assert evidence.warnings == ()
     of_map = detector.analyse(replace(cloud, projection="parallel", lens=None))
-    for one in (evidence, of_map):
-        assert np.nanmedian(one.residual_m[13:19, 11:17]) == pytest.approx(2e-3, abs=2e-4)
+    for detection in (evidence, of_map):
+        assert np.nanmedian(detection.residual_m[13:19, 11:17]) == pytest.approx(2e-3, abs=2e-4)
     moved = detector.analyse(replace(cloud, points_m=again + np.array([0.0, 0.0, 3e-3])))
     assert "3 mm off its reference scan" in moved.warnings[0]
     np.save(path, stepped[:, :45])
@@ -189,16 +207,16 @@ def test_a_reference_scan_of_any_shape(tmp_path: Path) -> None:
 
 
 def test_the_library_neither_prints_nor_writes_nor_sets_threads(
-    monkeypatch, tmp_path, capfd
+    monkeypatch,
+    tmp_path,
+    capfd,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     load_detector("m3c2", WHOLE).analyse(undamaged(16))
-    assert (
-        capfd.readouterr() == ("", "")
-        and not list(tmp_path.iterdir())
-        and "OMP_NUM_THREADS" not in os.environ
-    )
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+    assert "OMP_NUM_THREADS" not in os.environ
 
 
 def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch, capsys) -> None:
@@ -208,7 +226,8 @@ def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch
     assert caught.value.fix == "pip install 'tofpod[peers]'"
     assert ls(["detectors"]) == 0
     (row,) = [line for line in capsys.readouterr().out.splitlines() if "m3c2" in line]
-    assert "needs the package py4dgeo" in row and "tofpod[peers]" in row
+    assert "needs the package py4dgeo" in row
+    assert "tofpod[peers]" in row
 
 
 # ---------------------------------------------------------------- fpfh_memory
@@ -228,9 +247,11 @@ def test_without_a_memory_nothing_is_judged() -> None:
 def test_what_was_learned_is_plain_arrays_that_give_the_same_scores() -> None:
     detector = FpfhMemoryDetector(learned().settings)
     arrays = detector.calibrate([undamaged(seed) for seed in (11, 12, 13)])
-    assert arrays["memory"].shape == (60, 33) and arrays["unit"].shape == ()
+    assert arrays["memory"].shape == (60, 33)
+    assert arrays["unit"].shape == ()
     scores = [
-        one.analyse(undamaged(17)).score for one in (learned(), detector.calibrated(dict(arrays)))
+        detection.analyse(undamaged(17)).score
+        for detection in (learned(), detector.calibrated(dict(arrays)))
     ]
     np.testing.assert_array_equal(*scores)
     # the memory has not seen this plane either
@@ -242,10 +263,14 @@ def test_the_nearest_and_the_farthest() -> None:
     features = rng.standard_normal((300, 5)) + 100.0
     taken = coreset(features, 20)
     np.testing.assert_allclose(
-        nearest(features, taken), cdist(features, taken).min(axis=1), atol=1e-5
+        nearest(features, taken),
+        cdist(features, taken).min(axis=1),
+        atol=1e-5,
     )
     # each is as far from those before it as any feature is
     for count in range(1, 20):
-        apart = cdist(features, taken[:count]).min(axis=1)
-        assert cdist(taken[count : count + 1], taken[:count]).min() == pytest.approx(apart.max())
+        from_dents_m = cdist(features, taken[:count]).min(axis=1)
+        assert cdist(taken[count : count + 1], taken[:count]).min() == pytest.approx(
+            from_dents_m.max()
+        )
     assert len(coreset(np.repeat(features[:4], 3, axis=0), 20)) == 4

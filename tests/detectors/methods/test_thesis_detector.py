@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors import detector_names, detector_type, load_detector
-from detectors.averages.noise import rounding_floor
 from detectors.interface import Detector, Evidence
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
+from detectors.pixels.noise import rounding_floor
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region
 
@@ -46,7 +46,7 @@ def board(
         flat,
         flat + n_frames,
         variance,
-        Region(0, *SHAPE[:1], 0, SHAPE[1]),
+        Region(0, SHAPE[0], 0, SHAPE[1]),
         z_step_m,
         n_frames,
         lens=LENS,
@@ -60,13 +60,13 @@ def test_holes_are_found_strongest_first_and_nothing_else() -> None:
     detector: Detector = load_detector("thesis", {})
     cloud = board(HOLES)
     evidence = detector.analyse(cloud)
-    found = detector.find(cloud, evidence, 6.0)
-    assert len(found) == 3
-    assert [d.score for d in found] == sorted((d.score for d in found), reverse=True)
+    detections = detector.find(cloud, evidence, 6.0)
+    assert len(detections) == 3
+    assert [d.score for d in detections] == sorted((d.score for d in detections), reverse=True)
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     expected = {tuple(np.flatnonzero((u - a) ** 2 + (v - b) ** 2 < r**2)) for a, b, r in HOLES}
-    assert {tuple(d.pixels) for d in found} == expected
-    measured = [detector.measure(cloud, evidence, d) for d in found]
+    assert {tuple(d.pixels) for d in detections} == expected
+    measured = [detector.measure(cloud, evidence, d) for d in detections]
     assert {(round(m.u_px), round(m.v_px)) for m in measured} == {(30, 40), (80, 60), (120, 90)}
 
 
@@ -77,7 +77,9 @@ def test_the_score_is_the_residual_in_robust_standard_deviations() -> None:
     assert evidence.scale_m == pytest.approx(np.median(np.abs(evidence.residual_m)) / 0.6745)
     np.testing.assert_allclose(evidence.score, np.abs(evidence.residual_m) / evidence.scale_m)
     np.testing.assert_allclose(
-        evidence.surface_z_m + evidence.residual_m, cloud.points_m[..., 2], atol=1e-12
+        evidence.surface_z_m + evidence.residual_m,
+        cloud.points_m[..., 2],
+        atol=1e-12,
     )
     assert evidence.residual_m[40, 30] == pytest.approx(0.0127, abs=1.5e-3)
 
@@ -89,7 +91,8 @@ def test_pixels_outside_the_crop_or_without_range_have_no_score() -> None:
         "crop": {"kind": "polygon", "vertices_px": [[-1, -1], [99.5, -1], [99.5, 200], [-1, 200]]}
     }
     evidence = load_detector("thesis", settings).analyse(cloud)
-    assert np.isnan(evidence.score[5, 5]) and np.isnan(evidence.score[:, 100:]).all()
+    assert np.isnan(evidence.score[5, 5])
+    assert np.isnan(evidence.score[:, 100:]).all()
     assert np.isfinite(evidence.score[:, :100]).sum() == 100 * SHAPE[0] - 1
 
 
@@ -116,7 +119,9 @@ def test_the_script_is_least_squares_without_cross_terms_and_the_std_of_raw_z() 
     distance_mm=st.sampled_from([4.0, 10.0]),
 )
 def test_the_quiet_threshold_is_the_lowest_that_finds_nothing(
-    seed: int, min_points: int, distance_mm: float
+    seed: int,
+    min_points: int,
+    distance_mm: float,
 ) -> None:
     config = {
         "min_points": min_points,
@@ -128,8 +133,9 @@ def test_the_quiet_threshold_is_the_lowest_that_finds_nothing(
     evidence = detector.analyse(cloud)
     quiet = detector.quiet_threshold(cloud, evidence)
     assert detector.find(cloud, evidence, quiet) == ()
-    found = detector.find(cloud, evidence, np.nextafter(quiet, 0.0))
-    assert len(found) >= 1 and found[0].score == quiet
+    detections = detector.find(cloud, evidence, np.nextafter(quiet, 0.0))
+    assert len(detections) >= 1
+    assert detections[0].score == quiet
     if min_points == 1:
         assert quiet == np.nanmax(evidence.score)
 
@@ -138,13 +144,18 @@ def test_a_detections_score_is_the_threshold_at_which_it_vanishes() -> None:
     detector = load_detector("thesis", {"min_points": 3})
     cloud = board(HOLES)
     evidence = detector.analyse(cloud)
-    for found in detector.find(cloud, evidence, 6.0):
+    for detections in detector.find(cloud, evidence, 6.0):
         kept = [
-            set(d.pixels) for d in detector.find(cloud, evidence, np.nextafter(found.score, 0.0))
+            set(d.pixels)
+            for d in detector.find(
+                cloud,
+                evidence,
+                np.nextafter(detections.score, 0.0),
+            )
         ]
-        gone = [set(d.pixels) for d in detector.find(cloud, evidence, found.score)]
-        assert any(pixels & set(found.pixels) for pixels in kept)
-        assert not any(pixels & set(found.pixels) for pixels in gone)
+        gone = [set(d.pixels) for d in detector.find(cloud, evidence, detections.score)]
+        assert any(pixels & set(detections.pixels) for pixels in kept)
+        assert not any(pixels & set(detections.pixels) for pixels in gone)
 
 
 def test_nothing_can_be_found_among_too_few_points() -> None:
@@ -153,10 +164,8 @@ def test_nothing_can_be_found_among_too_few_points() -> None:
     nothing[3, 3:6] = 9.0
     cloud = board()
     evidence = Evidence(nothing, nothing, nothing, 1.0)
-    assert (
-        detector.quiet_threshold(cloud, evidence) == 0.0
-        and detector.find(cloud, evidence, 0.0) == ()
-    )
+    assert detector.quiet_threshold(cloud, evidence) == 0.0
+    assert detector.find(cloud, evidence, 0.0) == ()
 
 
 def test_a_frontal_noise_free_rounded_board_keeps_the_rounding_as_scale() -> None:
@@ -170,11 +179,20 @@ def test_a_frontal_noise_free_rounded_board_keeps_the_rounding_as_scale() -> Non
 
 def test_without_rounding_a_perfect_board_still_has_a_scale() -> None:
     evidence = load_detector("thesis", {}).analyse(board(noise_m=0.0, tilt=0.0))
-    assert 1e-9 < evidence.scale_m < 1e-6 and np.isfinite(evidence.score).all()
+    assert 1e-9 < evidence.scale_m < 1e-6
+    assert np.isfinite(evidence.score).all()
 
 
 @pytest.mark.parametrize(
-    ("noise_mm", "frames"), [(0.1, 20), (0.2, 50), (0.3, 50), (0.6, 2), (0.6, 50), (1.0, 10)]
+    ("noise_mm", "frames"),
+    [
+        (0.1, 20),
+        (0.2, 50),
+        (0.3, 50),
+        (0.6, 2),
+        (0.6, 50),
+        (1.0, 10),
+    ],
 )
 def test_the_floor_is_the_rounding_error_of_simulated_averages(
     noise_mm: float, frames: int
@@ -190,7 +208,15 @@ def test_the_floor_is_the_rounding_error_of_simulated_averages(
     variance = rounded.var(axis=0, ddof=1)[None] * 1e-6
     points = np.stack([0 * z, 0 * z, z], axis=-1)
     flat = np.zeros(z.shape, dtype=np.uint8)
-    cloud = Cloud(points, flat, flat, variance, Region(0, 1, 0, z.size), 1e-3, frames)
+    cloud = Cloud(
+        points,
+        flat,
+        flat,
+        variance,
+        Region(0, 1, 0, z.size),
+        1e-3,
+        frames,
+    )
     floor_mm = rounding_floor(cloud, cloud.valid) * 1e3
     # never above the whole rounding, never below what is there; tight once the noise dithers
     assert error.std() * 0.95 < floor_mm <= 1 / np.sqrt(12) + 1e-12
@@ -208,17 +234,21 @@ def test_an_unknown_name_and_wrong_settings_are_clear_mistakes() -> None:
         load_detector("thesys", {})
     with pytest.raises(UserError) as caught:
         load_detector("thesis", {"surface": {"degree": 99}, "scael": "mad"})
-    assert "surface.degree" in str(caught.value) and "scael" in str(caught.value)
-    assert "thesis" in detector_names() and detector_type("thesis") is ThesisDetector
+    assert "surface.degree" in str(caught.value)
+    assert "scael" in str(caught.value)
+    assert "thesis" in detector_names()
+    assert detector_type("thesis") is ThesisDetector
 
 
 def test_the_threshold_of_the_cloud_itself_is_its_largest_residual_towards_the_camera() -> None:
     detector = load_detector("thesis", {"scale": "highest_before"})
-    assert isinstance(detector, ThesisDetector) and detector.default_threshold == 1.0
+    assert isinstance(detector, ThesisDetector)
+    assert detector.default_threshold == 1.0
     cloud = board(HOLES, seed=3)
     evidence = detector.analyse(cloud)
     assert evidence.scale_m == pytest.approx(-np.nanmin(evidence.residual_m))
     # Gaussian noise: the highest of 19,000 is about four deviations, and holes are 40 deep
     assert 3.5 * 3e-4 < evidence.scale_m < 5.5 * 3e-4
-    found = detector.find(cloud, evidence, 1.0)
-    assert {len(one.pixels) > 10 for one in found[:3]} == {True} and len(found) < 10
+    detections = detector.find(cloud, evidence, 1.0)
+    assert {len(detection.pixels) > 10 for detection in detections[:3]} == {True}
+    assert len(detections) < 10

@@ -11,6 +11,7 @@ from harness.evaluation.summary import (
     false_calls,
     found_holes,
     found_rule,
+    hole_list,
     summarise_holes,
 )
 from tests.support.synthetic_tables import World, joined, tables
@@ -39,8 +40,8 @@ def test_a_hole_by_hand() -> None:
 
 
 def test_rows_are_in_order() -> None:
-    both = joined(tables(frames=(1, 50), variant="far"), tables(frames=(1, 50)))
-    summary = summarise_holes(both.holes)
+    two_variants = joined(tables(frames=(1, 50), variant="far"), tables(frames=(1, 50)))
+    summary = summarise_holes(two_variants.holes)
     assert list(summary["variant"].unique()) == ["main", "far"]
     main = summary[(summary["variant"] == "main") & (summary["frames"] == 1)]
     assert list(main["hole"]) == [str(n) for n in range(1, 12)]
@@ -90,9 +91,60 @@ def test_a_repeat_of_rows_changes_counts_not_means() -> None:
 
 def test_too_few_trials_to_find_anything_are_told():
     for repeats, status in ((3, "undecided"), (4, "found")):
-        found = summarise_holes(
+        summary = summarise_holes(
             tables(World(repeats=repeats), frames=(50,)).holes.assign(detected=True)
         )
-        assert set(found["status"]) == {status}
+        assert set(summary["status"]) == {status}
     assert found_rule(4) == FOUND_RULE
     assert "3 repeats are too few for either" in found_rule(3)
+
+
+def test_fits_of_a_hole_are_compared_with_the_truth() -> None:
+    holes = tables(World(repeats=4), frames=(50,)).holes
+    holes = holes[holes["hole"] == "8"].copy()
+    true_mm = holes["true_diameter_mm"].iloc[0]
+    holes["detected"] = [True, True, True, False]
+    holes["model_diameter_mm"] = [true_mm + 0.58, true_mm - 0.60, true_mm + 0.59, np.nan]
+    holes["model_diameter_se_mm"] = [0.3, 0.3, 0.4, np.nan]
+    holes["model_depth_mm"] = [9.0, 10.0, 14.0, np.nan]
+    holes["model_depth_se_mm"] = [0.5, 0.7, 0.9, np.nan]
+    holes["seen_depth_mm"] = 12.0
+    holes["median_residual_mm"] = [1.0, 2.0, 3.0, 6.0]
+    holes["invalid_fraction"] = [0.0, 0.2, 0.0, 0.2]
+    row = summarise_holes(holes).iloc[0]
+    # 1.93, 2.0 and 1.475 standard errors: within 1.96 are two of three
+    assert row["model_diameter_covered"] == pytest.approx(2 / 3)
+    assert row["model_diameter_se_mean_mm"] == pytest.approx(1.0 / 3)
+    assert row["model_bias_mm"] == pytest.approx(0.19)
+    assert row["model_depth_mean_mm"] == 11.0
+    assert row["model_depth_se_mean_mm"] == pytest.approx(0.7)
+    assert row["model_depth_std_mm"] == pytest.approx(np.sqrt(7.0))
+    assert row["model_depth_bias_mm"] == -1.0
+    assert (row["median_residual_mm"], row["invalid_fraction"]) == (3.0, 0.1)
+
+
+def test_axes_are_kept_beside_the_holes() -> None:
+    holes = tables(World(repeats=4), frames=(50,)).holes.assign(distance=0.7)
+    assert set(summarise_holes(holes, ["distance"])["distance"]) == {0.7}
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (["4", "5", "6", "9"], "4–6, 9"),
+        (["11", "2", "1", "rim"], "1–2, 11, rim"),
+        ([], "none"),
+        (["b", "a"], "b, a"),
+        (["7"], "7"),
+    ],
+)
+def test_names_of_holes_as_runs_of_numbers(names: list[str], text: str) -> None:
+    assert hole_list(names) == text
+
+
+def test_holes_with_names_follow_those_with_numbers() -> None:
+    holes = tables(World(repeats=4), frames=(50,)).holes
+    renamed = holes.assign(hole=holes["hole"].replace({"3": "b", "1": "a"}))
+    order = ["2", *map(str, range(4, 12)), "a", "b"]
+    assert list(summarise_holes(renamed)["hole"]) == order
+    assert summarise_holes(pd.DataFrame()).empty

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 from harness.evaluation.summary import summarise_holes
+from harness.programs.thesis.answers import THESIS
 from harness.programs.thesis.claims import score_claims
 from harness.report.page import answer_sentence, report_html, write_report
 from harness.report.sections import About, holes_grid
@@ -74,7 +75,7 @@ def page(results: Tables) -> str:
     return report_html(
         results,
         [example(50), example(1, noise_mm=0.9)],
-        About(provenance(), YAML, "Averaging", True),
+        About(provenance(), YAML, "Averaging", THESIS),
     )
 
 
@@ -132,7 +133,7 @@ def test_the_same_input_gives_the_same_bytes(page: str, results: Tables) -> None
     again = report_html(
         results,
         [example(50), example(1, noise_mm=0.9)],
-        About(provenance(), YAML, "Averaging", True),
+        About(provenance(), YAML, "Averaging", THESIS),
     )
     assert again == page
 
@@ -174,7 +175,7 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
     page = report_html(
         tables(world, frames=(1, 50)),
         [example(50, "cylinder")],
-        About(told, YAML, "Averaging", True),
+        About(told, YAML, "Averaging", THESIS),
     )
     assert page.count("✗ not borne out") >= 4
     assert "More than the thesis: 2–3" in page
@@ -186,7 +187,7 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
 @pytest.mark.usefixtures("unsaved")
 def test_little_data_still_make_a_page() -> None:
     few = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
-    page = report_html(few, [], About({}, "", "Averaging", True))
+    page = report_html(few, [], About({}, "", "Averaging", THESIS))
     assert (
         "With one frame the camera finds 0 of 11 holes, with 1–11 undecided. Of 8 claims, 8 are undecided"
         in page

@@ -14,9 +14,10 @@ import pytest
 
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
+from harness.programs.thesis.answers import THESIS
 from harness.report.page import Layout, set_ups_html, write_report
 from harness.report.sections import About, set_ups_grid
-from harness.trials.trial import pair_noise
+from harness.trials.clouds import pair_noise
 from harness.vocabulary.path_names import camera_title, in_words
 from tests.harness.evaluation.test_limits import switched
 from tests.support.synthetic_tables import (
@@ -60,7 +61,7 @@ def varied():
 
 @pytest.fixture(scope="module")
 def page(varied):
-    return set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", True))
+    return set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", THESIS))
 
 
 def headings(page: str) -> list[str]:
@@ -116,7 +117,9 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
 
 
 def test_the_same_input_gives_the_same_bytes(varied, page):
-    assert set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", True)) == page
+    assert (
+        set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", THESIS)) == page
+    )
 
 
 @pytest.mark.usefixtures("unsaved")

@@ -10,11 +10,10 @@ import subprocess
 import numpy as np
 import pytest
 
+from harness.records.examples import Circle3d, Scene3d
 from harness.report.view3d import (
     MOST_POINTS,
     NO_RESIDUAL,
-    Circle3d,
-    Scene3d,
     packed,
     view3d_html,
     write_view3d,

@@ -111,18 +111,18 @@ def test_censored_rows_against_brute_force() -> None:
     best = optimize.minimize(
         negative, [0.0, 1.2, 0.5], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}
     )
-    here = np.array([fit.b0, fit.b1, fit.tau])
+    fitted = np.array([fit.b0, fit.b1, fit.tau])
     assert fit.below.any() and fit.above.any()
-    assert here == pytest.approx(best.x, abs=1e-6)
-    assert fit.log_likelihood == pytest.approx(-negative(here), rel=1e-12)
+    assert fitted == pytest.approx(best.x, abs=1e-6)
+    assert fit.log_likelihood == pytest.approx(-negative(fitted), rel=1e-12)
     step = 1e-4 * np.eye(3)
     hessian = [
         [
             (
-                negative(here + a + b)
-                - negative(here + a - b)
-                - negative(here - a + b)
-                + negative(here - a - b)
+                negative(fitted + a + b)
+                - negative(fitted + a - b)
+                - negative(fitted - a + b)
+                + negative(fitted - a - b)
             )
             / 4e-8
             for b in step
@@ -157,6 +157,22 @@ def test_deviance_compares_signal_and_its_logarithm() -> None:
     assert (best.log_size, best.log_signal) == (True, True)
 
 
+def test_logarithms_are_tried_only_where_all_values_have_one() -> None:
+    size, signal = study(4)
+
+    def axes(sizes: np.ndarray, signals: np.ndarray, **limits: float) -> set[tuple[bool, bool]]:
+        fits = choose_axes(sizes, signals, decision=2.0, **limits)
+        return {(fit.log_size, fit.log_signal) for fit in fits}
+
+    assert len(axes(size, signal)) == 4
+    zero = np.where(np.arange(60) == 7, 0.0, size)
+    assert axes(zero, signal) == {(False, False), (False, True)}
+    negative = np.where(np.arange(60) == 7, -0.1, signal)
+    assert axes(size, negative) == {(False, False), (True, False)}
+    # a floor above 0 takes the place of signals below it
+    assert len(axes(size, negative, left=1.0)) == 4
+
+
 @settings(max_examples=20, deadline=None)
 @given(
     unit=st.floats(1e-6, 1e6),
@@ -168,11 +184,11 @@ def test_units_of_size_and_signal_do_not_matter(
     unit: float, gain: float, offset: float, log_size: bool
 ) -> None:
     size, signal = study(5)
-    one = fit_ahat(size, signal, decision=2.0, left=1.5, right=3.1, log_size=log_size)
+    fit = fit_ahat(size, signal, decision=2.0, left=1.5, right=3.1, log_size=log_size)
     decision = (2.0 + offset) * gain
     left = (1.5 + offset) * gain
     right = (3.1 + offset) * gain
-    other = fit_ahat(
+    scaled = fit_ahat(
         size * unit,
         (signal + offset) * gain,
         decision=decision,
@@ -180,8 +196,8 @@ def test_units_of_size_and_signal_do_not_matter(
         right=right,
         log_size=log_size,
     )
-    assert ahat_bound(other).value == pytest.approx(ahat_bound(one).value * unit, rel=1e-6)
-    assert other.curve.size_at(0.9) == pytest.approx(one.curve.size_at(0.9) * unit, rel=1e-6)
+    assert ahat_bound(scaled).value == pytest.approx(ahat_bound(fit).value * unit, rel=1e-6)
+    assert scaled.curve.size_at(0.9) == pytest.approx(fit.curve.size_at(0.9) * unit, rel=1e-6)
 
 
 def test_the_band_is_that_of_the_bounds() -> None:
@@ -237,7 +253,7 @@ def test_diagnostics_against_statsmodels() -> None:
     size, signal = study(9)
     fit = fit_ahat(size, signal, decision=2.0, log_size=True)
     z = residual_scores(fit)
-    tests = {one.test: one for one in diagnose(fit)}
+    tests = {diagnostic_test.test: diagnostic_test for diagnostic_test in diagnose(fit)}
     design = np.column_stack([np.ones_like(size), np.log(size)])
     assert z == pytest.approx((signal - design @ [fit.b0, fit.b1]) / fit.tau, abs=1e-12)
     lm, p, *_ = diagnostic.het_breuschpagan(z, design)
@@ -250,7 +266,12 @@ def test_diagnostics_against_statsmodels() -> None:
 
 def test_diagnostics_hold_their_level_with_a_third_of_the_signals_censored() -> None:
     """200 sound studies: p-values uniform by Kolmogorov and Smirnov at alpha = 0.001, seeds fixed."""
-    p = np.array([[one.p_value for one in diagnose(fit_study(2000 + i))] for i in range(200)])
+    p = np.array(
+        [
+            [diagnostic_test.p_value for diagnostic_test in diagnose(fit_study(2000 + i))]
+            for i in range(200)
+        ]
+    )
     assert p.shape == (200, 4)
     assert all(stats.kstest(column, "uniform").pvalue > 0.001 for column in p.T)
 
@@ -269,7 +290,11 @@ def test_a_broken_assumption_is_seen(assumption: str) -> None:
         "independence of rows": np.convolve(noise, np.ones(4) / 4, "same"),
     }[assumption]
     tests = diagnose(fit_ahat(size, 0.5 * size + scatter, decision=5.0))
-    assert [one.p_value < LEVEL for one in tests if one.assumption == assumption] == [True]
+    assert [
+        diagnostic_test.p_value < LEVEL
+        for diagnostic_test in tests
+        if diagnostic_test.assumption == assumption
+    ] == [True]
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_targets_inspected_unequally_often_count_once_each(example3: list[np.nda
     times = np.where(np.arange(len(size)) % 3 == 0, 3, 1)
     once = fit_hit_miss(size, hit)
     often = fit_hit_miss(
-        *(np.repeat(each, times) for each in (size, hit)),
+        *(np.repeat(column, times) for column in (size, hit)),
         inspections=np.repeat(np.arange(len(size)), times),
     )
     assert (often.targets, often.n) == (len(size), times.sum())
@@ -125,11 +125,13 @@ def test_statsmodels_agrees(link: str) -> None:
     names = {"logit": "Logit", "probit": "Probit", "cloglog": "CLogLog", "loglog": "LogLog"}
     family = models.families.Binomial(getattr(models.families.links, names[link])())
     sizes, hits = simulated(80, seed=3)
-    other = models.GLM(hits, models.add_constant(sizes), family=family).fit(tol=1e-12, maxiter=500)
+    expected = models.GLM(hits, models.add_constant(sizes), family=family).fit(
+        tol=1e-12, maxiter=500
+    )
     fit = fit_hit_miss(sizes, hits, link=link)
-    assert [fit.b0, fit.b1] == pytest.approx(other.params, rel=1e-6)
-    assert fit.covariance == pytest.approx(other.cov_params(), rel=1e-5)
-    assert fit.deviance == pytest.approx(other.deviance, rel=1e-10)
+    assert [fit.b0, fit.b1] == pytest.approx(expected.params, rel=1e-6)
+    assert fit.covariance == pytest.approx(expected.cov_params(), rel=1e-5)
+    assert fit.deviance == pytest.approx(expected.deviance, rel=1e-10)
 
 
 # bounds
@@ -165,6 +167,23 @@ def test_the_band_crosses_ninety_per_cent_at_the_bound(log_size: bool) -> None:
     assert lower[0] == pytest.approx(0.9, abs=1e-4)
     middle = fit.curve.pod(np.array([limit, 2.0, 4.0, 9.0]))
     assert (lower < middle).all() and (middle < upper).all()
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_the_band_of_a_small_study_holds_all_curves_of_the_likelihood_ratio_set(link: str) -> None:
+    """18 targets: the set reaches further than two standard errors on one side."""
+    sizes, hits = simulated(18, seed=3)
+    fit = fit_hit_miss(sizes, hits, link=link)
+    intercepts = np.linspace(-20.0, 40.0, 241)
+    slopes = np.geomspace(0.2, 80.0, 120)
+    grid = np.stack(np.meshgrid(intercepts, slopes, indexing="ij"), axis=-1).reshape(-1, 2)
+    top = float(fit.data.value(fit.maximum))
+    inside = grid[2.0 * (top - fit.data.value(grid)) <= criterion(0.95)]
+    at_mm = np.array([2.5, 3.5, 4.5, 6.0])
+    predictors = inside[:, :1] + inside[:, 1:] * (at_mm - fit.centre) / fit.spread
+    low, high = band(fit, at_mm)
+    assert low == pytest.approx(link_cdf(link, predictors.min(axis=0)), abs=0.02)
+    assert high == pytest.approx(link_cdf(link, predictors.max(axis=0)), abs=0.02)
 
 
 def test_a_weak_study_demonstrates_nothing_and_says_why() -> None:
@@ -287,12 +306,12 @@ def test_of_several_penalised_maxima_the_highest_is_taken(link: str, seed: int, 
     assert fit.method == "Firth"
     b0 = fit.b0 + fit.b1 * fit.centre
     b1 = fit.b1 * fit.spread
-    found = fit.data.hits > 0
-    below = fit.data.z[~found].max()
-    above = fit.data.z[found].min()
-    slopes = np.geomspace(0.2, 3000, 240)[:, None]
-    places = np.linspace(below - 1, above + 1, 800)
-    values = fit.data.value(np.stack([-slopes * places, slopes + 0 * places], axis=-1))
+    is_hit = fit.data.hits > 0
+    below = fit.data.z[~is_hit].max()
+    above = fit.data.z[is_hit].min()
+    slopes = np.geomspace(0.2, 3000, 120)[:, None]
+    middles = np.linspace(below - 1, above + 1, 200)
+    values = fit.data.value(np.stack([-slopes * middles, slopes + 0 * middles], axis=-1))
     assert float(fit.data.value(np.array([b0, b1]))) >= values.max()
 
 
@@ -320,7 +339,7 @@ def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
     starts = random.uniform([-5.0, 0.5, 0.0, 0.6], [5.0, 30.0, 0.4, 1.0], (25, 4))
     losses = [
         optimize.minimize(
-            lambda place: tuple(-part for part in value_and_gradient(data, place)),
+            lambda curve: tuple(-part for part in value_and_gradient(data, curve)),
             start,
             jac=True,
             method="L-BFGS-B",
@@ -328,10 +347,10 @@ def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
         ).fun
         for start in starts
     ]
-    both = _search(
-        data, np.append(fit_hit_miss(sizes, hits).place, [0.0, 1.0]), (0.0, 0.5), (0.5, 1.0)
+    likelihood = _search(
+        data, np.append(fit_hit_miss(sizes, hits).maximum, [0.0, 1.0]), (0.0, 0.5), (0.5, 1.0)
     )[1]
-    assert -both <= min(losses) + 5e-5
+    assert -likelihood <= min(losses) + 5e-5
 
 
 @pytest.mark.slow
@@ -354,9 +373,9 @@ def test_ceiling_of_one_adds_nothing_and_the_boundary_has_half_the_probability()
 def test_gradient_of_the_bounded_likelihood() -> None:
     sizes, hits = simulated(60, seed=1, floor=0.1, ceiling=0.9)
     data = standardised(sizes, hits, "probit")
-    place = np.array([0.3, 1.7, 0.12, 0.93])
-    numeric = optimize.approx_fprime(place, lambda at: value_and_gradient(data, at)[0], 1e-7)
-    assert value_and_gradient(data, place)[1] == pytest.approx(numeric, rel=1e-4)
+    curve = np.array([0.3, 1.7, 0.12, 0.93])
+    numeric = optimize.approx_fprime(curve, lambda point: value_and_gradient(data, point)[0], 1e-7)
+    assert value_and_gradient(data, curve)[1] == pytest.approx(numeric, rel=1e-4)
 
 
 # coverage
@@ -427,15 +446,15 @@ def test_a_bound_far_beyond_all_sizes_is_where_the_ratio_says():
     hit = np.isin(np.arange(72), (53, 64, 71)).astype(float)
     for log_size in (True, False):
         fit = fit_hit_miss(size, hit, link="cloglog", log_size=log_size)
-        found = bound(fit)
-        top = float(fit.data.value(fit.place))
+        limit = bound(fit)
+        top = float(fit.data.value(fit.maximum))
         level = float(link_ppf("cloglog", np.array(0.9)))
         slopes = np.geomspace(1e-4, 10.0, 4000)
         for far in (4.0, 32.0, 64.0, 200.0):
             largest = fit.data.value(np.stack([level - slopes * far, slopes], axis=-1)).max()
             assert profile(fit.data, far, level, 1.0)[0] == pytest.approx(largest, abs=1e-3)
-        if found.demonstrated:
-            at = ((np.log(found.value) if log_size else found.value) - fit.centre) / fit.spread
-            assert 2.0 * (top - profile(fit.data, at, level, 0.1)[0]) == pytest.approx(
+        if limit.demonstrated:
+            z = ((np.log(limit.value) if log_size else limit.value) - fit.centre) / fit.spread
+            assert 2.0 * (top - profile(fit.data, z, level, 0.1)[0]) == pytest.approx(
                 criterion(0.95), abs=1e-6
             )

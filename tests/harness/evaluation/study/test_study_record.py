@@ -36,13 +36,13 @@ EMPTY: dict[str, list[Any]] = {name: [] for name in DATA["set_ups"][0]["inspecte
 
 def changed(path: tuple[str | int, ...], value: Any) -> Any:
     data = copy.deepcopy(DATA)
-    at = data
+    container = data
     for step in path[:-1]:
-        at = at[step]
+        container = container[step]
     if value is MISSING:
-        del at[path[-1]]
+        del container[path[-1]]
     else:
-        at[path[-1]] = value
+        container[path[-1]] = value
     return data
 
 
@@ -55,7 +55,7 @@ def refusal(file: Path) -> UserError:
 
 def test_written_and_read_it_is_the_same(tmp_path):
     by_depth = STUDY.set_ups[0].inspected.hit
-    seen = replace(
+    inspected = replace(
         STUDY.set_ups[0].inspected,
         signal=np.where(np.arange(12) == 3, np.nan, 2.5),
         by_depth=by_depth,
@@ -63,7 +63,10 @@ def test_written_and_read_it_is_the_same(tmp_path):
     )
     study = replace(
         STUDY,
-        set_ups=(replace(STUDY.set_ups[0], inspected=seen, threshold_mm=np.nan), STUDY.set_ups[1]),
+        set_ups=(
+            replace(STUDY.set_ups[0], inspected=inspected, threshold_mm=np.nan),
+            STUDY.set_ups[1],
+        ),
     )
     text = record_text(study)
     assert "NaN" not in text, "JSON has no such word"
@@ -73,10 +76,10 @@ def test_written_and_read_it_is_the_same(tmp_path):
     for field in fields(StudyRecord):
         if field.name != "set_ups":
             assert getattr(again, field.name) == getattr(study, field.name)
-    for one, other in zip(study.set_ups, again.set_ups, strict=True):
+    for first, second in zip(study.set_ups, again.set_ups, strict=True):
         for field in fields(SetUpRecord):
-            a = getattr(one, field.name)
-            b = getattr(other, field.name)
+            a = getattr(first, field.name)
+            b = getattr(second, field.name)
             if isinstance(a, Inspected | Unflawed | Calibrated):
                 for column in fields(a):
                     before = getattr(a, column.name)

@@ -22,7 +22,8 @@ from scenes.closed_form import plane_view
 from scenes.implants import Implant, implant_of, local_board, side_mm, unit_config
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom, flaws
 from scenes.target.drawn import DrawnTargetConfig

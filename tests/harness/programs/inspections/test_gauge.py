@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from harness import detect, sweep
+from harness import sweep
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record
 from harness.programs.inspections import design_statistics as plan
@@ -28,7 +28,8 @@ from harness.programs.inspections.gauge_page import (
 from harness.vocabulary.geometry import MM, Lens, invert, rotation_xyz_deg, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
@@ -175,7 +176,7 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
 ):
     truth = read_gauge(made / "gauge.json")
     given = [str(captured(tmp_path / "seen", truth)), "--gauge", str(made / "gauge.json")]
-    assert detect.main([*given, "--out", str(tmp_path / "found")]) == 0
+    assert gauge.main(["read", *given, "--out", str(tmp_path / "found")]) == 0
     said = capsys.readouterr().out
     assert "4 marks" in said and "0 false calls" in said
     lines = (tmp_path / "found" / "gauge.csv").read_text().splitlines()
@@ -195,10 +196,10 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
     assert pod.main([table, *asked, "--out", str(tmp_path / "pod")]) == 0
 
     hidden = captured(tmp_path / "hidden", truth, hidden=(0, 2))
-    assert detect.main([str(hidden), "--gauge", str(made / "gauge.json")]) == 2
+    assert gauge.main(["read", str(hidden), "--gauge", str(made / "gauge.json")]) == 2
     assert "no board is recognised" in capsys.readouterr().err
     (tmp_path / "no.json").write_text('{"gauge_version": 1, "boards": []}')
-    assert detect.main([str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
+    assert gauge.main(["read", str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
     assert "boards" in capsys.readouterr().err
 
 
@@ -210,9 +211,9 @@ def seen_by(
     (board,) = truth.boards
     holes = tuple(
         custom.HoleConfig(
-            id=each.id, diameter_mm=each.diameter_mm, centre_mm=(each.x_mm, each.y_mm)
+            id=hole.id, diameter_mm=hole.diameter_mm, centre_mm=(hole.x_mm, hole.y_mm)
         )
-        for each in board.holes
+        for hole in board.holes
     )
     target = custom.TargetConfig(
         board=custom.BoardConfig(
@@ -280,7 +281,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
     changes.append(f"source.target.edge_mm={2 * gauge.EDGE_MM}")
     changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
     changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
-    given = [text for each in changes for text in ("--set", each)]
+    given = [text for change in changes for text in ("--set", change)]
     assert sweep.main([str(experiment), *given, "--out", str(tmp_path / "study")]) == 0
     study = tmp_path / "study" / "detection_limit" / "latest"
     simulated, real = (limit_of(one) for one in read_record(study).set_ups)
@@ -306,7 +307,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         ]
         given += ["--intrinsics", CAMERA, "--detector", "local", "--threshold", str(THRESHOLD)]
         given += ["--gauge", str(tmp_path / "gauge" / "gauge.json"), "--out", str(out / "found")]
-        assert detect.main(given) == 0
+        assert gauge.main(["read", *given]) == 0
         given = [
             str(out / "found" / "gauge.csv"),
             "--size",

@@ -29,7 +29,7 @@ def verdict(claim, found):
 def test_every_claim_is_judged_in_order():
     found = worlds(MapWorld())
     summary = summarise_holes(found.holes, list(found.axes["path"]))
-    assert [one.claim for one in score_views(map_cases(found, summary))] == list(VIEW_CLAIMS)
+    assert [score_view.claim for score_view in score_views(map_cases(found, summary))] == list(VIEW_CLAIMS)
 
 
 def worlds(world, **settings):

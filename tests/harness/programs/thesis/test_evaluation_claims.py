@@ -12,8 +12,7 @@ import pandas as pd
 import pytest
 from scipy.stats import spearmanr
 
-from harness.evaluation.profile import HoleInView, hole_shape, hole_shapes
-from harness.evaluation.summary import hole_list
+from harness.evaluation.profile import hole_shape, hole_shapes
 from harness.programs.thesis.claims import (
     RULES,
     Verdict,
@@ -22,8 +21,8 @@ from harness.programs.thesis.claims import (
     scatter_ratio,
     score_claims,
 )
-from harness.records.trials import CLAIMS
-from harness.report.clouds import ExampleCloud
+from harness.records.examples import ExampleCloud, HoleInView
+from harness.records.trials import CLAIMS, hole_list
 from tests.support.synthetic_tables import World, example, joined, tables
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from harness.evaluation.summary import summarise_holes
 from harness.experiment.load import load_experiment
+from harness.programs.thesis.answers import THESIS
 from harness.programs.thesis.inference import KIND, SET_UP, borne_out_if, posterior_of
 from harness.report.page import Layout, set_ups_html
 from harness.report.sections import About
@@ -104,7 +105,7 @@ def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(found):
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_page_begins_with_the_sentence(found):
-    page = set_ups_html(found, [], About(provenance(), "", "Inference", True))
+    page = set_ups_html(found, [], About(provenance(), "", "Inference", THESIS))
     answer = page.split('<p class="answer">')[1]
     assert (
         answer.startswith("The thesis&#39; outcome is borne out if")

@@ -1,0 +1,293 @@
+"""Matches the marks of two views, by code or by the distances between marks, and finds the
+transform between them.
+
+Two marks and their normals fix a placement (Grimson and Lozano-Perez 1987, without the tree). A
+hypothesis is an ordered pair of marks of the larger set with the distance of a pair of the smaller
+set; further marks support it if their distances to both fit. More than half of the smaller set
+must agree. Normals face the camera, so a mirror image is not a solution.
+
+Kabsch's closed form (1976; Umeyama 1991 for the sign) gives the start; Gauss-Newton with the full
+covariances gives the most probable rigid transform and its covariance. Not modelled: marks that
+are seen twice, or moved between the views; errors that the points of one set share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from detectors.rigid_motion import displacement_jacobian, kabsch, moved_by
+from detectors.views.marks.mark import LEAST_MARKS, Mark
+from harness.vocabulary.geometry import MM, invert, transform_points
+
+MAX_STEPS = 20
+# Gauss-Newton, which converges within three to five steps, stops when no point moves by more
+SMALL_STEP_M = 1e-10
+
+
+@dataclass(frozen=True)
+class Placement:
+    """``T_to_from`` (4, 4): rigid. ``covariance`` (6, 6): of a small error (w, t), by which a
+    point p of the target frame is off by w x (p - ``centre_m``) + t. ``residuals_m`` (n, 3):
+    mapped points minus their partners. ``chi2``: their sum of squares in units of the covariances,
+    with 3 n - 6 degrees of freedom."""
+
+    T_to_from: np.ndarray
+    covariance: np.ndarray
+    centre_m: np.ndarray
+    residuals_m: np.ndarray
+    chi2: float
+    iterations: int
+    converged: bool
+
+
+def place(
+    from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_spread_m2: np.ndarray
+) -> Placement:
+    """Find the most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3,
+    3), n >= 3. Raises numpy.linalg.LinAlgError if the points leave it undetermined (two, or all on
+    a line)."""
+
+    def state(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        spread = to_spread_m2 + T[:3, :3] @ from_spread_m2 @ T[:3, :3].T
+        return transform_points(T, from_m) - to_m, np.linalg.inv(spread)
+
+    trust = 1.0 / np.trace(from_spread_m2 + to_spread_m2, axis1=1, axis2=2)
+    T = kabsch(from_m, to_m, trust)
+    centre = np.average(to_m, axis=0, weights=trust)
+    converged = False
+    steps = 0
+    while not converged and steps < MAX_STEPS:
+        steps += 1
+        residuals, weight = state(T)
+        jacobian = displacement_jacobian(residuals + to_m, centre)
+        information = np.einsum("nki,nkl,nlj->ij", jacobian, weight, jacobian)
+        motion = -np.linalg.solve(
+            information, np.einsum("nki,nkl,nl->i", jacobian, weight, residuals)
+        )
+        T = moved_by(motion, centre) @ T
+        converged = bool(np.abs(jacobian @ motion).max() < SMALL_STEP_M)
+    residuals, weight = state(T)
+    chi2 = float(np.einsum("ni,nij,nj->", residuals, weight, residuals))
+    covariance = np.linalg.inv(information)
+    return Placement(T, (covariance + covariance.T) / 2, centre, residuals, chi2, steps, converged)
+
+
+SHARED_M = 1.0 * MM
+"""Standard deviation per axis of an error that a mark's pixels share but two views do not; in no
+covariance."""
+DISTANCE_SIGMAS = 4.0
+"""Largest difference of a distance between two marks, in standard deviations: a true pair is lost
+once in 16,000."""
+FIT_CHI2 = 21.1
+"""Largest chi^2 of a matched mark's place, with three degrees of freedom: a true match is lost
+once in 10,000."""
+GUESS_SIGMA_M = 50 * MM
+"""Root mean square error of the guess at the marks: five degrees over half a metre, and a few
+centimetres."""
+PAIR_WORTH = 3.0  # logarithm of the odds that a mark of one view is found in the other: 20 to 1
+CLEAR_ODDS = 4.5
+FEWER = 3
+"""Log odds, 90 to 1, that decide between two placements; largest number of pairs that the winner
+may lack."""
+NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """``pairs`` (n, 2): indices into the reference's and the view's marks, in the reference's
+    order. ``problem``: why they must not be used, else empty. ``notes``: further remarks."""
+
+    pairs: np.ndarray
+    problem: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def pair_marks(
+    reference: Sequence[Mark], view: Sequence[Mark], T_reference_view_guess: np.ndarray | None
+) -> Pairing:
+    """Match the marks of two views by the placement that is best in number of pairs, fit and
+    closeness to the guess."""
+    counts = f"{len(reference)} marks in the reference and {len(view)} in the view"
+    if min(len(reference), len(view)) < LEAST_MARKS:
+        return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
+    if all(mark.code is not None for mark in (*reference, *view)):
+        return _by_code(reference, view)
+    ours = _Side(reference)
+    theirs = _Side(view)
+    swapped = len(view) < len(reference)
+    solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
+    if not solutions:
+        least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
+        what = f"of {counts}, no {least} have matching distances"
+        return Pairing(
+            NO_PAIRS, f"{what}: the targets differ, or other objects were taken for marks"
+        )
+    away = np.zeros(len(solutions))
+    if T_reference_view_guess is not None:
+        placed = [
+            transform_points(T if swapped else invert(T), theirs.places) for _, T, _ in solutions
+        ]
+        off = np.stack(placed) - transform_points(T_reference_view_guess, theirs.places)
+        away = np.sqrt((off**2).sum(axis=-1).mean(axis=-1))
+    number = [sum(mark >= 0 for mark in partner) for partner, _, _ in solutions]
+    fit = np.array(
+        [
+            n * (PAIR_WORTH - 0.5 * misfit)
+            for n, (_, _, misfit) in zip(number, solutions, strict=True)
+        ]
+    )
+    odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
+    first, *rest = np.argsort(-odds, kind="stable").tolist()
+    pairs = np.array(
+        [(mark, solution) for mark, solution in enumerate(solutions[first][0]) if solution >= 0],
+        dtype=np.int64,
+    )
+    pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
+    if not rest or odds[first] - odds[rest[0]] >= CLEAR_ODDS:
+        return Pairing(pairs)
+    both = f"{number[first]} and {number[rest[0]]}"
+    problem = f"the marks lie symmetrically: two placements bring {both} of them together, and "
+    if T_reference_view_guess is None:
+        return Pairing(pairs, problem + "there is no guess to choose by")
+    between = f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} mm from the other"
+    return Pairing(pairs, problem + between)
+
+
+def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
+    ours, theirs = ([int(mark.code or 0) for mark in marks] for marks in (reference, view))
+    twice = sorted({code for codes in (ours, theirs) for code in codes if codes.count(code) > 1})
+    common = [code for code in ours if code in theirs and code not in twice]
+    pairs = np.array(
+        [(ours.index(code), theirs.index(code)) for code in common], dtype=np.int64
+    ).reshape(-1, 2)
+    shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
+    notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
+    few = f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
+    return Pairing(pairs, few if len(common) < LEAST_MARKS else "", notes)
+
+
+class _Side:
+    """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n) with
+    ``variances`` (n, n), and ``worst`` (n,), each place's variance in its worst direction."""
+
+    def __init__(self, marks: Sequence[Mark]) -> None:
+        self.places = np.stack([mark.centre_m for mark in marks])
+        self.normals = np.stack([mark.normal for mark in marks])
+        covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
+        apart = self.places[:, None] - self.places[None]
+        self.distances = np.linalg.norm(apart, axis=-1)
+        along = apart / np.maximum(self.distances, 1e-12)[..., None]
+        own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
+        self.variances, self.worst = own + own.T, np.linalg.eigvalsh(covariances)[:, -1]
+
+    def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of
+        pairs of marks."""
+        along = self.places[j] - self.places[i]
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        normal = self.normals[i] + self.normals[j]
+        normal -= (normal * along).sum(axis=-1, keepdims=True) * along
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        axes = np.stack([along, np.cross(normal, along), normal], axis=-1)
+        return axes, (self.places[i] + self.places[j]) / 2
+
+
+Solution = tuple[tuple[int, ...], np.ndarray, float]
+"""Each mark's partner in the larger set, or -1; (4, 4) larger from smaller; mean square distance
+over its variance."""
+
+
+def _solutions(few: _Side, many: _Side) -> list[Solution]:
+    """Return the placements that match over half of the smaller set and at most `FEWER` pairs less
+    than the best."""
+    n = len(few.places)
+    least = max(LEAST_MARKS, n // 2 + 1)
+    # every set of more than half of the marks contains one of these pairs: disjoint ones, longest
+    # first, and for an odd number the last mark with both marks of the first pair
+    pairs: list[tuple[int, int]] = []
+    free = set(range(n))
+    for i, j in sorted(combinations(range(n), 2), key=lambda pair: (-few.distances[pair], pair)):
+        if i in free and j in free:
+            pairs.append((i, j))
+            free -= {i, j}
+    pairs += [(mark, last) for last in free for mark in pairs[0]]
+    found: dict[tuple[int, ...], Solution] = {}
+    best = least
+    for i, j in pairs:
+        for solution in _holding(few, many, i, j, least):
+            found.setdefault(solution[0], solution)
+            best = max(best, n - solution[0].count(-1))
+    near = [solution for solution in found.values() if n - solution[0].count(-1) >= best - FEWER]
+    # leave out solutions that place the marks like a better one, to within half the distance
+    # between neighbours
+    limit = (few.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
+    kept: list[Solution] = []
+    for solution in sorted(near, key=lambda s: (s[0].count(-1), s[2], s[0])):
+        placed = transform_points(solution[1], few.places)
+        if all(
+            np.linalg.norm(placed - transform_points(T, few.places), axis=1).max() > limit
+            for _, T, _ in kept
+        ):
+            kept.append(solution)
+    return kept
+
+
+def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Solution]:
+    """Return the solutions with at least ``least`` pairs in which marks i and j of the smaller set
+    have partners."""
+    apart = np.abs(many.distances - few.distances[i, j])
+    fits = apart < DISTANCE_SIGMAS * np.sqrt(few.variances[i, j] + many.variances)
+    a, b = np.nonzero(fits & ~np.eye(len(apart), dtype=bool))
+    if len(a) == 0:
+        return []
+    # partners (k, n) that lie as far from both partners (k,) of the pair as they should ...
+    consistent = np.ones((len(a), len(few.places), len(many.places)), dtype=bool)
+    for mark, partner in ((i, a), (j, b)):
+        off = np.abs(few.distances[mark][None, :, None] - many.distances[partner][:, None, :])
+        variance = few.variances[mark][None, :, None] + many.variances[partner][:, None, :]
+        # a mark's distance to itself is exactly 0 on both sides
+        consistent &= off <= DISTANCE_SIGMAS * np.sqrt(variance)
+    # ... on the side of the line through them that the normals indicate: the mirror image beyond
+    # it lies two heights away; half a height allows for normals wrong by 30 degrees
+    (axes,), (middle,) = few.frames(np.array([i]), np.array([j]))
+    axes_there, middle_there = many.frames(a, b)
+    local = (few.places - middle) @ axes
+    expected = np.einsum("kij,nj->kni", axes_there, local) + middle_there[:, None, :]
+    off = np.linalg.norm(expected[:, :, None, :] - many.places[None, None], axis=-1)
+    worst = few.worst[:, None] + many.worst[None]
+    consistent &= off < 0.5 * np.linalg.norm(local[:, 1:], axis=-1)[
+        :, None
+    ] + DISTANCE_SIGMAS * np.sqrt(worst)
+    partner = _mutual(np.where(consistent, off, np.inf))
+    partner = partner[(partner >= 0).sum(axis=1) >= least]
+    for _ in range(2):
+        # the first pass uses the marks with fitting distances, the second those that fit the
+        # transform
+        if len(partner) == 0:
+            return []
+        weights = np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
+        T = kabsch(np.broadcast_to(few.places, (*partner.shape, 3)), many.places[partner], weights)
+        placed = np.einsum("kij,nj->kni", T[:, :3, :3], few.places) + T[:, None, :3, 3]
+        square = ((placed[:, :, None, :] - many.places[None, None]) ** 2).sum(axis=-1) / worst
+        partner = _mutual(np.where(square < FIT_CHI2, square, np.inf))
+        own = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
+        count = (partner >= 0).sum(axis=1)
+        misfit = np.where(partner >= 0, own, 0.0).sum(axis=1) / np.maximum(count, 1)
+        T = T[count >= least]
+        partner = partner[count >= least]
+        misfit = misfit[count >= least]
+    return [
+        (tuple(row), transform, value)
+        for row, transform, value in zip(partner.tolist(), T, misfit, strict=True)
+    ]
+
+
+def _mutual(cost: np.ndarray) -> np.ndarray:
+    """Return (k, n): for each row of costs (k, n, m) its cheapest column if that is mutual, else
+    -1."""
+    column = cost.argmin(axis=2)
+    row = cost.argmin(axis=1)
+    back = np.take_along_axis(row, column, axis=1) == np.arange(cost.shape[1])
+    finite = np.isfinite(np.take_along_axis(cost, column[..., None], axis=2)[..., 0])
+    return np.where(back & finite, column, -1)

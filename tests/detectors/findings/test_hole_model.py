@@ -1,0 +1,335 @@
+"""The model of a blurred hole against its plainly written reference: pictures, fits, stated
+errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from detectors.findings import hole_model_reference as reference
+from detectors.findings.hole_model import (
+    DEPTH_ERROR,
+    MODEL_ERROR,
+    RADIUS_ERROR_PX,
+    THIN_PX,
+    WALL_PRIOR,
+    HolePatch,
+    _likelihood_covariance,
+    fit_hole,
+    pictures,
+    sandwich_covariance,
+    sight,
+    straight_sight,
+    whitened,
+)
+from detectors.findings.measure import local_plane
+from detectors.findings.whitening import correlated_products
+
+PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
+CENTRE_M = np.array([0.03, -0.02, 0.7])
+EMITTER_M = np.array([-14e-3, 0.0, 1e-3])
+SIGHT = sight(CENTRE_M, PER_PX_M, EMITTER_M)
+WHITE = np.pad([[1.0]], 10)
+"""Correlation by lag of white noise."""
+
+
+def blank_patch(
+    noise_m: float = 1.5e-4,
+    shape: tuple[int, int] = (34, 37),
+    blur_px: tuple[float, float] = (5.0, 5.0),
+    sights: np.ndarray = SIGHT[None],
+) -> HolePatch:
+    return HolePatch(
+        residual_m=np.zeros(shape),
+        used=np.ones(shape, bool),
+        metric_m2=PER_PX_M @ PER_PX_M.T,
+        blur_px=blur_px,
+        noise_m=noise_m,
+        sights=sights,
+    )
+
+
+def patch_of(hole: np.ndarray, noise_m: float, seed: int) -> HolePatch:
+    """A hole seen by a camera that averages over 5 x 5 pixels, with the noise that this leaves."""
+    random = np.random.default_rng(seed)
+    blank = blank_patch(noise_m)
+    used = random.random(blank.used.shape) > 0.02
+    noise = cv2.blur(random.standard_normal(used.shape), (5, 5)) * 5.0 * noise_m
+    residual_m = np.where(
+        used,
+        pictures(blank, hole[None])[0] + noise + 1e-4,
+        np.nan,
+    )
+    return replace(blank, residual_m=residual_m, used=used)
+
+
+# ---- pictures
+
+
+OBLIQUE = sight(np.array([0.3, -0.2, 0.7]), PER_PX_M, EMITTER_M)
+TWO_CAMERAS = np.stack(
+    [
+        sight(np.array([0.3, -0.2, 0.7]), PER_PX_M, EMITTER_M, 0.3),
+        sight(np.array([-0.2, 0.1, 0.7]), PER_PX_M, EMITTER_M, 0.7),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("sights", "blur_px", "radius_mm", "depth_mm", "wall"),
+    [
+        (SIGHT[None], (5.0, 5.0), 6.4, 12.7, 0.6),
+        (SIGHT[None], (5.0, 5.0), 2.1, 33.0, 1.0),
+        (OBLIQUE[None], (1.0, 1.0), 12.7, 33.0, 0.3),
+        (OBLIQUE[None], (5.0, 3.0), 12.7, 20.0, 0.0),
+        (OBLIQUE[None], (3.0, 3.0), 9.0, -5.0, 0.5),
+        (TWO_CAMERAS, (5.0, 5.0), 9.0, 20.0, 0.7),
+        (straight_sight(PER_PX_M)[None], (3.0, 3.0), 6.0, 10.0, 0.9),
+    ],
+)
+def test_a_picture_is_that_of_the_reference(sights, blur_px, radius_mm, depth_mm, wall):
+    patch = blank_patch(blur_px=blur_px, sights=sights)
+    hole = np.array([18.3, 16.4, radius_mm * 1e-3, depth_mm * 1e-3, wall])
+    image = pictures(patch, hole[None])[0]
+    expected = reference.picture(patch, hole)
+    # chords are those of the middles of strips, points lie an eighth of a pixel apart
+    np.testing.assert_allclose(
+        image,
+        expected,
+        atol=0.06e-3 * abs(depth_mm) / blur_px[0],
+    )
+    assert image.sum() == pytest.approx(expected.sum(), rel=6e-3)
+
+
+def test_pictures_of_several_holes_are_those_of_each():
+    holes = np.array([[18.3, 16.4, 5e-3, 0.01, 0.5], [3.0, 30.0, 8e-3, 0.02, 0.1]])
+    patch = blank_patch()
+    together = pictures(patch, holes)
+    for image, hole in zip(together, holes, strict=True):
+        np.testing.assert_array_equal(image, pictures(patch, hole[None])[0])
+    # the second is cut by the patch's edge
+    np.testing.assert_allclose(
+        together[1],
+        reference.picture(patch, holes[1]),
+        atol=2e-4,
+    )
+
+
+def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
+    normal = np.cross(*PER_PX_M)
+    normal /= np.copysign(np.linalg.norm(normal), normal @ CENTRE_M)
+    ray = CENTRE_M / CENTRE_M[2]
+    z = CENTRE_M[2]
+    slopes = ((PER_PX_M - np.outer(PER_PX_M[:, 2], ray)) / z)[:, :2].T
+    drift = np.linalg.pinv(slopes) @ (normal - normal[2] * ray)[:2] / z
+    before = float(normal @ EMITTER_M) / float(normal @ CENTRE_M)
+    beam = np.linalg.pinv(PER_PX_M.T) @ (EMITTER_M - CENTRE_M * before)
+    height = normal @ CENTRE_M - normal @ EMITTER_M
+    expected = [normal @ ray, *drift, normal[2] / z, *beam, height, 1.0]
+    np.testing.assert_allclose(SIGHT, expected, rtol=1e-10)
+
+
+def test_a_straight_sight_moves_deep_circles_along_the_normal() -> None:
+    """A circle at the depth h along the normal n stands h (n_x, n_y) beside the mouth: so many
+    pixels, of which one is per_px long."""
+    result = straight_sight(PER_PX_M)
+    normal = np.cross(*PER_PX_M) / np.linalg.norm(np.cross(*PER_PX_M))
+    drift = result[1:3] @ PER_PX_M[:, :2]
+    np.testing.assert_allclose(drift, normal[:2], rtol=1e-12)
+    np.testing.assert_allclose(
+        result[[0, 3, 4, 5, 6, 7]],
+        [normal[2], 0, 0, 0, 1, 1],
+        rtol=1e-12,
+    )
+
+
+# ---- fits
+
+
+def square_of(patch: HolePatch, hole: np.ndarray, offset_m: float) -> float:
+    """The sum of squares that is least."""
+    residuals = (pictures(patch, hole[None])[0] + offset_m - patch.residual_m)[patch.used]
+    prior = patch.prior_weight * (hole[4] - WALL_PRIOR[0])
+    return float(residuals @ residuals + prior**2)
+
+
+def draw(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
+    return pictures(patch, hole[None])[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("radius_mm", "depth_mm"),
+    [
+        (2.1, 12.7),
+        (3.2, 6.0),
+        (4.8, 33.0),
+        (6.4, 3.0),
+        (12.7, 12.7),
+        (4.0, -5.0),
+    ],
+)
+def test_a_fit_is_that_of_the_reference(radius_mm: float, depth_mm: float, seed: int) -> None:
+    hole = np.array([18.3, 16.4, radius_mm * 1e-3, depth_mm * 1e-3, 0.6])
+    patch = patch_of(hole, 1.5e-4, seed)
+    start = (17.6, 16.9, 1.2e-3 * radius_mm, 0.7e-3 * depth_mm, 0.0)
+    fit = fit_hole(patch, *start)
+    expected, offset_m, converged = reference.fitted(patch, start, draw)
+    assert fit.converged == converged
+    assert fit.misfit == 0.0
+    fitted = np.array([fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.offset_m, fit.wall])
+    error = np.sqrt(np.diag(fit.covariance))
+    # the sum of squares has kinks where circles cross strips, so that descents end near its least,
+    # not at one point
+    assert (np.abs(fitted - [*expected[:4], offset_m, expected[4]]) < error).all()
+    least = square_of(patch, expected, offset_m)
+    assert square_of(patch, fitted[[0, 1, 2, 3, 5]], fit.offset_m) < 1.005 * least
+
+
+def test_a_hopeless_start_is_told_and_not_looped_over() -> None:
+    patch = patch_of(np.array([18.3, 16.4, 3e-3, 0.01, 0.6]), 1.5e-4, 0)
+    flat = replace(patch, residual_m=np.where(patch.used, 1e-4, np.nan))
+    fit = fit_hole(flat, 1000.0, -1000.0, 50.0, 0.1, 0.0)
+    assert np.isfinite([fit.u_px, fit.v_px, fit.radius_m]).all()
+
+
+# ---- stated errors
+
+
+@pytest.mark.parametrize(
+    "blur_px",
+    [
+        (5.0, 5.0),
+        (3.0, 5.0),
+        (1.0, 1.0),
+    ],
+)
+def test_a_sandwich_is_that_of_the_dense_covariance(blur_px: tuple[float, float]) -> None:
+    """Few pixels, of which the six parameters and the correlation of the noise leave half as
+    degrees of freedom."""
+    random = np.random.default_rng(3)
+    patch = replace(blank_patch(shape=(9, 11), blur_px=blur_px), used=random.random((9, 11)) > 0.1)
+    derivatives = random.standard_normal((6, int(patch.used.sum()))) * 1e-4
+    expected = reference.sandwich(patch, derivatives, 3e-7)
+    result = sandwich_covariance(patch, derivatives, 3e-7)
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
+
+
+def test_a_sandwich_without_freedom_or_rank_is_not_a_number() -> None:
+    patch = blank_patch(shape=(2, 3), blur_px=(1.0, 1.0))
+    square = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1e9])
+    assert np.isnan(sandwich_covariance(patch, square, 1e-8)).all()
+    assert np.isnan(sandwich_covariance(patch, np.zeros((6, 6)), 1e-8)).all()
+
+
+def test_a_likelihood_s_covariance_is_the_inverse_information_and_the_model_s_errors() -> None:
+    patch = blank_patch()
+    derivatives = np.random.default_rng(4).standard_normal((6, 40)) * 1e3
+    result = _likelihood_covariance(patch, derivatives, 1.7, 0.02)
+    information = derivatives @ derivatives.T
+    information[5, 5] += 12.0
+    expected = np.linalg.inv(information) * 1.7
+    pitch_m2 = (PER_PX_M[0] @ PER_PX_M[0] + PER_PX_M[1] @ PER_PX_M[1]) / 2
+    expected[2, 2] += 0.05**2 * pitch_m2
+    expected[3, 3] += (0.05 * 0.02) ** 2
+    np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-24)
+
+
+def test_a_deep_hole_without_noise_has_the_errors_of_the_model() -> None:
+    hole = np.array([18.3, 16.4, 8e-3, 0.03, 0.5])
+    blank = blank_patch(noise_m=1e-6)
+    patch = replace(blank, residual_m=pictures(blank, hole[None])[0])
+    patch = whitened(patch, WHITE, 0.0, patch.used)
+    fit = fit_hole(patch, 18.0, 16.0, 7e-3, 0.025, 0.0)
+    depth_se_m = np.sqrt(fit.covariance[3, 3])
+    radius_se_m = np.sqrt(fit.covariance[2, 2])
+    assert fit.depth_m == pytest.approx(0.03, rel=0.01)
+    assert depth_se_m == pytest.approx(DEPTH_ERROR * 0.03, rel=0.02)
+    assert radius_se_m == pytest.approx(RADIUS_ERROR_PX * 1.41e-3, rel=0.02)
+
+
+def test_the_misfit_of_noise_as_stated_is_1_and_that_of_twice_as_much_2() -> None:
+    hole = np.array([18.3, 16.4, 5e-3, 0.004, 0.5])
+    noise = np.random.default_rng(5).standard_normal((34, 37))
+    misfits = []
+    for times in (1.0, 2.0):
+        blank = blank_patch(noise_m=3e-4)
+        seen_m = pictures(blank, hole[None])[0] + times * 3e-4 * noise
+        patch = whitened(replace(blank, residual_m=seen_m), WHITE, 0.0, blank.used)
+        misfits.append(fit_hole(patch, 18.0, 16.0, 5e-3, 0.004, 0.0).misfit)
+    # 1,258 pixels: known to 2 %
+    assert misfits == pytest.approx([1.0, 2.0], rel=0.08)
+
+
+def test_far_pixels_are_thinned_and_errors_of_the_model_added() -> None:
+    patch = replace(blank_patch(noise_m=2e-4), residual_m=np.full((34, 37), 5e-3))
+    vicinity = np.zeros((34, 37), bool)
+    vicinity[10:20, 12:25] = True
+    thin = np.zeros_like(vicinity)
+    thin[::THIN_PX, ::THIN_PX] = True
+    result = whitened(patch, WHITE, 1e-3, vicinity)
+    np.testing.assert_array_equal(result.used, vicinity | thin)
+    assert result.left_out == 34 * 37 - (vicinity | thin).sum()
+    assert result.factor is not None
+    deviation_m = np.hypot(2e-4, MODEL_ERROR * 4e-3)
+    np.testing.assert_allclose(np.tril(result.factor), np.eye(len(result.factor)) * deviation_m)
+    assert whitened(patch, None, 1e-3, vicinity) is patch
+
+
+# ---- their parts
+
+
+@pytest.mark.parametrize(
+    "window",
+    [
+        (5, 5),
+        (1, 1),
+        (3, 7),
+    ],
+)
+def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
+    across, down = window
+    columns = np.random.default_rng(1).standard_normal((6, 19, 23))
+    padded = np.pad(columns, ((0, 0), (down - 1, down - 1), (across - 1, across - 1)))
+    filtered = [
+        cv2.boxFilter(
+            image,
+            -1,
+            window,
+            normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        for image in padded
+    ]
+    summed = np.stack(filtered).reshape(6, -1)
+    products = correlated_products(np.moveaxis(columns, 0, -1), across, down)
+    np.testing.assert_allclose(products, summed @ summed.T, rtol=1e-10, atol=1e-9)
+
+
+@pytest.mark.parametrize("projection", ["central", "parallel"])
+def test_a_local_plane_is_that_of_exact_points(projection: str) -> None:
+    """A point and derivatives of a plane that is known everywhere, from some of its pixels with
+    other depths."""
+    random = np.random.default_rng(2)
+    v, u = np.mgrid[:9, :11].astype(float)
+    if projection == "parallel":
+        surface = np.stack([1e-3 * u, 1.1e-3 * v, 0.7 + 2e-4 * u - 1e-4 * v], axis=-1)
+        points = surface + np.multiply.outer(random.uniform(-0.01, 0.01, u.shape), [0.0, 0.0, 1.0])
+        expected = np.array([[1e-3, 0.0, 2e-4], [0.0, 1.1e-3, -1e-4]])
+    else:
+        rays = np.stack([2e-3 * (u - 40), 2e-3 * (v + 30), np.ones(u.shape)], axis=-1)
+        surface = rays * (0.7 + 2e-4 * u - 1e-4 * v)[..., None]
+        points = rays * random.uniform(0.69, 0.71, u.shape)[..., None]
+        by_u = (surface[4, 6] - surface[4, 4]) / 2
+        by_v = (surface[5, 5] - surface[3, 5]) / 2
+        expected = np.stack([by_u, by_v])
+    finite = random.random(u.shape) > 0.3
+    detection = np.zeros(u.shape, dtype=bool)
+    detection[3:6, 4:7] = True
+    plane = local_plane(points, surface[..., 2], finite, detection, projection)
+    assert plane is not None
+    np.testing.assert_allclose(plane[0], surface[4, 5], rtol=1e-10)
+    np.testing.assert_allclose(plane[1], expected, rtol=1e-9, atol=1e-12)

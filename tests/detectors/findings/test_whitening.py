@@ -1,0 +1,211 @@
+"""Whitening against dense algebra and its plainly written reference."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from detectors.findings import whitening_reference as reference
+from detectors.findings.templates import bank, window_of, worths
+from detectors.findings.whitening import (
+    CONVERGED,
+    GRID,
+    LONGEST_LAG_PX,
+    MOST_WHITENED,
+    _spread,
+    correlation,
+    covariance_factor,
+    filters,
+    grid_of,
+    inverse_times,
+    noise_covariance,
+    spectrum,
+)
+
+SHAPE = (26, 30)
+BLUR_PX = 5
+
+
+def blurred(seed: int, shape: tuple[int, int], side: int = BLUR_PX) -> np.ndarray:
+    """Noise of deviation 1 that a square of pixels correlates."""
+    white = np.random.default_rng(seed).standard_normal((shape[0] + side, shape[1] + side))
+    filtered = cv2.blur(white, (side, side)) * side
+    first = side // 2
+    return filtered[first : first + shape[0], first : first + shape[1]].astype(np.float32)
+
+
+def dense_of(known: np.ndarray, by_lag: np.ndarray, grid: tuple[int, ...]) -> np.ndarray:
+    """The covariance of the known pixels that `filters` stand for: with the least power added."""
+    covariance = np.fft.irfft2(spectrum(by_lag, grid), grid)
+    reach = np.arange(-LONGEST_LAG_PX - 2, LONGEST_LAG_PX + 3)
+    return reference.dense_covariance(known, covariance[np.ix_(reach, reach)])
+
+
+def test_a_grid_holds_picture_template_and_margin_and_its_half_is_even() -> None:
+    for side in (3, 90, 100, 240, 1023):
+        (padded,) = grid_of((side,))
+        assert padded >= max(side, GRID) + LONGEST_LAG_PX
+        assert padded % 8 == 0
+        assert padded < 1.25 * (max(side, GRID) + LONGEST_LAG_PX) + 8
+    assert grid_of((100, 200), 56, 4) == (112, 216)
+
+
+@pytest.mark.parametrize(
+    "lag",
+    [
+        (0, 0),
+        (0, 1),
+        (2, 0),
+        (3, 4),
+        (5, 13),
+        (0, 20),
+        (12, 25),
+    ],
+)
+def test_a_covariance_is_the_mean_product_of_quiet_pixels(lag: tuple[int, int]) -> None:
+    noise = blurred(1, (60, 70))
+    quiet = np.random.default_rng(2).random(noise.shape) > 0.2
+    result = noise_covariance(noise, quiet, grid_of(noise.shape))
+    expected = reference.autocovariance(noise, quiet, *lag)
+    middle = LONGEST_LAG_PX
+    down, across = lag
+    assert result[middle + down, middle + across] == pytest.approx(expected, abs=2e-6)
+    assert result[middle - down, middle - across] == pytest.approx(expected, abs=2e-6)
+
+
+def test_a_correlation_is_the_covariance_over_the_variance() -> None:
+    """Of noise whose spectrum falls nowhere below a hundredth of its mean."""
+    lags = np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
+    covariance = 3.0 * np.outer(0.4**lags, 0.5**lags)
+    np.testing.assert_allclose(correlation(covariance), covariance / 3.0, atol=1e-6)
+
+
+def test_the_least_power_is_a_hundredth_of_the_mean() -> None:
+    lags = np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
+    smooth = np.exp(-0.5 * (lags / 4.0) ** 2)
+    power = spectrum(np.outer(smooth, smooth), (GRID, GRID))
+    assert power.shape == (GRID, GRID // 2 + 1)
+    mean = np.fft.rfft2(np.eye(1), (GRID, GRID)).real.mean()
+    full = np.abs(np.fft.rfft2(np.outer(smooth, smooth), (GRID, GRID)))
+    assert power.min() == pytest.approx(0.01 * full.mean() * mean, rel=0.01)
+    assert power[0, 0] == pytest.approx(np.outer(smooth, smooth).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("image_shape", "grid_shape"),
+    [
+        ((9, 13), (16, 20)),
+        ((16, 20), (9, 13)),
+        ((9, 20), (16, 13)),
+    ],
+)
+@pytest.mark.parametrize("back", [False, True])
+def test_unknown_pixels_are_filled_as_by_the_reference(image_shape, grid_shape, back) -> None:
+    random = np.random.default_rng(3)
+    image = random.standard_normal(image_shape).astype(np.float32)
+    inner = random.random(image_shape).astype(np.float32)
+    outer = random.random(grid_shape).astype(np.float32)
+    if back:
+        # the image is a grid, and the result as small as the picture
+        image_rows, image_columns = np.maximum(image_shape, grid_shape)
+        image = random.standard_normal((image_rows, image_columns)).astype(np.float32)
+        inner = random.random(image.shape).astype(np.float32)
+    result = np.zeros(grid_shape, np.float32)
+    _spread(image, inner, outer, back, result)
+    np.testing.assert_allclose(
+        result,
+        reference.spread(image, inner, outer, back),
+        atol=2e-6,
+    )
+
+
+@pytest.mark.parametrize("side", [3, 5])
+def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(side: int) -> None:
+    known = np.random.default_rng(6).random(SHAPE) > 0.1
+    known[10:14, 8:12] = False
+    by_lag = noise_covariance(
+        blurred(3, (90, 120), side),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
+    values = np.where(known, blurred(1, SHAPE, side), np.float32(0.0))
+    solved = inverse_times(values, known, filters(by_lag, SHAPE), error=0.01)
+    dense = dense_of(known, by_lag, grid_of(SHAPE))
+    expected = np.linalg.solve(dense, values[known])
+    np.testing.assert_allclose(
+        solved[known],
+        expected,
+        atol=0.02 * np.abs(expected).max(),
+    )
+    assert not solved[~known].any()
+
+
+def test_a_solution_goes_on_from_another() -> None:
+    known = np.random.default_rng(6).random(SHAPE) > 0.1
+    by_lag = noise_covariance(
+        blurred(3, (90, 120)),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
+    values = np.where(known, blurred(1, SHAPE), np.float32(0.0))
+    noise_filters = filters(by_lag, SHAPE)
+    solved = inverse_times(values, known, noise_filters, error=0.01)
+    again = inverse_times(values, known, noise_filters, solved)
+    # nothing is left to do
+    np.testing.assert_array_equal(again, solved)
+
+
+def test_scores_are_the_likelihoods_where_pixels_are_missing() -> None:
+    """Beside the dense covariance of the known pixels alone, for each template that the picture
+    holds: closely if solved to a small error, and within twice the error that `CONVERGED` states.
+    """
+    noise = blurred(1, SHAPE)
+    known = np.random.default_rng(2).random(SHAPE) > 0.1
+    by_lag = noise_covariance(
+        blurred(3, (90, 120)),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
+    dense = dense_of(known, by_lag, grid_of(SHAPE))
+    assert window_of(by_lag) == BLUR_PX
+    values = np.where(known, noise, np.float32(0.0))
+    noise_filters = filters(by_lag, SHAPE)
+    solved = inverse_times(values, known, noise_filters, error=0.01)
+    rough = inverse_times(values, known, noise_filters)
+    all_worths = worths(spectrum(by_lag, (GRID, GRID)), BLUR_PX)
+    for drawn, worth in zip(bank(BLUR_PX)[:10], all_worths, strict=False):
+        half = len(drawn.image) // 2
+        template = np.pad(drawn.image, 20)[half + 7 : half + 33, half + 5 : half + 35]
+        whitened = np.linalg.solve(dense, template[known])
+        energy = float(template[known] @ whitened)
+        exact = reference.score(template[known], noise[known], dense)
+        score = (template * solved).sum() / energy**0.5
+        assert score == pytest.approx(exact, rel=0.02, abs=0.02)
+        assert abs((template * rough).sum() / energy**0.5 - exact) < 2.0 * CONVERGED
+        # a part of the template is hidden
+        assert 0.6 * worth.energy < energy < 1.02 * worth.energy
+
+
+def test_a_factor_is_that_of_the_covariance_of_the_used_pixels() -> None:
+    random = np.random.default_rng(4)
+    used = random.random((9, 11)) > 0.2
+    lags = np.abs(np.arange(-8, 9))
+    correlations = np.outer(0.6**lags, 0.7**lags)
+    error_m = np.where(used, 2e-4 * random.random(used.shape), np.nan)
+    factor = covariance_factor(used, correlations, 3e-4, error_m)
+    assert factor is not None
+    errors = 3e-4**2 + np.outer(error_m[used], error_m[used])
+    dense = reference.dense_covariance(used, correlations) * errors
+    product = np.tril(factor) @ np.tril(factor).T
+    np.testing.assert_allclose(product, dense, atol=1e-14 * dense.max())
+    assert covariance_factor(used, None, 3e-4, error_m) is None
+    assert covariance_factor(used, 0.0 * correlations, 3e-4, error_m) is None
+
+
+def test_too_many_pixels_have_no_factor() -> None:
+    white = np.eye(1)
+    for pixels, is_factored in ((MOST_WHITENED, True), (MOST_WHITENED + 1, False)):
+        used = np.ones((1, pixels), bool)
+        factor = covariance_factor(used, white, 1.0, np.zeros((1, pixels)))
+        assert (factor is not None) == is_factored

@@ -1,0 +1,156 @@
+"""Robust statistics, what rounding leaves in an average, and the reach of shared noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from detectors.pixels.noise import (
+    LEAST_FRAMES,
+    average_variance_m2,
+    median_of,
+    noise_reach_px,
+    quantile_of,
+    rounding_floor,
+    rounding_left_m2,
+    rounding_variances,
+    sigma_of,
+)
+from harness.testing.synthetic_clouds import SHAPE, plane
+from harness.vocabulary.geometry import Cloud, Frame
+
+STEP_M = 1e-3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
+def test_robust_statistics_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).standard_normal(count)
+    assert median_of(values) == pytest.approx(np.median(values), abs=1e-15)
+    assert sigma_of(values) == pytest.approx(np.median(np.abs(values)) / 0.6745, rel=1e-12)
+    for share in (0.0, 0.25, 0.9, 1.0):
+        assert quantile_of(values, share) == pytest.approx(np.quantile(values, share), abs=1e-14)
+
+
+@pytest.mark.parametrize("noise_steps", [0.0, 0.1, 0.3, 0.5])
+def test_rounding_leaves_what_an_average_of_many_frames_shows(noise_steps: float) -> None:
+    """The mean of z + noise rounded, at 400 positions within a step, by the integral over the
+    noise."""
+    positions = (np.arange(400) + 0.5) / 400
+    if noise_steps == 0.0:
+        errors = np.round(positions) - positions
+    else:
+        noise = np.linspace(-4, 4, 8001) * noise_steps
+        density = np.exp(-0.5 * (noise / noise_steps) ** 2)
+        rounded = np.round(positions[:, None] + noise)
+        errors = rounded @ (density / density.sum()) - positions
+    left_m2 = rounding_left_m2(STEP_M, (noise_steps * STEP_M) ** 2)
+    assert left_m2 / STEP_M**2 == pytest.approx(
+        (errors**2).mean(),
+        rel=0.01,
+        abs=2e-7,
+    )
+
+
+def cloud_with(variance_m2: float, frames: int, step_m: float = STEP_M) -> Cloud:
+    flat = plane(seed=1, tilt=0.1)
+    return replace(
+        flat,
+        variance_m2=np.full(SHAPE, variance_m2),
+        n_frames=frames,
+        z_step_m=step_m,
+    )
+
+
+def test_what_rounding_leaves_is_fixed_or_averages_out() -> None:
+    everywhere = np.ones(SHAPE, bool)
+    whole_m2 = STEP_M**2 / 12
+    dither_m2 = (0.3 * STEP_M) ** 2
+    fixed_m2, random_m2 = rounding_variances(cloud_with(dither_m2 + whole_m2, 20), everywhere)
+    assert fixed_m2 == pytest.approx(rounding_left_m2(STEP_M, dither_m2), rel=1e-9)
+    assert random_m2 == pytest.approx((whole_m2 - fixed_m2) / 20, rel=1e-9)
+    floor_m = rounding_floor(cloud_with(dither_m2 + whole_m2, 20), everywhere)
+    assert floor_m == pytest.approx(np.sqrt(fixed_m2 + random_m2), rel=1e-12)
+    # without a step, z counts as float32
+    fine = rounding_floor(cloud_with(1e-6, 20, step_m=0.0), everywhere)
+    z_m = plane(seed=1, tilt=0.1).points_m[..., 2].max()
+    assert fine == pytest.approx(2.0**-23 * z_m / np.sqrt(12 * 20), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frames", "parts", "is_whole"),
+    [
+        (3, 2, True),
+        (2, 2, False),
+        (3, 4, False),
+    ],
+)
+def test_a_median_that_lies_on_half_steps_keeps_the_whole_rounding(frames, parts, is_whole) -> None:
+    cloud = cloud_with(1e-6, frames)
+    points_m = cloud.points_m.copy()
+    points_m[..., 2] = np.round(points_m[..., 2] / STEP_M * parts) / parts * STEP_M
+    result = rounding_variances(replace(cloud, points_m=points_m), np.ones(SHAPE, bool))
+    assert (result == (STEP_M**2 / 12, 0.0)) == is_whole
+
+
+def test_the_variance_of_an_average_is_the_scatter_nearby_over_its_frames() -> None:
+    scatter_m2 = np.random.default_rng(1).chisquare(4, SHAPE) * 1e-6
+    cloud = replace(plane(seed=1), variance_m2=scatter_m2, n_frames=5)
+    everywhere = np.ones(SHAPE, bool)
+    result = average_variance_m2(cloud, everywhere)
+    assert result is not None
+    expected = cv2.blur(scatter_m2, (7, 7))[10:-10, 10:-10] / 5
+    np.testing.assert_allclose(result[10:-10, 10:-10], expected, rtol=1e-9)
+    # unknown ones have the typical variance; their neighbours do not count them
+    scatter_m2[20:40, 20:40] = np.nan
+    gap = average_variance_m2(replace(cloud, variance_m2=scatter_m2), everywhere)
+    assert gap is not None
+    assert gap[30, 30] == pytest.approx(np.median(expected), rel=0.05)
+    assert gap[30, 42] == pytest.approx(scatter_m2[27:34, 40:46].mean() / 5, rel=1e-9)
+
+
+def test_the_variance_of_an_average_is_unknown_with_few_frames_or_pixels() -> None:
+    everywhere = np.ones(SHAPE, bool)
+    cloud = cloud_with(1e-6, LEAST_FRAMES)
+    assert average_variance_m2(cloud, everywhere) is not None
+    assert average_variance_m2(replace(cloud, n_frames=LEAST_FRAMES - 1), everywhere) is None
+    assert average_variance_m2(replace(cloud, organised=False), everywhere) is None
+    sparse_m2 = cloud.variance_m2.copy()
+    sparse_m2[: SHAPE[0] // 2 + 1] = np.nan
+    assert average_variance_m2(replace(cloud, variance_m2=sparse_m2), everywhere) is None
+    sparse_m2[SHAPE[0] // 2 - 1 :] = 1e-6
+    assert average_variance_m2(replace(cloud, variance_m2=sparse_m2), everywhere) is not None
+
+
+def frames_of(
+    side: int,
+    count: int,
+    tilt: float = 0.0,
+    shape: tuple[int, int] = (200, 260),
+) -> list[Frame]:
+    """Frames of a plane whose noise a square of pixels correlates."""
+    frames = []
+    columns = np.arange(shape[1])
+    for seed in range(count):
+        white = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+        noise = cv2.blur(white, (side, side)) * side
+        z_m = (0.7 + tilt * columns + 1e-3 * noise).astype(np.float32)
+        frames.append(Frame(f"frame {seed}", z_m, np.zeros(shape, np.uint8)))
+    return frames
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+@pytest.mark.parametrize("side", [1, 3, 5])
+def test_noise_reaches_as_far_as_the_square_that_correlates_it(side: int, count: int) -> None:
+    assert noise_reach_px(frames_of(side, count, tilt=1e-4), 0.0) == side
+
+
+def test_noise_that_rounding_or_few_pixels_hide_has_no_reach() -> None:
+    assert noise_reach_px(frames_of(3, 1), 1e-2) == 0.0
+    assert noise_reach_px(frames_of(3, 1), 1.9e-3) == 3.0
+    assert noise_reach_px(frames_of(3, 2, shape=(70, 71)), 0.0) == 0.0
+    assert noise_reach_px(frames_of(3, 2, shape=(71, 71)), 0.0) == 3.0
+    assert noise_reach_px(frames_of(9, 2), 0.0) == 9.0
+    assert noise_reach_px([], 0.0) == 0.0
