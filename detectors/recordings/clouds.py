@@ -211,12 +211,18 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
         packed, states = struct.unpack("<II", stated.ljust(8, b"\0"))
         least = 8 + packed
         if len(stated) == 8 and (states != unpacked or states > LZF_STRONGEST * packed):
-            problem = f"{path}: its points would have {unpacked} bytes, but it states {states} packed into {packed}"
+            problem = (
+                f"{path}: its points would have {unpacked} bytes, but it states {states} packed "
+                f"into {packed}"
+            )
             raise UserError(problem, legal=LEGAL_CLOUD, fix="copy or export it again")
     return width, height, end.end() + least
 
 
-LEGAL_LIST = "one point per line: x y z [intensity] [red green blue], separated by blanks, tabs, commas or semicolons"
+LEGAL_LIST = (
+    "one point per line: x y z [intensity] [red green blue], separated by blanks, tabs, commas "
+    "or semicolons"
+)
 MOST_COLUMNS = 20
 HEAD_LINES = 200  # lines within which the numbers must begin
 COLUMNS = {

@@ -143,7 +143,10 @@ def open_depth_list(
     if first is not None and (colour_shape := _colour(first).shape)[:2] != (height, width):
         colours = ()
         notes = [
-            f"colour pictures of {colour_shape[1]} x {colour_shape[0]} pixels are not aligned with the depth and are not used"
+            (
+                f"colour pictures of {colour_shape[1]} x {colour_shape[0]} pixels are not "
+                "aligned with the depth and are not used"
+            )
         ]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are assumed to be undistorted")

@@ -88,7 +88,10 @@ def open_mkv(path: Path, options: CaptureOptions) -> Recording:
         if cameras is not None and "COLOR" in sizes
         else None
     )
-    note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
+    note = (
+        "colour sampled at each depth point's place in the colour picture, without a test for "
+        "occlusion"
+    )
     scale_m = options.scale_m or UNITS_M["mm"]
     read = partial(_frames, path, scale_m, lens, colour)
     notes = () if colour is None else (note,)
@@ -300,7 +303,10 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
         np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
     )
     if not good or not (0 < cx < colour[0] and 0 < cy < colour[1] and fy > 0):
-        problem = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is not a lens of {size} pixels"
+        problem = (
+            f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is not a lens "
+            f"of {size} pixels"
+        )
         raise UserError(
             f"{name}: {problem}", fix="pass --intrinsics FILE with the lens of the depth pictures"
         )
@@ -462,7 +468,10 @@ def _plane(
     try:
         import liblzfse  # type: ignore[import-not-found]
     except ImportError as error:
-        problem = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
+        problem = (
+            f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not "
+            "installed"
+        )
         raise UserError(
             problem, fix="pip install pyliblzfse, or export the capture as PLY"
         ) from error

@@ -19,9 +19,8 @@ LEGAL_UNITS = (
 NEAREST_M = 0.05
 FARTHEST_M = 20.0
 """Bounds of a plausible median distance: no time-of-flight camera works nearer or sees farther."""
-FARTHEST_ASIDE = (
-    4.0  # largest ratio of the median point's distance from the axis to its z: 76 degrees
-)
+# largest ratio of the median point's distance from the axis to its z: 76 degrees
+FARTHEST_ASIDE = 4.0
 RAYS_TELL = 3.0
 """Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a
 pipe's up to 2."""
@@ -98,8 +97,14 @@ def frame_of(
     elif behind.sum() > max(
         (0.5 if stored.ndim == 2 else 1 - TURNED_SHARE) * valid.sum(), SHARED_CODE
     ):
-        problem = f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the camera (z below 0)"
-        fix = "transform the cloud (from y up, z back: negate y and z; from x forward, z up: take -y, -z, x)"
+        problem = (
+            f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the "
+            "camera (z below 0)"
+        )
+        fix = (
+            "transform the cloud (from y up, z back: negate y and z; from x forward, z up: take "
+            "-y, -z, x)"
+        )
         raise UserError(problem, legal=CAMERA_FRAME, fix=fix)
     reason[behind] = Reason.OUT_OF_RANGE
     xy_m = None
@@ -304,7 +309,10 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     best = ranked[0]
     if chances[best] < LIKELY:
         problem = "several units are plausible" if shown else "no usual unit is plausible"
-        problem = f"{name}: nothing states the unit of its depth, and {problem} (median stored number {median:.5g})"
+        problem = (
+            f"{name}: nothing states the unit of its depth, and {problem} (median stored number "
+            f"{median:.5g})"
+        )
         fix = (
             f"pass the unit; median distance in each: {', '.join(shown)}"
             if shown
@@ -317,7 +325,10 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
         if chances[best] >= SURE:
             return Unit(scale_m, usual)
     else:
-        usual = f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be {median * usual_m:.4g} m"
+        usual = (
+            f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be "
+            f"{median * usual_m:.4g} m"
+        )
     also = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
     taken = (
         f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{also}"
@@ -366,8 +377,14 @@ def refuse_far_aside(frame: Frame) -> None:
     """Raise UserError if half of the points are farther off the axis than in any camera's picture."""
     across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
-        problem = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
-        problem += " off the camera's axis: the cloud is in another frame, or z has another unit than x and y"
+        problem = (
+            f"{frame.name}: half of the points lie more than "
+            f"{math.degrees(math.atan(aside)):.0f} degrees"
+        )
+        problem += (
+            " off the camera's axis: the cloud is in another frame, or z has another unit than "
+            "x and y"
+        )
         raise UserError(
             problem,
             legal=CAMERA_FRAME,
@@ -387,8 +404,14 @@ def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]
     if not bends[0] > RAYS_TELL * bends[1]:
         return ""
-    problem = f"the numbers look like lengths along the rays, not z: as lengths, surfaces are {bends[0] / bends[1]:.0f}"
-    return f"{problem} times as flat. Places and sizes are then wrong: store z, the length times the ray's cosine"
+    problem = (
+        "the numbers look like lengths along the rays, not z: as lengths, surfaces are "
+        f"{bends[0] / bends[1]:.0f}"
+    )
+    return (
+        f"{problem} times as flat. Places and sizes are then wrong: store z, the length times "
+        "the ray's cosine"
+    )
 
 
 def _bend(image: np.ndarray) -> float:

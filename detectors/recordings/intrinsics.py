@@ -113,7 +113,10 @@ def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str,
         numbers = [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
     is_known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
     if not is_known or numbers[10] or numbers[11]:
-        problem = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
+        problem = (
+            f"lens model {model} with {len(numbers)} parameters, or with a centre of "
+            "distortion, is not known"
+        )
         raise UserError(f"{name}: {problem}", legal=legal, fix=OWN_LENS)
     return camera, numbers
 
@@ -128,8 +131,10 @@ def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:
 
 
 LEGAL_LENS = (
-    "JSON or YAML with fx, fy, cx, cy (RealSense: ppx, ppy) in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's "
-    "intrinsic.json; OpenCV's or ROS' camera_info YAML; BOP's scene_camera.json; a matrix of 3 x 3 or 4 x 4 numbers; "
+    "JSON or YAML with fx, fy, cx, cy (RealSense: ppx, ppy) in pixels [distortion: k1 k2 p1 "
+    "p2 k3 k4 k5 k6]; Open3D's "
+    "intrinsic.json; OpenCV's or ROS' camera_info YAML; BOP's scene_camera.json; a matrix "
+    "of 3 x 3 or 4 x 4 numbers; "
     "an Azure Kinect's calibration.json"
 )
 FOUND_BESIDE = (
@@ -220,7 +225,10 @@ def lens_for(
         problem = (
             f"{name}: the lens of these depth images is unknown; without it they give no points"
         )
-        fix = f"pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough{hint}"
+        fix = (
+            "pass --intrinsics FILE, or the name of a camera whose nominal lens is good "
+            f"enough{hint}"
+        )
         raise UserError(problem, legal=LEGAL_LENS, fix=fix)
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
     for mode in modes:
@@ -231,8 +239,14 @@ def lens_for(
         for mode in modes[1:]
         if isinstance(mode, OtherLens)
     )
-    problem = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
-    fix = "pass --intrinsics FILE with the lens of these images (of the colour camera, if the depth was aligned to it)"
+    problem = (
+        f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x "
+        f"{lens.height}"
+    )
+    fix = (
+        "pass --intrinsics FILE with the lens of these images (of the colour camera, if the "
+        "depth was aligned to it)"
+    )
     raise UserError(
         problem, legal=f"the modes of this camera: {mode_names}" if mode_names else None, fix=fix
     )
@@ -260,7 +274,10 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
             f"{path}: the lens' width and height are not whole numbers", legal=LEGAL_LENS
         )
     if across * height != down * width:
-        problem = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
+        problem = (
+            f"{path}: is for images of {across} x {down} pixels, but the depth images have "
+            f"{width} x {height}"
+        )
         raise UserError(
             problem,
             fix="give the lens of the depth images (or of the colour camera they are aligned to)",
@@ -274,20 +291,32 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
     if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
-        problem = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for {width} x {height}"
+        problem = (
+            f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for "
+            f"{width} x {height}"
+        )
         fix = "multiply a normalised focal length by the image's width"
         raise UserError(
             f"{path}: {problem}", legal="pixels, from the centre of the first one", fix=fix
         )
     numbers = (width, height, fx, fy, cx, cy, _distortion(path, data))
     if (across, down) != (width, height):
-        warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
+        warning = (
+            f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to "
+            f"{width} x {height},"
+        )
         warning += " which is right unless the smaller image is a crop of the larger"
         return OtherLens(*numbers, warning=warning)
     if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= FAR_OFF:
         return Lens(*numbers)
-    off = f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of {width} x {height} pixels"
-    doubt = "unless the images are crops of larger images, the lens is for another size, and all sizes are wrong"
+    off = (
+        f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of "
+        f"{width} x {height} pixels"
+    )
+    doubt = (
+        "unless the images are crops of larger images, the lens is for another size, and all "
+        "sizes are wrong"
+    )
     return OtherLens(*numbers, warning=f"{off}: {doubt}")
 
 

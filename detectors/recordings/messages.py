@@ -29,7 +29,10 @@ AMPLITUDE_FIELDS = ("intensity", "amplitude", "i")
 LEGAL_CLOUD = "sensor_msgs/PointCloud2 with the fields x, y, z, each a single number"
 DEPTH_NUMBERS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings that may hold depth: whole millimetres, or floating-point metres."""
-LEGAL_IMAGE = "sensor_msgs/Image as 16UC1, mono16 or 32FC1; CompressedImage as compressedDepth (PNG or RVL) of these"
+LEGAL_IMAGE = (
+    "sensor_msgs/Image as 16UC1, mono16 or 32FC1; CompressedImage as compressedDepth (PNG or "
+    "RVL) of these"
+)
 CONFIG_BYTES = 12
 
 
@@ -66,7 +69,10 @@ def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray
         row_bytes < width * kind.itemsize
         or data.size < (height - 1) * row_bytes + width * kind.itemsize
     ):
-        problem = f"{data.size} bytes in rows of {row_bytes} cannot hold {width} of {kind.itemsize} bytes, {height} times"
+        problem = (
+            f"{data.size} bytes in rows of {row_bytes} cannot hold {width} of {kind.itemsize} "
+            f"bytes, {height} times"
+        )
         raise UserError(f"{name}: is truncated: {problem}", fix="record or convert it again")
     return np.ndarray((height, width), kind, data.data, strides=(row_bytes, kind.itemsize))
 

@@ -33,8 +33,10 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import OtherLens
 
 LEGAL_FORMATS = (
-    "a folder or list of 16-bit depth .png, of .ply or .pcd, or of .xyz .txt .csv points; a folder of .npy or .tiff;"
-    " a ROS bag (folder, .mcap, .db3, .bag); one .npy, .npz, .mat, .tiff, .pfm, .mkv or .r3d file; a Stray Scanner"
+    "a folder or list of 16-bit depth .png, of .ply or .pcd, or of .xyz .txt .csv points; a "
+    "folder of .npy or .tiff;"
+    " a ROS bag (folder, .mcap, .db3, .bag); one .npy, .npz, .mat, .tiff, .pfm, .mkv or "
+    ".r3d file; a Stray Scanner"
     " folder; with --pitch a height map; with --raw a file of bare numbers"
 )
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
@@ -85,7 +87,10 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
     doubts = [stated.warning]
     if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
         doubts += [
-            "the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"
+            (
+                "the first two frames are equal: repeated frames do not lower noise, but are "
+                "counted as if they did"
+            )
         ]
     if recording.slopes is not None and first.xy_m is None:
         doubts += [ray_lengths_doubt(first.z_m, recording.slopes)]

@@ -203,9 +203,8 @@ def calibration_text(lens: Lens) -> str:
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
-BAG_VERSION: Literal[8] = (
-    8  # of metadata.yaml: the oldest that the library writes; later ROS versions read it too
-)
+# of metadata.yaml: the oldest that the library writes; later ROS versions read it too
+BAG_VERSION: Literal[8] = 8
 FLOAT32 = 7  # sensor_msgs/PointField's code
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
 """``rgb`` holds the bytes of 0x00RRGGBB; by ROS's convention, its field is declared as a float of

@@ -98,7 +98,8 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     change = maps.against_one(case, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if change is None:
         return "undecided", (
-            "Not judged: the experiment has not finished both one view and two views, registered by"
+            "Not judged: the experiment has not finished both one view and two views, "
+            "registered by"
             " CPD and merged on the grid."
         )
     # if no smaller hole can be compared, one that only the single view finds speaks for the claim

@@ -162,7 +162,8 @@ class EmitterFacts(ConeFacts):
             x, y = np.diff([*self.mask_slopes.value, *self.mask_slopes.value[:2]], axis=0).T
             if len(x) < 4 or not (x[:-1] * y[1:] - y[:-1] * x[1:] > 0).all():
                 raise ValueError(
-                    "mask_slopes must be the corners of a convex polygon, counter-clockwise in the "
+                    "mask_slopes must be the corners of a convex polygon, counter-clockwise "
+                    "in the "
                     "image's axes"
                 )
         return self
@@ -378,7 +379,10 @@ class AmcwCamera(CameraFacts):
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
             raise ValueError(
-                f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}"
+                (
+                    f"lens.width_px is {self.lens.width_px.value}; the model allows at most "
+                    f"{widest_px}"
+                )
             )
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
             raise ValueError(

@@ -295,14 +295,20 @@ def ros_yaml(lens: Lens) -> str:
     k = lens.matrix.ravel().tolist()
     d = list(lens.distortion)
     size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
-    matrices = f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\ndistortion_coefficients:\n  data: {d}\n"
+    matrices = (
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\ndistortion_coefficients:\n  data: "
+        f"{d}\n"
+    )
     return f"{size}camera_name: depth\ndistortion_model: rational_polynomial\n{matrices}"
 
 
 def ros_message(lens: Lens) -> str:
     k = lens.matrix.ravel().tolist()
     d = list(lens.distortion)
-    return f"height: {lens.height}\nwidth: {lens.width}\ndistortion_model: rational_polynomial\nD: {d}\nK: {k}\n"
+    return (
+        f"height: {lens.height}\nwidth: {lens.width}\ndistortion_model: rational_polynomial\nD: "
+        f"{d}\nK: {k}\n"
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -336,13 +342,13 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
         ("500 510 300 200", (0.0,) * 8),
         ('{"intrinsic_matrix": [500, 0, 300, 0, 510, 200, 0, 0, 1]}', (0.0,) * 8),
         ('{"K": [500, 0, 0, 0, 510, 0, 300, 200, 1]}', (0.0,) * 8),
-        ('{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510, "coeffs": [0, 0, 0, 0, 0],'
+        ('{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510, ' '"coeffs": [0, 0, 0, 0, 0],'
          ' "model": "distortion.inverse_brown_conrady"}', (0.0,) * 8),
-        ('{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576, "k1": 0.1, "k2": 0.2, "p1": 0.01,'
+        ('{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576, "k1": 0.1, ' '"k2": 0.2, "p1": 0.01,'
          ' "p2": 0.02, "camera_model": "OPENCV", "frames": []}', (0.1, 0.2, 0.01, 0.02, 0, 0, 0, 0)),
         ('{"0": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1},'
          ' "1": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1}}', (0.0,) * 8),
-        ('{"color": {"fx": 900, "fy": 900, "cx": 640, "cy": 360}, "depth": {"fx": 500, "fy": 510, "cx": 300,'
+        ('{"color": {"fx": 900, "fy": 900, "cx": 640, "cy": 360}, "depth": {"fx": 500, "fy": ' '510, "cx": 300,'
          ' "cy": 200}}', (0.0,) * 8),
     ),
 )  # fmt: skip

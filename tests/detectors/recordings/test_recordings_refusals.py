@@ -437,11 +437,17 @@ def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> Non
         ),
         ('{"intrinsic_matrix": [1, 2, 3]}', "list of 9"),
         (
-            "K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\nD: [.1, 0, 0, 0]\ndistortion_model: equidistant",
+            (
+                "K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\nD: [.1, 0, 0, 0]\ndistortion_model: "
+                "equidistant"
+            ),
             "equidistant",
         ),
         (
-            '{"a": {"fx": 500, "fy": 500, "cx": 300, "cy": 200}, "b": {"fx": 400, "fy": 500, "cx": 300, "cy": 200}}',
+            (
+                '{"a": {"fx": 500, "fy": 500, "cx": 300, "cy": 200}, "b": {"fx": 400, "fy": '
+                '500, "cx": 300, "cy": 200}}'
+            ),
             "2 dif",
         ),
         ("fx: 500\nfx: 500\n", ":2:1:"),

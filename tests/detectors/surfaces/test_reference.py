@@ -146,4 +146,6 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
     )
     assert settings["surface"]["reference"] == {"file": str(path), "unit": "cm", "front": "+z"}
     with pytest.raises(UserError, match="has no surface setting"):
-        detector_of(main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", [])
+        detector_of(
+            main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", []
+        )
