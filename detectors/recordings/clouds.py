@@ -92,9 +92,25 @@ def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
 LEGAL_CLOUD = (
     "PLY (ASCII or binary) or PCD (ASCII, binary or compressed) with x, y, z for each point"
 )
-PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8} | {
-    "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8,
-}  # fmt: skip
+PLY_BYTES = {
+    "char": 1,
+    "uchar": 1,
+    "short": 2,
+    "ushort": 2,
+    "int": 4,
+    "uint": 4,
+    "float": 4,
+    "double": 8,
+} | {
+    "int8": 1,
+    "uint8": 1,
+    "int16": 2,
+    "uint16": 2,
+    "int32": 4,
+    "uint32": 4,
+    "float32": 4,
+    "float64": 8,
+}
 HEADER_BYTES = 65536
 COUNT = re.compile(r"\d{1,15}", re.ASCII)
 """A count in a header. No file has more digits, and Python refuses to read thousands of them."""
@@ -105,7 +121,8 @@ LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent 
 def _read_cloud(
     path: Path, _: Lens | None
 ) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
-    """Read one PLY or PCD. Raises UserError if it has no header, holds no points, or is truncated."""
+    """Read one PLY or PCD. Raises UserError if it has no header, holds no points, or is
+    truncated."""
     o3d = load_open3d()
     with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)

@@ -199,8 +199,8 @@ UNIT_NAMES = {
 READINGS = {
     **{"mm": (0.867, 0.15), "4000/m": (0.08, 0.0), "tum": (0.03, 0.0), "10000/m": (0.015, 0.0)},
     **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "in": (0.0003, 0.01), "m": (0.0, 0.8)},
-    # units and how common each is among integers and floating-point numbers: guesses that hardly move
-    # a decision
+    # units and how common each is among integers and floating-point numbers: guesses that hardly
+    # move a decision
 }
 NEAR_M = (
     0.8,
@@ -224,7 +224,8 @@ MILLIMETRE_SIZES = {
         (512, 424): 8.0,
         (256, 192): 8.0,
     }
-    # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
+    # image sizes of cameras that all store 1 mm and the median distance in metres that they can
+    # reach
 }
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
 """Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and
@@ -351,7 +352,8 @@ def rounding_step_m(z_m: np.ndarray) -> float:
 
 
 def refuse_implausible(frame: Frame, scale_m: float) -> None:
-    """Raise UserError if the median distance of a frame with a valid pixel indicates a wrong unit."""
+    """Raise UserError if the median distance of a frame with a valid pixel indicates a wrong
+    unit."""
     valid = frame.z_m[np.isfinite(frame.z_m)]
     median_m = float(np.median(valid[:: max(1, valid.size // 50_000)]))
     if NEAREST_M <= median_m <= FARTHEST_M:

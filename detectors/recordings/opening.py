@@ -64,8 +64,8 @@ HELD = 6  # most names of a folder's contents in a message
 def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements: Any) -> Recording:
     """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of
     the stored distances (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other
-    ``statements`` are the fields of `recording.CaptureOptions`. Raises UserError for every fault of the
-    files."""
+    ``statements`` are the fields of `recording.CaptureOptions`. Raises UserError for every fault
+    of the files."""
     paths = [Path(path) for path in paths]
     if not paths:
         raise UserError("no capture is named", legal=LEGAL_FORMATS)

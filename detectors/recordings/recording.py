@@ -94,7 +94,8 @@ class Recording:
         is_whole: bool = False,
         **fields: Any,
     ) -> Recording:
-        """Return a recording of the first frame's size and step. Raises UserError without a frame."""
+        """Return a recording of the first frame's size and step. Raises UserError without a
+        frame."""
         first = next(read(), None)
         if first is None:
             raise UserError(

@@ -139,7 +139,8 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
 def detector_of(
     arguments: argparse.Namespace, crop: str, assignments: Sequence[str]
 ) -> tuple[Detector, dict[str, Any]]:
-    """Return the detector with the crop and settings of --crop and --set, and all of its settings."""
+    """Return the detector with the crop and settings of --crop and --set, and all of its
+    settings."""
     from detectors import detector_type, load_detector
 
     settings: dict[str, Any] = {}

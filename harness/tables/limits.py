@@ -50,8 +50,8 @@ def bound_text(bound: Estimate) -> str:
 
 
 def size_estimate(limit: SetUpLimit, name: str) -> Estimate:
-    """Return a50 or a90 (``name``) with its interval; an upper bound if nothing was missed; unknown
-    if not above 0."""
+    """Return a50 or a90 (``name``) with its interval; an upper bound if nothing was missed;
+    unknown if not above 0."""
     size_mm = getattr(limit, f"{name}_mm")
     ends = getattr(limit, f"{name}_interval_mm")
     if size_mm <= 0:

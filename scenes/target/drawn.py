@@ -204,8 +204,8 @@ class _Room(NamedTuple):
     rim_mm: float
     """Largest radius of a rim."""
     shrinkage: float
-    """Factor by which axes along a bent face's normals start farther apart in plan, so that they do
-    not meet within the board: parallel surfaces at a depth t shrink by 1 - t / radius of
+    """Factor by which axes along a bent face's normals start farther apart in plan, so that they
+    do not meet within the board: parallel surfaces at a depth t shrink by 1 - t / radius of
     curvature."""
     margin_mm: float
     """Least distance of centres from the edge."""

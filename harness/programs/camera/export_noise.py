@@ -2,8 +2,8 @@
 
 The files are for simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc):
 ``NAME.npz`` with the table, and ``depth_noise.py`` (NumPy or torch), a copy of
-`scenes.sensor.common.tabled`, which states what is not modelled. The full model is measured on planes of
-many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
+`scenes.sensor.common.tabled`, which states what is not modelled. The full model is measured on
+planes of many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
 
@@ -74,11 +74,11 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
-    """Return the arrays of `scenes.sensor.common.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are
-    the deviation and the probability of a return over log2 of intensity / range^2, from ``first``
-    on, with ``per_octave`` entries each. There are filters of the noise and of the pattern, whose
-    deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w), each pixel's light
-    relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
+    """Return the arrays of `scenes.sensor.common.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,)
+    are the deviation and the probability of a return over log2 of intensity / range^2, from
+    ``first`` on, with ``per_octave`` entries each. There are filters of the noise and of the
+    pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w), each
+    pixel's light relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
     from scenes.sensor.calibration import with_number
 
     # the table rounds by itself

@@ -328,8 +328,8 @@ def _of_equal_frames(
 def _of_equal_exposures(
     case: maps.MapCase, fused: Sequence[maps.MapSetUp]
 ) -> tuple[maps.Map, maps.Map] | None:
-    """Return the first map with the most frames that has a rival of as many exposures in total, and
-    the rival."""
+    """Return the first map with the most frames that has a rival of as many exposures in total,
+    and the rival."""
     preferred = case.single()
     singles = [set_up for set_up in case.maps if set_up.views == 1]
     singles.sort(

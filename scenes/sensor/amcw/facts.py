@@ -31,8 +31,8 @@ from scenes.sensor.common.facts import (
 
 
 class UnwrapTable(NamedTuple):
-    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path. Sums of the
-    wrapped phases that are whole numbers are a key of the wrap counts."""
+    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path. Sums of
+    the wrapped phases that are whole numbers are a key of the wrap counts."""
 
     lattice: np.ndarray
     """(f,) float32: integers m with f_k = m_k f_0."""
@@ -140,8 +140,8 @@ Phases = Annotated[
     Fact[int],
     checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3),
 ]
-# longest row with the filter's window: `kernels.STRIDE`, repeated here so that declarations compile
-# nothing
+# longest row with the filter's window: `kernels.STRIDE`, repeated here so that declarations
+# compile nothing
 WIDEST_PX = 2128
 
 
@@ -379,10 +379,7 @@ class AmcwCamera(CameraFacts):
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
             raise ValueError(
-                (
-                    f"lens.width_px is {self.lens.width_px.value}; the model allows at most "
-                    f"{widest_px}"
-                )
+                f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}"
             )
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
             raise ValueError(
