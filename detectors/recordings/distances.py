@@ -376,7 +376,8 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
 
 
 def refuse_far_aside(frame: Frame) -> None:
-    """Raise UserError if half of the points are farther off the axis than in any camera's picture."""
+    """Raise UserError if half of the points are farther off the axis than in any camera's
+    picture."""
     across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
         problem = (

@@ -248,7 +248,8 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
 def opened(
     paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any
 ) -> Recording:
-    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
+    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of
+    `open_capture`."""
     from detectors.recordings import open_capture
 
     file = None if intrinsics is None else Path(intrinsics)
