@@ -179,7 +179,7 @@ def test_a_set_up_is_found_by_its_label_or_alone() -> None:
         with pytest.raises(UserError, match="synthetic has 2 set-ups") as caught:
             set_up_named(STUDY, name)
         assert caught.value.legal == "1 frame; 5 frames"
-    with pytest.raises(UserError, match="no set-up '5 frame'; did you mean '5 frames'?"):
+    with pytest.raises(UserError, match=r"no set-up '5 frame'; did you mean '5 frames'\?"):
         set_up_named(STUDY, "5 frame")
 
 
