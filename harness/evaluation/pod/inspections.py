@@ -236,7 +236,7 @@ def _column(
             f"{path}: {header.count(name)} columns are called {name!r}", fix="rename all but one"
         )
     if name not in header:
-        from harness.vocabulary.declaration.diagnose import nearest
+        from harness.vocabulary.words import nearest
 
         meant = nearest(name, header)
         legal = ", ".join(map(repr, header))

@@ -24,11 +24,12 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from harness.vocabulary.declaration.diagnose import nearest, shown
+from harness.vocabulary.declaration.diagnose import shown
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
+from harness.vocabulary.words import nearest
 
 # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
 RECORD_VERSION = 2

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from detectors.masks import shrunk
+from detectors.pixels.masks import shrunk
 from detectors.recordings.arrays import load_npz
 from harness.experiment.schema import Experiment, Point
 from harness.programs.dataset.exchange import depth_units, on_window, picture_bytes, run_lengths
@@ -35,7 +35,8 @@ from harness.vocabulary.path_names import differing, names_of, value_text
 from harness.vocabulary.provenance import check_version
 from harness.vocabulary.seeds import canonical_json
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import truth_of

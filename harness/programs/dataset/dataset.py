@@ -201,9 +201,9 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
     for category in about["categories"]:
         for split in dict.fromkeys(split for split, _, _ in SPLITS):
             pictures = [
-                truths[each.name]
-                for each in samples
-                if (each.category, each.split) == (category, split)
+                truths[sample.name]
+                for sample in samples
+                if (sample.category, sample.split) == (category, split)
             ]
             text = json.dumps(coco_data(pictures, kinds, info), separators=(",", ":"))
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")

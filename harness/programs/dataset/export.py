@@ -89,7 +89,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
             captures.append(unit.capture(frames, seed, role, REPEAT, *labels))
         targets = [job.target for job in batch.renders[:count]]
         rate = camera.unit.frames_per_second.value
-        views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
+        views = in_turn(captures, [target.pose.T_camera_board for target in targets], frames, rate)
         if arguments.format == "tum":
             write_tum(folder, views)
         for exported in () if arguments.format == "tum" else views:

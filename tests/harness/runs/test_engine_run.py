@@ -74,23 +74,23 @@ def made_up(task: Trial, factor: float = 1.0) -> str:
     quiet = factor * (3 + word[0] / 256)
     runs = [
         {
-            "point": one.digest,
-            "variant": one.variant,
-            "frames": one.frames,
-            "quiet_threshold": quiet if one.criteria.threshold is None else None,
+            "point": point.digest,
+            "variant": point.variant,
+            "frames": point.frames,
+            "quiet_threshold": quiet if point.criteria.threshold is None else None,
             "inspected_m2": 0.06,
-            "threshold": one.criteria.threshold,
+            "threshold": point.criteria.threshold,
         }
-        for one in task.points
+        for point in task.points
     ]
     operating = [
         {
-            "variant": one.variant,
-            "frames": one.frames,
-            "threshold": grid(one.criteria.threshold, FINDING_OCTAVES).tolist(),
+            "variant": point.variant,
+            "frames": point.frames,
+            "threshold": grid(point.criteria.threshold, FINDING_OCTAVES).tolist(),
         }
-        for one in task.points
-        if one.criteria.threshold is not None
+        for point in task.points
+        if point.criteria.threshold is not None
     ]
     return record_text({"runs": runs, "operating": operating})
 
@@ -193,7 +193,7 @@ def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
         outcome = go(plan, folder, Pretended(seed, ends))
         assert outcome.trials.over == outcome.trials.total
         assert outcome.trials.failed <= len(outcome.failures)
-        assert {one.why for one in outcome.failures} <= {
+        assert {failure.why for failure in outcome.failures} <= {
             "a fault",
             *(f.why for f in outcome.failures),
         }
@@ -305,7 +305,9 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
         [id(leader) for leader, parts in zip(leaders, each, strict=True) if parts]
         for each in judged
     ]
-    both = [group for group in leaders if all(id(group) in each for each in shards) and group.first]
+    both = [
+        group for group in leaders if all(id(group) in shard for shard in shards) and group.first
+    ]
     calibrates = any(
         point.config.threshold.calibrate is not None for group in both for point in group.points
     )

@@ -112,13 +112,13 @@ def test_groups_that_differ_in_damage_share_their_trials_before_thresholds(tmp_p
     assert second.leader is first and second.first == () and len(first.first) == 5
     for batch in first.first:
         ((_, task),) = first.trials(batch, {})
-        assert [one.digest for one in task.points] == [
+        assert [point.digest for point in task.points] == [
             point.digest for point in (*first.points, *second.points)
         ]
     for group in (first, second):
         tasks = [task for batch in group.then for _, task in group.trials(batch, AT_5)]
         assert len(tasks) == 7
-        assert {one.digest for task in tasks for one in task.points} == {
+        assert {point.digest for task in tasks for point in task.points} == {
             point.digest for point in group.points
         }
     for apart in ("source.camera.unit_seed: [1, 2]", "source.target.distance_m: [0.6, 0.7]"):

@@ -16,13 +16,8 @@ from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, ax
 from harness.records.examples import StudyExample
 from harness.records.schema import Estimate
 from harness.report.clouds import examples_figure
-from harness.report.study_page import (
-    MOST_CURVES,
-    axis_figure,
-    overlay_figure,
-    study_parts,
-    with_room,
-)
+from harness.report.study_figures import MOST_CURVES, axis_figure, overlay_figure, with_room
+from harness.report.study_page import study_parts
 from harness.tables.limits import (
     LIMITS,
     is_within_sizes,

@@ -300,8 +300,8 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tin
     assert again[renders[0].name].value[0] is True
     assert all(read_view(cache / job.name) is not None for job in renders)
     assert {how.state for how in ended.values()} == {"done"}, ended
-    assert len({how.worker for how in looks.values()}) == 2
-    assert all(how.value == [] for how in looks.values()), "a worker loaded Mitsuba"
+    assert len({look.worker for look in looks.values()}) == 2
+    assert all(look.value == [] for look in looks.values()), "a worker loaded Mitsuba"
     assert {path.name for path in cache.glob(".*")} <= {
         ".lock",
         ".rendering",
