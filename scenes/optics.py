@@ -18,39 +18,47 @@ FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian
 
 @dataclass(frozen=True)
 class Optics:
-    """The geometry of a camera's light, in the camera's frame. An imager looks through ``lens``
-    and is lit by a point at ``emitter_m`` (3,), of uniform intensity within a cone about the axis
-    with a linear roll-off between two half angles. A scanner sends its beam from the origin and
-    receives at ``emitter_m``: by Helmholtz' reciprocity it is an imager whose pixels are beams and
-    whose emitter is the receiver. ``beam_fwhm_rad``: full width at half maximum of the beam, a
-    round Gaussian in angle about the pixel's central ray; None for an imager, whose pixel is
-    evenly weighted between its corners. ``frequencies_hz``: where phasors are wanted.
-    ``margin_px``: pixels beyond a region whose light reaches it through the camera's own filter.
-    The camera gives no range below ``nearest_m`` or beyond ``farthest_m``, along its rays or its
-    axis; they change no render."""
+    """The geometry of a camera's light, in the camera's frame.
+
+    An imager looks through ``lens`` and is lit by a point of uniform intensity within a cone about
+    the axis, with a linear roll-off between two half angles. A scanner sends its beam from the
+    origin and receives at ``emitter_m``: by Helmholtz' reciprocity it is an imager whose pixels
+    are beams and whose emitter is the receiver."""
 
     title: str
+    """Name of the camera in messages."""
     lens: Lens
+    """The lens, or the directions of a scanner's beams."""
     emitter_m: np.ndarray
+    """(3,): the emitter, or a scanner's receiver."""
     full_half_angle_deg: float
+    """Angle from the axis up to which the emitter has its full intensity."""
     cutoff_half_angle_deg: float
+    """Angle at which nothing is left of it."""
     frequencies_hz: tuple[float, ...]
+    """Modulation frequencies at which phasors are wanted."""
     wavelength_nm: float
+    """Wavelength of the light."""
     margin_px: int
+    """Pixels beyond a region whose light reaches it through the camera's own filter."""
     beam_fwhm_rad: float | None = None
+    """Full width at half maximum of the beam, a round Gaussian in angle about the pixel's central
+    ray; None for an imager, whose pixel is evenly weighted between its corners."""
     nearest_m: float = 0.0
+    """The camera gives no range below; this changes no render."""
     farthest_m: float = float("inf")
+    """The camera gives no range beyond; this changes no render."""
     limits_along: Literal["ray", "axis"] = "ray"
+    """Direction along which these two count: the camera's rays or its axis."""
 
     def cone(self, slopes: np.ndarray) -> np.ndarray:
         """Return the emitter's light along rays from it (..., 2) relative to the axis."""
         full, cutoff = np.cos(np.radians([self.full_half_angle_deg, self.cutoff_half_angle_deg]))
-        return np.clip(
-            (1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0
-        )
+        cosine = 1 / np.sqrt(1 + (slopes**2).sum(axis=-1))
+        return np.clip((cosine - cutoff) / (full - cutoff), 0.0, 1.0)
 
     def content(self) -> dict[str, Any]:
-        """Return all data that can change a render; they are equal for cameras that share renders."""
+        """Return all data that can change a render; equal for cameras that share renders."""
         return {
             "lens": [*self.lens.__dict__.values()],
             "emitter_m": self.emitter_m.tolist(),
@@ -69,19 +77,20 @@ def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
 
 COARSE = 4  # sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm
 FINE = 256  # sub-rays where a footprint meets an edge: one of them is 0.4 % of a step
-BEAM_REACH = (
-    3.0  # deviations of a beam within which edges are considered: 1 % of the light lies beyond
-)
+# deviations of a beam within which edges are considered: 1 % of the light lies beyond
+BEAM_REACH = 3.0
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals:
+def footprint_of(
+    lens: Lens,
+    region: Region,
+    beam_fwhm_rad: float | None,
+) -> Quadrilaterals:
     """Return the footprints of a region's pixels: beams if the camera has a beam width."""
-    return (
-        Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION)
-        if beam_fwhm_rad
-        else Quadrilaterals(lens, region)
-    )
+    if beam_fwhm_rad:
+        return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION)
+    return Quadrilaterals(lens, region)
 
 
 class Quadrilaterals:
@@ -93,24 +102,29 @@ class Quadrilaterals:
     # pixels
     reach_px = 0
 
-    def __init__(self, lens: Lens, region: Region) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        region: Region,
+    ) -> None:
         # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
-        self.corner = lens.region_slopes(
-            Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1), -0.5
-        )
+        corners = Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1)
+        self.corner = lens.region_slopes(corners, -0.5)
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): a pixel's sub-rays are these vectors, weighted by `grid` or `lattice`;
         z is 1."""
-        c00, c01, c10, c11 = (self.corner[rows + i, cols + j] for i in (0, 1) for j in (0, 1))
+        c00 = self.corner[rows, cols]
+        c01 = self.corner[rows, cols + 1]
+        c10 = self.corner[rows + 1, cols]
+        c11 = self.corner[rows + 1, cols + 1]
         axes = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
-        return np.concatenate(
-            [axes, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))], axis=1
-        )
+        z = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))
+        return np.concatenate([axes, z], axis=1)
 
     def grid(self, side: int = COARSE) -> np.ndarray:
         """Return weights (k, side^2) of the centres of side x side cells of a pixel, row by row."""
-        fy, fx = ((each.ravel() + 0.5) / side for each in np.indices((side, side)))
+        fy, fx = (np.indices((side, side)).reshape(2, -1) + 0.5) / side
         return np.stack([np.ones(side**2), fx, fy, fx * fy])
 
     def lattice(self, count: int = FINE) -> np.ndarray:
@@ -120,7 +134,12 @@ class Quadrilaterals:
         fy = (number * GOLDEN) % 1
         return np.stack([np.ones(count), fx, fy, fx * fy])
 
-    def slopes(self, rows: np.ndarray, cols: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def slopes(
+        self,
+        rows: np.ndarray,
+        cols: np.ndarray,
+        weights: np.ndarray,
+    ) -> np.ndarray:
         """Return slopes (n, m, 2) of the sub-rays of pixels with ``weights`` (k, m)."""
         rays = self.axes(rows, cols) @ weights
         return np.moveaxis(rays[:, :2] / rays[:, 2:], 1, 2)
@@ -132,22 +151,34 @@ class Beams(Quadrilaterals):
     shares: a knife edge cuts off its share of the Gaussian to 0.02. The coarse grid has the
     Gaussian's second moments. Angles are approximated by tangents."""
 
-    def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        region: Region,
+        deviation_rad: float,
+    ) -> None:
         super().__init__(lens, region)
         self._slopes = lens.region_slopes(region)
         self._deviation_rad = deviation_rad
         # away from the axis, an angle spans a larger slope, and so more pixels, by 1 + slope^2
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
-        self.reach_px = 1 + int(
-            np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy))
-        )
+        reach_px = BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)
+        self.reach_px = 1 + int(np.ceil(reach_px))
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): the central ray and two axes across it, for angles."""
         centre = np.concatenate([self._slopes[rows, cols], np.ones((len(rows), 1))], axis=-1)
-        centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
+        centre /= np.linalg.norm(
+            centre,
+            axis=-1,
+            keepdims=True,
+        )
         across = np.cross([0.0, 1.0, 0.0], centre)
-        across /= np.linalg.norm(across, axis=-1, keepdims=True)
+        across /= np.linalg.norm(
+            across,
+            axis=-1,
+            keepdims=True,
+        )
         return np.stack([centre, across, np.cross(centre, across)], axis=-1)
 
     def grid(self, side: int = COARSE) -> np.ndarray:
@@ -168,31 +199,41 @@ class Beams(Quadrilaterals):
 
 @dataclass(frozen=True)
 class NoiseFreeView:
-    """Noise-free light of a view on a region of the sensor. ``phasor`` (f, h, w) complex64 (its
-    rounding turns 200 MHz by 10 nm): per modulation frequency the light of all paths, sum over
-    paths of a * exp(+i 2 pi f L / c), L the full path length; amplitudes in units of an unoccluded
-    albedo-1 Lambertian plane facing emitter and camera at 1 m on the axis (=1). ``phasor_direct``
-    (f, h, w): the part without interreflection. ``intensity`` (h, w): the same sum at frequency 0.
-    ``indirect_noise_m`` (h, w): one standard deviation of range that the Monte Carlo part leaves
-    in a pixel. ``range_m`` (h, w): true distance from the lens along the pixel's central ray, NaN
-    where it meets nothing. ``surface`` (h, w) int16: index into ``surface_names`` at the central
-    ray, -1 for nothing. ``coverage`` (h, w): fraction of the footprint on that surface. ``rgb``
-    (h, w, 3) float32 albedo. ``slopes`` (h, w, 2): x/z, y/z."""
+    """Noise-free light of a view on a region (h, w) of the sensor.
+
+    Amplitudes are in units of an unoccluded albedo-1 Lambertian plane facing emitter and camera at
+    1 m on the axis (=1)."""
 
     region: Region
+    """The pixels."""
     frequencies_hz: tuple[float, ...]
+    """Modulation frequencies."""
     phasor: np.ndarray
+    """(f, h, w) complex64: per modulation frequency the light of all paths, sum over paths of a *
+    exp(+i 2 pi f L / c), L the full path length. Its rounding turns 200 MHz by 10 nm."""
     phasor_direct: np.ndarray
+    """(f, h, w) complex64: the part without interreflection."""
     intensity: np.ndarray
+    """(h, w): the same sum at frequency 0."""
     indirect_noise_m: np.ndarray
+    """(h, w): one standard deviation of range that the Monte Carlo part leaves in a pixel."""
     range_m: np.ndarray
+    """(h, w): true distance from the lens along the pixel's central ray; NaN where it meets
+    nothing."""
     surface: np.ndarray
+    """(h, w) int16: index into ``surface_names`` at the central ray; -1 for nothing."""
     surface_names: tuple[str, ...]
+    """Names of the surfaces."""
     coverage: np.ndarray
+    """(h, w) float32: fraction of the footprint on that surface."""
     rgb: np.ndarray
+    """(h, w, 3) float32: albedo at the central ray."""
     slopes: np.ndarray
+    """(h, w, 2): x/z, y/z of the central ray."""
     seconds: float
+    """Time that it took to compute."""
     variant: str
+    """Name of what computed it: the variant of Mitsuba, or "closed form"."""
 
 
 class RenderConfig(Config):
@@ -204,11 +245,33 @@ class RenderConfig(Config):
         le=32,
         description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10",
     )
-    face_spacing_mm: float = Field(80.0, gt=0, description="spacing of the nodes on the face")
-    face_samples: int = Field(8192, ge=8, description="light paths for each node on the face")
-    hole_noise_mm: float = Field(
-        0.1, gt=0, description="aim for the noise of range in pixels off the face"
+    face_spacing_mm: float = Field(
+        80.0,
+        gt=0,
+        description="spacing of the nodes on the face",
     )
-    hole_samples: int = Field(8192, ge=8, description="most light paths for each of those pixels")
-    rest_samples: int = Field(16, ge=8, description="light paths for each pixel around the board")
-    seed: int = Field(1, ge=0, le=1_000_000)
+    face_samples: int = Field(
+        8192,
+        ge=8,
+        description="light paths for each node on the face",
+    )
+    hole_noise_mm: float = Field(
+        0.1,
+        gt=0,
+        description="aim for the noise of range in pixels off the face",
+    )
+    hole_samples: int = Field(
+        8192,
+        ge=8,
+        description="most light paths for each of those pixels",
+    )
+    rest_samples: int = Field(
+        16,
+        ge=8,
+        description="light paths for each pixel around the board",
+    )
+    seed: int = Field(
+        1,
+        ge=0,
+        le=1_000_000,
+    )

@@ -1,6 +1,7 @@
 """Several views of one target: its pose in each, the error of the nominal poses, and whether a
 camera sees it. The room moves with the camera, as if the target were turned on a table."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Annotated, Literal
 
@@ -26,24 +27,23 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
     all of the face out of its range. A face may be partly out of view or range; damage out of view
     is not a target."""
     face = _face_before_lens(config, CHECKED_STEPS)
-    places = np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
-    centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
-    if (
-        not len(centres) or not optics.lens.images(centres).any()
-    ):  # if damage is in view, so is a part of the face
+    x_m, y_m = np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2).T
+    centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(x_m, y_m))
+    # if damage is in view, so is a part of the face
+    if not len(centres) or not optics.lens.images(centres).any():
         seen_region(config, optics)
         if len(centres):
-            message = f"none of the target's {len(centres)} damages is in view of {optics.title}"
-            legal = "at least one damage in view; damage out of view is not counted as a target"
-            raise UserError(message, legal=legal, fix="change target.pose, or move the damage")
+            raise UserError(
+                f"none of the target's {len(centres)} damages is in view of {optics.title}",
+                legal="at least one damage in view; damage out of view is not counted as a target",
+                fix="change target.pose, or move the damage",
+            )
     range_m = face[..., 2] if optics.limits_along == "axis" else np.sqrt((face**2).sum(axis=-1))
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
-        message = (
-            f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera"
-        )
-        legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}"
         raise UserError(
-            message, legal=legal, fix="change target.pose.distance_m (or target.distance_m)"
+            f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
+            legal=f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}",
+            fix="change target.pose.distance_m (or target.distance_m)",
         )
 
 
@@ -54,18 +54,17 @@ def seen_region(config: TargetConfig, optics: Optics) -> Region:
     face = _face_before_lens(config, OUTLINE_STEPS).reshape(-1, 3)
     in_view = lens.images(face)
     if not in_view.any():
-        fix = "move the target towards the axis (offset) or turn it to the camera (tilt)"
         raise UserError(
             f"the target is out of view of {optics.title}",
             legal="a part of the face in view",
-            fix=fix,
+            fix="move the target towards the axis (offset) or turn it to the camera (tilt)",
         )
     if not in_view.all():
         return lens.whole
     uv = lens.project(face)
-    low = np.floor(uv.min(axis=0)).astype(int)
-    high = np.ceil(uv.max(axis=0)).astype(int) + 1
-    return Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
+    left, top = np.floor(uv.min(axis=0)).astype(int).tolist()
+    right, bottom = np.ceil(uv.max(axis=0)).astype(int).tolist()
+    return Region(top, bottom + 1, left, right + 1)
 
 
 def _face_before_lens(config: TargetConfig, steps: int) -> np.ndarray:
@@ -74,12 +73,10 @@ def _face_before_lens(config: TargetConfig, steps: int) -> np.ndarray:
     face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=steps))
     nearest_m = float(face[..., 2].min())
     if nearest_m <= NEAREST_M:
-        legal = f"all of the face at least {NEAREST_M:g} m in front of the camera"
-        fix = "raise target.pose.distance_m (or target.distance_m) or lower its tilt"
         raise UserError(
             f"the target's nearest point is {nearest_m:.3f} m in front of the lens",
-            legal=legal,
-            fix=fix,
+            legal=f"all of the face at least {NEAREST_M:g} m in front of the camera",
+            fix="raise target.pose.distance_m (or target.distance_m) or lower its tilt",
         )
     return face
 
@@ -103,10 +100,16 @@ class _Spread(_Guess):
         description="angle between the outermost views"
     )
     distance_jitter_mm: float = Field(
-        0.0, ge=0.0, le=500.0, description="deviation of distances but the first"
+        0.0,
+        ge=0.0,
+        le=500.0,
+        description="deviation of distances but the first",
     )
     aim_jitter_mm: float = Field(
-        0.0, ge=0.0, le=500.0, description="deviation of the aim, to the sides and up or down"
+        0.0,
+        ge=0.0,
+        le=500.0,
+        description="deviation of the aim, to the sides and up or down",
     )
 
 
@@ -162,26 +165,34 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
     if isinstance(views, ListedViews):
         return views.poses
     if isinstance(views, HandHeldViews):
-        return tuple(_moved(pose, *shift) for shift in _walk(views))
-    half = views.spread_deg / 2
-    poses = []
+        return tuple(_moved(pose, step[:3], step[3:]) for step in _walk(views))
     turns = _grid(views.count)
     if isinstance(views, ArcViews):
-        turns = [
-            (share, 0.0) if views.about == "x" else (0.0, share) for share in _shares(views.count)
-        ]
+        turns = []
+        for share in _shares(views.count):
+            turns.append((share, 0.0) if views.about == "x" else (0.0, share))
+    half_deg = views.spread_deg / 2
+    poses = []
     for number, (turn_x, turn_y) in enumerate(turns):
-        aside = up = distance = 0.0
-        if number > 0:  # the first view keeps its pose
-            distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
-            aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
-        shifts = (
-            aside * views.aim_jitter_mm,
-            up * views.aim_jitter_mm,
-            distance * views.distance_jitter_mm,
-        )
-        poses.append(_moved(pose, turn_x * half, turn_y * half, 0.0, *shifts))
+        shift_mm = (0.0, 0.0, 0.0)  # the first view keeps its pose
+        if number > 0:
+            shift_mm = _jitter_mm(views, number)
+        poses.append(_moved(pose, (turn_x * half_deg, turn_y * half_deg, 0.0), shift_mm))
     return tuple(poses)
+
+
+def _jitter_mm(
+    views: ArcViews | GridViews,
+    number: int,
+) -> tuple[float, float, float]:
+    """Draw the deviation of a view's target along x, y and z."""
+    distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
+    aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
+    return (
+        aside * views.aim_jitter_mm,
+        up * views.aim_jitter_mm,
+        distance * views.distance_jitter_mm,
+    )
 
 
 def T_reference_view_of(poses: tuple[PoseConfig, ...], number: int) -> np.ndarray:
@@ -198,11 +209,14 @@ def guessed_T_reference_view(
     if number == 0:
         return T_reference_view
     rng = random_stream(views.seed, "guess", number, *labels)
-    axis, shift = (vector / np.linalg.norm(vector) for vector in rng.standard_normal((2, 3)))
+    axis, direction = rng.standard_normal((2, 3))
+    axis = axis / np.linalg.norm(axis)
+    direction = direction / np.linalg.norm(direction)
+    turn = Rotation.from_rotvec(axis * np.deg2rad(views.guess_error_deg)).as_matrix()
     centre = poses[0].T_camera_board[:3, 3]
     error = np.eye(4)
-    error[:3, :3] = Rotation.from_rotvec(axis * np.deg2rad(views.guess_error_deg)).as_matrix()
-    error[:3, 3] = centre - error[:3, :3] @ centre + shift * views.guess_error_mm * MM
+    error[:3, :3] = turn
+    error[:3, 3] = centre - turn @ centre + direction * views.guess_error_mm * MM
     return error @ T_reference_view
 
 
@@ -212,9 +226,8 @@ def _shares(wanted: int) -> list[float]:
     shares = [0.0, 1.0, -1.0]
     step = 0.5
     while len(shares) < wanted:
-        shares += [
-            sign * step * odd for odd in range(1, round(1 / step), 2) for sign in (1.0, -1.0)
-        ]
+        for odd in range(1, round(1 / step), 2):
+            shares += [step * odd, -step * odd]
         step /= 2
     return shares[:wanted]
 
@@ -222,14 +235,18 @@ def _shares(wanted: int) -> list[float]:
 def _grid(wanted: int) -> list[tuple[float, float]]:
     """Return grids of 3 x 3, 5 x 5, 9 x 9 ... places in -1..1, each after the coarser ones;
     corners before edges."""
-    places = [(0.0, 0.0)]
+
+    def farthest_first(point: tuple[float, float]) -> tuple[float, tuple[float, float]]:
+        return -(point[0] ** 2) - point[1] ** 2, point
+
+    points = [(0.0, 0.0)]
     side = 3
-    while len(places) < wanted:
+    while len(points) < wanted:
         ticks = np.linspace(-1.0, 1.0, side).tolist()
-        new = [(x, y) for x in ticks for y in ticks if (x, y) not in places]
-        places += sorted(new, key=lambda place: (-(place[0] ** 2) - place[1] ** 2, place))
+        finer = [(x, y) for x in ticks for y in ticks if (x, y) not in points]
+        points += sorted(finer, key=farthest_first)
         side = 2 * side - 1
-    return places[:wanted]
+    return points[:wanted]
 
 
 @lru_cache(maxsize=16)
@@ -249,9 +266,17 @@ def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(step) for step in (paths / greatest * reach).T.tolist())
 
 
-def _moved(pose: PoseConfig, *by: float) -> PoseConfig:
-    """Return the pose turned by three angles in degrees and shifted along x, y and z by
-    millimetres."""
-    names = ("tilt_x_deg", "tilt_y_deg", "roll_deg", "offset_x_mm", "offset_y_mm", "distance_m")
-    moves = zip(names, (*by[:5], by[5] * MM), strict=True)
-    return PoseConfig(**{key: getattr(pose, key) + moved for key, moved in moves})
+def _moved(
+    pose: PoseConfig,
+    turn_deg: Sequence[float],
+    shift_mm: Sequence[float],
+) -> PoseConfig:
+    """Return the pose turned about x, y and z, and shifted along them."""
+    return PoseConfig(
+        tilt_x_deg=pose.tilt_x_deg + turn_deg[0],
+        tilt_y_deg=pose.tilt_y_deg + turn_deg[1],
+        roll_deg=pose.roll_deg + turn_deg[2],
+        offset_x_mm=pose.offset_x_mm + shift_mm[0],
+        offset_y_mm=pose.offset_y_mm + shift_mm[1],
+        distance_m=pose.distance_m + shift_mm[2] * MM,
+    )

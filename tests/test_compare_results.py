@@ -85,6 +85,15 @@ def test_a_single_folder_needs_no_link(old: Path, new: Path) -> None:
     assert differences_of(old, new) == {}
 
 
+def test_a_digest_in_a_files_name_is_replaced_by_that_of_its_content(old: Path, new: Path) -> None:
+    (results_in(old) / f"learning-00000-{DIGEST}.npz").write_bytes(b"spectrum")
+    learned = results_in(new) / f"learning-00000-{OTHER_DIGEST}.npz"
+    learned.write_bytes(b"spectrum")
+    assert differences_of(old, new) == {}
+    learned.write_bytes(b"another spectrum")
+    assert len(differences_of(old, new)) == 2
+
+
 def test_a_changed_value_is_listed_with_row_and_column(old: Path, new: Path) -> None:
     change_table(results_in(new), TABLE.assign(rate=[0.25, np.nextafter(1.0, 2.0)]))
     differences = differences_of(old, new)
@@ -184,6 +193,16 @@ def test_an_exception_of_text_holds_in_values_too(old: Path, new: Path) -> None:
     assert differences_of(old, new) == {}
     change_json(results_in(new), note="see tofpod pod")
     assert differences_of(old, new).keys() == {"provenance.json"}
+
+
+def test_a_column_of_a_page_may_differ_by_its_title(old: Path, new: Path) -> None:
+    head = "<thead><tr><th>hole</th><th>time (s)</th></tr></thead>"
+    page = f"<table>{head}<tr><td>{{}}</td><td>{{}}</td></tr></table>"
+    (results_in(old) / "report.html").write_text(page.format(1, 0.2))
+    (results_in(new) / "report.html").write_text(page.format(1, 0.3))
+    assert differences_of(old, new) == {}
+    (results_in(new) / "report.html").write_text(page.format(2, 0.2))
+    assert differences_of(old, new).keys() == {"report.html"}
 
 
 def test_parts_limit_the_comparison_to_folders(old: Path, new: Path) -> None:

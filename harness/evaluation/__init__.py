@@ -1,1 +1,1 @@
-"""Statistics of result tables: rates with intervals, noise against frames, comparisons of set-ups."""
+"""Statistics of result tables: rates with intervals, noise by frames, comparisons of set-ups."""

@@ -25,7 +25,9 @@ class Interval:
     """A closed interval; both ends are NaN if the data cannot support one."""
 
     low: float
+    """Lower end."""
     high: float
+    """Upper end."""
 
     @property
     def known(self) -> bool:
@@ -43,7 +45,9 @@ class Interval:
     def over(self, value: float) -> bool | None:
         """Return whether the estimated quantity certainly exceeds ``value``; None if the interval
         includes both."""
-        return True if self.low > value else False if self.high <= value else None
+        if self.low > value:
+            return True
+        return False if self.high <= value else None
 
     def within(self, low: float, high: float) -> bool:
         """Return whether the whole interval lies in [low, high]; False if it is unknown."""
@@ -53,11 +57,25 @@ class Interval:
 UNKNOWN = Interval(np.nan, np.nan)
 
 
+def _floats(*values: ArrayLike) -> tuple[np.ndarray, ...]:
+    """Return values as arrays of numbers of one shape."""
+    return np.broadcast_arrays(*(np.asarray(value, float) for value in values))
+
+
+def _ends_where(
+    is_defined: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of intervals, NaN where they are not defined."""
+    return np.where(is_defined, low, np.nan), np.where(is_defined, high, np.nan)
+
+
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where
     ``trials`` is 0. Its average coverage over the proportion is near nominal; `clopper_pearson` is
     never below nominal and wider."""
-    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    k, n = _floats(successes, trials)
     z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
@@ -65,37 +83,39 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndar
     # rounding would give 1e-17 instead of exactly 0 or 1
     low = np.where(k == 0, 0.0, centre - half)
     high = np.where(k == n, 1.0, centre + half)
-    return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
+    return _ends_where(n > 0, low, high)
 
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Clopper and Pearson's exact interval of a proportion, element by element; NaN where
     ``trials`` is 0."""
-    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    k, n = _floats(successes, trials)
     low = np.where(k == 0, 0.0, special.betaincinv(k, n - k + 1, 1 - UPPER))
     high = np.where(k == n, 1.0, special.betaincinv(k + 1, n - k, UPPER))
-    return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
+    return _ends_where(n > 0, low, high)
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that
     is 0."""
-    k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
+    k, time = _floats(count, exposure)
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
+        return _ends_where(time > 0, low / time, high / time)
 
 
-def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def mean_t(
+    mean: ArrayLike,
+    std: ArrayLike,
+    n: ArrayLike,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN
     below two values."""
-    m, s, k = np.broadcast_arrays(
-        np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float)
-    )
-    size = np.where(k >= 2, k, np.nan)
-    half = special.stdtrit(size - 1, UPPER) * s / np.sqrt(size)
-    return m - half, m + half
+    centre, deviation, count = _floats(mean, std, n)
+    size = np.where(count >= 2, count, np.nan)
+    half = special.stdtrit(size - 1, UPPER) * deviation / np.sqrt(size)
+    return centre - half, centre + half
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
@@ -108,12 +128,17 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     if min(len(a), len(b)) < 2:
         return UNKNOWN
     if np.ptp(a) == np.ptp(b) == 0:
-        return Interval(float(a[0] - b[0]), float(a[0] - b[0]))
+        difference = float(a[0] - b[0])
+        return Interval(difference, difference)
     ends = stats.ttest_ind(a, b, equal_var=False).confidence_interval(CONFIDENCE)
     return Interval(float(ends.low), float(ends.high))
 
 
-def standardised_bias(bias: float, std: float, n: int) -> Interval:
+def standardised_bias(
+    bias: float,
+    std: float,
+    n: int,
+) -> Interval:
     """Return the interval of bias / standard deviation (an effect size) from ``n`` normal values,
     by the large-sample variance 1/n + d^2/(2n) (Hedges and Olkin 1985). Exact if they do not vary;
     unknown below two values."""
@@ -128,7 +153,10 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
 
 
 def bootstrap(
-    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES
+    statistic: Callable[[np.ndarray], np.ndarray],
+    n: int,
+    *,
+    resamples: int = RESAMPLES,
 ) -> Interval:
     """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of
     pixels), with the same draws every time. ``statistic`` maps indices (resamples, n) to values
@@ -143,12 +171,11 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
     """Return the central interval of bootstrap draws (B,); infinite ends remain. NaN draws (such
     as differences of two infinities) are left out; if they are more than half, the interval is
     unknown."""
-    known = draws[~np.isnan(draws)]
-    if len(known) < 2 or len(known) < 0.5 * len(draws):
+    numbers = draws[~np.isnan(draws)]
+    if len(numbers) < 2 or len(numbers) < 0.5 * len(draws):
         return UNKNOWN
-    low, high = np.quantile(
-        known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf"
-    )
+    shares = [(1 - confidence) / 2, (1 + confidence) / 2]
+    low, high = np.quantile(numbers, shares, method="inverted_cdf")
     return Interval(float(low), float(high))
 
 
@@ -157,12 +184,16 @@ SITES_PER_TARGET = 3  # fewest unflawed sites per flawed one, by MIL-HDBK-1823A
 
 @dataclass(frozen=True)
 class FalseCallRate:
-    """False calls per square metre: estimate and Garwood's interval."""
+    """False calls per square metre."""
 
     rate_per_m2: float
+    """Estimate."""
     interval_per_m2: Interval
+    """Garwood's interval."""
     calls: int
+    """Number of false calls."""
     area_m2: float
+    """Unflawed surface inspected."""
 
 
 def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
@@ -178,20 +209,27 @@ def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold of scores: findings *above* ``value`` are calls (-inf: every finding is).
-    ``rate_per_m2``: expected false calls on new runs. ``upper_per_m2``: bound on the true rate at
-    one-sided ``confidence``."""
+    """A threshold of scores that keeps to a rate of false calls."""
 
     value: float
+    """Findings *above* it are calls (-inf: every finding is)."""
     rate_per_m2: float
+    """Expected false calls on new runs."""
     upper_per_m2: float
+    """Bound on the true rate at one-sided ``confidence``."""
     confidence: float
+    """Confidence of that bound."""
     runs: int
+    """Number of hole-free runs that set the threshold."""
     calling_runs: int
+    """Number of these with a score above it."""
 
 
 def threshold_for_rate(
-    highest_scores_per_run: ArrayLike, area_m2: float, rate_per_m2: float, confidence: float = 0.95
+    highest_scores_per_run: ArrayLike,
+    area_m2: float,
+    rate_per_m2: float,
+    confidence: float = 0.95,
 ) -> Threshold:
     """Return the lowest observed score whose rate of false calls is at most the wanted rate, from
     hole-free runs of ``area_m2`` each. ``highest_scores_per_run`` (runs,): -inf without a finding.
@@ -212,13 +250,23 @@ def threshold_for_rate(
     # the margin is for rounding where (n + 1) * wanted is a whole number
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
-        what = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
-        fix = "simulate more hole-free boards, or ask for a higher rate"
+        runs = f"{n} hole-free runs of {area_m2:.2g} m²"
+        fewest = int(np.ceil(1 / wanted * (1 - 1e-12))) - 1
         raise UserError(
-            what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix
+            f"{runs} are too few for a rate of {rate_per_m2:g} per m² of false calls",
+            legal=f"at least {fewest} runs",
+            fix="simulate more hole-free boards, or ask for a higher rate",
         )
     value = float(np.sort(scores)[n - 1 - k])
     above = int(np.sum(scores > value))
     bound = float(special.betaincinv(above + 1, n - above, confidence))
-    rate, upper = -np.log1p(-np.array([(above + 1) / (n + 1), bound])) / area_m2
-    return Threshold(value, float(rate), float(upper), confidence, n, above)
+    probabilities = np.array([(above + 1) / (n + 1), bound])
+    rate, upper = -np.log1p(-probabilities) / area_m2
+    return Threshold(
+        value=value,
+        rate_per_m2=float(rate),
+        upper_per_m2=float(upper),
+        confidence=confidence,
+        runs=n,
+        calling_runs=above,
+    )

@@ -28,88 +28,103 @@ CAMERA_UNIT = "source.camera.unit_seed"
 MANY = 50  # number of frames per view at which maps are compared, if they have as many
 THESIS_REGISTRATION = "cpd"
 THESIS_MERGE = "grid"
-LARGE_MM = (
-    25.4 * 3 / 8
-)  # diameter from which two views are claimed to measure sizes better than one view
+# diameter from which two views are claimed to measure sizes better than one view
+LARGE_MM = 25.4 * 3 / 8
 FEWEST_BOTH = 2  # fewest repeats in which both maps must measure a hole to compare it
 
 
 @dataclass(frozen=True)
 class MapSetUp:
-    """One set-up or variation. ``views``: 0 for "all" without a finished run. ``registration``,
-    ``merge``: empty if no axis states them. ``place``: the other axes' values as text.
-    ``reference``: the set-up of a variation, or ""."""
+    """One set-up or variation."""
 
     variant: str
+    """Name in the tables."""
     views: int
+    """Number of views; 0 for "all" without a finished run."""
     registration: str
+    """Method of registration; empty if no axis states it."""
     merge: str
-    place: str
+    """Kind of merging; empty if no axis states it."""
+    conditions: str
+    """The other axes' values as text."""
     is_variation: bool
+    """True if it varies a fact of another set-up."""
     reference: str
+    """Name of that set-up, or "" for a set-up."""
 
 
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
     """Return all set-ups and variations in the table's order. For "all views", the runs give the
     number."""
-    varied = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
-    runs = tables.runs
-    seen = dict[Any, Any]()
-    if not runs.empty and "views_used" in runs:
-        seen = (
-            (runs["views_used"] + runs["views_left_out"])
-            .groupby(runs["variant"])
-            .max()
-            .dropna()
-            .to_dict()
-        )
-
-    def views(row: pd.Series) -> int:
-        try:
-            return int(float(row.get(VIEWS)))  # type: ignore[arg-type]
-        except (TypeError, ValueError, OverflowError):
-            return int(seen.get(row["variant"], 0))
-
-    found = []
+    special = (VIEWS, REGISTRATION, MERGE)
+    varied = [str(path) for path in tables.axes["path"] if path not in special]
+    most_views = _most_views(tables.runs)
+    set_ups = []
     for _, row in tables.variants.iterrows():
-        named = [row.get(axis) for axis in (REGISTRATION, MERGE)]
-        ways = [name if isinstance(name, str) and name != "null" else "" for name in named]
-        place = ", ".join(value_text(path, row[path]) for path in varied)
-        facts = place, bool(row["is_variation"]), str(row["reference"])
-        found.append(MapSetUp(str(row["variant"]), views(row), ways[0], ways[1], *facts))
-    return found
+        variant = str(row["variant"])
+        views = _whole(row.get(VIEWS))
+        set_up = MapSetUp(
+            variant=variant,
+            views=most_views.get(variant, 0) if views is None else views,
+            registration=_axis_name(row.get(REGISTRATION)),
+            merge=_axis_name(row.get(MERGE)),
+            conditions=", ".join(value_text(path, row[path]) for path in varied),
+            is_variation=bool(row["is_variation"]),
+            reference=str(row["reference"]),
+        )
+        set_ups.append(set_up)
+    return set_ups
+
+
+def _most_views(runs: pd.DataFrame) -> dict[str, int]:
+    """Return by variant the largest number of views of a run, with those that were left out."""
+    if runs.empty or "views_used" not in runs:
+        return {}
+    views = runs["views_used"] + runs["views_left_out"]
+    largest = views.groupby(runs["variant"]).max().dropna()
+    return {str(variant): int(number) for variant, number in largest.items()}
+
+
+def _whole(value: Any) -> int | None:
+    """Return an axis' value as a number; None for another value, such as "all"."""
+    try:
+        return int(float(value))
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _axis_name(value: Any) -> str:
+    return value if isinstance(value, str) and value != "null" else ""
 
 
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of `compare_set_ups` for all set-ups with a map, and the fields of
     `MapSetUp`. Over runs on the damaged board: mean ``views_left_out``, median ``seconds_map``,
     and the noise's deviation ``surface_std_mm``."""
-    maps = pd.DataFrame([asdict(each) for each in maps_of(tables)])
-    compared = compare_set_ups(
-        tables, summary, [str(name) for name in maps["variant"]], half_sizes=False
-    )
+    maps = pd.DataFrame([asdict(set_up) for set_up in maps_of(tables)])
+    variants = [str(name) for name in maps["variant"]]
+    compared = compare_set_ups(tables, summary, variants, half_sizes=False)
     if compared.empty:
         return compared
-    columns = {
-        "views_left_out": ("views_left_out", "mean"),
-        "seconds_map": ("seconds_map", "median"),
-    }
-    columns |= {"surface_std_mm": ("surface_noise_mm", "std")}
-    means = (
-        tables.runs[tables.runs["role"] == "damaged"]
-        .groupby(["variant", "frames"], as_index=False)
-        .agg(**columns)
+    damaged = tables.runs[tables.runs["role"] == "damaged"]
+    means = damaged.groupby(["variant", "frames"], as_index=False).agg(
+        views_left_out=("views_left_out", "mean"),
+        seconds_map=("seconds_map", "median"),
+        surface_std_mm=("surface_noise_mm", "std"),
     )
     return compared.merge(maps, "left", "variant").merge(means, "left", ["variant", "frames"])
 
 
 @dataclass(frozen=True)
 class Change:
-    """A mean difference (second minus first), with its interval over ``n`` repeats."""
+    """A mean difference, second minus first."""
 
     mean: float
+    """The mean; NaN below two repeats."""
     interval: Interval
+    """Student's interval over repeats."""
     n: int
+    """Number of repeats."""
 
     @property
     def is_below(self) -> bool | None:
@@ -121,30 +136,32 @@ class Change:
 def change_of(differences: np.ndarray) -> Change:
     """Return the mean difference over repeats, without NaN, and Student's interval, unknown below
     two repeats."""
-    known = differences[np.isfinite(differences)]
-    if len(known) < 2:
+    finite = differences[np.isfinite(differences)]
+    if len(finite) < 2:
         return Change(np.nan, UNKNOWN, 0)
-    mean = float(known.mean())
-    std = float(known.std(ddof=1))
-    return Change(mean, Interval(*map(float, mean_t(mean, std, len(known)))), len(known))
+    mean = float(finite.mean())
+    low, high = mean_t(mean, float(finite.std(ddof=1)), len(finite))
+    return Change(mean, Interval(float(low), float(high)), len(finite))
 
 
 @dataclass(frozen=True)
 class SizeErrors:
-    """Change (second minus first) of |measured - true diameter|, mm, of holes that both maps
-    measure. ``holes`` (h,): names. ``diameters_mm`` (h,): ascending. ``differences_mm`` (repeats,
-    h): NaN where a map lacks the hole."""
+    """Change (second minus first) of |measured - true diameter| of holes that both maps measure."""
 
     holes: tuple[str, ...]
+    """Names of the holes."""
     diameters_mm: np.ndarray
+    """True diameters (h,), ascending."""
     differences_mm: np.ndarray
+    """Change (repeats, h); NaN where a map lacks the hole."""
 
-    def change(self, of: np.ndarray | None = None) -> Change:
-        """Return the mean over repeats of the mean difference over the holes ``of`` (h,) bool."""
-        chosen = self.differences_mm if of is None else self.differences_mm[:, of]
+    def change(self, holes: np.ndarray | None = None) -> Change:
+        """Return the mean over repeats of the mean difference over ``holes`` (h,) bool."""
+        chosen = self.differences_mm if holes is None else self.differences_mm[:, holes]
         valid = np.isfinite(chosen)
+        total = np.where(valid, chosen, 0.0).sum(axis=1)
         with np.errstate(invalid="ignore"):
-            return change_of(np.where(valid, chosen, 0.0).sum(axis=1) / valid.sum(axis=1))
+            return change_of(total / valid.sum(axis=1))
 
 
 def size_errors(first: pd.DataFrame, second: pd.DataFrame) -> SizeErrors:
@@ -163,12 +180,15 @@ def size_errors(first: pd.DataFrame, second: pd.DataFrame) -> SizeErrors:
     return SizeErrors(tuple(map(str, holes)), sizes, differences)
 
 
-def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
+def run_ratio(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    column: str,
+) -> Change:
     """Return the paired change of a column's logarithm over runs on the damaged board; its ``exp``
     is a ratio."""
-    return change_of(
-        np.log((_by_repeat(second)[column] / _by_repeat(first)[column]).to_numpy(float))
-    )
+    ratio = _by_repeat(second)[column] / _by_repeat(first)[column]
+    return change_of(np.log(ratio.to_numpy(float)))
 
 
 def _by_repeat(runs: pd.DataFrame) -> pd.DataFrame:
@@ -177,57 +197,75 @@ def _by_repeat(runs: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Map:
-    """One map of the experiment: a set-up or variation with one number of frames per view."""
+    """One map of the experiment."""
 
     variant: str
+    """Name of its set-up or variation."""
     frames: int
+    """Number of frames per view."""
     views: int
+    """Number of views."""
 
 
 @dataclass(frozen=True)
 class MapCase:
-    """The maps of one place: one value of every axis except views, registration and merging.
-    ``summary``: of `harness.evaluation.summary.summarise_holes`. ``without_unit``: the place
-    without the camera's unit."""
+    """The maps under the same conditions: one value of every axis except views, registration and
+    merging."""
 
     tables: ResultTables
+    """Tables of the whole experiment."""
     summary: pd.DataFrame
+    """Rows of `harness.evaluation.summary.summarise_holes`."""
     maps: Sequence[MapSetUp]
-    place: str
+    """The set-ups and variations of the case."""
+    conditions: str
+    """The other axes' values as text."""
     without_unit: str = ""
+    """These without the camera's unit."""
 
     @property
     def set_ups(self) -> list[MapSetUp]:
         """Maps of set-ups, without variations."""
-        return [each for each in self.maps if not each.is_variation]
+        return [set_up for set_up in self.maps if not set_up.is_variation]
 
-    def variant(self, views: int, registration: str, merge: str) -> str | None:
+    def variant(
+        self,
+        views: int,
+        registration: str,
+        merge: str,
+    ) -> str | None:
         """Return the name of the set-up. All registrations of a single view are the same, so any
         of them will do."""
-        alike = [each for each in self.set_ups if (each.views, each.merge) == (views, merge)]
-        chosen = [each for each in alike if each.registration == registration] or (
-            alike if views == 1 else []
-        )
-        return chosen[0].variant if chosen else None
+        merged = [
+            set_up for set_up in self.set_ups if set_up.views == views and set_up.merge == merge
+        ]
+        for set_up in merged:
+            if set_up.registration == registration:
+                return set_up.variant
+        return merged[0].variant if merged and views == 1 else None
 
     def frames(self, variant: str) -> list[int]:
         """Return the numbers of frames with which this variant was finished, ascending."""
-        return sorted(
-            int(n) for n in self.summary["frames"][self.summary["variant"] == variant].unique()
-        )
+        finished = self.summary["frames"][self.summary["variant"] == variant]
+        return sorted(int(frames) for frames in finished.unique())
 
     def common_frames(self, *variants: str | None) -> int | None:
         """Return `MANY` if all variants have it, else the most that all have; None if a variant is
         missing."""
-        if any(variant is None for variant in variants):
-            return None
-        shared = set.intersection(
-            *(set(self.frames(variant)) for variant in variants if variant is not None)
-        )
+        finished = []
+        for variant in variants:
+            if variant is None:
+                return None
+            finished.append(set(self.frames(variant)))
+        shared = set.intersection(*finished)
         return MANY if MANY in shared else max(shared, default=None)
 
     def named(
-        self, views: int, registration: str, merge: str, frames: int | None = None
+        self,
+        views: int,
+        registration: str,
+        merge: str,
+        frames: int | None = None,
     ) -> Map | None:
         """Return the map of that name with this number of frames (default: that of
         `common_frames`), if any."""
@@ -239,11 +277,12 @@ class MapCase:
 
     def single(self, frames: int | None = None) -> Map | None:
         """Return the map of a single view, by the thesis' merging if that was tried."""
-        merges = [THESIS_MERGE, *(each.merge for each in self.set_ups)]
-        singles = (
-            self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges)
-        )
-        return next((each for each in singles if each is not None), None)
+        merges = [THESIS_MERGE, *(set_up.merge for set_up in self.set_ups)]
+        for merge in dict.fromkeys(merges):
+            single = self.named(1, THESIS_REGISTRATION, merge, frames)
+            if single is not None:
+                return single
+        return None
 
     def holes(self, chosen: Map) -> pd.DataFrame:
         """Return the rows of one map in the table of holes."""
@@ -260,53 +299,66 @@ class MapCase:
     def registrations(self, frames: int) -> pd.DataFrame:
         """Return the registrations of the set-ups with this number of frames."""
         rows = self.tables.registrations
-        return rows[
-            (rows["frames"] == frames)
-            & rows["variant"].isin([each.variant for each in self.set_ups])
-        ]
+        variants = [set_up.variant for set_up in self.set_ups]
+        return rows[(rows["frames"] == frames) & rows["variant"].isin(variants)]
 
 
 def _rows(table: pd.DataFrame, chosen: Map) -> pd.DataFrame:
-    return table[(table["variant"] == chosen.variant) & (table["frames"] == chosen.frames)]
+    of_variant = table["variant"] == chosen.variant
+    of_frames = table["frames"] == chosen.frames
+    return table[of_variant & of_frames]
 
 
 def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
-    """Make one case for each place, in the order of the set-ups."""
+    """Make one case for each set of conditions, in the order of the set-ups."""
     maps = maps_of(tables)
-    places = dict.fromkeys(each.place for each in maps if not each.is_variation)
-    alike = (
-        tables.variants.assign(**{CAMERA_UNIT: ""})
-        if CAMERA_UNIT in tables.variants
-        else tables.variants
-    )
-    without = {each.variant: each.place for each in maps_of(replace(tables, variants=alike))}
-    groups = ((place, [each for each in maps if each.place == place]) for place in places)
-    return [
-        MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups
-    ]
+    variants = tables.variants
+    if CAMERA_UNIT in variants:
+        variants = variants.assign(**{CAMERA_UNIT: ""})
+    maps_without_unit = maps_of(replace(tables, variants=variants))
+    without_unit = {set_up.variant: set_up.conditions for set_up in maps_without_unit}
+    cases = []
+    for conditions in dict.fromkeys(
+        set_up.conditions for set_up in maps if not set_up.is_variation
+    ):
+        group = [set_up for set_up in maps if set_up.conditions == conditions]
+        first = group[0].variant
+        cases.append(MapCase(tables, summary, group, conditions, without_unit[first]))
+    return cases
 
 
 @dataclass(frozen=True)
 class AgainstOne:
-    """Several merged views compared with the first view on the same repeats. ``large``, ``small``:
-    change of |size error| in mm over the holes from `LARGE_MM` and below. ``threshold``: change of
-    the calibrated threshold in mm. ``noise``: of the logarithm of the surface noise. ``lost``,
-    ``gained``: holes found only by the single view, and only by the several views."""
+    """Several merged views compared with the first view on the same repeats."""
 
     frames: int
+    """Number of frames per view of both maps."""
     sizes: SizeErrors
+    """Change of |size error| by hole."""
     large: Change
+    """Change of |size error| in mm over the holes from `LARGE_MM`."""
     small: Change
+    """The same over the holes below."""
     threshold: Change
+    """Change of the calibrated threshold in mm."""
     noise: Change
+    """Change of the logarithm of the surface noise."""
     lost: tuple[str, ...]
+    """Holes found only by the single view."""
     gained: tuple[str, ...]
+    """Holes found only by the several views."""
 
 
-def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | None:
+def against_one(
+    case: MapCase,
+    registration: str,
+    merge: str,
+) -> AgainstOne | None:
     """Compare two views with the most frames that both have (`MapCase.common_frames`); None if a
     map is missing."""
-    frames = case.common_frames(*(case.variant(views, registration, merge) for views in (1, 2)))
+    of_one = case.variant(1, registration, merge)
+    of_two = case.variant(2, registration, merge)
+    frames = case.common_frames(of_one, of_two)
     if frames is None:
         return None
     single = case.named(1, registration, merge, frames)
@@ -314,27 +366,41 @@ def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | No
     assert single is not None and several is not None
     sizes = size_errors(case.holes(single), case.holes(several))
     large = sizes.diameters_mm >= LARGE_MM - 1e-9
-    states = (case.status(single), case.status(several))
-    runs = (case.runs(single), case.runs(several))
-    lost, gained = (
-        tuple(
-            hole
-            for hole, state in before.items()
-            if state == "found" and after.get(hole) == "missed"
-        )
-        for before, after in (states, states[::-1])
-    )
-    before_mm, now_mm = (rows["threshold"] * rows["scale_mm"] for rows in map(_by_repeat, runs))
-    threshold = change_of((now_mm - before_mm).to_numpy(float))
-    noise = run_ratio(*runs, "surface_noise_mm")
+    before = case.runs(single)
+    after = case.runs(several)
+    threshold_mm = _threshold_mm(after) - _threshold_mm(before)
     return AgainstOne(
-        frames, sizes, sizes.change(large), sizes.change(~large), threshold, noise, lost, gained
+        frames=frames,
+        sizes=sizes,
+        large=sizes.change(large),
+        small=sizes.change(~large),
+        threshold=change_of(threshold_mm.to_numpy(float)),
+        noise=run_ratio(before, after, "surface_noise_mm"),
+        lost=_found_only(case.status(single), case.status(several)),
+        gained=_found_only(case.status(several), case.status(single)),
     )
 
 
-def label_of(registration: str, merge: str, place: str = "") -> str:
+def _threshold_mm(runs: pd.DataFrame) -> pd.Series:
+    rows = _by_repeat(runs)
+    return rows["threshold"] * rows["scale_mm"]
+
+
+def _found_only(first: dict[str, HoleState], second: dict[str, HoleState]) -> tuple[str, ...]:
+    """Return the holes that the first map finds and the second misses."""
+    return tuple(
+        hole for hole, state in first.items() if state == "found" and second.get(hole) == "missed"
+    )
+
+
+def label_of(
+    registration: str,
+    merge: str,
+    conditions: str = "",
+) -> str:
     """Return the name of a way to make a map: ``cpd, grid``."""
-    return ", ".join(part for part in (registration, merge, place) if part) or "as declared"
+    stated = [part for part in (registration, merge, conditions) if part]
+    return ", ".join(stated) or "as declared"
 
 
 def frames_text(frames: int) -> str:
@@ -354,19 +420,17 @@ def span(interval: Interval, digits: int = 2) -> str:
 
 def change_text(change: Change) -> str:
     """Return ``+0.12 mm (0.05 to 0.19)``."""
-    known = np.isfinite(change.mean)
-    return (
-        f"{round(change.mean, 2) + 0.0:+.2f} mm ({span(change.interval)})"
-        if known
-        else "not compared"
-    )
+    if not np.isfinite(change.mean):
+        return "not compared"
+    return f"{round(change.mean, 2) + 0.0:+.2f} mm ({span(change.interval)})"
 
 
 def ratio_text(change: Change) -> str:
     """Return a change of a logarithm as a factor: ``× 0.61 (0.60 to 0.62)``."""
     if not np.isfinite(change.mean):
         return "not compared"
-    return f"× {np.exp(change.mean):.2f} ({span(Interval(*np.exp([change.interval.low, change.interval.high])))})"
+    low, high = np.exp([change.interval.low, change.interval.high])
+    return f"× {np.exp(change.mean):.2f} ({span(Interval(low, high))})"
 
 
 PARTS = ("in_plane", "across")
@@ -375,7 +439,11 @@ UNIT = ["frames", "repeat", "role"]
 MOST_REASONS = 3
 
 
-def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
+def of_map(
+    registrations: pd.DataFrame,
+    method: str,
+    views: int,
+) -> pd.DataFrame:
     """Return the registrations behind a map of this number of views: those of exactly ``views``,
     else of the nearest number, since a method that registers each view alone gives the same result
     for any number."""
@@ -383,9 +451,9 @@ def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame
     if VIEWS not in rows:
         return rows
     # "all views" counts as more than any number
-    apart = pd.to_numeric(rows[VIEWS], errors="coerce").fillna(np.inf).sub(views).abs()
-    order = rows.assign(_apart=apart).sort_values("_apart", kind="stable")
-    return order.drop_duplicates([*UNIT, "view"]).drop(columns="_apart").sort_index()
+    numbers = pd.to_numeric(rows[VIEWS], errors="coerce").fillna(np.inf)
+    order = rows.assign(_distance=numbers.sub(views).abs()).sort_values("_distance", kind="stable")
+    return order.drop_duplicates([*UNIT, "view"]).drop(columns="_distance").sort_index()
 
 
 def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
@@ -394,9 +462,10 @@ def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
     predict, and the ``_ratio`` of actual to predicted (1: honest, above 1: too sure) with a
     bootstrap over repeats. ``guess_mm``: error of the initial guess."""
     groups = registrations.groupby(["method", "frames"], sort=False)
-    return pd.DataFrame(
-        [{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups]
-    )
+    rows = []
+    for (method, frames), part in groups:
+        rows.append({"method": method, "frames": frames, **_summary(part)})
+    return pd.DataFrame(rows)
 
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:
@@ -408,11 +477,9 @@ def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame
             rows = of_map(registrations, method, views)
             if len(rows):
                 parts.append(summarise_registrations(rows).assign(views=views))
-    return (
-        pd.concat(parts, ignore_index=True)
-        if parts
-        else pd.DataFrame(columns=["method", "frames", "views"])
-    )
+    if not parts:
+        return pd.DataFrame(columns=["method", "frames", "views"])
+    return pd.concat(parts, ignore_index=True)
 
 
 def trusted(registrations: pd.DataFrame) -> pd.DataFrame:
@@ -429,54 +496,67 @@ def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
 
 
 def paired_ratio(
-    first: pd.DataFrame, second: pd.DataFrame, column: str
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    column: str,
 ) -> tuple[float, float, float, int]:
     """Return the geometric mean of second / first over pairs of views, Student's interval, number;
     NaN below two."""
-    both = (
-        per_pair(first, column)
-        .to_frame("first")
-        .join(per_pair(second, column).rename("second"), how="inner")
+    pairs = pd.concat(
+        [per_pair(first, column).rename("first"), per_pair(second, column).rename("second")],
+        axis=1,
+        join="inner",
     )
-    both = both[(both > 0).all(axis=1)]
-    if len(both) < 2:
-        return np.nan, np.nan, np.nan, len(both)
-    logs = np.log((both["second"] / both["first"]).to_numpy(float))
+    pairs = pairs[(pairs > 0).all(axis=1)]
+    if len(pairs) < 2:
+        return np.nan, np.nan, np.nan, len(pairs)
+    logs = np.log((pairs["second"] / pairs["first"]).to_numpy(float))
     low, high = mean_t(logs.mean(), logs.std(ddof=1), len(logs))
     return float(np.exp(logs.mean())), float(np.exp(low)), float(np.exp(high)), len(logs)
 
 
 def _summary(part: pd.DataFrame) -> dict[str, Any]:
+    """Return the columns of `summarise_registrations` of one group."""
     good = trusted(part)
     failures = part.loc[part["failure"] != "", "failure"]
-    order = sorted(
-        failures.value_counts(sort=False).items(), key=lambda item: (-int(item[1]), str(item[0]))
-    )
+    counts = [(str(reason), int(n)) for reason, n in failures.value_counts(sort=False).items()]
+    counts.sort(key=lambda reason_and_count: (-reason_and_count[1], reason_and_count[0]))
     row: dict[str, Any] = {
-        **{"n": len(part), "failed": len(failures)},
-        "reasons": [f"{reason} ({count})" for reason, count in order[:MOST_REASONS]],
+        "n": len(part),
+        "failed": len(failures),
+        "reasons": [f"{reason} ({count})" for reason, count in counts[:MOST_REASONS]],
         "guess_mm": float(part["guess_tre_mm"].median()),
         "seconds": float(part["seconds"].astype(float).median()),
     }
     for name in PARTS:
-        errors = good[[f"tre_{name}_mm", f"predicted_{name}_mm"]].astype(float)
-        errors = errors.where(np.isfinite(errors)).set_axis(["actual", "predicted"], axis="columns")
-        actual = errors["actual"]
-        known = errors.notna().all(axis=1)
-        rms = np.sqrt((errors[known] ** 2).mean())
-        # units resampled
-        sums = np.asarray(
-            (errors[known] ** 2).groupby([good.loc[known, key] for key in UNIT]).sum(), float
-        )
-        ratio = _ratio(sums, np.arange(len(sums))[None]).item() if rms["predicted"] > 0 else np.nan
-        ends = bootstrap(partial(_ratio, sums), len(sums)) if rms["predicted"] > 0 else UNKNOWN
-        row |= {
-            f"{name}_median_mm": float(actual.median()),
-            f"{name}_rms_mm": float(np.sqrt((actual**2).mean())),
-            **{f"{name}_predicted_mm": float(rms["predicted"]), f"{name}_ratio": ratio},
-            **{f"{name}_ratio_low": ends.low, f"{name}_ratio_high": ends.high},
-        }
+        row.update(_error_summary(good, name))
     return row
+
+
+def _error_summary(good: pd.DataFrame, name: str) -> dict[str, float]:
+    """Return the columns on errors in one of `PARTS`, of registrations that did not fail."""
+    errors = good[[f"tre_{name}_mm", f"predicted_{name}_mm"]].astype(float)
+    errors = errors.where(np.isfinite(errors)).set_axis(["actual", "predicted"], axis="columns")
+    actual = errors["actual"]
+    complete = errors.notna().all(axis=1)
+    squares = errors[complete] ** 2
+    predicted = float(np.sqrt(squares["predicted"].mean()))
+    ratio = np.nan
+    interval = UNKNOWN
+    if predicted > 0:
+        # units resampled
+        units = [good.loc[complete, key] for key in UNIT]
+        sums = np.asarray(squares.groupby(units).sum(), float)
+        ratio = _ratio(sums, np.arange(len(sums))[None]).item()
+        interval = bootstrap(partial(_ratio, sums), len(sums))
+    return {
+        f"{name}_median_mm": float(actual.median()),
+        f"{name}_rms_mm": float(np.sqrt((actual**2).mean())),
+        f"{name}_predicted_mm": predicted,
+        f"{name}_ratio": ratio,
+        f"{name}_ratio_low": interval.low,
+        f"{name}_ratio_high": interval.high,
+    }
 
 
 def _ratio(sums: np.ndarray, chosen: np.ndarray) -> np.ndarray:

@@ -1,9 +1,8 @@
 """Rates, means and intervals of rows per trial, and the error of an averaged range against the
 number of frames."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
@@ -20,8 +19,8 @@ Measure = Literal["extent", "model"]
 # the variant that the experiment declares; all others change a fact that the thesis leaves open
 MAIN = "main"
 FOUND_RULE = (
-    "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
-    "as missed when it lies below, and as undecided otherwise."
+    "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats "
+    "lies above 0.5, as missed when it lies below, and as undecided otherwise."
 )
 FEWEST_TRIALS = 4  # 4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain
 GROUP = ["variant", "frames", "hole"]
@@ -31,9 +30,11 @@ TRUTH_COLUMNS = [column.name for column in TRUTH]
 def by_hole(names: pd.Series) -> pd.Series:
     """Return a sort key: holes by number if they have one ("2" before "11"), then the others by
     name."""
-    return names.map(
-        lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name))
-    )
+
+    def key(name: Any) -> tuple[int, int, str]:
+        return (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name))
+
+    return names.map(key)
 
 
 def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
@@ -50,9 +51,8 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]
     out["rate_low"], out["rate_high"] = intervals.wilson(out["detected"], out["n"])
-    out["status"] = np.select(
-        [out["rate_low"] > 0.5, out["rate_high"] < 0.5], ["found", "missed"], "undecided"
-    )
+    certain = [out["rate_low"] > 0.5, out["rate_high"] < 0.5]
+    out["status"] = np.select(certain, ["found", "missed"], "undecided")
     for measure in ("extent", "model"):
         out = pd.concat([out, _measured(groups, out, measure)], axis=1)
     out = pd.concat([out, _fitted(holes, out)], axis=1)
@@ -63,21 +63,24 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 
 def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
     """Return the table of holes, with its columns even if no trial on the damaged board ended."""
-    return (
-        holes
-        if "hole" in holes
-        else holes.reindex(columns=[column.name for column in TRIALS.columns])
-    )
+    if "hole" in holes:
+        return holes
+    return holes.reindex(columns=[column.name for column in TRIALS.columns])
 
 
 def found_rule(trials: int) -> str:
     """Return `FOUND_RULE`, with a remark if the trials are too few to call any hole found."""
     if trials >= FEWEST_TRIALS:
         return FOUND_RULE
-    return f"{FOUND_RULE} {trials} repeats are too few for either: at least {FEWEST_TRIALS} are needed."
+    too_few = f"{trials} repeats are too few for either"
+    return f"{FOUND_RULE} {too_few}: at least {FEWEST_TRIALS} are needed."
 
 
-def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:
+def found_holes(
+    summary: pd.DataFrame,
+    variant: str,
+    frames: int,
+) -> dict[str, HoleState]:
     """Return each hole's status by `FOUND_RULE`, in the holes' order; empty if the variant lacks
     these frames."""
     rows = summary[(summary["variant"] == variant) & (summary["frames"] == frames)]
@@ -90,32 +93,37 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
     it (their threshold is NaN), ``quiet_runs`` is their number and ``quiet_highest`` the highest
     of their quiet thresholds."""
     keys = ["variant", "frames"]
-    judged = runs[runs["threshold"].notna()].assign(
-        threshold_mm=lambda r: r["threshold"] * r["scale_mm"]
+    judged = runs[runs["threshold"].notna()]
+    judged = judged.assign(threshold_mm=judged["threshold"] * judged["scale_mm"])
+    out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(
+        runs=("repeat", "size"),
+        false_calls=("false_calls", "sum"),
+        threshold=("threshold", "mean"),
+        threshold_mm=("threshold_mm", "mean"),
+        surface_noise_mm=("surface_noise_mm", "mean"),
     )
-    counts = {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")}
-    means = ("threshold", "threshold_mm")
-    counts |= {name: (name, "mean") for name in (*means, "surface_noise_mm")}
-    out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(**counts)
-    quiet = runs[runs["role"] == "hole_free"].groupby(keys, as_index=False)
-    out = out.merge(
-        quiet.agg(quiet_runs=("repeat", "size"), quiet_highest=("quiet_threshold", "max")),
-        "left",
-        keys,
-    )
+    hole_free = runs[runs["role"] == "hole_free"].groupby(keys, as_index=False)
+    quiet = hole_free.agg(quiet_runs=("repeat", "size"), quiet_highest=("quiet_threshold", "max"))
+    out = out.merge(quiet, "left", keys)
     out["false_calls"] = out["false_calls"].astype(int)
     out["per_run"] = out["false_calls"] / out["runs"]
-    out["per_run_low"], out["per_run_high"] = intervals.poisson_rate(
-        out["false_calls"], out["runs"]
-    )
+    low, high = intervals.poisson_rate(out["false_calls"], out["runs"])
+    out["per_run_low"] = low
+    out["per_run_high"] = high
     return out.sort_values([*keys, "role"], key=_order, kind="stable", ignore_index=True)
 
 
-def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+def _measured(
+    groups: Any,
+    truth: pd.DataFrame,
+    measure: Measure,
+) -> pd.DataFrame:
     """Return means, standard deviations and biases of one measure's diameters and offsets."""
     diameter = groups[f"{measure}_diameter_mm"]
     offset = groups[f"{measure}_offset_mm"]
-    out = diameter.agg(measured="count", diameter_mean_mm="mean", diameter_std_mm="std")
+    out: pd.DataFrame = diameter.agg(
+        measured="count", diameter_mean_mm="mean", diameter_std_mm="std"
+    )
     out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
     out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(
         out["bias_mm"], out["diameter_std_mm"], out["measured"]
@@ -129,15 +137,17 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     """Return depths, which only the model gives, and each fit's stated standard errors, compared
     with the truth."""
-    miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes[
-        "model_diameter_se_mm"
-    ]
-    covered = (miss <= 1.96).astype(float).where(miss.notna())
-    columns = {"model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean")}
-    columns |= {"model_diameter_covered": ("covered", "mean")}
-    columns |= {f"model_depth_{how}_mm": ("model_depth_mm", how) for how in ("mean", "std")}
-    columns |= {"model_depth_se_mean_mm": ("model_depth_se_mm", "mean")}
-    out = holes.assign(covered=covered).groupby(GROUP, sort=False).agg(**columns)
+    error_mm = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs()
+    standard_errors = error_mm / holes["model_diameter_se_mm"]
+    covered = (standard_errors <= 1.96).astype(float).where(standard_errors.notna())
+    groups = holes.assign(covered=covered).groupby(GROUP, sort=False)
+    out = groups.agg(
+        model_diameter_se_mean_mm=("model_diameter_se_mm", "mean"),
+        model_diameter_covered=("covered", "mean"),
+        model_depth_mean_mm=("model_depth_mm", "mean"),
+        model_depth_std_mm=("model_depth_mm", "std"),
+        model_depth_se_mean_mm=("model_depth_se_mm", "mean"),
+    )
     out["model_depth_bias_mm"] = out["model_depth_mean_mm"] - truth["seen_depth_mm"]
     return out
 
@@ -148,44 +158,48 @@ def _order(column: pd.Series) -> pd.Series:
     if column.name == "hole":
         return by_hole(column)
     if column.name == "variant":
-        first_seen = {name: place for place, name in enumerate(dict.fromkeys(column))}
-        return column.map(lambda name: -1 if name == MAIN else first_seen[name])
+        order = {name: position for position, name in enumerate(dict.fromkeys(column))}
+        order[MAIN] = -1
+        return column.map(order)
     return column
-
-
-def hole_list(names: Iterable[str]) -> str:
-    """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
-    all_names = [str(name) for name in names]
-    numbered = sorted(int(name) for name in all_names if name.isdecimal())
-    runs = [
-        [number for _, number in run]
-        for _, run in groupby(enumerate(numbered), lambda at: at[1] - at[0])
-    ]
-    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
-    return ", ".join([*parts, *(name for name in all_names if not name.isdecimal())]) or "none"
 
 
 BLOCKS = 40
 """Blocks of neighbouring probe pixels that the bootstrap resamples: a camera's filter correlates
 neighbours, so pixels are not exchangeable, but contiguous blocks far larger than the filter nearly
 are. 40 give a quantile."""
-COLUMNS = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
-COLUMNS += ["systematic_mm", "displacement_mm", "total_rms_mm"]
+COLUMNS = [
+    "variant",
+    "frames",
+    "pixels",
+    "repeats",
+    "temporal_rms_mm",
+    "offset_mm",
+    "pattern_mm",
+    "systematic_mm",
+    "displacement_mm",
+    "total_rms_mm",
+]
 
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """Effect of averaging. ``slope``: exponent of the temporal noise against the number of frames
-    (white noise: -0.5). ``systematic_ratio``: systematic error (offset and pattern) of the longest
-    over the shortest average."""
+    """Effect of averaging."""
 
     slope: float
+    """Exponent of the temporal noise against the number of frames (white noise: -0.5)."""
     slope_interval: Interval
+    """Its interval over blocks of pixels."""
     systematic_ratio: float
+    """Systematic error (offset and pattern) of the longest over the shortest average."""
     systematic_ratio_interval: Interval
+    """Its interval over blocks of pixels."""
     few_frames: int
+    """Number of frames of the shortest average."""
     many_frames: int
+    """Number of frames of the longest average."""
     pixels: int
+    """Number of pixels with a value at every number of frames."""
 
 
 def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
@@ -198,22 +212,28 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
         moments = _moments(part)
-        if len(moments):
-            variance, offset, *_ = mean = moments.mean(axis=0)
-            pattern2 = float(_pattern_variance(mean, len(moments)))
-            repeats = int(part["repeats"].median())
-            temporal, systematic, total = np.sqrt(
-                [variance, offset**2 + pattern2, variance + offset**2 + pattern2]
-            )
-            displacement = float(part["displacement_std_mm"].median())
-            start = (variant, frames, len(moments), repeats)
-            rows.append(
-                (*start, temporal, offset, np.sqrt(pattern2), systematic, displacement, total)
-            )
+        if not len(moments):
+            continue
+        mean = moments.mean(axis=0)
+        variance = mean[0]
+        offset = mean[1]
+        pattern2 = float(_pattern_variance(mean, len(moments)))
+        row = {
+            "variant": variant,
+            "frames": frames,
+            "pixels": len(moments),
+            "repeats": int(part["repeats"].median()),
+            "temporal_rms_mm": np.sqrt(variance),
+            "offset_mm": offset,
+            "pattern_mm": np.sqrt(pattern2),
+            "systematic_mm": np.sqrt(offset**2 + pattern2),
+            "displacement_mm": float(part["displacement_std_mm"].median()),
+            "total_rms_mm": np.sqrt(variance + offset**2 + pattern2),
+        }
+        rows.append(row)
     table = pd.DataFrame(rows, columns=COLUMNS)
-    table = table.sort_values("frames", kind="stable").sort_values(
-        "variant", kind="stable", ignore_index=True
-    )
+    table = table.sort_values("frames", kind="stable")
+    table = table.sort_values("variant", kind="stable", ignore_index=True)
     first = table.groupby("variant")[["frames", "temporal_rms_mm"]].transform("first")
     table["guide_mm"] = first["temporal_rms_mm"] * np.sqrt(first["frames"] / table["frames"])
     return table
@@ -233,7 +253,8 @@ def fit_floor(
     n = n[usable]
     total2 = total2[usable]
     design = np.column_stack([1 / n, np.ones_like(n)]) / total2[:, None]
-    return float(np.sqrt(nnls(design, np.ones_like(n))[0][1]))
+    (_, floor2), _ = nnls(design, np.ones_like(n))
+    return float(np.sqrt(floor2))
 
 
 def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
@@ -248,9 +269,8 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
     present = usable.groupby("pixel")["frames"].nunique()
     common = present.index[present == len(frames)].sort_values()
     parts = [usable[usable["frames"] == n].set_index("pixel").loc[common] for n in frames]
-    stacked = np.stack(
-        [_moments(part) for part in parts], axis=1
-    )  # (pixels, frames, 4), only pixels that have all
+    # (pixels, frames, 4), only pixels that have all
+    stacked = np.stack([_moments(part) for part in parts], axis=1)
     pixels = len(stacked)
     if pixels < 2 or not (stacked[..., 0].mean(axis=0) > 0).all():
         return None
@@ -261,10 +281,12 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
     x = np.log(frames) - np.log(frames).mean()
 
     def means(indices: np.ndarray) -> np.ndarray:
-        return sums[indices].sum(axis=1) / counts[indices].sum(axis=1)[:, None, None]
+        """Return mean moments (draws, frames, 4) over the blocks ``indices`` (draws, blocks)."""
+        return np.asarray(sums[indices].sum(axis=1) / counts[indices].sum(axis=1)[:, None, None])
 
     def slope(indices: np.ndarray) -> np.ndarray:
-        return (0.5 * np.log(means(indices)[..., 0]) @ x) / (x @ x)
+        """Return the slope (draws,) of ln temporal noise over ln frames."""
+        return np.asarray((0.5 * np.log(means(indices)[..., 0]) @ x) / (x @ x))
 
     def ratio(indices: np.ndarray) -> np.ndarray:
         """Return the systematic error of the longest over the shortest average; NaN if the latter
@@ -274,12 +296,15 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(systematic[:, 0] > 0, systematic[:, -1] / systematic[:, 0], np.nan)
 
-    whole = np.arange(blocks)[None]
-    exponent = float(slope(whole)[0])
-    change = float(ratio(whole)[0])
-    intervals = bootstrap(slope, blocks), bootstrap(ratio, blocks)
+    all_blocks = np.arange(blocks)[None]
     return NoiseLaw(
-        exponent, intervals[0], change, intervals[1], int(frames[0]), int(frames[-1]), pixels
+        slope=float(slope(all_blocks)[0]),
+        slope_interval=bootstrap(slope, blocks),
+        systematic_ratio=float(ratio(all_blocks)[0]),
+        systematic_ratio_interval=bootstrap(ratio, blocks),
+        few_frames=int(frames[0]),
+        many_frames=int(frames[-1]),
+        pixels=pixels,
     )
 
 
@@ -288,14 +313,13 @@ def _moments(part: pd.DataFrame) -> np.ndarray:
     mean error."""
     error = part["mean_error_mm"].to_numpy(float)
     variance = part["temporal_std_mm"].to_numpy(float) ** 2
-    moments = np.stack(
-        [variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1
-    )
-    return moments[np.isfinite(moments).all(axis=1)]
+    left_over = variance / part["repeats"].to_numpy(float)
+    moments = np.stack([variance, error, error**2, left_over], axis=-1)
+    return np.asarray(moments[np.isfinite(moments).all(axis=1)])
 
 
 def _pattern_variance(mean: np.ndarray, pixels: int) -> np.ndarray:
     """Return the variance over pixels of the mean error, minus leftover temporal variance, from
     means of `_moments`."""
     unbiased = (mean[..., 2] - mean[..., 1] ** 2) * (pixels / max(pixels - 1, 1))
-    return np.maximum(unbiased - mean[..., 3], 0.0)
+    return np.asarray(np.maximum(unbiased - mean[..., 3], 0.0))

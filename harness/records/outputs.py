@@ -10,14 +10,16 @@ FolderKind = Literal["results", "capture"]
 
 @dataclass(frozen=True)
 class Output:
-    """A file, or several if ``name`` holds * or ?. ``note`` describes its content. ``place`` is a
-    results folder or a real capture's folder in it. ``of`` is the kind of experiment or program
-    that writes it; empty for every sweep."""
+    """A file, or several, that programs write."""
 
     name: str
+    """Its name; * and ? stand for any characters."""
     note: str
+    """Its content."""
     place: FolderKind = "results"
+    """Folder that holds it: a results folder, or a real capture's folder in it."""
     of: str = ""
+    """Kind of experiment or program that writes it; empty for every sweep."""
 
 
 REPORT = Output("report.html", "the report: a single file that can be read offline")
@@ -55,9 +57,27 @@ BLIND = Output("blind.png", "the pixels without a return", "capture", "capture")
 GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
 CLOUD = Output("cloud.ply", "the cloud, with findings in magenta", "capture", "capture")
 FILES = (
-    REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
-    COVERAGE_PAGE, ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
-)  # fmt: skip
+    REPORT,
+    EXPERIMENT,
+    PROVENANCE,
+    STUDY,
+    LEARNED,
+    MAPS,
+    CAPTURES,
+    COMPARISON,
+    COMPARISON_PAGE,
+    EFFICIENCY_PAGE,
+    COVERAGE_PAGE,
+    ATLAS_PAGE,
+    ATLAS_PICTURE,
+    FINDINGS,
+    FINDINGS_DATA,
+    ANNOTATED,
+    TARGETS,
+    BLIND,
+    GAUGE_ROWS,
+    CLOUD,
+)
 JOURNAL = "journal"
 LATEST = "latest"
 LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")

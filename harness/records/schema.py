@@ -10,19 +10,27 @@ three columns of a file (``speed_m``, ``speed_low_m``, ``speed_high_m``) and one
     name = Column("animal", "animal", "species.name", "name of the species")
     speed = Column("speed_m", "speed (m/s)", ("speed", "interval"), "metres in a second")
     SPEEDS = Table("speeds", "one row per animal", (name, speed))
-    SPEEDS.frame(animals)        # a DataFrame; write_table(folder, SPEEDS, frame) makes speeds.csv, speeds.parquet
-    SPEEDS.grid(animals).html()  # a page's table; .lines() and .rich() for terminals; harness.vocabulary.text.show prints
-    SPEEDS.data(animals)         # JSON's types
+    SPEEDS.frame(animals)  # a DataFrame, which write_table makes into speeds.csv, speeds.parquet
+    SPEEDS.grid(animals).html()  # a page's table; .lines() and .rich() are for terminals
+    SPEEDS.data(animals)  # JSON's types
+
+A class of rows may declare its columns with its fields (`declared_columns`):
+
+    @dataclass(frozen=True)
+    class Run:
+        speed_m: Annotated[float, "metres in a second"]
+
+    RUNS = Table("runs", "one row per run", declared_columns(Run))
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import numpy as np
 
@@ -50,14 +58,18 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval, NaN if unknown; shown as ``> most`` beyond ``most``, with ``≤``
-    if ``at_most``."""
+    """A number with its interval."""
 
     value: float
+    """The number; NaN if unknown."""
     low: float = np.nan
+    """Lower end of the interval; NaN if unknown."""
     high: float = np.nan
+    """Upper end of the interval; NaN if unknown."""
     most: float = np.inf
+    """Largest number that is known; beyond it, the text is ``> most``."""
     at_most: bool = False
+    """True for a bound, which the text marks with ``≤``."""
 
     def text(self, digits: int = 2) -> str:
         """Return ``3.20 (2.90 to 3.60)``, ``> 15.9``, ``≤ 2.05`` or ``none``."""
@@ -69,65 +81,106 @@ class Estimate:
 def _share(share: float | Estimate) -> str:
     """Return a share as text, such as ``0.12 % (0.05 to 0.2 %)``."""
     estimate = share if isinstance(share, Estimate) else Estimate(share)
-    value = f"{100 * estimate.value:.{(2 if estimate.value < 0.995 else 3)}g}"
-    low = f"{100 * estimate.low:.{(2 if estimate.low < 0.995 else 3)}g}"
-    high = f"{100 * estimate.high:.{(2 if estimate.high < 0.995 else 3)}g}"
-    ends = f" ({low} to {high} %)" if np.isfinite(estimate.low) else ""
-    return text.UNKNOWN_TEXT if np.isnan(estimate.value) else f"{value} %{ends}"
+    if np.isnan(estimate.value):
+        return text.UNKNOWN_TEXT
+    value = _percent(estimate.value)
+    if not np.isfinite(estimate.low):
+        return f"{value} %"
+    return f"{value} % ({_percent(estimate.low)} to {_percent(estimate.high)} %)"
+
+
+def _percent(share: float) -> str:
+    """Return a share in per cent with two digits, or three from 99.5 % on."""
+    digits = 2 if share < 0.995 else 3
+    return f"{100 * share:.{digits}g}"
+
+
+def _size(size: float | Estimate | None) -> str:
+    """Return a size in millimetres as text."""
+    if isinstance(size, Estimate):
+        return size.text()
+    return text.mm(np.nan if size is None else size)
+
+
+def _area(area: float | None) -> str:
+    """Return an area under a curve as text."""
+    if area is None or np.isnan(area):
+        return text.UNKNOWN_TEXT
+    return f"{area:.3f}"
+
+
+def _plain(value: Any) -> str:
+    """Return any value as text."""
+    return value.text() if isinstance(value, Estimate) else text.plain(value)
 
 
 FORMATS: dict[str, Callable[[Any], str]] = {
-    "_mm": lambda size: (
-        size.text() if isinstance(size, Estimate) else text.mm(np.nan if size is None else size)
-    ),
+    "_mm": _size,
     "_share": _share,
-    "_area": lambda area: text.UNKNOWN_TEXT if area is None or np.isnan(area) else f"{area:.3f}",
+    "_area": _area,
     "_p": text.p_value,
-    "": lambda value: value.text() if isinstance(value, Estimate) else text.plain(value),
+    "": _plain,
 }
 """Default formats of numbers, by the endings of column names."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a result table, as the module's docstring describes it. ``interval``: its values
-    are `Estimate`. ``spread``: they are mappings, and each key becomes a column. ``brief``: text
-    at a terminal, False to hide it."""
+    """A column of a result table."""
 
-    name: str
+    name: str = ""
+    """Its name in data files, whose ending is its unit; empty for a column of pages only."""
     label: str = ""
+    """Its head on pages and terminals; empty for a column of files only."""
     value: str | tuple[str, str] | Callable[[Any], Any] | None = None
+    """Path of a row's attributes, paths of an estimate and its interval, or a function of the row;
+    None: the entry of a mapping with the column's name."""
     note: str = ""
+    """Its meaning."""
     text: Callable[[Any], str] | None = None
+    """Format of a value; None: that of its name's ending (`FORMATS`)."""
     interval: bool = False
+    """True if its values are `Estimate`."""
     spread: bool = False
+    """True if its values are mappings, each key of which becomes a column."""
     tone: Callable[[Any], Tone] | None = None
+    """Colour of a row's cell."""
     brief: Callable[[Any], str] | bool = True
+    """Format at a terminal; False hides the column there."""
 
     @property
     def unit(self) -> str:
         """The unit that the ending of the name states, or an empty text."""
-        return next((unit for ending, unit in UNITS.items() if self.name.endswith(ending)), "")
+        return UNITS.get(self._ending, "")
 
     @property
     def names(self) -> tuple[str, ...]:
         """The column's names in files; an interval has three."""
-        if not (self.interval or isinstance(self.value, tuple)):
+        if not self.interval and not isinstance(self.value, tuple):
             return (self.name,)
-        ending = next((ending for ending in UNITS if self.name.endswith(ending)), "")
-        stem = self.name.removesuffix(ending)
-        return (self.name, f"{stem}_low{ending}", f"{stem}_high{ending}")
+        stem = self.name.removesuffix(self._ending)
+        return (self.name, f"{stem}_low{self._ending}", f"{stem}_high{self._ending}")
+
+    @property
+    def _ending(self) -> str:
+        """The ending of the name that states its unit, or an empty text."""
+        return next((ending for ending in UNITS if self.name.endswith(ending)), "")
 
     def of(self, row: Any) -> Any:
-        """Return the row's value; None if a mapping lacks it or an attribute on its path is None."""
+        """Return the row's value; None if a mapping lacks it or an attribute on its path is
+        None."""
         if self.value is None:
             values = [row.get(name) for name in self.names]
             return values[0] if len(values) == 1 or values[0] is None else Estimate(*values)
         if isinstance(self.value, str):
             return _attribute(row, self.value)
         if isinstance(self.value, tuple):
-            value, ends = (_attribute(row, path) for path in self.value)
-            return Estimate(np.nan) if value is None else Estimate(value, ends.low, ends.high)
+            value_path, interval_path = self.value
+            value = _attribute(row, value_path)
+            if value is None:
+                return Estimate(np.nan)
+            interval = _attribute(row, interval_path)
+            return Estimate(value, interval.low, interval.high)
         return self.value(row)
 
     def cell(self, row: Any, *, terminal: bool = False) -> Cell:
@@ -135,29 +188,59 @@ class Column:
         value = self.of(row)
         if isinstance(value, Cell):
             return replace(value, text=value.text.replace("\n", " ")) if terminal else value
-        how = self.brief if terminal and callable(self.brief) else self.text
-        how = how or next(form for ending, form in FORMATS.items() if self.name.endswith(ending))
-        return Cell(how(value), self.tone(row) if self.tone else "")
+        as_text = self.text
+        if terminal and callable(self.brief):
+            as_text = self.brief
+        if as_text is None:
+            as_text = next(FORMATS[ending] for ending in FORMATS if self.name.endswith(ending))
+        return Cell(as_text(value), self.tone(row) if self.tone else "")
+
+
+def declared_columns(row_type: type) -> tuple[Column, ...]:
+    """Return the columns that the fields of a class of rows declare, in order. A field is annotated
+    with its note or its `Column`; a field that is itself a dataclass adds the columns of that
+    class."""
+    columns: list[Column] = []
+    for name, hint in get_type_hints(row_type, include_extras=True).items():
+        if isinstance(hint, type) and is_dataclass(hint):
+            columns += declared_columns(hint)
+            continue
+        _, declared = get_args(hint)
+        column = Column(note=declared) if isinstance(declared, str) else declared
+        columns.append(replace(column, name=name))
+    return tuple(columns)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A result table. ``note`` says what a row is, ``order`` names the columns that sort rows,
-    ``formats`` its files, ``digits`` the precision of CSV, ``title`` the title at a terminal.
-    ``always`` writes it even without rows; ``left`` columns hold text on a page; ``lists`` names
-    columns whose list elements become rows of the files."""
+    """A result table."""
 
     name: str
+    """Name of its files, without their endings."""
     note: str
+    """Meaning of a row."""
     columns: tuple[Column, ...]
+    """Its columns, in order."""
     order: tuple[str, ...] = ()
+    """Columns that sort the rows."""
     formats: tuple[str, ...] = ("csv", "parquet")
+    """Endings of its files."""
     title: str = ""
+    """Title at a terminal."""
     always: bool = False
+    """True if its files are written even without rows."""
     lists: tuple[str, ...] = ()
+    """Columns of lists whose elements become rows of the files."""
     left: int = 1
+    """Number of columns that hold text on a page and are flush left."""
     digits: str = "%.6g"
+    """Format of numbers in CSV."""
     kind: str = "limits"
+    """Class of the table on a page."""
+
+    def column(self, name: str) -> Column:
+        """Return a column by its name in files. Raises KeyError."""
+        return {column.name: column for column in self.columns}[name]
 
     @property
     def stored(self) -> tuple[Column, ...]:
@@ -171,30 +254,30 @@ class Table:
 
     def records(self, rows: Iterable[Any]) -> list[dict[str, Any]]:
         """Return the rows as mappings from the columns' names in files to their values."""
-        found = []
+        records = []
         for row in rows:
             record: dict[str, Any] = {}
             for column in self.stored:
                 value = column.of(row)
                 if column.spread:
-                    record |= {name: _scalar(part) for name, part in value.items()}
+                    record.update({name: _scalar(part) for name, part in value.items()})
                 elif len(column.names) > 1:
-                    record |= dict(
-                        zip(column.names, (value.value, value.low, value.high), strict=True)
-                    )
+                    ends = (value.value, value.low, value.high)
+                    record.update(zip(column.names, ends, strict=True))
                 else:
                     record[column.name] = value.value if isinstance(value, Estimate) else value
-            found.append(record)
-        return found
+            records.append(record)
+        return records
 
     def frame(self, rows: Iterable[Any]) -> pd.DataFrame:
         """Return the rows as a DataFrame; columns with both numbers and text become text."""
         import pandas as pd
 
         records = self.records(rows)
-        names = dict.fromkeys(name for record in records for name in record)
-        empty = [name for column in self.stored if not column.spread for name in column.names]
-        frame = pd.DataFrame(records, columns=list(names) or empty)
+        names = list(dict.fromkeys(name for record in records for name in record))
+        if not names:
+            names = [name for column in self.stored if not column.spread for name in column.names]
+        frame = pd.DataFrame(records, columns=names)
         for name in frame.columns[frame.dtypes.map(str) == "object"]:
             kinds = {type(value) for value in frame[name][frame[name].notna()]}
             if kinds and kinds <= {bool, np.bool_}:
@@ -220,21 +303,14 @@ class Table:
         """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only``
         lists the labels to show; ``heads`` replaces declared labels, and an empty label hides its
         column."""
-        shown = [
-            column
-            for column in self.columns
-            if column.label and not (terminal and column.brief is False)
-        ]
-        labels = {
-            col: (heads or {}).get(col.label, col.label)
-            for col in shown
-            if not only or col.label in only
-        }
-        shown = [column for column, label in labels.items() if label]
+        shown: dict[Column, str] = {}
+        for column in self.columns:
+            is_hidden = terminal and column.brief is False
+            label = (heads or {}).get(column.label, column.label)
+            if label and not is_hidden and (not only or column.label in only):
+                shown[column] = label
         cells = [[column.cell(row, terminal=terminal) for column in shown] for row in rows]
-        return Grid.of(
-            [labels[column] for column in shown], cells, self.left, self.title, self.kind
-        )
+        return Grid.of(list(shown.values()), cells, self.left, self.title, self.kind)
 
 
 def write_table(
@@ -244,36 +320,52 @@ def write_table(
     JSON under "tofpod". Without rows, the files of an earlier run are removed. Raises UserError if
     the folder cannot be written."""
     for ending, name in zip(table.formats, table.files, strict=True):
+        file = Path(folder) / name
         if frame.empty and not table.always:
-            (Path(folder) / name).unlink(missing_ok=True)
-            continue
-        if ending == "csv":
-            with atomic_path(Path(folder) / name) as path:
+            file.unlink(missing_ok=True)
+        elif ending == "csv":
+            with atomic_path(file) as path:
                 frame.to_csv(path, index=False, float_format=table.digits, lineterminator="\n")
-            continue
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+        else:
+            _write_parquet(file, table, frame, about)
 
-        noted = {name: column for column in table.stored for name in column.names}
-        at_once = LISTS_AT_ONCE if table.lists and len(frame) else max(len(frame), 1)
-        starts = range(0, max(len(frame), 1), at_once)
-        parts = (_unfolded(frame.iloc[start : start + at_once], table.lists) for start in starts)
-        blocks = (pa.Table.from_pandas(part, preserve_index=False) for part in parts)
-        block = next(blocks)
-        fields = []
-        for field in block.schema:
-            column = noted.get(field.name)
-            facts = {} if column is None else {"unit": column.unit, "note": column.note}
-            fields.append(
-                field.with_metadata({key: value for key, value in facts.items() if value})
-            )
-        metadata = dict(block.schema.metadata or {})
-        if about is not None:
-            metadata[b"tofpod"] = json.dumps(about, sort_keys=True).encode()
-        schema = pa.schema(fields, metadata=metadata)
-        with atomic_path(Path(folder) / name) as path, pq.ParquetWriter(path, schema) as writer:
-            for stored in chain([block], blocks):
-                writer.write_table(stored.cast(schema))
+
+def _write_parquet(
+    file: Path, table: Table, frame: pd.DataFrame, about: Mapping[str, Any] | None
+) -> None:
+    """Write a table as Parquet, some rows at a time if their lists become rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    count = max(len(frame), 1)
+    at_once = LISTS_AT_ONCE if table.lists and len(frame) else count
+    schema = None
+    with atomic_path(file) as path, contextlib.ExitStack() as stack:
+        for start in range(0, count, at_once):
+            part = _unfolded(frame.iloc[start : start + at_once], table.lists)
+            block = pa.Table.from_pandas(part, preserve_index=False)
+            if schema is None:
+                schema = _noted_schema(block.schema, table, about)
+                writer = stack.enter_context(pq.ParquetWriter(path, schema))
+            writer.write_table(block.cast(schema))
+
+
+def _noted_schema(schema: Any, table: Table, about: Mapping[str, Any] | None) -> Any:
+    """Return a schema of Parquet with the columns' units and notes, and ``about``."""
+    import pyarrow as pa
+
+    columns = {name: column for column in table.stored for name in column.names}
+    fields = []
+    for field in schema:
+        notes = {}
+        if field.name in columns:
+            column = columns[field.name]
+            notes = {"unit": column.unit, "note": column.note}
+        fields.append(field.with_metadata({key: value for key, value in notes.items() if value}))
+    metadata = dict(schema.metadata or {})
+    if about is not None:
+        metadata[b"tofpod"] = json.dumps(about, sort_keys=True).encode()
+    return pa.schema(fields, metadata=metadata)
 
 
 def _unfolded(frame: pd.DataFrame, lists: Sequence[str]) -> pd.DataFrame:
@@ -281,20 +373,26 @@ def _unfolded(frame: pd.DataFrame, lists: Sequence[str]) -> pd.DataFrame:
     if not lists or frame.empty:
         return frame
     rows = np.repeat(np.arange(len(frame)), frame[lists[0]].map(len))
-    whole = np.zeros(0, int)  # makes counts 64-bit integers
-    elements = {name: np.concatenate([*frame[name].to_numpy(), whole]) for name in lists}
+    as_int64 = np.zeros(0, int)  # makes counts 64-bit integers
+    elements = {name: np.concatenate([*frame[name].to_numpy(), as_int64]) for name in lists}
     return frame.drop(columns=list(lists)).iloc[rows].assign(**elements)[list(frame.columns)]
 
 
 def _attribute(row: Any, path: str) -> Any:
+    """Return the attribute at a dotted path; None if an attribute on the way is None."""
+    value = row
     for name in path.split("."):
-        row = None if row is None else getattr(row, name)
-    return row
+        value = None if value is None else getattr(value, name)
+    return value
 
 
 def _scalar(value: Any) -> Any:
-    return value if value is None or isinstance(value, str | int | float) else canonical_json(value)
+    """Return a value of a file's cell: numbers and texts as they are, other data as JSON."""
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return canonical_json(value)
 
 
 def _text(value: Any) -> str:
+    """Return a value of a column of texts."""
     return value if isinstance(value, str) else canonical_json(value)

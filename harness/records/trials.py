@@ -1,18 +1,28 @@
-"""Tables of trials: the measurements of each trial, and summaries of experiments that are not
-studies.
+"""Tables of trials: the measurements of each trial, whose columns are the fields of the classes in
+`harness.records.rows`, and summaries of experiments that are not studies.
 
-Columns declare only a name and a note; their values come from `harness.trials.trial` and
-`harness.evaluation`."""
+The columns of summaries declare a name and a note; their values come from `harness.evaluation`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from harness.records import outputs
-from harness.records.schema import Column, Table
+from harness.records.rows import (
+    DamageRow,
+    FindingRow,
+    NoiseRow,
+    OperatingRow,
+    PixelsRow,
+    ProbeRow,
+    RegistrationRow,
+    RunRow,
+    SiteRow,
+)
+from harness.records.schema import Column, Table, declared_columns
 from harness.vocabulary import text
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -31,51 +41,15 @@ def _fine(value: float | None) -> str:
 
 
 def _percent(share: float | None) -> str:
-    return text.UNKNOWN_TEXT if share is None or math.isnan(share) else f"{100 * share:.0f} %"
+    if share is None or math.isnan(share):
+        return text.UNKNOWN_TEXT
+    return f"{100 * share:.0f} %"
 
 
 def _word(name: str | None) -> str:
     return name or "as declared"
 
 
-COMMON = _columns(
-    variant="name of the set-up",
-    frames="number of averaged frames",
-    repeat="draw of the noise and unit",
-)
-BOARD = _columns(board="number of the board in a study")
-POINT = _columns(point="digest of the set-up with its number of frames")
-ROLE = _columns(role="role of the board: damaged, hole_free or calibration")
-TRUTH = _columns(
-    kind="kind of damage",
-    true_diameter_mm="true diameter",
-    true_depth_mm="true depth of removed material",
-    seen_depth_mm="depth of the surface that is visible in the damage; for a through-hole, of the backing",
-    true_x_mm="x of its centre on the board",
-    true_y_mm="y of its centre on the board",
-    true_offset_mm="distance of its centre from the centre of the largest hole",
-)
-SHAPE = _columns(
-    size_of="what true_diameter_mm is: the diameter or, for long damage, the width or length",
-    true_length_mm="true length; empty for holes and ball dents",
-    true_width_mm="true width; empty for holes and ball dents",
-    true_angle_deg="angle from the board's x axis to its length",
-)
-SIZES = _columns(
-    extent_diameter_mm="measured diameter (the thesis' measure)",
-    extent_offset_mm="distance of its centre from the largest cluster's (the thesis' measure)",
-    extent_error_mm="distance of its centre from the true centre (the thesis' measure)",
-    model_diameter_mm="measured diameter (the fitted model of a blurred hole)",
-    model_diameter_se_mm="standard error of that diameter, as the fit estimates it",
-    model_depth_mm="measured depth (the model)",
-    model_depth_se_mm="standard error of that depth, as the fit estimates it",
-    model_offset_mm="distance of its centre from the largest cluster's (the model)",
-    model_error_mm="distance of its centre from the true centre (the model)",
-    length_mm="length of the rectangle with the second moments of the residual, corrected for blur",
-    width_mm="width of that rectangle",
-    angle_deg="angle from the board's x axis to that rectangle's length, -90 to 90",
-    model_note="remark of the fit about its result",
-)
 STATISTICS = {
     "measured": "number of trials with a finite diameter",
     "diameter_mean_mm": "mean diameter",
@@ -98,183 +72,97 @@ MARKS: dict[str, tuple[str, Tone]] = {
     "undecided": ("?", "open"),
 }
 PITCH = ("pitch_u_mm", "pitch_v_mm")
-LAGS = tuple(f"correlation_{way}{lag}" for way in "uv" for lag in (1, 2, 3))
 
 TRIALS = Table(
     "trials",
     "one row per trial on a damaged board and damage",
-    (
-        *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the damage"), *TRUTH, *SHAPE),
-        *_columns(
-            detected="whether it was hit, which means that a finding matches it",
-            threshold="threshold in use, in the detector's units",
-            invalid_fraction="share of its pixels without a range",
-            median_residual_mm="median distance of its pixels behind the surface",
-            state="state of its pixels, independent of the detector: found, wrong depth, invalid or invisible",
-            score="score of the finding that matches it",
-            points="number of points of that finding",
-            signal="in a study: highest score within the hit radius",
-            no_return="in a study: whether a finding of pixels without a return matches it",
-        ),
-        *SIZES,
-    ),
-    ("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
-    ("parquet",),
+    declared_columns(DamageRow),
+    order=("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
+    formats=("parquet",),
     always=True,
 )
 RUNS = Table(
     "runs",
     "one row per trial",
-    (
-        *(*POINT, *COMMON, *BOARD, *ROLE),
-        *_columns(
-            threshold="threshold in use; empty in calibration runs",
-            quiet_threshold="hole-free boards: score above which nothing is found",
-            scale_mm="residual per unit of score",
-            surface_noise_mm="robust deviation from the fitted surface on the undamaged face",
-            frames_used="number of frames in the average",
-            left_out="number of frames left out as disturbed",
-            detections="number of findings",
-            false_calls="number of findings that match no damage",
-            inspected_m2="in a study: judged area of the face",
-            no_return_calls="in a study: false calls that consist of pixels without a return",
-            loudest_x_mm="calibration: x of the highest score on the board",
-            loudest_y_mm="calibration: y of the highest score on the board",
-            loudest_u_px="calibration: column of the highest score on the sensor",
-            loudest_v_px="calibration: row of the highest score on the sensor",
-            views_used="maps: number of merged views",
-            views_left_out="maps: number of views left out because their registration failed",
-            seconds_map="maps: time to make the map",
-            seconds_frames="time to simulate and average the frames",
-            seconds_detect="time to detect and measure",
-        ),
-    ),
-    ("variant", "role", "frames", "board", "repeat"),
-    ("parquet",),
+    declared_columns(RunRow),
+    order=("variant", "role", "frames", "board", "repeat"),
+    formats=("parquet",),
     always=True,
 )
 PROBES = Table(
     "probes",
     "one row per set-up, number of frames and sample pixel, over the hole-free repeats",
-    (
-        *COMMON[:2],
-        *_columns(
-            pixel="number of the pixel, in sensor order",
-            mean_error_mm="mean error of z",
-            temporal_std_mm="standard deviation of z over repeats",
-            displacement_std_mm="standard deviation of whole clouds' displacement, which the other columns exclude",
-            repeats="number of repeats",
-        ),
-    ),
-    ("variant", "frames", "pixel"),
-    ("parquet",),
+    declared_columns(ProbeRow),
+    order=("variant", "frames", "pixel"),
+    formats=("parquet",),
 )
 NOISE = Table(
     "noise",
     "one row per hole-free trial of a single view: noise and pixels on an undamaged board",
-    (
-        *COMMON,
-        *_columns(
-            valid_share="share of the board's pixels with a range",
-            pitch_u_mm="median distance on the board between neighbouring pixels of a row",
-            pitch_v_mm="median distance on the board between neighbouring pixels of a column",
-            single_frame_mm="standard deviation of one frame's temporal noise of z",
-            **{
-                name: "correlation of that noise between pixels n columns (u) or rows (v) apart"
-                for name in LAGS
-            },
-        ),
-    ),
-    ("variant", "frames", "repeat"),
+    declared_columns(NoiseRow),
+    order=("variant", "frames", "repeat"),
 )
 REGISTRATIONS = Table(
     "registrations",
-    "one row per registration of a view; registrations that set-ups share are under the first of them",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            view="number of the view; the reference is 0",
-            method="method of registration",
-            tre_mm="target registration error, root mean square over the board",
-            tre_in_plane_mm="part of that error in the board's plane",
-            tre_across_mm="part of that error perpendicular to the plane",
-            predicted_in_plane_mm="predicted error in the plane; empty if the method predicts none",
-            predicted_across_mm="predicted error perpendicular to the plane",
-            guess_tre_mm="error of the nominal pose from which it started",
-            residual_mm="root mean square residual",
-            overlap="share of points with a partner",
-            pairs="number of pairs of points",
-            marks="number of marks that were used",
-            iterations="number of iterations",
-            converged="whether it converged",
-            seconds="time in seconds",
-            failure="reason for a failure; empty if it succeeded",
-        ),
-    ),
-    ("variant", "role", "frames", "repeat", "view"),
+    "one row per registration of a view; registrations that set-ups share are under the first "
+    "of them",
+    declared_columns(RegistrationRow),
+    order=("variant", "role", "frames", "repeat", "view"),
 )
 SITES = Table(
     "sites",
     "one row per repeat and place on a hole-free board from which the damage was left out",
-    (
-        *(*COMMON, *BOARD, *ROLE, *_columns(hole="number of the place"), *TRUTH[1:3], *TRUTH[4:6]),
-        *_columns(
-            detected="whether a finding lies there by chance",
-            signal="highest score within the hit radius",
-        ),
-    ),
-    ("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
-    ("parquet",),
+    declared_columns(SiteRow),
+    order=("variant", "frames", "board", "repeat", "true_diameter_mm", "hole"),
+    formats=("parquet",),
 )
 FINDINGS = Table(
     "findings",
     "one row per finding on a study's boards",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            x_mm="x on the board",
-            y_mm="y on the board",
-            score="score",
-            hole="damage that it hits; empty: none",
-        ),
-    ),
-    ("variant", "frames", "role", "board", "repeat"),
-    ("parquet",),
+    declared_columns(FindingRow),
+    order=("variant", "frames", "role", "board", "repeat"),
+    formats=("parquet",),
 )
 OPERATING = Table(
     "operating",
     "one row per trial of a study and threshold of a grid, besides the threshold in use",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(threshold="threshold", findings="findings above it", hits="hits among them"),
-    ),
-    ("variant", "frames", "role", "board", "repeat"),
-    ("parquet",),
+    declared_columns(OperatingRow),
+    order=("variant", "frames", "role", "board", "repeat"),
+    formats=("parquet",),
     lists=("threshold", "findings", "hits"),
 )
 PIXELS = Table(
     "pixels",
     "one row per trial on a study's damaged boards, damage, and threshold on a finer grid",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            hole="damage; empty: intact face",
-            pixels="judged pixels",
-            threshold="threshold",
-            above="above it",
-        ),
-    ),
-    ("variant", "frames", "board", "repeat"),
-    ("parquet",),
+    declared_columns(PixelsRow),
+    order=("variant", "frames", "board", "repeat"),
+    formats=("parquet",),
     lists=("threshold", "above"),
+)
+STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
+STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
+SET_UP = (TRIALS.column("variant"), TRIALS.column("frames"))
+TRUTH = tuple(
+    TRIALS.column(name)
+    for name in (
+        "kind",
+        "true_diameter_mm",
+        "true_depth_mm",
+        "seen_depth_mm",
+        "true_x_mm",
+        "true_y_mm",
+        "true_offset_mm",
+    )
 )
 
 
 def _mean(kind: str, label: str) -> Column:
     """Return a column for pages with a mean and its standard deviation."""
-    return Column(
-        "", label, lambda row: text.plus_minus(row[f"{kind}_mean_mm"], row[f"{kind}_std_mm"])
-    )
+
+    def mean(row: Mapping[str, Any]) -> str:
+        return text.plus_minus(row[f"{kind}_mean_mm"], row[f"{kind}_std_mm"])
+
+    return Column("", label, mean)
 
 
 def _error(kind: str, label: str) -> Column:
@@ -283,46 +171,61 @@ def _error(kind: str, label: str) -> Column:
 
     def error(row: Mapping[str, Any]) -> str:
         count = int(row[f"{kind}_n"])
-        return (
-            f"{text.plus_minus(row[f'{kind}_bias_mm'], row[f'{kind}_std_mm'], '+')} ({count})"
-            if count
-            else "–"
-        )
+        if not count:
+            return "–"
+        mean = text.plus_minus(row[f"{kind}_bias_mm"], row[f"{kind}_std_mm"], "+")
+        return f"{mean} ({count})"
 
     return Column("", label, error)
 
 
-def _found(row: Mapping[str, Any]) -> Cell:
+def _holes_found(row: Mapping[str, Any]) -> Cell:
     """Return the number of holes found, and their names if there are few enough to read."""
-    from harness.evaluation.summary import hole_list
+    lists_names = row["holes"] <= MOST_NAMES
+    words = []
+    if lists_names:
+        words.append(hole_list(row["found"]))
+    if row["undecided"]:
+        undecided = hole_list(row["undecided"]) if lists_names else str(len(row["undecided"]))
+        words.append(f"undecided {undecided}")
+    count = len(row["found"])
+    share = f"{count} of {row['holes']}"
+    return Cell(f"{share}\n{'; '.join(words)}".strip(), share=count / row["holes"])
 
-    names = hole_list(row["found"]) if row["holes"] <= MOST_NAMES else ""
-    undecided = (
-        hole_list(row["undecided"]) if row["holes"] <= MOST_NAMES else str(len(row["undecided"]))
-    )
-    words = "; ".join(
-        part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part
-    )
-    return Cell(
-        f"{len(row['found'])} of {row['holes']}\n{words}".strip(),
-        share=len(row["found"]) / row["holes"],
-    )
+
+def hole_list(names: Iterable[str]) -> str:
+    """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
+    all_names = [str(name) for name in names]
+    numbered = sorted(int(name) for name in all_names if name.isdecimal())
+    runs: list[list[int]] = []
+    for number in numbered:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
+    parts += [name for name in all_names if not name.isdecimal()]
+    return ", ".join(parts) or "none"
+
+
+def _false_calls(row: Mapping[str, Any]) -> str:
+    """Return the number of false calls in a number of runs."""
+    if not row["runs"] > 0:
+        return "–"
+    return f"{row['false_calls']:.0f} in {row['runs']:.0f}"
 
 
 MOST_NAMES = 15  # most holes that a cell lists by name; for more holes it gives only the number
-CALLS_OF = Column(
-    "",
-    "false calls",
-    lambda row: f"{row['false_calls']:.0f} in {row['runs']:.0f}" if row["runs"] > 0 else "–",
-)
+CALLS_OF = Column("", "false calls", _false_calls)
 SUMMARY = Table(
     "summary",
-    "one row per set-up, number of frames and damage, with 95 % intervals; means are over the trials that detected it",
+    "one row per set-up, number of frames and damage, with 95 % intervals; means are over the "
+    "trials that detected it",
     (
-        *COMMON[:2],
+        *SET_UP,
         Column("hole", "hole", note="number of the damage"),
         *(
-            replace(column, label={"true_diameter_mm": "true (mm)"}.get(column.name, ""))
+            replace(column, label="true (mm)") if column.name == "true_diameter_mm" else column
             for column in TRUTH
         ),
         *_columns(n="number of trials", detected="number of trials that detected it"),
@@ -372,7 +275,7 @@ NOISE_BY_FRAMES = Table(
     "noise_by_frames",
     "one row per set-up and number of frames: components of the error of z over the sample pixels",
     (
-        COMMON[0],
+        TRIALS.column("variant"),
         Column("frames", "frames", note="number of averaged frames"),
         *_columns(pixels="number of sample pixels", repeats="number of repeats"),
         Column(
@@ -414,7 +317,9 @@ FALSE_CALLS = Table(
     (
         Column("variant", "set-up", None, "name of the set-up", in_words),
         Column("frames", "frames", note="number of averaged frames"),
-        Column("role", "board", note=ROLE[0].note, text=lambda role: role.replace("_", "-")),
+        Column(
+            "role", "board", note=RUNS.column("role").note, text=lambda role: role.replace("_", "-")
+        ),
         CALLS_OF,
         *_columns(
             runs="number of runs with a threshold", false_calls="number of false calls in them"
@@ -440,7 +345,8 @@ FALSE_CALLS = Table(
 )
 SET_UPS = Table(
     "set_ups",
-    "one row per set-up and number of frames: holes found, errors of size and place, noise, threshold",
+    "one row per set-up and number of frames: holes found, errors of size and place, noise, "
+    "threshold",
     (
         Column("variant", "set-up", None, "name of the set-up", in_words),
         Column("registration", "registration", note="maps: method of registration", text=_word),
@@ -449,7 +355,7 @@ SET_UPS = Table(
         Column("frames", "frames", note="number of averaged frames"),
         *_columns(holes="number of holes", repeats="number of repeats"),
         *_columns(found="numbers of the holes found", undecided="numbers of the undecided holes"),
-        Column("", "found", _found),
+        Column("", "found", _holes_found),
         Column(
             "limit_mm", "from (mm)", note="smallest diameter at and above which all holes are found"
         ),
@@ -478,9 +384,9 @@ SET_UPS = Table(
             "mm per pixel",
             lambda row: " × ".join(text.mm(row.get(name, math.nan)) for name in PITCH),
         ),
-        Column("valid_share", "valid", note=NOISE.columns[3].note, text=_percent),
-        *NOISE.columns[4:6],
-        Column("single_frame_mm", "one frame (mm)", note=NOISE.columns[6].note),
+        Column("valid_share", "valid", note=NOISE.column("valid_share").note, text=_percent),
+        *(NOISE.column(name) for name in PITCH),
+        replace(NOISE.column("single_frame_mm"), label="one frame (mm)"),
         Column("temporal_mm", "average (mm)", None, "temporal noise of the averaged z", _fine),
         Column("offset_mm", "offset (mm)", None, "mean error of z", _fine),
         Column(
@@ -490,7 +396,7 @@ SET_UPS = Table(
             "standard deviation over pixels of the mean error",
             _fine,
         ),
-        *NOISE.columns[7:],
+        *(column for column in NOISE.columns if column.name.startswith("correlation_")),
         Column(
             "surface_mm",
             "surface noise (mm)",
@@ -574,7 +480,8 @@ CLAIMS = Table(
 )
 POSTERIOR = Table(
     "posterior",
-    "one row per set-up and per value of an axis: how well it agrees with the thesis' result (from 20 set-ups on)",
+    "one row per set-up and per value of an axis: how well it agrees with the thesis' result "
+    "(from 20 set-ups on)",
     (
         Column(
             "axis",
@@ -594,7 +501,8 @@ POSTERIOR = Table(
 )
 EFFECTS = Table(
     "effects",
-    "one row per effect, condition and number of frames of an experiment with `switches`: the effect's loss",
+    "one row per effect, condition and number of frames of an experiment with `switches`: the "
+    "effect's loss",
     (
         Column("place", "place", note="values of the other axes"),
         Column("frames", "frames", note="number of averaged frames"),
@@ -615,8 +523,6 @@ EFFECTS = Table(
         ),
     ),
 )
-STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
-STUDY_ONLY = (SITES, FINDINGS, OPERATING, PIXELS)
 SUMMARISED = (
     SUMMARY,
     NOISE_BY_FRAMES,
@@ -637,39 +543,47 @@ def _empty() -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class ResultTables:
-    """Tables of trials as declared above; ``holes`` is `TRIALS`. A table that an experiment lacks
-    is empty. ``variants`` has a row per set-up and then per variation: variant, reason, settings,
-    is_variation, reference, switches, and the axes. ``axes`` has the path, name and unit of every
-    axis on which set-ups differ, in order."""
+    """Tables of trials as declared above. A table that an experiment lacks is empty."""
 
     holes: pd.DataFrame
+    """`TRIALS`: one row for each trial on a damaged board and damage."""
     runs: pd.DataFrame
+    """`RUNS`: one row for each trial."""
     probes: pd.DataFrame
+    """`PROBES`: one row for each set-up, number of frames and sample pixel."""
     variants: pd.DataFrame
+    """One row for each set-up and then for each variation: variant, reason, settings,
+    is_variation, reference, switches, and the axes."""
     noise: pd.DataFrame
+    """`NOISE`: one row for each hole-free trial of a single view."""
     axes: pd.DataFrame
+    """Path, name and unit of every axis on which set-ups differ, in order."""
     registrations: pd.DataFrame = field(default_factory=_empty)
+    """`REGISTRATIONS`: one row for each registration of a view."""
     sites: pd.DataFrame = field(default_factory=_empty)
+    """`SITES`: one row for each repeat and place on a hole-free board."""
     findings: pd.DataFrame = field(default_factory=_empty)
+    """`FINDINGS`: one row for each finding of a study."""
     operating: pd.DataFrame = field(default_factory=_empty)
+    """`OPERATING`: one row for each trial of a study."""
     pixels: pd.DataFrame = field(default_factory=_empty)
+    """`PIXELS`: one row for each trial of a study and damage, and for the intact face."""
 
     def of(self, variant: str, frames: int) -> ResultTables:
         """Return the rows of one set-up."""
-        found = vars(self).items()
-        by_set_up = {
-            name: table for name, table in found if {"variant", "frames"} <= set(table.columns)
-        }
-        own = {
-            n: t[(t["variant"] == variant) & (t["frames"] == frames)] for n, t in by_set_up.items()
-        }
-        return replace(self, **own)
+        selected = {}
+        for name, table in vars(self).items():
+            if {"variant", "frames"} <= set(table.columns):
+                is_own = (table["variant"] == variant) & (table["frames"] == frames)
+                selected[name] = table[is_own]
+        return replace(self, **selected)
 
     def stored(self) -> dict[Table, pd.DataFrame]:
         """Return the tables that are written to files, in order."""
-        return {
-            table: getattr(self, "holes" if table is TRIALS else table.name) for table in STORED
-        }
+        tables = {}
+        for table in STORED:
+            tables[table] = getattr(self, "holes" if table is TRIALS else table.name)
+        return tables
 
 
 # ---------------------------------------------------------------- real captures

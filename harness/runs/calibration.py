@@ -17,7 +17,7 @@ from harness.runs.jobs import Ended, Failure
 from harness.runs.journal import THRESHOLDS, Journal, record_text
 from harness.runs.plan import Group
 from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, grid
-from harness.trials.trial import TrialTask
+from harness.trials.trial import Trial
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import canonical_json, digest
@@ -119,11 +119,11 @@ def _agree(first: Mapping[str, float], second: Mapping[str, float]) -> bool:
     return all(isclose(first[name], second[name], rel_tol=AGREES) for name in second)
 
 
-def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
+def refiled(entry: Ended, judged: Trial, task: Trial) -> Ended:
     """Return a trial's entry with the thresholds of ``task``, which agree with those at which it
     was judged."""
-    new = {(point.variant, point.frames): point.threshold for point in task.points}
-    old = {(point.variant, point.frames): point.threshold for point in judged.points}
+    new = {(point.variant, point.frames): point.criteria.threshold for point in task.points}
+    old = {(point.variant, point.frames): point.criteria.threshold for point in judged.points}
     octaves = {"operating": FINDING_OCTAVES, "pixels": PIXEL_OCTAVES}
     record = entry.record or {}
     for table, rows in record.items():

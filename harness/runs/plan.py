@@ -1,25 +1,32 @@
 """The plan of a sweep: views to render, trials to run, points that share their frames, and the
-parts of a shard."""
+parts of a shard.
+
+Points whose frames are equal form a `Group`. A group's trials come in batches: each `Batch` shows
+one target in one role, and repeats differ in their noise only. `parts_of` cuts batches into parts
+of some repeats, which shards share out."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from detectors import DETECTORS
 from detectors.interface import Calibratable
-from harness.experiment.schema import Experiment, Point, SimulatedSource
+from harness.experiment.schema import Experiment, Point, SimulatedSource, StudyConfig
+from harness.records.rows import Role
 from harness.runs.journal import JOURNAL_VERSION
 from harness.runs.shards import Shard
-from harness.trials.judge import detector_of
+from harness.trials.averages import Averaging
+from harness.trials.board import BoardRef
+from harness.trials.clouds import TrialPoint
+from harness.trials.judge import Criteria, detector_of
 from harness.trials.learning import LEARNING_BOARDS
-from harness.trials.setup import SetUpRef
-from harness.trials.trial import PointTask, Role, TrialTask
+from harness.trials.trial import Trial
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import source_digest
@@ -27,14 +34,19 @@ from harness.vocabulary.seeds import canonical_json, digest, random_stream
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews, poses_of
 from scenes.render.cache import render_key
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 
 CODE = "harness.trials.learning"
 PACKAGES = (
-    "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
-)  # fmt: skip
+    "numpy",
+    "scipy",
+    "numba",
+    "opencv-python-headless",
+    "open3d-cpu" if sys.platform == "linux" else "open3d",
+)
 """A trial runs again after a change of its task, of sources that it reaches, or of a version of
 these packages."""
 MOST_REPEATS = 256  # repeats in one part of a plan; a part is looked up and queued as a whole
@@ -43,7 +55,8 @@ MOST_REPEATS = 256  # repeats in one part of a plan; a part is looked up and que
 def trial_code(detector: str) -> tuple[str, ...]:
     """Return the modules whose sources determine a trial with a detector, including those of a
     plug-in."""
-    return (CODE, DETECTORS.offer(detector).target.partition(":")[0])
+    module, _, _ = DETECTORS.offer(detector).target.partition(":")
+    return (CODE, module)
 
 
 @dataclass(frozen=True)
@@ -51,64 +64,74 @@ class RenderJob:
     """A view to render, unless it is in the cache."""
 
     target: TargetConfig
+    """The target as the view shows it."""
     camera: CameraConfig
+    """The camera, of which only the optics matter."""
     config: RenderConfig
+    """Settings of the render."""
     folder: Path
+    """The cache."""
 
     @cached_property
     def path(self) -> Path:
         """Its file in the cache."""
-        return (
-            self.folder
-            / f"{render_key(self.target, camera_of(self.camera).optics, self.config)}.npz"
-        )
+        key = render_key(self.target, camera_of(self.camera).optics, self.config)
+        return self.folder / f"{key}.npz"
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials of one role with one target, which share its renders. ``renders`` and ``set_ups``
-    have an entry for each view (in the role "learning": the views of all targets in sequence).
-    ``board``: the board's number in a study; None for other experiments. ``units``: cameras that
-    take turns over the repeats; empty: the camera of the set-ups."""
+    """Trials of one role with one target, which share its renders."""
 
     role: Role
+    """Purpose of the target."""
     renders: tuple[RenderJob, ...]
-    set_ups: tuple[SetUpRef, ...]
+    """A render for each view; in the role "learning", those of all targets in sequence."""
+    views: tuple[BoardRef, ...]
+    """The board in each of these views."""
     board: int | None = None
+    """The board's number in a study; None for other experiments."""
     units: tuple[CameraConfig, ...] = ()
+    """Cameras that take turns over the repeats; empty: the camera of the views."""
 
     @cached_property
     def paths(self) -> tuple[Path, ...]:
         """The files of its views."""
         return tuple(job.path for job in self.renders)
 
-    def before(self, repeat: int) -> tuple[SetUpRef, ...]:
-        """Return the set-ups of a repeat, with its unit of the camera."""
+    def before(self, repeat: int) -> tuple[BoardRef, ...]:
+        """Return the board in each view before the camera of a repeat."""
         if not self.units:
-            return self.set_ups
-        return tuple(
-            replace(ref, camera=self.units[repeat % len(self.units)]) for ref in self.set_ups
-        )
+            return self.views
+        unit = self.units[repeat % len(self.units)]
+        return tuple(replace(view, camera=unit) for view in self.views)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Points that share their frames: one set-up, one seed. Detectors learn on the batch
-    ``learning``; the batches ``first`` are hole-free and set thresholds; the batches ``then`` are
-    judged at them. ``poses`` declares several views. ``folder`` is for files of what detectors
-    learn. Groups of a study that differ only in the damage have the same trials before thresholds.
-    The first such group is the ``leader`` of the others and also runs these trials for their
-    points, ``also``, in the same order as its own."""
+    """Points that share their frames: one set-up, one seed.
+
+    Groups of a study that differ only in the damage have the same trials before thresholds. The
+    first such group is the ``leader`` of the others and runs these trials for all of them."""
 
     points: tuple[Point, ...]
+    """The points, in the experiment's order."""
     learning: tuple[Batch, ...]
+    """The batch on which detectors learn, if any does."""
     first: tuple[Batch, ...]
+    """Hole-free batches that set thresholds."""
     then: tuple[Batch, ...]
+    """Batches that are judged at the thresholds."""
     seed: int
+    """Seed of the noise."""
     folder: Path
+    """Folder for files of what detectors learn."""
     poses: AnyViews | None = None
+    """Declaration of several views."""
     also: tuple[Point, ...] = ()
+    """Points of the groups that this group leads, in the same order as its own."""
     leader: Group | None = None
+    """The group that runs the trials before thresholds; None: this group."""
 
     @property
     def batches(self) -> tuple[Batch, ...]:
@@ -118,12 +141,12 @@ class Group:
     @cached_property
     def learners(self) -> tuple[Point, ...]:
         """The points whose detector learns."""
-        pairs = ((point, point.config.detector) for point in self.points)
-        made = (
-            (point, detector_of(config.name, canonical_json(config.settings)))
-            for point, config in pairs
-        )
-        return tuple(point for point, detector in made if isinstance(detector, Calibratable))
+        learners = []
+        for point in self.points:
+            settings = canonical_json(point.config.detector.settings)
+            if isinstance(detector_of(point.config.detector.name, settings), Calibratable):
+                learners.append(point)
+        return tuple(learners)
 
     @cached_property
     def learned(self) -> dict[str, str]:
@@ -131,12 +154,15 @@ class Group:
         in the journal."""
         if self.leader is not None:
             return self.leader.learned
-        trials = (trial for batch in self.learning for trial in self.trials(batch, None))
-        files = {task.points[0].digest: str(self.folder / f"{key}.npz") for key, task in trials}
-        pairs = zip(self.also, cycle(self.points), strict=False)
-        return files | {
-            point.digest: files[own.digest] for point, own in pairs if own.digest in files
-        }
+        files = {}
+        for batch in self.learning:
+            for key, trial in self.trials(batch, None):
+                files[trial.points[0].digest] = str(self.folder / f"{key}.npz")
+        followers = {}
+        for point, like in zip(self.also, cycle(self.points), strict=False):
+            if like.digest in files:
+                followers[point.digest] = files[like.digest]
+        return {**files, **followers}
 
     @property
     def damaged(self) -> Batch:
@@ -167,84 +193,109 @@ class Group:
         thresholds: Mapping[str, float] | None,
         repeats: Iterable[int] | None = None,
         without: Collection[str] = (),
-    ) -> Iterator[tuple[str, TrialTask]]:
-        """Yield (journal key, task) of the trials of a batch, or of some ``repeats``.
+    ) -> Iterator[tuple[str, Trial]]:
+        """Yield (journal key, trial) of the trials of a batch, or of some ``repeats``.
         ``thresholds``: by point digest, empty in calibration; None: list all trials. Points
         without a threshold, or in ``without``, are not judged."""
         if batch.role == "learning":
-            for number in range(len(self.learners)) if repeats is None else repeats:
-                learner = (point_task(self.learners[number], None, None),)
-                task = TrialTask(batch.set_ups, self.seed, batch.role, 0, learner, self.poses)
-                yield self._key(batch, task), task
+            yield from self._learning_trials(batch, repeats)
             return
-        sets_threshold = batch in self.first
-        every = (*self.points, *(self.also if sets_threshold else ()))
-        unjudged = thresholds is None or sets_threshold
-        given = {
-            point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k)
-            for point in every
-        }
-        points = [point for point in every if unjudged or given[point.digest] is not None]
-        points = [point for point in points if point.digest not in without]
-        learned = self.learned
-        tasks = {
-            point.digest: point_task(point, given[point.digest], learned.get(point.digest))
-            for point in points
-        }
-        count = max((self.repeats(batch, point) for point in points), default=0)
-        for repeat in range(count) if repeats is None else repeats:
-            wanted = tuple(
-                tasks[point.digest] for point in points if repeat < self.repeats(batch, point)
+        points = []
+        for point in self._judging_points(batch):
+            threshold = point.config.threshold.k
+            if thresholds is not None:
+                threshold = thresholds.get(point.digest, threshold)
+            is_judged = thresholds is None or batch in self.first or threshold is not None
+            if is_judged and point.digest not in without:
+                learned = self.learned.get(point.digest)
+                points.append((self.repeats(batch, point), trial_point(point, threshold, learned)))
+        if repeats is None:
+            repeats = range(max((count for count, _ in points), default=0))
+        for repeat in repeats:
+            judging = tuple(point for count, point in points if repeat < count)
+            if not judging:
+                continue
+            trial = Trial(
+                views=batch.before(repeat),
+                seed=self.seed,
+                role=batch.role,
+                repeat=repeat,
+                points=judging,
+                poses=self.poses,
+                board=batch.board,
             )
-            if wanted:
-                task = TrialTask(
-                    batch.before(repeat),
-                    self.seed,
-                    batch.role,
-                    repeat,
-                    wanted,
-                    self.poses,
-                    batch.board,
-                )
-                yield self._key(batch, task), task
+            yield self._key(batch, trial), trial
 
-    def _key(self, batch: Batch, task: TrialTask) -> str:
-        content = [
-            JOURNAL_VERSION,
-            *(
-                source_digest(trial_code(name), PACKAGES)
-                for name in sorted({each.detector for each in task.points})
-            ),
-            *(path.stem for path in batch.paths),
+    def _learning_trials(
+        self, batch: Batch, repeats: Iterable[int] | None
+    ) -> Iterator[tuple[str, Trial]]:
+        """Yield the trials in which detectors learn: one for each learner, by its number."""
+        numbers = range(len(self.learners)) if repeats is None else repeats
+        for number in numbers:
+            trial = Trial(
+                views=batch.views,
+                seed=self.seed,
+                role=batch.role,
+                repeat=0,
+                points=(trial_point(self.learners[number], None, None),),
+                poses=self.poses,
+            )
+            yield self._key(batch, trial), trial
+
+    def _judging_points(self, batch: Batch) -> tuple[Point, ...]:
+        """Return the points that judge a batch: before thresholds, also those of led groups."""
+        if batch in self.first:
+            return (*self.points, *self.also)
+        return self.points
+
+    def _key(self, batch: Batch, trial: Trial) -> str:
+        """Return a trial's key in the journal: its role and number, and a digest of everything
+        that determines its record."""
+        detectors = sorted({point.criteria.detector for point in trial.points})
+        content: list[Any] = [JOURNAL_VERSION]
+        content += [source_digest(trial_code(name), PACKAGES) for name in detectors]
+        content += [path.stem for path in batch.paths]
+        content += [
             None if self.poses is None else self.poses.to_data(),
-            task.role,
-            task.board,
-            task.repeat,
-            [ref.camera.unit_seed for ref in task.set_ups],
-            [
-                [p.digest, p.variant, p.threshold, p.learned and Path(p.learned).name]
-                for p in task.points
-            ],
+            trial.role,
+            trial.board,
+            trial.repeat,
+            [view.camera.unit_seed for view in trial.views],
+            [_point_key(point) for point in trial.points],
         ]
-        number = task.repeat if task.board is None else task.board
-        return f"{task.role}-{number:05d}-{digest(content)}"
+        number = trial.repeat if trial.board is None else trial.board
+        return f"{trial.role}-{number:05d}-{digest(content)}"
 
 
-def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
-    """Return a point's part of a trial. ``threshold`` is None during calibration; ``learned`` as
-    in `PointTask`."""
-    capture = point.config.capture
-    detector = point.config.detector
-    matching = point.config.matching
-    first = (
-        detector.name,
-        canonical_json(detector.settings),
-        capture.average,
-        matching.radius_mm * MM,
-        threshold,
+def _point_key(point: TrialPoint) -> list[Any]:
+    """Return what distinguishes a point's part of a trial in its journal key."""
+    learned = point.criteria.learned
+    if learned is not None:
+        learned = Path(learned).name
+    return [point.digest, point.variant, point.criteria.threshold, learned]
+
+
+def trial_point(point: Point, threshold: float | None, learned: str | None) -> TrialPoint:
+    """Return a point's part of a trial. ``threshold``: None during calibration. ``learned``: file
+    of what its detector has learned."""
+    config = point.config
+    return TrialPoint(
+        digest=point.digest,
+        variant=point.variant,
+        frames=config.capture.frames,
+        averaging=Averaging(
+            config.capture.average, config.capture.exact, config.capture.flat_field
+        ),
+        criteria=Criteria(
+            detector=config.detector.name,
+            settings_json=canonical_json(config.detector.settings),
+            threshold=threshold,
+            radius_m=config.matching.radius_mm * MM,
+            overlap=config.matching.overlap,
+            learned=learned,
+        ),
+        mapping=config.mapping,
     )
-    further = (point.config.mapping, capture.exact, learned, capture.flat_field, matching.overlap)
-    return PointTask(point.digest, point.variant, capture.frames, *first, *further)
 
 
 @dataclass(frozen=True)
@@ -252,16 +303,15 @@ class SweepPlan:
     """All groups of an experiment."""
 
     groups: tuple[Group, ...]
+    """Leaders stand before the groups that they lead."""
 
     @property
     def renders(self) -> tuple[RenderJob, ...]:
         """The different views, in the order in which trials need them."""
-        jobs = {
-            job.path: job
-            for group in self.groups
-            for batch in group.batches
-            for job in batch.renders
-        }
+        jobs = {}
+        for group in self.groups:
+            for batch in group.batches:
+                jobs.update({job.path: job for job in batch.renders})
         return tuple(jobs.values())
 
 
@@ -271,17 +321,16 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
-    alike: dict[str, list[Group]] = {}
+    by_first_trials: dict[str, list[Group]] = {}
     for points in by_frames.values():
         group = _group(tuple(points), cache, folder or cache)
-        alike.setdefault(_before_thresholds(group), []).append(group)
+        by_first_trials.setdefault(_before_thresholds(group), []).append(group)
     groups: list[Group] = []
-    for first, *rest in alike.values():
-        leader = replace(first, also=tuple(point for group in rest for point in group.points))
-        groups += [
-            leader,
-            *(replace(group, learning=(), first=(), leader=leader) for group in rest),
-        ]
+    for leader, *followers in by_first_trials.values():
+        also = tuple(point for group in followers for point in group.points)
+        leader = replace(leader, also=also)
+        groups.append(leader)
+        groups += [replace(group, learning=(), first=(), leader=leader) for group in followers]
     return SweepPlan(tuple(groups))
 
 
@@ -291,62 +340,98 @@ def _before_thresholds(group: Group) -> str:
     batches = (*group.learning, *group.first)
     if not batches or batches[-1].board is None:
         return group.points[0].frames_key
-    tasks = [
-        replace(point_task(point, None, None), digest="", variant="") for point in group.points
-    ]
-    seen = [(batch.paths, [ref.camera for ref in batch.before(0)]) for batch in batches]
-    return repr(
-        [group.seed, group.poses, tasks, [point.config.threshold for point in group.points], seen]
-    )
+    judged_as = []
+    for point in group.points:
+        unnamed = replace(trial_point(point, None, None), digest="", variant="")
+        judged_as.append((unnamed, point.config.threshold))
+    shown = []
+    for batch in batches:
+        shown.append((batch.paths, [view.camera for view in batch.before(0)]))
+    return repr([group.seed, group.poses, judged_as, shown])
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
-    source = points[0].config.simulated
-    study = points[0].config.study
-    target = source.target
-    seed = points[0].config.seed
-    if study is not None and isinstance(target, DrawnTargetConfig):
-        calibrate = points[0].config.threshold.calibrate
-        boards = 0 if calibrate is None else calibrate.boards or 0
-
-        def batches(role: Role, count: int) -> tuple[Batch, ...]:
-            """Return a role's batches: all units inspect each damaged board; every other board has
-            its own unit."""
-            made = []
-            for board in range(count):
-                numbers = (
-                    range(study.units or 0) if role == "damaged" else [board] if study.units else []
-                )
-                units = tuple(unit_of(source.camera, seed, role, number) for number in numbers)
-                made.append(
-                    batch_of(_drawn(target, role, board), role, source, cache, board, units)
-                )
-            return tuple(made)
-
-        learning = batches("learning", LEARNING_BOARDS)
-        first = batches("calibration", boards)
-        then = (*batches("damaged", study.boards), *batches("hole_free", study.hole_free_boards))
+    """Return the group of points that share their frames. Raises UserError for a target without
+    damage."""
+    config = points[0].config
+    source = config.simulated
+    if config.study is not None and isinstance(source.target, DrawnTargetConfig):
+        boards = _StudyBoards(source, source.target, config.study, config.seed, cache)
+        calibrate = config.threshold.calibrate
+        calibrating = 0 if calibrate is None else calibrate.boards or 0
+        learning = boards.batches("learning", LEARNING_BOARDS)
+        first = boards.batches("calibration", calibrating)
+        damaged = boards.batches("damaged", config.study.boards)
+        then = damaged + boards.batches("hole_free", config.study.hole_free_boards)
     else:
-        declared = target.declare()
-        if not declared.damages:
-            what = "the target has no damage, so that there is nothing to find"
+        target = source.target.declare()
+        if not target.damages:
             raise UserError(
-                what, fix="declare source.target.holes, source.target.dents or source.target.flaws"
+                "the target has no damage, so that there is nothing to find",
+                fix="declare source.target.holes, source.target.dents or source.target.flaws",
             )
-        learning = (batch_of(declared, "learning", source, cache),) * LEARNING_BOARDS
-        first = (batch_of(declared, "hole_free", source, cache),)
-        then = (batch_of(declared, "damaged", source, cache),)
-    group = Group(points, (), first, then, seed, folder, source.views)
+        learning = [batch_of(target, "learning", source, cache)] * LEARNING_BOARDS
+        first = [batch_of(target, "hole_free", source, cache)]
+        then = [batch_of(target, "damaged", source, cache)]
+    group = Group(
+        points=points,
+        learning=(),
+        first=tuple(first),
+        then=tuple(then),
+        seed=config.seed,
+        folder=folder,
+        poses=source.views,
+    )
     if not group.learners:
         return group
-    renders = {job.path: job for batch in learning for job in batch.renders}
-    set_ups = tuple(ref for batch in learning for ref in batch.before(0))
-    return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
+    return replace(group, learning=(_joined("learning", learning),))
 
 
-_drawn = lru_cache(maxsize=4096)(
-    DrawnTargetConfig.drawn
-)  # cameras, frames and detectors share boards
+def _joined(role: Role, batches: Sequence[Batch]) -> Batch:
+    """Return one batch whose trials need the views of several."""
+    renders = {}
+    views: list[BoardRef] = []
+    for batch in batches:
+        renders.update({job.path: job for job in batch.renders})
+        views += batch.before(0)
+    return Batch(role, tuple(renders.values()), tuple(views))
+
+
+@dataclass(frozen=True)
+class _StudyBoards:
+    """Makes the batches of a study: one for each board."""
+
+    source: SimulatedSource
+    """The camera, its poses and the settings of renders."""
+    family: DrawnTargetConfig
+    """The family from which boards are drawn."""
+    study: StudyConfig
+    """The number of units of the camera."""
+    seed: int
+    """Seed from which units are drawn."""
+    cache: Path
+    """The cache of renders."""
+
+    def batches(self, role: Role, count: int) -> list[Batch]:
+        """Return the batches of a role's first ``count`` boards."""
+        batches = []
+        for board in range(count):
+            target = _drawn(self.family, role, board)
+            units = self.units(role, board)
+            batches.append(batch_of(target, role, self.source, self.cache, board, units))
+        return batches
+
+    def units(self, role: Role, board: int) -> tuple[CameraConfig, ...]:
+        """Return the units of the camera that inspect a board: all of the study's for a damaged
+        board, one of its own for any other; none if the study does not draw units."""
+        if not self.study.units:
+            return ()
+        numbers = range(self.study.units) if role == "damaged" else [board]
+        return tuple(unit_of(self.source.camera, self.seed, role, number) for number in numbers)
+
+
+# cameras, frames and detectors share boards
+_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)
 
 
 def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:
@@ -366,68 +451,76 @@ def batch_of(
     """Return the trials of a role with one declared target, which shows its damage only in the
     role "damaged"."""
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
-    poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
-    renders = []
-    set_ups = []
     damaged = role == "damaged"
+    poses = [target.pose]
+    if source.views is not None:
+        poses = list(poses_of(source.views, target.pose))
+    renders = []
+    views = []
     for pose in poses:
         placed = target.model_copy(update={"pose": pose})
-        renders.append(
-            RenderJob(
-                placed if damaged else placed.hole_free(), source.camera, source.render, cache
-            )
-        )
-        set_ups.append(SetUpRef(str(renders[-1].path), source.camera, placed, damaged))
-    return Batch(role, tuple(renders), tuple(set_ups), board, units)
+        shown = placed if damaged else placed.hole_free()
+        render = RenderJob(shown, source.camera, source.render, cache)
+        renders.append(render)
+        views.append(BoardRef(str(render.path), source.camera, placed, damaged))
+    return Batch(role, tuple(renders), tuple(views), board, units)
 
 
-class PlanPart(NamedTuple):
-    """Some repeats of one batch of group number ``group``. ``sets_threshold``: whether they set
-    its thresholds."""
+@dataclass(frozen=True)
+class PlanPart:
+    """Some repeats of one batch."""
 
     group: int
+    """Number of the batch's group in the plan."""
     batch: Batch
+    """The batch."""
     sets_threshold: bool
+    """True if these trials set the group's thresholds."""
     repeats: range
+    """The repeats."""
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
     """Cut a plan, by group, into parts that set thresholds (learning first), and the judged parts
     of a shard."""
-
-    def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
-        starts = range(repeats.start, repeats.stop, MOST_REPEATS)
-        slices = (range(start, min(start + MOST_REPEATS, repeats.stop)) for start in starts)
-        return [PlanPart(number, batch, sets_threshold, each) for each in slices]
-
-    mine = shard.part(
-        sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)
-    )
-    before = 0
-    then: list[list[PlanPart]] = []
-    for number, group in enumerate(plan.groups):
-        judged = []
-        for batch in group.then:
-            count = group.most_repeats(batch)
-            judged += cut(
-                number,
-                batch,
-                range(max(mine.start - before, 0), min(mine.stop - before, count)),
-                False,
-            )
-            before += count
-        then.append(judged)
-    wanted = {
-        id(group.leader or group) for group, judged in zip(plan.groups, then, strict=True) if judged
-    }
+    judged = _judged_parts(plan, shard)
+    leaders = set()
+    for group, parts in zip(plan.groups, judged, strict=True):
+        if parts:
+            leaders.add(id(group.leader or group))
     first: list[list[PlanPart]] = []
     for number, group in enumerate(plan.groups):
-        calibrating = (*group.learning, *group.first) if id(group) in wanted else ()
-        first.append(
-            [
-                part
-                for b in calibrating
-                for part in cut(number, b, range(group.most_repeats(b)), True)
-            ]
-        )
-    return first, then
+        parts = []
+        if id(group) in leaders:
+            for batch in (*group.learning, *group.first):
+                repeats = range(group.most_repeats(batch))
+                parts += _cut(number, batch, repeats, sets_threshold=True)
+        first.append(parts)
+    return first, judged
+
+
+def _judged_parts(plan: SweepPlan, shard: Shard) -> list[list[PlanPart]]:
+    """Return a shard's parts of the judged batches, by group."""
+    total = sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)
+    wanted = shard.part(total)
+    before = 0
+    judged: list[list[PlanPart]] = []
+    for number, group in enumerate(plan.groups):
+        parts: list[PlanPart] = []
+        for batch in group.then:
+            count = group.most_repeats(batch)
+            start = max(wanted.start - before, 0)
+            stop = min(wanted.stop - before, count)
+            parts += _cut(number, batch, range(start, stop), sets_threshold=False)
+            before += count
+        judged.append(parts)
+    return judged
+
+
+def _cut(number: int, batch: Batch, repeats: range, *, sets_threshold: bool) -> list[PlanPart]:
+    """Cut the repeats of a batch into parts of `MOST_REPEATS` at most."""
+    parts = []
+    for start in range(repeats.start, repeats.stop, MOST_REPEATS):
+        stop = min(start + MOST_REPEATS, repeats.stop)
+        parts.append(PlanPart(number, batch, sets_threshold, range(start, stop)))
+    return parts

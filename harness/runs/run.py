@@ -21,7 +21,7 @@ from harness.runs.pictures import pictures_of
 from harness.runs.plan import PlanPart, RenderJob, SweepPlan, parts_of
 from harness.runs.shards import WHOLE, Shard
 from harness.trials.learning import learn, learned_file
-from harness.trials.trial import TrialTask, run_trial
+from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.errors import DiskFull
 from harness.vocabulary.files import write_bytes
 
@@ -106,7 +106,7 @@ class _Trial:
 
     part: PlanPart
     key: str  # its key in the journal, which also names its job
-    task: TrialTask
+    task: Trial
 
 
 class _Run:
@@ -306,7 +306,7 @@ class _Run:
                 self._refile(trial, others_key, others_task)
         return trials
 
-    def _refile(self, trial: _Trial, others_key: str, others_task: TrialTask) -> None:
+    def _refile(self, trial: _Trial, others_key: str, others_task: Trial) -> None:
         """File what another shard has judged under this run's key, unless it is there."""
         if self._journal.state(trial.key) == "done" or self._journal.state(others_key) != "done":
             return
@@ -372,7 +372,9 @@ class _Run:
             self._count(trial, entry)
 
 
-def trial_as_text(task: TrialTask) -> str:
+def trial_as_text(task: Trial) -> str:
     """Return a trial's record as JSON for the journal. The worker makes this text, because it
     takes a millisecond."""
-    return record_text(learn(task) if task.role == "learning" else run_trial(task))
+    if task.role == "learning":
+        return record_text(learn(task))
+    return record_text(run_trial(task).to_data())

@@ -15,10 +15,11 @@ from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import Experiment
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.records.trials import ResultTables
+from harness.report.claims import claim_set_of
 from harness.report.page import write_report
 from harness.report.sections import final_tables
 from harness.report.study_page import study_html, study_parts
-from harness.report.summaries import as_files, is_thesis, summaries
+from harness.report.summaries import as_files, summaries
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
 from harness.runs.job_batches import pictures_from, render_missing, values_of
@@ -208,7 +209,7 @@ def _write_report(
     """Write the summaries and the report of an experiment that is not a study. Return what the
     terminal shows."""
     facts = experiment.data
-    summary_tables = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
+    summary_tables = summaries(tables, outcome.examples, claim_set_of(facts))
     write_tables(folder, as_files(summary_tables), provenance)
     write_report(
         folder,
@@ -218,7 +219,7 @@ def _write_report(
         resolved_yaml(experiment),
         title_of(experiment),
         facts,
-        found=summary_tables,
+        computed=summary_tables,
     )
     return final_tables(tables, summary_tables)
 

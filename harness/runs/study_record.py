@@ -68,7 +68,7 @@ def _set_up(
     targets = []
     for batch in group.then:
         if batch.role == "damaged":
-            board = batch.set_ups[0].target
+            board = batch.views[0].target
             damages = [damage.to_data() for damage in board.damages]
             targets.append([board.board.to_data(), *damages])
     units = 1 if config.study is None else config.study.units or 1

@@ -27,7 +27,7 @@ its own."""
 
 
 def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
-    """Return whether ``bound`` (a90/95 unless given) is demonstrated by sizes that were inspected."""
+    """Return whether a bound (a90/95 if None) is demonstrated by sizes that were inspected."""
     bound = bound or limit.a90_95
     return bound.demonstrated and not limit.beyond(bound.value)
 
@@ -44,29 +44,34 @@ def bound_estimate(limit: SetUpLimit, bound: Bound) -> Estimate:
 
 def bound_text(bound: Estimate) -> str:
     """Return a bound in mm as text without its unit, or that it is not demonstrated."""
-    return NOT_DEMONSTRATED if np.isnan(bound.value) else text.size(bound.value, bound.most)
+    if np.isnan(bound.value):
+        return NOT_DEMONSTRATED
+    return text.size(bound.value, bound.most)
 
 
-def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown
+def size_estimate(limit: SetUpLimit, name: str) -> Estimate:
+    """Return a50 or a90 (``name``) with its interval; an upper bound if nothing was missed; unknown
     if not above 0."""
-    size_mm = getattr(limit, f"{of}_mm")
-    ends = getattr(limit, f"{of}_interval_mm")
+    size_mm = getattr(limit, f"{name}_mm")
+    ends = getattr(limit, f"{name}_interval_mm")
     if size_mm <= 0:
         return Estimate(np.nan)
     return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
-a50_of = partial(size_estimate, of="a50")
-a90_of = partial(size_estimate, of="a90")
+a50_of = partial(size_estimate, name="a50")
+a90_of = partial(size_estimate, name="a90")
 FOUND_50 = f"size found {50} % of the time"
 FOUND_90 = f"size found {90} % of the time"
 BRIEF: dict[str, Any] = {
     "interval": True,
     "brief": lambda estimate: estimate.text().partition(" ")[0],
 }
-OF = "what these sizes are: diameters (for long damage, widths or lengths), or depths if only the depth varies"
-MET = "status of that bound: demonstrated, beyond the sizes inspected, or not demonstrated"
+SIZES_OF = (
+    "what these sizes are: diameters (for long damage, widths or lengths), "
+    "or depths if only the depth varies"
+)
+VERDICT = "status of that bound: demonstrated, beyond the sizes inspected, or not demonstrated"
 EFFECT = "variance of a90 with boards as sampling units over that with damages as sampling units"
 SET_UP = Column(
     "set_up",
@@ -103,41 +108,52 @@ def quoted(limit: SetUpLimit) -> Bound:
 def _one_unit(limit: SetUpLimit) -> Estimate:
     """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several
     units."""
-    bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
-    middle = float(np.median(bounds))
-    low = float(np.min(bounds))
-    high = float(np.max(bounds))
-    ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
-    return Estimate(middle if np.isfinite(middle) else np.nan, *ends, limit.largest_mm)
+    units = limit.over_units
+    if units is None:
+        return bound_estimate(limit, limit.a90_95)
+    middle = float(np.median(units.a90_95_mm))
+    return Estimate(
+        value=middle if np.isfinite(middle) else np.nan,
+        low=float(np.min(units.a90_95_mm)),
+        high=float(np.max(units.a90_95_mm)),
+        most=limit.largest_mm,
+    )
 
 
 def _verdict(limit: SetUpLimit, bound: Bound) -> str:
-    beyond = "beyond the sizes inspected" if bound.demonstrated else NOT_DEMONSTRATED
-    return "demonstrated" if is_within_sizes(limit, bound) else beyond
+    if is_within_sizes(limit, bound):
+        return "demonstrated"
+    return "beyond the sizes inspected" if bound.demonstrated else NOT_DEMONSTRATED
 
 
-def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
-    """Return the numbers of hits by depth and by missing returns; None if they were not counted
-    separately."""
-    seen = limit.record.inspected
-    if seen.by_depth is None or seen.by_no_return is None:
+def _by_depth(limit: SetUpLimit) -> int | None:
+    """Return the number of hits by depth; None if kinds of hits were not counted separately."""
+    inspected = limit.record.inspected
+    if inspected.by_depth is None or inspected.by_no_return is None:
         return None
-    return int(seen.by_depth.sum()), int(seen.by_no_return.sum())
+    return int(inspected.by_depth.sum())
+
+
+def _by_no_return(limit: SetUpLimit) -> int | None:
+    """Return the number of hits by missing returns; None if they were not counted separately."""
+    inspected = limit.record.inspected
+    if inspected.by_depth is None or inspected.by_no_return is None:
+        return None
+    return int(inspected.by_no_return.sum())
 
 
 def _found(limit: SetUpLimit) -> str:
-    kinds = _kinds(limit)
-    beside = (
-        ""
-        if kinds is None or not kinds[1]
-        else f" ({kinds[0]} by depth, {kinds[1]} by missing returns)"
-    )
-    return f"{limit.hits} of {limit.inspections}{beside}"
+    by_no_return = _by_no_return(limit)
+    text_of_hits = f"{limit.hits} of {limit.inspections}"
+    if not by_no_return:
+        return text_of_hits
+    return f"{text_of_hits} ({_by_depth(limit)} by depth, {by_no_return} by missing returns)"
 
 
 LIMITS = Table(
     "limits",
-    "one row per set-up and number of frames of a study: its detection limit, and the data behind it",
+    "one row per set-up and number of frames of a study: its detection limit, "
+    "and the data behind it",
     (
         SET_UP,
         Column("variant", "", "record.variant", "name of the set-up"),
@@ -153,11 +169,12 @@ LIMITS = Table(
             "a90_95_mm",
             "a90/95 (mm)",
             lambda row: bound_estimate(row, row.a90_95),
-            "upper bound of a90 at 95 % confidence, which is the limit to quote; empty if not demonstrated",
+            "upper bound of a90 at 95 % confidence, which is the limit to quote; "
+            "empty if not demonstrated",
             bound_text,
             tone=lambda row: "key" if is_within_sizes(row) else "bad",
         ),
-        Column("a90_95_verdict", "", lambda row: _verdict(row, row.a90_95), MET),
+        Column("a90_95_verdict", "", lambda row: _verdict(row, row.a90_95), VERDICT),
         Column("a90_95_method", "", "a90_95.method", "method by which the bound was computed"),
         Column(
             "over_boards_mm",
@@ -167,7 +184,7 @@ LIMITS = Table(
             bound_text,
             tone=lambda row: "" if is_within_sizes(row, row.over_boards) else "bad",
         ),
-        Column("over_boards_verdict", "", lambda row: _verdict(row, row.over_boards), MET),
+        Column("over_boards_verdict", "", lambda row: _verdict(row, row.over_boards), VERDICT),
         Column(
             "new_unit_mm",
             "new unit (mm)",
@@ -179,7 +196,7 @@ LIMITS = Table(
             "new_unit_verdict",
             "",
             lambda row: _verdict(row, quoted(row)) if row.over_units else None,
-            MET,
+            VERDICT,
         ),
         Column(
             "one_unit_mm",
@@ -201,7 +218,7 @@ LIMITS = Table(
         Column(
             "a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF
         ),
-        Column("limit_of", "", "record.inspected.limit_of", OF),
+        Column("limit_of", "", "record.inspected.limit_of", SIZES_OF),
         Column(
             "is_at_most",
             "",
@@ -227,7 +244,8 @@ LIMITS = Table(
             "size_error_mm",
             "size error (mm)",
             "size_error_mm",
-            "median error of the measured size of hits (the model's diameter; for long damage, width or length)",
+            "median error of the measured size of hits "
+            "(the model's diameter; for long damage, width or length)",
             brief=False,
         ),
         Column("sized", "", "sized", "number of hits whose size was measured"),
@@ -239,13 +257,8 @@ LIMITS = Table(
             lambda seconds: text.UNKNOWN_TEXT if np.isnan(seconds) else f"{1e3 * seconds:.0f}",
             brief=False,
         ),
-        Column("hits_by_depth", "", lambda row: (_kinds(row) or (None, None))[0], "hits by depth"),
-        Column(
-            "hits_by_no_return",
-            "",
-            lambda row: (_kinds(row) or (None, None))[1],
-            "hits by missing returns",
-        ),
+        Column("hits_by_depth", "", _by_depth, "hits by depth"),
+        Column("hits_by_no_return", "", _by_no_return, "hits by missing returns"),
         Column("targets", "targets", "targets", "number of damages", brief=False),
         Column("boards", "boards", "boards", "number of damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
@@ -306,7 +319,9 @@ def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid
 
 def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
     sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
-    return (float(sizes.min()), float(sizes.max())) if len(sizes) else (np.nan, np.nan)
+    if not len(sizes):
+        return np.nan, np.nan
+    return float(sizes.min()), float(sizes.max())
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
@@ -317,102 +332,131 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
     answer = _answer(limits)
     if any(limit.over_units for limit in limits):
         return answer
-    return f"{ONE_UNIT}: {answer[0].lower() if answer.startswith(('Of ', 'None ')) else answer[0]}{answer[1:]}"
+    if answer.startswith(("Of ", "None ")):
+        answer = answer[0].lower() + answer[1:]
+    return f"{ONE_UNIT}: {answer}"
 
 
 def _answer(limits: Sequence[SetUpLimit]) -> str:
-    if len(limits) <= MOST_ANSWERS:
-        return " ".join(
-            limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits)
-        )
-    shown = sorted(
-        (lim for lim in limits if is_within_sizes(lim, quoted(lim))),
-        key=lambda lim: quoted(lim).value,
-    )
-    if not shown:
-        sentence = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
-        return f"{sentence}{_sizes(*limits)}."
-    kinds = sorted({limit.record.inspected.limit_of for limit in shown}, reverse=True)
+    count = len(limits)
+    if count <= MOST_ANSWERS:
+        sentences = [limit_sentence(limit, again=index > 0) for index, limit in enumerate(limits)]
+        return " ".join(sentences)
+    within = [limit for limit in limits if is_within_sizes(limit, quoted(limit))]
+    if not within:
+        none = f"None of {count} set-ups demonstrates a limit (a90/95) within the sizes inspected"
+        return f"{none}{_sizes(*limits)}."
+    within.sort(key=lambda limit: quoted(limit).value)
+    kinds = sorted({limit.record.inspected.limit_of for limit in within}, reverse=True)
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
-        own = [limit for limit in shown if limit.record.inspected.limit_of == kind]
-        best = (text.size(quoted(own[0]).value), own[0].record.label)
-        worst = (text.size(quoted(own[-1]).value), own[-1].record.label)
-        which = f" of {kind}" if len(kinds) > 1 else ""
-        spans.append(
-            "the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(
-                which, *best, *worst
-            )
-        )
-    span = f"Of {len(limits)} set-ups, {'; '.join(spans)}"
-    without = len(limits) - len(shown)
-    few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
-    return f"{span}{few} no limit within the sizes inspected." if without else f"{span}."
+        of_kind = [limit for limit in within if limit.record.inspected.limit_of == kind]
+        suffix = f" of {kind}" if len(kinds) > 1 else ""
+        smallest = _size_and_label(of_kind[0])
+        largest = _size_and_label(of_kind[-1])
+        spans.append(f"the smallest limit{suffix} (a90/95) is {smallest}, the largest {largest}")
+    answer = f"Of {count} set-ups, {'; '.join(spans)}"
+    without = count - len(within)
+    if not without:
+        return f"{answer}."
+    verb = "demonstrates" if without == 1 else "demonstrate"
+    return f"{answer}; {without} of {count} set-ups {verb} no limit within the sizes inspected."
+
+
+def _size_and_label(limit: SetUpLimit) -> str:
+    return f"{text.size(quoted(limit).value)} mm ({limit.record.label})"
 
 
 def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
     """Return ``50 frames: damage of 5.31 mm is found 90 % ...``, or only the size after such a
     sentence (``again``)."""
-    quote = quoted(limit)
-    new = ""
-    if limit.over_units is not None:
-        new = f" by a new unit of the camera, judged from {limit.over_units.units},"
-    if not quote.demonstrated:
-        reason = _reason(quote)
-        if reason.startswith("a constant probability"):
-            reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
-        # the statistics in brackets are left to the notes
-        found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
-    elif not is_within_sizes(limit, quote):
-        found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
+    bound = quoted(limit)
+    if not bound.demonstrated:
+        answer = f"a90/95 is {NOT_DEMONSTRATED}: {_short_reason(limit, bound)}"
+    elif not is_within_sizes(limit, bound):
+        answer = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
+    elif again:
+        answer = _size_words(limit, bound).removeprefix("of ")
     else:
-        confidence = f"{100 * quote.confidence:.0f} %"
-        words = {"depth": "{} mm deep", "width": "{} mm wide", "length": "{} mm long"}
-        size = words.get(limit.record.inspected.limit_of, "of {} mm").format(text.size(quote.value))
-        found = (
-            f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
-        )
-        found = size.removeprefix("of ") if again else found
+        unit = ""
+        if limit.over_units is not None:
+            unit = f" by a new unit of the camera, judged from {limit.over_units.units},"
+        confidence = f"{100 * bound.confidence:.0f} % confidence (a90/95)"
+        size = _size_words(limit, bound)
+        answer = f"damage {size} is found 90 % of the time{unit} with {confidence}"
+    return f"{limit.record.label}: {answer}{_false_call_words(limit, bound)}."
+
+
+def _short_reason(limit: SetUpLimit, bound: Bound) -> str:
+    """Return why there is no bound; the statistics in brackets are left to the notes."""
+    reason = _reason(bound)
+    if reason.startswith("a constant probability"):
+        reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
+    return re.sub(r" [(][^()]*[<>=][^()]*[)]", "", reason)
+
+
+def _size_words(limit: SetUpLimit, bound: Bound) -> str:
+    """Return ``of 5.31 mm``, ``5.31 mm deep``, ``5.31 mm wide`` or ``5.31 mm long``."""
+    size = f"{text.size(bound.value)} mm"
+    adjectives = {"depth": "deep", "width": "wide", "length": "long"}
+    adjective = adjectives.get(limit.record.inspected.limit_of)
+    return f"{size} {adjective}" if adjective else f"of {size}"
+
+
+def _false_call_words(limit: SetUpLimit, bound: Bound) -> str:
+    """Return ``, at 0.65 false calls per m² (0.3 to 1.2)``; empty without hole-free boards."""
     calls = limit.false_calls
-    rate = ""
-    if calls is not None:
-        ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
-        if (
-            limit.over_units is not None
-        ):  # each board has its own unit: false calls on one board are not independent
-            over = limit.false_calls_interval_per_m2
-            ends = (ends[0], float(np.fmin(ends[1], over.low)), float(np.fmax(ends[2], over.high)))
-        at, low, high = (f"{end:.2g}" if end < 99.5 else f"{end:.0f}" for end in ends)
-        joint = ", at" if is_within_sizes(limit, quote) else ";"
-        rate = f"{joint} {at} false call{'' if at == '1' else 's'} per m² ({low} to {high})"
-    return f"{limit.record.label}: {found}{rate}."
+    if calls is None:
+        return ""
+    low = calls.interval_per_m2.low
+    high = calls.interval_per_m2.high
+    if limit.over_units is not None:
+        # each board has its own unit: false calls on one board are not independent
+        over_boards = limit.false_calls_interval_per_m2
+        low = float(np.fmin(low, over_boards.low))
+        high = float(np.fmax(high, over_boards.high))
+    rate = _rate_text(calls.rate_per_m2)
+    plural = "" if rate == "1" else "s"
+    joint = ", at" if is_within_sizes(limit, bound) else ";"
+    interval = f"({_rate_text(low)} to {_rate_text(high)})"
+    return f"{joint} {rate} false call{plural} per m² {interval}"
+
+
+def _rate_text(rate: float) -> str:
+    return f"{rate:.2g}" if rate < 99.5 else f"{rate:.0f}"
 
 
 def notes_of(limit: SetUpLimit) -> list[str]:
     """Return the reasons why there is no limit, or why the limit is cautious or doubtful."""
-    notes = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
     stated = limit.statement
-    if stated is None:
-        notes += [limit.a90_95.method] if limit.a90_95.demonstrated else []
-    else:
-        if limit.a90_95.demonstrated and not is_within_sizes(limit):
+    demonstrated = limit.a90_95.demonstrated
+    notes = []
+    if not demonstrated:
+        notes.append(_reason(limit.a90_95))
+    if stated is None and demonstrated:
+        notes.append(limit.a90_95.method)
+    if stated is not None:
+        if demonstrated and not is_within_sizes(limit):
             notes.append(
                 f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, so no inspection supports it"
             )
         notes += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
     if limit.a50_mm <= 0:
         notes.append(
-            "the curve hardly rises with size: the sizes found would lie below 0, so they are not stated"
+            "the curve hardly rises with size: the sizes found would lie below 0, "
+            "so they are not stated"
         )
     if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
         notes.append(
-            f"the results of damages on one board are correlated ({effect}): quote the limit over boards"
+            f"the results of damages on one board are correlated ({effect}): "
+            "quote the limit over boards"
         )
-    only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
-    if only:
+    by_depth = _by_depth(limit)
+    if by_depth is not None and by_depth != limit.hits:
         notes.append(
-            f"{only} of {limit.hits} hits by missing returns alone, which leave no depth to measure"
+            f"{limit.hits - by_depth} of {limit.hits} hits by missing returns alone, "
+            "which leave no depth to measure"
         )
     if limit.record.failed:
         notes.append(f"{limit.record.failed} trials failed and are not included")
@@ -420,18 +464,16 @@ def notes_of(limit: SetUpLimit) -> list[str]:
 
 
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
-    notes = [(limit.record.label, notes_of(limit)) for limit in limits]
-    shared = (
-        [note for note in notes[0][1] if all(note in these for _, these in notes)]
-        if len(notes) > 1
-        else []
-    )
-    own = [
-        ("every set-up", shared),
-        *((name, [note for note in these if note not in shared]) for name, these in notes),
-    ]
-    return [f"{name}: {'; '.join(these)}" for name, these in own if these]
+    """Return notes on the limits: first those that all set-ups share, then a line for each
+    set-up."""
+    notes = [notes_of(limit) for limit in limits]
+    shared: list[str] = []
+    if len(notes) > 1:
+        shared = [note for note in notes[0] if all(note in of_set_up for of_set_up in notes)]
+    lines = [("every set-up", shared)]
+    for limit, of_set_up in zip(limits, notes, strict=True):
+        lines.append((limit.record.label, [note for note in of_set_up if note not in shared]))
+    return [f"{label}: {'; '.join(of_line)}" for label, of_line in lines if of_line]
 
 
 def _reason(bound: Bound) -> str:

@@ -1,7 +1,7 @@
 """Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and
 limits of depth."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.evaluation.study.curves import PRO_LIMIT
 from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.record import StudyRecord
+from harness.evaluation.study.record import Calibrated, StudyRecord
 from harness.evaluation.study.result import FRAMES, AxisLine, Difference, SetUpResult, StudyResult
 from harness.records.schema import Column, Estimate, Table
 from harness.tables.limits import (
@@ -77,7 +77,8 @@ GIVEN = "number of calibration runs; 0 for a given threshold"
 UNSET = "none: given"
 THRESHOLDS = Table(
     "thresholds",
-    "one row per set-up and number of frames: its threshold, and the false calls at that threshold on other boards",
+    "one row per set-up and number of frames: its threshold, "
+    "and the false calls at that threshold on other boards",
     (
         SET_UP,
         Column("threshold", "threshold", "record.threshold", "threshold in the detector's units"),
@@ -103,42 +104,55 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run that set a threshold. ``same_pixels`` counts runs with the highest score
-    on the same pixels."""
+    """The hole-free run that set a threshold."""
 
     limit: SetUpLimit
+    """The set-up."""
     board: int
+    """The run's board."""
     x_mm: float
+    """Position of its highest score on the board, to the right; NaN off the board."""
     y_mm: float
+    """Position of its highest score on the board, upwards; NaN off the board."""
     runs: int
+    """Number of calibration runs."""
     same_pixels: int | None
+    """Number of runs with the highest score on the same pixels; None if unknown."""
 
     @property
     def place(self) -> str:
         """The place on the board in mm, as text."""
-        return (
-            f"{self.x_mm:.0f}, {self.y_mm:.0f}".replace("-", "−")
-            if np.isfinite(self.x_mm)
-            else OFF_BOARD
-        )
+        if not np.isfinite(self.x_mm):
+            return OFF_BOARD
+        return f"{self.x_mm:.0f}, {self.y_mm:.0f}".replace("-", "−")
 
 
 def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
     """Return the run that set each calibrated threshold."""
-    found = []
+    rows = []
     for limit in limits:
-        if (runs := limit.record.calibrated) is not None:
-            at = int(np.abs(runs.score - limit.record.threshold).argmin())
-            place = (int(runs.board[at]), float(runs.x_mm[at]), float(runs.y_mm[at]))
-            same = None
-            if runs.u_px is not None and runs.v_px is not None:
-                same = int(
-                    (
-                        np.hypot(runs.u_px - runs.u_px[at], runs.v_px - runs.v_px[at]) <= BLOB_PX
-                    ).sum()
-                )
-            found.append(SetBy(limit, *place, len(runs.score), same))
-    return found
+        runs = limit.record.calibrated
+        if runs is None:
+            continue
+        index = int(np.abs(runs.score - limit.record.threshold).argmin())
+        row = SetBy(
+            limit=limit,
+            board=int(runs.board[index]),
+            x_mm=float(runs.x_mm[index]),
+            y_mm=float(runs.y_mm[index]),
+            runs=len(runs.score),
+            same_pixels=_same_pixels(runs, index),
+        )
+        rows.append(row)
+    return rows
+
+
+def _same_pixels(runs: Calibrated, index: int) -> int | None:
+    """Return the number of runs with the highest score on the pixels of this run's."""
+    if runs.u_px is None or runs.v_px is None:
+        return None
+    distance_px = np.hypot(runs.u_px - runs.u_px[index], runs.v_px - runs.v_px[index])
+    return int((distance_px <= BLOB_PX).sum())
 
 
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
@@ -148,39 +162,52 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
     warnings = []
     crowded = [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
     if crowded:
-        counts = sorted({row.same_pixels or 0 for row in crowded})
-        where = (
-            crowded[0].limit.record.label
-            if len(crowded) == 1
-            else f"{len(crowded)} of {len(limits)} set-ups"
-        )
-        warnings.append(
-            f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
-            "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
-            "the threshold (set study.units to draw several units)"
-        )
+        warnings.append(_crowd_warning(crowded, len(limits)))
     for row in rows:
         threshold = row.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
             where = row.place if row.place == OFF_BOARD else f"at x, y = {row.place} mm"
             warnings.append(
-                f"{row.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
-                f"something other than noise sets it (calibration board {row.board}, {where}) and thus the limit"
+                f"{row.limit.record.label}: the threshold is {threshold:.3g} deviations, "
+                f"above {HIGH_THRESHOLD:g}: something other than noise sets it "
+                f"(calibration board {row.board}, {where}) and thus the limit"
             )
     return warnings
 
 
+def _crowd_warning(crowded: Sequence[SetBy], set_ups: int) -> str:
+    """Return a warning about thresholds that one place on the sensor sets."""
+    counts = sorted({row.same_pixels or 0 for row in crowded})
+    span = str(counts[0])
+    if len(counts) > 1:
+        span += f" to {counts[-1]}"
+    subject = f"{len(crowded)} of {set_ups} set-ups"
+    if len(crowded) == 1:
+        subject = crowded[0].limit.record.label
+    return (
+        f"{subject}: {span} of {crowded[0].runs} calibration boards have their highest score on "
+        "the same pixels of the sensor: one place of this unit's fixed pattern sets the threshold "
+        "(set study.units to draw several units)"
+    )
+
+
 def threshold_note(record: StudyRecord) -> str:
     """Return how the thresholds were set."""
-    if stated := record.provenance.get("thresholds"):
+    stated = record.provenance.get("thresholds")
+    if stated:
         return str(stated)
-    if record.false_calls_per_m2 is None:
-        return "Thresholds were given, not calibrated; the rates beside them are those that were observed."
     wanted = record.false_calls_per_m2
+    if wanted is None:
+        return (
+            "Thresholds were given, not calibrated; "
+            "the rates beside them are those that were observed."
+        )
+    plural = "" if wanted == 1 else "s"
     return (
-        f"Thresholds are calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on separate undamaged "
-        "boards: a threshold is the lowest of their runs' highest scores that keeps to that rate by order statistics "
-        "(Wilks 1941). It is itself an estimate: the rate on other boards scatters about the wanted rate."
+        f"Thresholds are calibrated to {wanted:g} false call{plural} per m² on separate undamaged "
+        "boards: a threshold is the lowest of their runs' highest scores that keeps to that rate "
+        "by order statistics (Wilks 1941). It is itself an estimate: the rate on other boards "
+        "scatters about the wanted rate."
     )
 
 
@@ -204,30 +231,29 @@ OPERATING = Table(
 
 def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
     """Return the definition of AU-PRO, and the set-ups for which it could not be computed."""
-    text = (
-        "AU-PRO: area under the mean share of a damage's pixels above the threshold, against the share of undamaged "
-        f"pixels above it, up to a share of {PRO_LIMIT:g} and divided by {PRO_LIMIT:g}, as in MVTec AD."
-    )
-    without = [result for result in results if result.pixels is not None and result.pixels.why]
-    return [
-        text,
-        *(
-            f"{name_of(result.limit)}: no AU-PRO: {result.pixels.why}."
-            for result in without
-            if result.pixels
-        ),
+    notes = [
+        "AU-PRO: area under the mean share of a damage's pixels above the threshold, against the "
+        f"share of undamaged pixels above it, up to a share of {PRO_LIMIT:g} and divided by "
+        f"{PRO_LIMIT:g}, as in MVTec AD."
     ]
+    for result in results:
+        if result.pixels is not None and result.pixels.why:
+            notes.append(f"{name_of(result.limit)}: no AU-PRO: {result.pixels.why}.")
+    return notes
 
 
 @dataclass(frozen=True, eq=False)
 class AxisGroup:
-    """An axis: its ``values``, ascending if they are numbers, and its ``lines`` by their values on
-    the other axes."""
+    """An axis and its lines."""
 
     path: str
+    """Dotted path of the axis."""
     name: str
+    """Name of the axis in words."""
     values: tuple[Any, ...]
+    """Its values, ascending if they are numbers."""
     lines: dict[str, AxisLine]
+    """Its lines by their values on the other axes."""
 
     @property
     def numeric(self) -> bool:
@@ -248,36 +274,37 @@ class AxisGroup:
 def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
     """Return the lines of each axis. A line's label gives its values on those other axes on which
     the lines differ."""
-    names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
+    names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.fixed)))
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
         of_axis = [line for line in lines if line.axis == path]
-        axes = dict.fromkeys(axis for line in of_axis for axis in line.held)
-        taken = {axis: [line.held.get(axis) for line in of_axis] for axis in axes}
-        varied = [axis for axis, values in taken.items() if len(set(map(on_one_line, values))) > 1]
-
-        def held(line: AxisLine, axis: str, values: Sequence[Any]) -> str:
-            """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key
-            (``albedo=0.2``)."""
-            words = axis_value(axis, differing(line.held[axis], values))
-            return (
-                words
-                if axis == FRAMES or isinstance(line.held[axis], str)
-                else f"{names[axis]}={words}"
-            )
-
-        labels = [
-            ", ".join(held(line, axis, taken[axis]) for axis in varied if axis in line.held)
-            for line in of_axis
-        ]
-        every = [value for line in of_axis for value in line.values]
-        values = [value for at, value in enumerate(every) if value not in every[:at]]
+        values: list[Any] = []
+        for line in of_axis:
+            values += [value for value in line.values if value not in values]
         if all(line.numeric for line in of_axis):
             values.sort()
-        groups.append(
-            AxisGroup(path, names[path], tuple(values), dict(zip(labels, of_axis, strict=True)))
-        )
+        labels = _line_labels(of_axis, names)
+        by_label = dict(zip(labels, of_axis, strict=True))
+        groups.append(AxisGroup(path, names[path], tuple(values), by_label))
     return groups
+
+
+def _line_labels(lines: Sequence[AxisLine], names: Mapping[str, str]) -> list[str]:
+    """Return the values of each line on those other axes on which the lines differ."""
+    axes = dict.fromkeys(axis for line in lines for axis in line.fixed)
+    values_of = {axis: [line.fixed.get(axis) for line in lines] for axis in axes}
+    varied = [axis for axis, values in values_of.items() if len(set(map(on_one_line, values))) > 1]
+    labels = []
+    for line in lines:
+        parts = []
+        for axis in varied:
+            if axis in line.fixed:
+                words = axis_value(axis, differing(line.fixed[axis], values_of[axis]))
+                # a name such as kinect_v2 explains itself, a number needs a key (albedo=0.2)
+                explains_itself = axis == FRAMES or isinstance(line.fixed[axis], str)
+                parts.append(words if explains_itself else f"{names[axis]}={words}")
+        labels.append(", ".join(parts))
+    return labels
 
 
 def axis_value(path: str, value: Any) -> str:
@@ -288,22 +315,28 @@ def axis_value(path: str, value: Any) -> str:
 
 
 class AxisRow(NamedTuple):
-    """One value of one line of an axis. ``step`` is the change of a90 from the previous value."""
+    """One value of one line of an axis."""
 
     group: AxisGroup
+    """The axis."""
     line: str
+    """Label of the line."""
     value: Any
+    """The value."""
     limit: SetUpLimit
+    """The limit at this value."""
     step: Difference | None
+    """The change of a90 from the previous value."""
 
 
 def axis_rows(group: AxisGroup) -> list[AxisRow]:
     """Return the values of all lines of an axis."""
-    return [
-        AxisRow(group, label, value, limit, step)
-        for label, line in group.lines.items()
-        for value, limit, step in zip(line.values, line.limits, (None, *line.steps), strict=True)
-    ]
+    rows = []
+    for label, line in group.lines.items():
+        steps = (None, *line.steps)
+        for value, limit, step in zip(line.values, line.limits, steps, strict=True):
+            rows.append(AxisRow(group, label, value, limit, step))
+    return rows
 
 
 def _step_text(row: AxisRow) -> str:
@@ -312,15 +345,18 @@ def _step_text(row: AxisRow) -> str:
         return ""
     beyond = " *" if step.beyond_chance else ""
     if not np.isfinite(step.ratio):
-        return f"no a90 {'here' if np.isnan(step.to.a90_mm) else 'above'}{beyond}"
-    if all(end.beyond(end.a90_mm) for end in (step.frm, step.to)):
+        row_without = "here" if np.isnan(step.to.a90_mm) else "above"
+        return f"no a90 {row_without}{beyond}"
+    if step.frm.beyond(step.frm.a90_mm) and step.to.beyond(step.to.a90_mm):
         return f"both beyond{beyond}"
-    return f"× {step.ratio:.2f} ({text.interval(step.interval.low, step.interval.high)}){beyond}"
+    interval = text.interval(step.interval.low, step.interval.high)
+    return f"× {step.ratio:.2f} ({interval}){beyond}"
 
 
 AXES = Table(
     "axes",
-    "one row per axis, line (set-ups that differ only on this axis) and value: the limits and the change of a90",
+    "one row per axis, line (set-ups that differ only on this axis) and value: "
+    "the limits and the change of a90",
     (
         Column("axis", "", "group.path", "dotted path of the axis"),
         Column("line", "set-ups", "line", "values of the line's set-ups on the other axes"),
@@ -370,17 +406,16 @@ def axis_grid(group: AxisGroup) -> Grid:
 def axis_note(group: AxisGroup) -> str:
     """Explain the changes of a90 and their intervals."""
     steps = [step for line in group.lines.values() for step in line.steps]
-    paired = (
-        "the same boards, resampled together"
-        if all(step.paired for step in steps)
-        else "not all of them the same"
-    )
+    paired = "not all of them the same"
+    if all(step.paired for step in steps):
+        paired = "the same boards, resampled together"
     beyond = sum(step.beyond_chance for step in steps)
     rows = sum(len(line.values) for line in group.lines.values())
     cut = f" The first {SHOWN_ROWS} of {rows} rows are shown." if rows > SHOWN_ROWS else ""
     return (
-        f"Ratio of a90 with its 95 % interval over boards ({paired}). A * marks an interval that excludes 1: {beyond} "
-        f"of {len(steps)}. The intervals are a little narrow: 8 to 9 % of equal pairs get a *, not 5 %.{cut}"
+        f"Ratio of a90 with its 95 % interval over boards ({paired}). A * marks an interval that "
+        f"excludes 1: {beyond} of {len(steps)}. The intervals are a little narrow: 8 to 9 % of "
+        f"equal pairs get a *, not 5 %.{cut}"
     )
 
 
@@ -388,29 +423,36 @@ class DepthAt(NamedTuple):
     """The depth that one set-up finds 90 % of the time at one diameter."""
 
     limit: SetUpLimit
+    """The set-up."""
     diameter_mm: float
+    """The diameter."""
     depth: Estimate
+    """The depth in mm with its interval."""
 
 
 def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
     """Return the contours at a probability of 90 % of all surfaces."""
     rows = []
-    for limit, surface in (
-        (result.limit, result.surface) for result in results if result.surface is not None
-    ):
-        depths = np.stack(
-            [surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1
-        ).tolist()
-        for diameter, (depth, low, high) in zip(surface.diameter_mm.tolist(), depths, strict=True):
-            rows.append(
-                DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1]))
+    for result in results:
+        surface = result.surface
+        if surface is None:
+            continue
+        deepest = surface.depth_range_mm[1]
+        for index, diameter_mm in enumerate(surface.diameter_mm.tolist()):
+            depth = Estimate(
+                value=float(surface.d90_mm[index]),
+                low=float(surface.d90_low_mm[index]),
+                high=float(surface.d90_high_mm[index]),
+                most=deepest,
             )
+            rows.append(DepthAt(result.limit, diameter_mm, depth))
     return rows
 
 
 DEPTH_LIMITS = Table(
     "depth_limits",
-    "one row per set-up, number of frames and diameter: the depth found 90 % of the time, where limits depend on both",
+    "one row per set-up, number of frames and diameter: the depth found 90 % of the time, "
+    "where limits depend on both",
     (
         SET_UP_OF,
         Column("diameter_mm", "diameter (mm)", "diameter_mm", "diameter of the damage"),

@@ -6,37 +6,38 @@ for trials."""
 
 import base64
 import io
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import Any
 
 import numpy as np
 
 from detectors.interface import Calibratable
-from harness.trials.judge import Rows, detector_of
-from harness.trials.trial import TrialTask, cloud_of
+from harness.trials.judge import detector_of
+from harness.trials.trial import Trial, cloud_of
 
-LEARNING_BOARDS = (
-    8  # boards to learn from: at 0.7 m, 200,000 pixels each give a spectrum to a few per cent
-)
+# boards to learn from: at 0.7 m, 200,000 pixels each give a spectrum to a few per cent
+LEARNING_BOARDS = 8
 
 
-def learn(task: TrialTask) -> Rows:
-    """Return the record of what a task's detector learns from its `LEARNING_BOARDS` boards: an
-    ``.npz`` in base 64."""
-    (point,), views = task.points, len(task.set_ups) // LEARNING_BOARDS
-    boards = (
-        replace(task, set_ups=task.set_ups[number * views : (number + 1) * views], repeat=number)
-        for number in range(LEARNING_BOARDS)
-    )
-    clouds = [cloud_of(board, point) for board in boards]
-    learned = cast("Calibratable", detector_of(point.detector, point.settings_json)).calibrate(
-        clouds
-    )
+def learn(trial: Trial) -> dict[str, list[dict[str, Any]]]:
+    """Return the record of what a trial's detector learns from its `LEARNING_BOARDS` boards, whose
+    views follow one another: an ``.npz`` in base 64."""
+    (point,) = trial.points
+    views = len(trial.views) // LEARNING_BOARDS
+    clouds = []
+    for number in range(LEARNING_BOARDS):
+        own_views = trial.views[number * views : (number + 1) * views]
+        clouds.append(cloud_of(replace(trial, views=own_views, repeat=number), point))
+    detector = detector_of(point.criteria.detector, point.criteria.settings_json)
+    if not isinstance(detector, Calibratable):
+        raise TypeError(f"the detector {point.criteria.detector!r} does not learn")
     file = io.BytesIO()
-    np.savez_compressed(file, **dict(learned))  # type: ignore[arg-type]
-    return {"runs": [], "learned": [{"arrays": base64.b64encode(file.getvalue()).decode()}]}
+    np.savez_compressed(file, **dict(detector.calibrate(clouds)))  # type: ignore[arg-type]
+    arrays = base64.b64encode(file.getvalue()).decode()
+    return {"runs": [], "learned": [{"arrays": arrays}]}
 
 
-def learned_file(record: Rows) -> bytes:
+def learned_file(record: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     """Return the ``.npz`` that a record of `learn` holds."""
     return base64.b64decode(record["learned"][0]["arrays"])

@@ -18,7 +18,13 @@ from scenes.target.mesh import TargetPart
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 LEGAL = "LLVM 17 or newer (14 to 16 abort the process with Dr.Jit 1.5)"
-FIX = "pip install karellen-llvm-core (Linux x86-64), or set DRJIT_LIBLLVM_PATH to the path of such a library"
+FIX = (
+    "pip install karellen-llvm-core (Linux x86-64), "
+    "or set DRJIT_LIBLLVM_PATH to the path of such a library"
+)
+ALIGNED_BYTES = 64  # Dr.Jit uses memory of NumPy as it is, and compiles a kernel for each alignment
+# of a ray's start from a surface: float32 places hits within 1e-6 m; Mitsuba's default is 0.15 mm
+LIFT_M = 1e-5
 
 
 def load_mitsuba() -> Any:
@@ -38,9 +44,12 @@ def load_mitsuba() -> Any:
     if "open3d" in sys.modules:
         # Both wheels contain a libc++.so.1; the first loaded serves both, and Open3D's is too old
         # for LLVM.
-        message = "Mitsuba cannot run: Open3D was imported before it, and Open3D's C++ library replaces LLVM's"
-        fix = "call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own"
-        raise UserError(message, fix=fix)
+        raise UserError(
+            "Mitsuba cannot run: Open3D was imported before it, "
+            "and Open3D's C++ library replaces LLVM's",
+            fix="call scenes.render.scene.load_mitsuba() before importing open3d, "
+            "or render in a process of its own",
+        )
     raise UserError(
         "Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found",
         legal=LEGAL,
@@ -58,9 +67,8 @@ def _works(mi: Any, name: str) -> bool:
         try:
             mi.set_variant(name)
             scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
-            return bool(
-                scene.ray_test(mi.Ray3f(mi.Point3f(0.1, 0.2, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))[0]
-            )
+            ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 1.0), mi.Vector3f(0.0, 0.0, -1.0))
+            return bool(scene.ray_test(ray)[0])
         except Exception:
             # Dr.Jit reports a missing backend by various exceptions; any of them means that this
             # variant does not work
@@ -81,105 +89,128 @@ def _point_to_llvm() -> UserError | None:
     """Set DRJIT_LIBLLVM_PATH, if it is not set, to the LLVM of the wheel karellen-llvm-core;
     Dr.Jit's own search may choose one that aborts the process. Return the UserError to raise if no
     LLVM can be used."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if named:
-        message = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist"
-        legal = "the path of LLVM 17 or newer"
-        return (
-            None
-            if Path(named).exists()
-            else UserError(message, legal=legal, fix="set or unset DRJIT_LIBLLVM_PATH")
+    declared = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if declared and Path(declared).exists():
+        return None
+    if declared:
+        return UserError(
+            f"DRJIT_LIBLLVM_PATH names {declared}, which does not exist",
+            legal="the path of LLVM 17 or newer",
+            fix="set or unset DRJIT_LIBLLVM_PATH",
         )
     for folder in (Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"):
-        found = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
-        if found:
-            os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
+        libraries = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
+        if libraries:
+            os.environ["DRJIT_LIBLLVM_PATH"] = str(libraries[-1])
             return None
-    return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
-
-
-# of inputs: Dr.Jit uses memory of NumPy as it is, and compiles a kernel anew for other alignments
-ALIGNED_BYTES = 64
+    return UserError(
+        "no LLVM was found that Dr.Jit can use",
+        legal=LEGAL,
+        fix=FIX,
+    )
 
 
 def on_device(kind: Any, values: np.ndarray) -> Any:
     """Return values (n,) as a Dr.Jit array of ``kind``, aligned, so that kernels are compiled once
     for all boards."""
-    room = np.empty(
-        values.size + ALIGNED_BYTES // 4, np.uint32 if kind.__name__ == "UInt" else np.float32
-    )
-    placed = room[-room.ctypes.data % ALIGNED_BYTES // 4 :][: values.size]
-    placed[:] = values
-    return kind(placed)
-
-
-# of a ray's start from a surface: float32 places hits within 1e-6 m; Mitsuba's default is 0.15 mm
-LIFT_M = 1e-5
+    dtype = np.uint32 if kind.__name__ == "UInt" else np.float32
+    buffer = np.empty(values.size + ALIGNED_BYTES // 4, dtype)
+    begin = -buffer.ctypes.data % ALIGNED_BYTES // 4
+    aligned = buffer[begin:][: values.size]
+    aligned[:] = values
+    return kind(aligned)
 
 
 class Met(NamedTuple):
-    """Hits of rays, as Dr.Jit arrays: whether there is a hit, its distance and position, the unit
-    normal towards the ray's origin, the indices of surface and triangle, and the direction back
-    along the ray."""
+    """Hits of rays, as Dr.Jit arrays."""
 
     valid: Any
+    """True where there is a hit."""
     distance: Any
-    place: Any
+    """Metres from the ray's origin; 0 without a hit."""
+    point: Any
+    """Position in the camera's frame."""
     normal: Any
+    """Unit normal of the surface, towards the ray's origin."""
     surface: Any
+    """Index of the surface."""
     triangle: Any
+    """Index of the triangle."""
     viewer: Any
+    """Unit direction back along the ray."""
 
 
 @dataclass(frozen=True)
 class LitScene:
     """A target's parts as one Mitsuba mesh, and the emitter: a point with uniform intensity in a
-    soft-edged cone. Mitsuba only finds the hits of rays: one shape without materials needs no
-    virtual calls, so that all scenes share their compiled kernels. ``surface_of`` (index into
-    ``parts``), ``normal_of`` and ``on_face`` are by triangle; ``albedos`` and, if any surface is
-    glossy, ``gloss`` (share and exponent of the lobes) by surface. The part ``textured`` has
-    ``texture``; -1 and None if there is none. Its coordinates are affine in position, by the eight
-    ``uv_factors``: data, because constants would compile the kernels anew for each board. ``mi``,
-    ``dr``: Mitsuba and Dr.Jit, loaded."""
+    soft-edged cone.
+
+    Mitsuba only finds the hits of rays: one shape without materials needs no virtual calls, so
+    that all scenes share their compiled kernels."""
 
     mi: Any
+    """Mitsuba, loaded."""
     dr: Any
+    """Dr.Jit, loaded."""
     scene: Any
+    """The mesh as a Mitsuba scene."""
     parts: tuple[TargetPart, ...]
+    """The surfaces, by index."""
     emitter_m: np.ndarray
+    """(3,): the emitter, in the camera's frame."""
     cos_full: float
+    """Cosine of the angle from the axis up to which the emitter has its full intensity."""
     cos_cutoff: float
+    """Cosine of the angle at which nothing is left of it."""
     surface_of: Any
+    """Index of the surface, by triangle."""
     normal_of: Any
+    """Unit normal, by triangle."""
     on_face: Any
+    """True on the undamaged face, by triangle."""
     albedos: Any
+    """Mean albedo, by surface."""
     gloss: tuple[Any, Any] | None
+    """Share and exponent of the lobes, by surface; None if no surface is glossy."""
     textured: int
+    """Index of the surface with a texture; -1 if there is none."""
     texture: Any
+    """Its albedo as a Mitsuba texture, or None."""
     uv_factors: list[Any]
+    """Eight factors by which texture coordinates are affine in position: data, because constants
+    would compile the kernels anew for each board."""
 
-    def meet(self, origin: Any, direction: Any, coherent: bool = False) -> Met:
+    def meet(
+        self,
+        origin: Any,
+        direction: Any,
+        coherent: bool = False,
+    ) -> Met:
         """Return the first hits of rays along unit directions. ``coherent``: neighbours are alike,
         which is a third of the time then, and twice the time otherwise, with the same hits."""
         mi = self.mi
         dr = self.dr
-        found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent)
-        valid = found.is_valid()
-        triangle = found.prim_index
+        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent)
+        valid = hit.is_valid()
+        triangle = hit.prim_index
         normal = dr.gather(mi.Normal3f, self.normal_of, triangle, valid)
-        surface = dr.gather(mi.UInt32, self.surface_of, triangle, valid)
-        normal = dr.mulsign(normal, -dr.dot(normal, direction))
-        distance = dr.select(valid, found.t, 0)
-        place = mi.Point3f(origin + distance * direction)
-        return Met(valid, distance, place, normal, surface, triangle, -direction)
+        distance = dr.select(valid, hit.t, 0)
+        return Met(
+            valid=valid,
+            distance=distance,
+            point=mi.Point3f(origin + distance * direction),
+            normal=dr.mulsign(normal, -dr.dot(normal, direction)),
+            surface=dr.gather(mi.UInt32, self.surface_of, triangle, valid),
+            triangle=triangle,
+            viewer=-direction,
+        )
 
-    def uv(self, place: Any) -> Any:
+    def uv(self, point: Any) -> Any:
         """Return the texture coordinates of points on the textured part."""
         ux, uy, uz, u0, vx, vy, vz, v0 = self.uv_factors
-        x = place.x
-        y = place.y
-        z = place.z
-        return self.mi.Point2f(ux * x + uy * y + uz * z + u0, vx * x + vy * y + vz * z + v0)
+        u = ux * point.x + uy * point.y + uz * point.z + u0
+        v = vx * point.x + vy * point.y + vz * point.z + v0
+        return self.mi.Point2f(u, v)
 
     def albedo(self, met: Met) -> Any:
         """Return the albedo at hits; 0 if a ray met nothing."""
@@ -187,29 +218,45 @@ class LitScene:
         plain = dr.gather(self.mi.Float, self.albedos, met.surface, met.valid)
         if self.texture is None:
             return plain
-        here = met.valid & (met.surface == self.textured)
-        return dr.select(here, self.texture.eval(self.uv(met.place), here)[0], plain)
+        on_textured = met.valid & (met.surface == self.textured)
+        value = self.texture.eval(self.uv(met.point), on_textured)[0]
+        return dr.select(on_textured, value, plain)
 
-    def lobe(self, surface: Any, normal: Any, viewer: Any, direction: Any) -> Any:
+    def lobe(
+        self,
+        surface: Any,
+        normal: Any,
+        viewer: Any,
+        direction: Any,
+    ) -> Any:
         """Return the light that a surface reflects from ``direction`` to ``viewer``, over that of
         a Lambertian one of the same albedo: 1 - share + share (exponent + 2) / 2 cos^exponent. All
         directions leave the surface."""
         if self.gloss is None:
             return 1.0
         dr = self.dr
-        share, exponent = (dr.gather(self.mi.Float, each, surface) for each in self.gloss)
-        cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
-        return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
+        shares, exponents = self.gloss
+        share = dr.gather(self.mi.Float, shares, surface)
+        exponent = dr.gather(self.mi.Float, exponents, surface)
+        mirrored = 2 * dr.dot(normal, viewer) * normal - viewer
+        cosine = dr.maximum(dr.dot(mirrored, direction), 1e-6)
+        return 1 - share + share * (exponent + 2) / 2 * dr.power(cosine, exponent)
 
-    def arriving(self, met: Met, coherent: bool = False, clear: Any = None) -> tuple[Any, Any]:
-        """Return the light from the emitter at each hit: (irradiance, distance). The irradiance is
-        cone(direction) cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0
-        behind an occluder and without a hit. ``clear``: where nothing is between, if that is
-        known."""
+    def arriving(
+        self,
+        met: Met,
+        coherent: bool = False,
+        clear: Any = None,
+    ) -> tuple[Any, Any]:
+        """Return the light from the emitter at each hit: (irradiance, distance).
+
+        The irradiance is cone(direction) cos(incidence) / d^2 times the `lobe`: 1 on a facing
+        surface at 1 m, 0 behind an occluder and without a hit. ``clear``: where nothing is
+        between, if that is known."""
         mi = self.mi
         dr = self.dr
-        emitter = mi.Point3f(*self.emitter_m.tolist())
-        towards = emitter - met.place
+        emitter = mi.Point3f(self.emitter_m.tolist())
+        towards = emitter - met.point
         squared = dr.squared_norm(towards)
         distance = dr.sqrt(squared)
         towards /= distance
@@ -217,15 +264,16 @@ class LitScene:
         on_axis = -towards.z
         cone = dr.clip((on_axis - self.cos_cutoff) / (self.cos_full - self.cos_cutoff), 0, 1)
         lit = met.valid & (cosine > 0) & (cone > 0)
-        # occluders between the emitter and the side of the surface from which the ray came
-        origin = met.place + LIFT_M * met.normal
-        way = emitter - origin
-        reach = dr.norm(way)
-        ray = mi.Ray3f(origin, way / reach)
-        ray.maxt = reach - 2 * LIFT_M
-        lit &= ~self.scene.ray_test(ray, coherent, lit) if clear is None else clear
+        if clear is None:
+            # occluders between the emitter and the side of the surface from which the ray came
+            origin = met.point + LIFT_M * met.normal
+            to_emitter = emitter - origin
+            reach = dr.norm(to_emitter)
+            ray = mi.Ray3f(origin, to_emitter / reach)
+            ray.maxt = reach - 2 * LIFT_M
+            clear = ~self.scene.ray_test(ray, coherent, lit)
         lobe = self.lobe(met.surface, met.normal, met.viewer, towards)
-        return dr.select(lit, cone * cosine / squared * lobe, 0), distance
+        return dr.select(lit & clear, cone * cosine / squared * lobe, 0), distance
 
 
 def lit_scene(
@@ -239,44 +287,64 @@ def lit_scene(
     face; None means none."""
     import drjit as dr
 
-    whole: Any = trimesh.util.concatenate([part.mesh for part in parts])
-    counts = [len(part.mesh.faces) for part in parts]
-    vertices = np.asarray(whole.vertices, np.float32)
-    faces = np.asarray(whole.faces, np.uint32)
+    joined: Any = trimesh.util.concatenate([part.mesh for part in parts])
+    vertices = np.asarray(joined.vertices, np.float32)
+    faces = np.asarray(joined.faces, np.uint32)
     mesh = mi.Mesh("target", len(vertices), len(faces))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
+    parameters["vertex_positions"] = vertices.ravel()
+    parameters["faces"] = faces.ravel()
     parameters.update()
-    corners = np.asarray(whole.vertices)[whole.faces]
+    corners = np.asarray(joined.vertices)[joined.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
-    textured = next((k for k, part in enumerate(parts) if part.texture_850 is not None), -1)
+    normals = across / np.maximum(
+        np.linalg.norm(
+            across,
+            axis=1,
+            keepdims=True,
+        ),
+        1e-30,
+    )
+    face_counts = [len(part.mesh.faces) for part in parts]
+    surface_of = np.repeat(np.arange(len(parts)), face_counts)
+    flags = np.zeros(len(faces), bool)
+    if on_face is not None:
+        flags = np.concatenate(list(on_face))
+    gloss = None
+    if any(part.gloss[0] > 0 for part in parts):
+        shares = mi.Float([part.gloss[0] for part in parts])
+        exponents = mi.Float([part.gloss[1] for part in parts])
+        gloss = (shares, exponents)
+    textured = -1
     texture = None
-    uv_of = np.zeros((2, 4))
-    if textured >= 0:
-        part: Any = parts[textured]
-        image = mi.TensorXf(np.ascontiguousarray(part.texture_850[..., None], np.float32))
-        texture = mi.Texture2f(image, wrap_mode=dr.WrapMode.Clamp)
-        places = np.column_stack([part.mesh.vertices, np.ones(len(part.mesh.vertices))])
-        uv_of = np.linalg.lstsq(places, part.uv, rcond=None)[0].T
-    flags = np.zeros(len(faces), bool) if on_face is None else np.concatenate(list(on_face))
-    full = float(np.cos(np.deg2rad(optics.full_half_angle_deg)))
-    cutoff = float(np.cos(np.deg2rad(optics.cutoff_half_angle_deg)))
-    shares, exponents = (mi.Float([part.gloss[k] for part in parts]) for k in (0, 1))
+    uv_factors = np.zeros((2, 4))
+    for index, part in enumerate(parts):
+        if part.texture_850 is not None:
+            textured = index
+            image = np.ascontiguousarray(part.texture_850[..., None], np.float32)
+            texture = mi.Texture2f(mi.TensorXf(image), wrap_mode=dr.WrapMode.Clamp)
+            uv_factors = _uv_factors(part)
     return LitScene(
         mi=mi,
         dr=dr,
         scene=mi.load_dict({"type": "scene", "target": mesh}),
         parts=tuple(parts),
         emitter_m=optics.emitter_m,
-        cos_full=full,
-        cos_cutoff=cutoff,
-        surface_of=mi.UInt32(np.repeat(np.arange(len(parts)), counts).astype(np.uint32)),
+        cos_full=float(np.cos(np.deg2rad(optics.full_half_angle_deg))),
+        cos_cutoff=float(np.cos(np.deg2rad(optics.cutoff_half_angle_deg))),
+        surface_of=mi.UInt32(surface_of.astype(np.uint32)),
         normal_of=mi.Float(normals.astype(np.float32).ravel()),
         on_face=mi.Bool(flags),
         albedos=mi.Float([float(part.albedo_850) for part in parts]),
-        gloss=(shares, exponents) if any(part.gloss[0] > 0 for part in parts) else None,
+        gloss=gloss,
         textured=textured,
         texture=texture,
-        uv_factors=[dr.opaque(mi.Float, float(each)) for each in uv_of.ravel()],
+        uv_factors=[dr.opaque(mi.Float, factor) for factor in uv_factors.ravel().tolist()],
     )
+
+
+def _uv_factors(part: Any) -> np.ndarray:
+    """Return the factors (2, 4) of x, y, z and 1 in a part's texture coordinates."""
+    vertices = part.mesh.vertices
+    with_one = np.column_stack([vertices, np.ones(len(vertices))])
+    return np.asarray(np.linalg.lstsq(with_one, part.uv, rcond=None)[0].T)

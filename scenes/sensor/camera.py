@@ -7,12 +7,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import read_as, settings_of, with_value_at
 from harness.vocabulary.declaration.yaml_source import (
     DeclarationError,
@@ -26,6 +24,7 @@ from harness.vocabulary.geometry import Lens, OtherLens
 from harness.vocabulary.plug_ins import PlugIns
 from harness.vocabulary.seeds import canonical_json
 from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
 
@@ -33,81 +32,30 @@ CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
 DEEPEST = 5  # most cameras in a chain of ``like``
 # its entry points give the path of a camera's file, which has the entry point's name
 GROUP = "tofpod.cameras"
+
+
+@lru_cache
+def _built_in_cameras() -> dict[str, str]:
+    """Return the paths of tofpod's camera files, by name."""
+    return {path.stem: str(path) for path in CAMERA_FOLDER.glob("[!.]*.yaml")}
+
+
 CAMERAS = PlugIns(
     GROUP,
     "camera",
-    lru_cache(lambda: {path.stem: str(path) for path in CAMERA_FOLDER.glob("[!.]*.yaml")}),
-    fix=f"to add one, write its file in scenes/cameras/, or install a package that offers it by {GROUP!r}",
+    _built_in_cameras,
+    fix="to add one, write its file in scenes/cameras/, or install a package that offers it by "
+    f"{GROUP!r}",
 )
 
 AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
 """All kinds of camera, distinguished by ``kind``. Each has name, title, nominal_lens, optics,
 unit, z_step_m."""
-KINDS: dict[str, type[AnyCamera]]
-KINDS = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar, "empirical": EmpiricalCamera}
-
-
-class EffectsConfig(Config):
-    """Switches for the effects of a real unit. With all off, the camera is noise-free and sees
-    direct light only."""
-
-    noise: bool = Field(True, description="shot and read noise of the samples")
-    multipath: bool = Field(True, description="light that was reflected by more than one surface")
-    wiggling: bool = Field(
-        True, description="error that harmonics of the modulation leave after factory calibration"
-    )
-    fixed_pattern: bool = Field(True, description="the unit's own range error of each pixel")
-    unit_offset: bool = Field(True, description="the unit's own constant range error")
-    warm_up_drift: bool = Field(True, description="range error that decays after power-on")
-    ambient: bool = Field(
-        True,
-        description="noise and full-scale range that ambient light (`ambient_uw_cm2_nm`) takes",
-    )
-    saturation: bool = Field(
-        True, description="pixels beyond their own or the converter's full scale are invalid"
-    )
-    frame_jumps: bool = Field(
-        True, description="displacement of whole frames: rare jumps and a small jitter"
-    )
-
-
-NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))  # every effect off
-
-
-class CameraConfig(Config):
-    """The camera of an experiment: its name, the unit, the effects that are on, and the ambient
-    light."""
-
-    name: str = Field(
-        "azure_kinect_nfov",
-        description="a camera of tofpod or of an installed package, or the path of a .yaml file",
-    )
-    unit_seed: int = Field(
-        1, ge=0, description="draws the unit's fixed pattern: another seed is another unit"
-    )
-    effects: EffectsConfig = EffectsConfig()
-    fixed_pattern_scale: float = Field(
-        1.0, ge=0, le=100, description="multiplies the file's fixed pattern; 0: off"
-    )
-    edge_gate: bool = Field(
-        True, description="whether pixels at edges are invalid, by a rule inferred from data"
-    )
-    ambient_uw_cm2_nm: Annotated[float, Field(ge=0, le=200)] = Field(
-        0.04,
-        description="irradiance of ambient light at the camera's wavelength, in microwatts per square centimetre and "
-        "nanometre: 0.04 in a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 in full sun",
-    )
-    minutes_since_power_on: float = Field(
-        60.0, ge=0, le=1e5, description="time for which the unit has warmed up"
-    )
-    numbers: dict[str, Any] = Field(
-        {}, description="replaces numbers of the camera file, such as lens.fx_px: 505.1"
-    )
-
-    def __hash__(self) -> int:
-        # a mapping has no hash, and workers keep what they derived from a camera by its
-        # declaration
-        return hash(canonical_json(self.to_data()))
+KINDS: dict[str, type[AnyCamera]] = {
+    "amcw_imager": AmcwCamera,
+    "scanned_lidar": ScannedLidar,
+    "empirical": EmpiricalCamera,
+}
 
 
 def camera_names() -> tuple[str, ...]:
@@ -153,8 +101,9 @@ def lens_names() -> dict[str, str]:
     camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
+        modes = dict.fromkeys((camera, *load_camera(camera).modes), camera)
         # a mode with its own file stays with the camera whose mode it is
-        names = dict.fromkeys((camera, *load_camera(camera).modes), camera) | names
+        names = {**modes, **names}
     return names
 
 
@@ -175,47 +124,54 @@ def lens_named(name: str) -> OtherLens:
 def camera_of(config: CameraConfig) -> AnyCamera:
     """Return the camera that an experiment declares. Raises UserError if a replaced number is
     impossible."""
-    return (
-        _with_numbers(config.name, canonical_json(config.numbers))
-        if config.numbers
-        else load_camera(config.name)
-    )
+    if not config.numbers:
+        return load_camera(config.name)
+    return _with_numbers(config.name, canonical_json(config.numbers))
 
 
 def guessed_precision(camera: AnyCamera) -> str:
     """Return a warning for a camera whose precision is not published (shot noise by its gain);
     empty for others."""
-    if (
-        isinstance(camera, EmpiricalCamera)
-        or (gain := camera.photons.signal_electrons).range is None
-    ):
+    if isinstance(camera, EmpiricalCamera):
         return ""
-    low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
-    what = f"the precision of {camera.title} is not published: its noise is a guess"
-    return f"{what}, which may be {low:.2g} to {high:.2g} times as much"
+    gain = camera.photons.signal_electrons
+    if gain.range is None:
+        return ""
+    least_gain, greatest_gain = gain.range
+    least_noise = float(np.sqrt(gain.value / greatest_gain))
+    greatest_noise = float(np.sqrt(gain.value / least_gain))
+    return (
+        f"the precision of {camera.title} is not published: its noise is a guess, which may be "
+        f"{least_noise:.2g} to {greatest_noise:.2g} times as much"
+    )
 
 
 def numbers_of_lens(lens: Lens) -> dict[str, Any]:
     """Return the numbers of a camera file (`CameraConfig.numbers`) that describe a lens."""
-    numbers = {f"lens.{key}_px": float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")}
-    return {**numbers, "lens.distortion": [*map(float, lens.distortion)]}
+    return {
+        "lens.fx_px": float(lens.fx),
+        "lens.fy_px": float(lens.fy),
+        "lens.cx_px": float(lens.cx),
+        "lens.cy_px": float(lens.cy),
+        "lens.distortion": [float(term) for term in lens.distortion],
+    }
 
 
 @lru_cache
 def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
     data = load_camera(name).to_data()
     for path, value in json.loads(numbers_json).items():
-        at: Any = data
+        fact: Any = data
         for key in path.split("."):
-            at = at.get(key) if isinstance(at, dict) else None
-        if not (isinstance(at, dict) and "value" in at):
-            near = difflib.get_close_matches(path, number_paths(data), n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            fact = fact.get(key) if isinstance(fact, dict) else None
+        if not (isinstance(fact, dict) and "value" in fact):
+            similar = difflib.get_close_matches(path, number_paths(data), n=1)
+            hint = f"; did you mean {similar[0]!r}?" if similar else ""
             legal = f"a number of {camera_file(name)}, such as lens.fx_px"
             raise UserError(
                 f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal
             )
-        at.update(value=value, tag="U", source="set by the experiment")
+        fact.update(value=value, tag="U", source="set by the experiment")
     return settings_of(
         KINDS[data["kind"]],
         data,
@@ -227,8 +183,12 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Return the dotted paths of all numbers in a camera's plain data."""
     paths: list[str] = []
     for key, value in data.items():
-        if isinstance(value, dict):
-            paths += [prefix + key] if "value" in value else number_paths(value, f"{prefix}{key}.")
+        if not isinstance(value, dict):
+            continue
+        if "value" in value:
+            paths.append(prefix + key)
+        else:
+            paths += number_paths(value, f"{prefix}{key}.")
     return paths
 
 
@@ -252,28 +212,28 @@ def _completed(source: Source, depth: int = 0) -> Source:
     if name is None:
         return source
     if not isinstance(name, str) or depth == DEEPEST:
-        message = (
-            "`like` is not the name of a camera"
-            if depth < DEEPEST
-            else f"`like` chains {DEEPEST} files"
-        )
-        problem = Problem(
-            message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}"
-        )
+        message = "`like` is not the name of a camera"
+        if depth == DEEPEST:
+            message = f"`like` chains {DEEPEST} files"
+        legal = f"one of {', '.join(camera_names())}"
+        problem = Problem(message, source.place_of(("like",)), legal=legal)
         raise DeclarationError(source.origin, [problem])
-    beside = Path(source.origin).parent / name
-    base = (
-        _completed(read_yaml(beside), depth + 1)
-        if is_camera_path(name)
-        else _named(name, depth + 1)
+    if is_camera_path(name):
+        base = _completed(read_yaml(Path(source.origin).parent / name), depth + 1)
+    else:
+        base = _named(name, depth + 1)
+    inherited = {key: value for key, value in base.data.items() if key != "modes"}
+    stated = {key: value for key, value in source.data.items() if key != "like"}
+    completed = replace(
+        source,
+        data=inherited,
+        values={**base.values, **source.values},
+        keys={**base.keys, **source.keys},
     )
-    found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})
-    found = replace(
-        found, values={**base.values, **source.values}, keys={**base.keys, **source.keys}
-    )
-    for path, value in _stated({key: value for key, value in source.data.items() if key != "like"}):
-        found = found.with_value(path, with_value_at(found.data, path, value), source, path)
-    return found
+    for path, value in _stated(stated):
+        data = with_value_at(completed.data, path, value)
+        completed = completed.with_value(path, data, source, path)
+    return completed
 
 
 @lru_cache

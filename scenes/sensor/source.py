@@ -15,10 +15,11 @@ from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw.at_once import AtOnce, at_once
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.camera import AnyCamera, CameraConfig
+from scenes.sensor.camera import AnyCamera
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.unit import FrameTotals, frame_errors_m
 from scenes.sensor.empirical.imager import EmpiricalImager
 from scenes.sensor.lidar.scanner import LidarScanner
-from scenes.sensor.unit import FrameTotals, frame_errors_m
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,11 @@ class SimulatedUnit:
     `capture` many times."""
 
     camera: AnyCamera
+    """The camera's numbers."""
     config: CameraConfig
+    """The unit, and the effects that are on."""
     view: NoiseFreeView
+    """The light before it, with a margin around its own region."""
 
     @cached_property
     def model(self) -> AmcwImager | LidarScanner | EmpiricalImager:
@@ -61,12 +65,13 @@ class SimulatedUnit:
         sensor's own border."""
         outer = self.view.region
         lens = self.camera.nominal_lens
-        m = self.camera.optics.margin_px
-        top = m * (outer.row0 > 0)
-        left = m * (outer.col0 > 0)
-        bottom = m * (outer.row1 < lens.height)
-        right = m * (outer.col1 < lens.width)
-        return Region(outer.row0 + top, outer.row1 - bottom, outer.col0 + left, outer.col1 - right)
+        margin = self.camera.optics.margin_px
+        return Region(
+            outer.row0 + margin * (outer.row0 > 0),
+            outer.row1 - margin * (outer.row1 < lens.height),
+            outer.col0 + margin * (outer.col0 > 0),
+            outer.col1 - margin * (outer.col1 < lens.width),
+        )
 
     @cached_property
     def rgb(self) -> np.ndarray:
@@ -90,15 +95,21 @@ class SimulatedCapture:
     """Frames of one simulated unit; a `harness.vocabulary.geometry.FrameSource`."""
 
     unit: SimulatedUnit
+    """The unit that takes them."""
     n_frames: int
+    """Number of frames."""
     seed: int
+    """Seed of all noise."""
     labels: tuple[str | int, ...]
+    """Names of the noise's stream."""
     organised = True
 
     def __post_init__(self) -> None:
         camera = self.unit.camera
-        self.name, self.region = f"simulated {camera.name}", self.unit.region
-        self.lens, self.z_step_m = camera.nominal_lens, camera.z_step_m
+        self.name = f"simulated {camera.name}"
+        self.region = self.unit.region
+        self.lens = camera.nominal_lens
+        self.z_step_m = camera.z_step_m
 
     @property
     def slopes(self) -> np.ndarray:
@@ -121,11 +132,11 @@ class SimulatedCapture:
         drawn at once: their distribution is that of `frames`. Each part has numbers of frames
         (t,). None if frames must be drawn."""
         summer = self.unit.at_once
+        if summer is None:
+            return None
         errors_m = self.errors_m
-        if (
-            summer is None
-            or np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0) > summer.farthest_error_m
-        ):
+        largest_error_m = np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0)
+        if largest_error_m > summer.farthest_error_m:
             return None
 
         def stream(block: int) -> np.random.Generator:
@@ -139,5 +150,10 @@ class SimulatedCapture:
         cut = self.unit.cut
         for number in range(self.n_frames):
             decoded = self.unit.model.frame(self.unit.exposure, rng, self.errors_m[number])
-            z_m, reason, amplitude = (plane[cut] for plane in decoded)
-            yield Frame(f"frame {number}", z_m, reason, rgb=self.unit.rgb, amplitude=amplitude)
+            yield Frame(
+                f"frame {number}",
+                decoded.z_m[cut],
+                decoded.reason[cut],
+                rgb=self.unit.rgb,
+                amplitude=decoded.amplitude[cut],
+            )

@@ -29,7 +29,12 @@ Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
 Chamfer = Annotated[
-    float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")
+    float,
+    Field(
+        ge=0.0,
+        le=100.0,
+        description="leg of the 45 degree chamfer at the mouth; 0: none",
+    ),
 ]
 
 
@@ -128,14 +133,18 @@ class RoughConfig(Config):
 class _FileConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
     content: str = Field(
-        "", max_length=32, description="the file's digest, filled in when the file is read"
+        "",
+        max_length=32,
+        description="the file's digest, filled in when the file is read",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _digest_of_file(cls, data: Any) -> Any:
-        path = Path(str(data.get("file", ""))) if isinstance(data, dict) else Path()
-        if not path.is_file() or data.get("content"):
+        if not isinstance(data, dict) or data.get("content"):
+            return data
+        path = Path(str(data.get("file", "")))
+        if not path.is_file():
             return data
         return {**data, "content": file_digest(path)}
 
@@ -253,7 +262,9 @@ class GlossConfig(Config):
 
     share: Albedo
     exponent: float = Field(
-        ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees"
+        ge=1.0,
+        le=500.0,
+        description="width of the lobe at half height: 7: 50, 180: 10 degrees",
     )
 
 
@@ -274,7 +285,10 @@ class ReflectanceConfig(Config):
     )
     rgb: Rgb = (0.55, 0.42, 0.28)
     grain_contrast: float = Field(
-        0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean"
+        0.05,
+        ge=0.0,
+        le=0.3,
+        description="standard deviation of the albedo over its mean",
     )
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(
         8.0, description="distance between dark lines"
@@ -284,7 +298,7 @@ class ReflectanceConfig(Config):
 
 
 class MaterialConfig(ReflectanceConfig):
-    """Reflectance of one board; ``grain_seed`` distinguishes it from boards of the same material."""
+    """Reflectance of one board; ``grain_seed`` tells it from boards of the same material."""
 
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
 
@@ -293,7 +307,9 @@ class BackingConfig(Config):
     """A plane behind the board, parallel to the board frame's x and y."""
 
     distance_mm: float = Field(
-        ge=0.0, le=5e3, description="distance behind the deepest point of the board's back"
+        ge=0.0,
+        le=5e3,
+        description="distance behind the deepest point of the board's back",
     )
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
@@ -314,9 +330,17 @@ class RoomConfig(Config):
     back_wall_albedo_850: Albedo = 0.6
     back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
     width_m: float = Field(
-        4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis"
+        4.0,
+        ge=0.5,
+        le=40.0,
+        description="width of floor and wall, centred on the optical axis",
     )
-    height_m: float = Field(2.5, ge=0.5, le=20.0, description="height of the wall above the floor")
+    height_m: float = Field(
+        2.5,
+        ge=0.5,
+        le=20.0,
+        description="height of the wall above the floor",
+    )
 
 
 class WavelengthConfig(Config):
@@ -361,7 +385,7 @@ class PoseConfig(Config):
 
 
 class SetUpConfig(Config):
-    """Surroundings of a board, and its pose. Without ``backing`` or ``room``, that space is empty."""
+    """Surroundings of a board, and its pose; without ``backing`` or ``room``, nothing is there."""
 
     name: str
     flaws: Annotated[
@@ -390,24 +414,28 @@ class TargetConfig(SetUpConfig):
     @model_validator(mode="before")
     @classmethod
     def _one_drill(cls, data: Any) -> Any:
-        drill, holes = (
-            (data.get("drill"), data.get("holes")) if isinstance(data, dict) else (None, None)
-        )
+        if not isinstance(data, dict):
+            return data
+        drill = data.get("drill")
+        holes = data.get("holes")
         if not isinstance(drill, dict) or not isinstance(holes, list | tuple):
             return data
-        whole = {"kind": "through", "depth_mm": None, "chamfer_mm": 0.0, **drill}
-        return {
-            **data,
-            "holes": [{**hole, **whole} if isinstance(hole, dict) else hole for hole in holes],
+        drilled = {
+            "kind": "through",
+            "depth_mm": None,
+            "chamfer_mm": 0.0,
+            **drill,
         }
+        drilled_holes = [{**hole, **drilled} if isinstance(hole, dict) else hole for hole in holes]
+        return {**data, "holes": drilled_holes}
 
     @model_validator(mode="after")
     def _ids_once(self) -> Self:
         ids = [damage.id for damage in self.damages]
-        if twice := sorted({i for i in ids if ids.count(i) > 1}):
-            raise ValueError(
-                f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}"
-            )
+        repeated = sorted({number for number in ids if ids.count(number) > 1})
+        if repeated:
+            listed = ", ".join(str(number) for number in repeated)
+            raise ValueError(f"ids of damage must differ; given more than once: {listed}")
         return self
 
     @property
@@ -427,48 +455,65 @@ class TargetConfig(SetUpConfig):
         """Return the declaration with the nearest albedos to that wavelength as its
         ``albedo_850``, and no others. Raises UserError if the declaration has none for it, or
         lacks the albedo of one of its surfaces."""
-        near = [
-            albedos
-            for albedos in self.other_wavelengths
-            if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM
-        ]
-        from_850 = abs(wavelength_nm - 850.0)
-        if from_850 <= NEAR_NM and all(
-            from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near
-        ):
+        albedos = self._nearest_albedos(wavelength_nm)
+        if albedos is None:
             return self.model_copy(update={"other_wavelengths": ()})
-        if not near:
-            known = sorted({850.0, *(albedos.wavelength_nm for albedos in self.other_wavelengths)})
-            raise UserError(
-                f"the target has no albedo at {wavelength_nm:g} nm",
-                legal=f"a camera within {NEAR_NM:g} nm of {', '.join(f'{nm:g}' for nm in known)} nm",
-                fix=f"declare other_wavelengths: [{{wavelength_nm: {wavelength_nm:g}, board: ..., tape: ..., ...}}]",
-            )
-        albedos = min(near, key=lambda albedos: abs(albedos.wavelength_nm - wavelength_nm))
         room = self.room
         surfaces: dict[str, Any] = {"tape": self.tapes, "backing": self.backing}
         if room is not None:
-            surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
+            surfaces["floor"] = room.floor_below_lens_m
+            surfaces["back_wall"] = room.back_wall_distance_m
         lacking = [
             name for name, surface in surfaces.items() if surface and getattr(albedos, name) is None
         ]
         if lacking:
-            what = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
-            raise UserError(what, legal="an albedo for every surface that the target has")
-        board = self.material.albedo_850 if albedos.board == "as_at_850" else albedos.board
-        changed: dict[str, Any] = {
-            "material": self.material.model_copy(update={"albedo_850": board})
-        }
-        changed["tapes"] = tuple(
-            tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes
-        )
-        if self.backing is not None:
-            changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
-        if room is not None:
-            named = {
-                f"{name}_albedo_850": getattr(albedos, name) for name in ("floor", "back_wall")
-            }
-            changed["room"] = room.model_copy(
-                update={key: value for key, value in named.items() if value is not None}
+            raise UserError(
+                f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for "
+                f"{', '.join(lacking)}",
+                legal="an albedo for every surface that the target has",
             )
-        return self.model_copy(update={**changed, "other_wavelengths": ()})
+        changed: dict[str, Any] = {"other_wavelengths": ()}
+        if albedos.board != "as_at_850":
+            changed["material"] = _with_albedo(self.material, albedos.board)
+        changed["tapes"] = tuple(_with_albedo(tape, albedos.tape) for tape in self.tapes)
+        if self.backing is not None:
+            changed["backing"] = _with_albedo(self.backing, albedos.backing)
+        if room is not None:
+            room_albedos = {
+                "floor_albedo_850": albedos.floor,
+                "back_wall_albedo_850": albedos.back_wall,
+            }
+            stated = {name: value for name, value in room_albedos.items() if value is not None}
+            changed["room"] = room.model_copy(update=stated)
+        return self.model_copy(update=changed)
+
+    def _nearest_albedos(self, wavelength_nm: float) -> WavelengthConfig | None:
+        """Return the nearest albedos; None for those at 850 nm. Raises UserError if none are near
+        enough."""
+
+        def off_nm(albedos: WavelengthConfig) -> float:
+            return abs(albedos.wavelength_nm - wavelength_nm)
+
+        near = [albedos for albedos in self.other_wavelengths if off_nm(albedos) <= NEAR_NM]
+        nearest = min(
+            near,
+            key=off_nm,
+            default=None,
+        )
+        limit_nm = NEAR_NM if nearest is None else off_nm(nearest)
+        if abs(wavelength_nm - 850.0) <= limit_nm:
+            return None
+        if nearest is None:
+            declared = {850.0, *(albedos.wavelength_nm for albedos in self.other_wavelengths)}
+            listed = ", ".join(f"{nm:g}" for nm in sorted(declared))
+            raise UserError(
+                f"the target has no albedo at {wavelength_nm:g} nm",
+                legal=f"a camera within {NEAR_NM:g} nm of {listed} nm",
+                fix=f"declare other_wavelengths: [{{wavelength_nm: {wavelength_nm:g}, board: ..., "
+                "tape: ..., ...}]",
+            )
+        return nearest
+
+
+def _with_albedo(surface: Any, albedo_850: float | None) -> Any:
+    return surface.model_copy(update={"albedo_850": albedo_850})

@@ -9,10 +9,20 @@ sizes and tilts: their results are paired.
 Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union, get_args
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Self,
+    Union,
+    get_args,
+)
 
 import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, create_model, model_validator
@@ -31,18 +41,17 @@ from scenes.target.truth import (
     outline_board_m,
 )
 
-Purpose = Literal[
-    "learning", "calibration", "hole_free", "damaged"
-]  # purposes of boards; no two share boards
+# purposes of boards; no two share boards
+Purpose = Literal["learning", "calibration", "hole_free", "damaged"]
 # limits of a pose's distance, jitter included
 NEAREST_M = 0.1
 FARTHEST_M = 10.0
 WIDEST_BACKING_MM = 1e4  # largest backing in a declaration
-ATTEMPTS = 50
-TRIES = 400
-"""Attempts to fill a board, and places tried for each damage: if discs ``apart_mm`` wide are to
-cover 40 % of the free area (random placement reaches 54.7 % at most), one attempt in three or more
-fills a board."""
+# If discs ``apart_mm`` wide are to cover 40 % of the free area (random placement reaches 54.7 % at
+# most), one attempt in three or more fills a board.
+ATTEMPTS = 50  # to fill a board
+TRIES = 400  # places tried for each damage
+Stream = Callable[[str], np.random.Generator]  # the random numbers of a quantity, by its name
 
 
 def _ascending(limits: tuple[float, float]) -> tuple[float, float]:
@@ -71,8 +80,8 @@ class _Drawn(Config):
     @property
     def size_mm(self) -> tuple[float, float]:
         """Ends of the size that ``size_of`` names."""
-        ends: tuple[float, float] = getattr(self, f"{self.size_of}_mm")
-        return ends
+        size_mm: tuple[float, float] = getattr(self, f"{self.size_of}_mm")
+        return size_mm
 
     @property
     def depths_mm(self) -> tuple[float, float] | None:
@@ -110,13 +119,16 @@ class DrawnDeep(DrawnThrough):
 
 
 Extents = Annotated[tuple[flaws.Extent, flaws.Extent], AfterValidator(_ascending)]
-RANGES: dict[str, Any] = dict.fromkeys(("length_mm", "width_mm", "diameter_mm"), (Extents, ...))
-RANGES["depth_mm"] = Annotated[tuple[flaws.Depth, flaws.Depth], AfterValidator(_ascending)], ...
-RANGES["angle_deg"] = (
-    Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(_ascending)],
-    (-90.0, 90.0),
-)
-"""Quantities that are ranges in a family of flaws: type and default."""
+FlawDepths = Annotated[tuple[flaws.Depth, flaws.Depth], AfterValidator(_ascending)]
+Angles = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(_ascending)]
+# quantities that are ranges in a family of flaws: type and default (...: none)
+RANGES: dict[str, Any] = {
+    "length_mm": (Extents, ...),
+    "width_mm": (Extents, ...),
+    "diameter_mm": (Extents, ...),
+    "depth_mm": (FlawDepths, ...),
+    "angle_deg": (Angles, (-90.0, 90.0)),
+}
 
 
 class DrawnFlaws(_Drawn):
@@ -134,21 +146,23 @@ class DrawnFlaws(_Drawn):
         long: Any = self
         return math.hypot(long.length_mm[1], long.width_mm[1] + 6 * long.wander_mm)
 
-    def declare(
-        self, facts: dict[str, Any], stream: Callable[[str], np.random.Generator]
-    ) -> dict[str, Any]:
+    def declare(self, facts: dict[str, Any], stream: Stream) -> dict[str, Any]:
         """Return the declaration of a flaw: ``facts`` (id, place, size and depth) and what else is
         drawn for it."""
-        own = {name for name in type(self).model_fields if name not in _Drawn.model_fields}
-        held = {name: value for name in own if (value := getattr(self, name)) is not None} | facts
         number = facts["id"]
-        for name, value in held.items():
-            if isinstance(value, tuple) and name != "centre_mm":
-                held[name] = float(
-                    value[0] + (value[1] - value[0]) * stream(name).random(number)[-1]
-                )
-        seed = {"seed": int(stream("shapes").integers(2**32, size=number)[-1])}
-        return held | (seed if self.kind in ("slot", "gouge", "corrosion") else {})
+        declared: dict[str, Any] = {}
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if name in _Drawn.model_fields or value is None:
+                continue
+            if isinstance(value, tuple) and name not in facts:
+                low, high = value
+                value = float(low + (high - low) * stream(name).random(number)[-1])
+            declared[name] = value
+        declared.update(facts)
+        if self.kind in ("slot", "gouge", "corrosion"):
+            declared["seed"] = int(stream("shapes").integers(2**32, size=number)[-1])
+        return declared
 
 
 def _drawn_of(flaw: type[flaws.FlawConfig]) -> type[DrawnFlaws]:
@@ -160,14 +174,21 @@ def _drawn_of(flaw: type[flaws.FlawConfig]) -> type[DrawnFlaws]:
         if name in ("id", "centre_mm", "seed") or (name, flaw) == ("angle_deg", flaws.ChipConfig):
             continue
         range_, default = RANGES.get(name, (field.annotation, field))
-        fields[name] = (range_ | None, field) if field.default is None else (range_, default)
-    name = f"Drawn{flaw.__name__}"
-    made = create_model(
-        name, __base__=DrawnFlaws, __doc__=flaw.__doc__, __module__=__name__, **fields
+        if field.default is None:
+            range_ = range_ | None
+            default = field
+        fields[name] = (range_, default)
+    family = create_model(
+        f"Drawn{flaw.__name__}",
+        __base__=DrawnFlaws,
+        __doc__=flaw.__doc__,
+        __module__=__name__,
+        **fields,
     )
-    made.size_of = flaw.size_of
-    globals()[name] = made  # under its name, or it could not be sent to another process
-    return made
+    family.size_of = flaw.size_of
+    # under its name, or it could not be sent to another process
+    globals()[family.__name__] = family
+    return family
 
 
 _flawed = tuple(map(_drawn_of, get_args(flaws.FlawConfig)))
@@ -175,6 +196,19 @@ if TYPE_CHECKING:
     AnyDrawn = DrawnThrough | DrawnDeep | DrawnFlaws
 else:
     AnyDrawn = Annotated[Union[DrawnThrough, DrawnDeep, *_flawed], Field(discriminator="kind")]
+
+
+class _Room(NamedTuple):
+    """The room that damage needs on a board, the same for all sizes."""
+
+    rim_mm: float
+    """Largest radius of a rim."""
+    shrinkage: float
+    """Factor by which axes along a bent face's normals start farther apart in plan, so that they do
+    not meet within the board: parallel surfaces at a depth t shrink by 1 - t / radius of
+    curvature."""
+    margin_mm: float
+    """Least distance of centres from the edge."""
 
 
 class DrawnTargetConfig(Config):
@@ -189,17 +223,23 @@ class DrawnTargetConfig(Config):
     damage: AnyDrawn
     board: custom.BoardConfig = Field(
         custom.BoardConfig(
-            width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()
+            width_mm=304.8,
+            height_mm=203.2,
+            thickness_mm=12.7,
+            shape=custom.FlatConfig(),
         ),
-        description="default: plywood of 12 x 8 in, as many pixels as the thesis' 24 x 4.5 in but fewer at the edge",
+        description="default: plywood of 12 x 8 in, as many pixels as the thesis' 24 x 4.5 in "
+        "but fewer at the edge",
     )
     apart_mm: Annotated[float, Field(gt=0.0, le=1e4)] = Field(
         40.0,
-        description="least distance of two centres; above two hit radii, no detection counts for two damages",
+        description="least distance of two centres; above two hit radii, no detection counts "
+        "for two damages",
     )
     edge_mm: Annotated[float, Field(ge=LEAST_WEB_MM, le=1e4)] = Field(
         15.0,
-        description="least distance of a damage's rim from the board's edge; a crop removes 6 to 12 mm there",
+        description="least distance of a damage's rim from the board's edge; "
+        "a crop removes 6 to 12 mm there",
     )
     tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field(
         (), description="on all boards"
@@ -231,70 +271,83 @@ class DrawnTargetConfig(Config):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        damage = self.damage
-        board = self.board
-        bend_per_mm = _tightest_per_mm(self.board)
-        problems = []
-        thick = board.thickness_mm
-        widest_mm = damage.size_mm[1]
-        jitter_mm = self.distance_jitter_mm
-        declared = damage.depths_mm or (0.0, 0.0)
-        if declared[1] >= thick and damage.kind not in (
-            "pressed_dent",
-            "pressed_bump",
-            "protrusion",
-        ):
-            deep = f"{declared[1]:g} mm is not less than the board's thickness, {thick:g} mm"
-            problems.append(f"damage.depth_mm: {deep}")
-        # Both limits of a dent's depth grow with the diameter, so checking the smallest and
-        # largest size suffices.
-        dents = isinstance(damage, DrawnDeep) and damage.kind == "dent"
-        for diameter_mm in sorted(set(damage.size_mm)) if dents else []:
-            least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)
-            if max(declared[0], least_mm) > min(declared[1], most_mm):
-                can = f"a dent {diameter_mm:g} mm wide on this face can be {least_mm:.3g} to {most_mm:g} mm deep"
-                problems.append(
-                    f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm"
-                )
-        if isinstance(damage, DrawnDeep) and dents and damage.chamfer_mm > 0:
-            problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
-        if not isinstance(damage, DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
-            wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"
-            problems.append(f"damage.diameter_mm: {wide}")
-        rim_mm, shrinkage, margin_mm = self._room_mm()
-        needed_mm = 2 * rim_mm * shrinkage + LEAST_WEB_MM
-        if self.apart_mm < needed_mm:
-            what = "damage" if isinstance(damage, DrawnFlaws) else "holes"
-            meet = f"{self.apart_mm:g} mm lets {what} of {damage.widest_mm:g} mm meet"
-            problems.append(f"apart_mm: {meet}; it must be {needed_mm:.4g} mm or more")
-        if min(board.width_mm, board.height_mm) / 2 < margin_mm:
-            off = f"no place for a centre that is {margin_mm:.4g} mm off every edge"
-            problems.append(f"board: {board.width_mm:g} x {board.height_mm:g} mm leaves {off}")
-        if (
-            not NEAREST_M
-            <= self.distance_m - jitter_mm * MM
-            <= self.distance_m + jitter_mm * MM
-            <= FARTHEST_M
-        ):
-            limits = f"{NEAREST_M:g} to {FARTHEST_M:g} m"
-            problems.append(
-                f"distance_jitter_mm: {jitter_mm:g} mm leads from {self.distance_m:g} m beyond {limits}"
-            )
+        problems = self._size_problems() + self._place_problems()
         if problems:
             raise ValueError("; ".join(problems))
         return self
 
-    def _room_mm(self) -> tuple[float, float, float]:
-        """Return the largest radius of a rim; the factor by which axes along a bent face's normals
-        start farther apart in plan, so that they do not meet within the board (parallel surfaces
-        at a depth t shrink by 1 - t / radius of curvature); and the least distance of centres from
-        the edge, the same for all sizes. A dent's rim on a face that bends away is up to sqrt 2
-        larger than on a flat one; holes get the same room, so that they have the dents' places."""
+    def _size_problems(self) -> list[str]:
+        """Find sizes and depths that no board of the family can have."""
+        damage = self.damage
         bend_per_mm = _tightest_per_mm(self.board)
-        round_on_bent = bend_per_mm > 0 and not isinstance(self.damage, DrawnFlaws)
-        rim_mm = self.damage.widest_mm / 2 * (math.sqrt(2) if round_on_bent else 1.0)
+        thickness_mm = self.board.thickness_mm
+        depths_mm = damage.depths_mm or (0.0, 0.0)
+        problems = []
+        moves_face = damage.kind in ("pressed_dent", "pressed_bump", "protrusion")
+        if depths_mm[1] >= thickness_mm and not moves_face:
+            problems.append(
+                f"damage.depth_mm: {depths_mm[1]:g} mm is not less than the board's thickness, "
+                f"{thickness_mm:g} mm"
+            )
+        if isinstance(damage, DrawnDeep) and damage.kind == "dent":
+            # Both limits of a dent's depth grow with the diameter, so checking the smallest and
+            # largest size suffices.
+            for diameter_mm in sorted(set(damage.size_mm)):
+                least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)
+                if max(depths_mm[0], least_mm) > min(depths_mm[1], most_mm):
+                    problems.append(
+                        f"damage.depth_mm: a dent {diameter_mm:g} mm wide on this face can be "
+                        f"{least_mm:.3g} to {most_mm:g} mm deep, "
+                        f"not {depths_mm[0]:g} to {depths_mm[1]:g} mm"
+                    )
+            if damage.chamfer_mm > 0:
+                problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
+        widest_mm = damage.size_mm[1]
+        if not isinstance(damage, DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
+            problems.append(
+                f"damage.diameter_mm: {widest_mm:g} mm is too wide for a face bent to a radius of "
+                f"{1 / bend_per_mm:.3g} mm"
+            )
+        return problems
+
+    def _place_problems(self) -> list[str]:
+        """Find distances that leave no room for damage, or for the board before the camera."""
+        board = self.board
+        room = self._room()
+        problems = []
+        needed_mm = 2 * room.rim_mm * room.shrinkage + LEAST_WEB_MM
+        if self.apart_mm < needed_mm:
+            what = "damage" if isinstance(self.damage, DrawnFlaws) else "holes"
+            problems.append(
+                f"apart_mm: {self.apart_mm:g} mm lets {what} of {self.damage.widest_mm:g} mm meet; "
+                f"it must be {needed_mm:.4g} mm or more"
+            )
+        if min(board.width_mm, board.height_mm) / 2 < room.margin_mm:
+            problems.append(
+                f"board: {board.width_mm:g} x {board.height_mm:g} mm leaves no place for a centre "
+                f"that is {room.margin_mm:.4g} mm off every edge"
+            )
+        nearest_m = self.distance_m - self.distance_jitter_mm * MM
+        farthest_m = self.distance_m + self.distance_jitter_mm * MM
+        if not NEAREST_M <= nearest_m <= farthest_m <= FARTHEST_M:
+            problems.append(
+                f"distance_jitter_mm: {self.distance_jitter_mm:g} mm leads from "
+                f"{self.distance_m:g} m beyond {NEAREST_M:g} to {FARTHEST_M:g} m"
+            )
+        return problems
+
+    def _room(self) -> _Room:
+        """Return the room that damage needs.
+
+        A dent's rim on a face that bends away is up to sqrt 2 larger than on a flat one; holes get
+        the same room, so that they have the dents' places."""
+        bend_per_mm = _tightest_per_mm(self.board)
+        rim_mm = self.damage.widest_mm / 2
+        if bend_per_mm > 0 and not isinstance(self.damage, DrawnFlaws):
+            rim_mm *= math.sqrt(2)
         shrinkage = 1 / (1 - min(self.board.thickness_mm * bend_per_mm, 0.5))
-        return rim_mm, shrinkage, (self.edge_mm + rim_mm) * shrinkage
+        margin_mm = (self.edge_mm + rim_mm) * shrinkage
+        return _Room(rim_mm, shrinkage, margin_mm)
 
     def declare(self) -> custom.TargetConfig:
         """Return the first damaged board, for programs that look at one target."""
@@ -308,170 +361,231 @@ class DrawnTargetConfig(Config):
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
 
-        def within(quantity: str, limit: float, count: int) -> list[Any]:
-            return (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
-
-        damage = self.damage
-        count = self.damage.per_board
-        depths = stream("depths")
-        made: list[custom.AnyDamage] = []
-        (low, high), parts = (
-            damage.size_mm,
-            (np.arange(count) + stream("diameters").random(count)) / count,
+        damages = self._damages(stream)
+        field = "flaws"
+        if not isinstance(self.damage, DrawnFlaws):
+            field = "dents" if self.damage.kind == "dent" else "holes"
+        damages_by_kind: dict[str, Any] = {field: damages}
+        config = custom.TargetConfig(
+            board=self._board(stream),
+            tapes=self.tapes,
+            material=custom.MaterialConfig(
+                **self.material.model_dump(),
+                grain_seed=int(stream("grain").integers(2**32)),
+            ),
+            backing=self.backing,
+            room=self.room,
+            pose=self._pose(stream),
+            other_wavelengths=self.other_wavelengths,
+            **damages_by_kind,
         )
-        sizes = low * (high / low) ** parts if damage.sizes == "log" else low + (high - low) * parts
-        quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
-        # What is placed first has the freest choice: which size that is, is drawn too.
-        places = self._edge_places_mm if damage.kind == "chip" else self._places_mm
-        places_mm = stream("order of places").permutation(places(stream("places"))).tolist()
-        for size, quantile, (x, y, *edge) in zip(
-            np.clip(sizes, low, high).tolist(), quantiles, places_mm, strict=True
-        ):
-            facts: dict[str, Any] = {
-                "id": len(made) + 1,
-                f"{damage.size_of}_mm": size,
-                "centre_mm": (x, y),
-            }
-            if damage.depths_mm is not None:
-                least, most = damage.depths_mm
-                if damage.kind == "dent":
-                    legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
-                    least = max(least, legal[0])
-                    most = min(most, legal[1])
-                facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
-            if isinstance(damage, DrawnFlaws):
-                facts |= {"angle_deg": round(edge[0])} if edge else {}
-                made.append(
-                    TypeAdapter(flaws.AnyFlawConfig).validate_python(damage.declare(facts, stream))
-                )
-            elif damage.kind == "dent":
-                made.append(custom.DentConfig(**facts))
-            else:
-                made.append(
-                    custom.HoleConfig(**facts, kind=damage.kind, chamfer_mm=damage.chamfer_mm)
-                )
-        common: dict[str, Any] = {
-            key: getattr(self, key) for key in ("tapes", "backing", "room", "other_wavelengths")
-        }
-        kinds = "dents" if damage.kind == "dent" else "holes"
-        common["flaws" if isinstance(damage, DrawnFlaws) else kinds] = tuple(made)
-        pose = (
-            within("offset", self.offset_mm, 2)
-            + within("tilt", self.tilt_deg, 2)
-            + within("roll", self.roll_deg, 1)
-        )
-        board = self.board
-        if isinstance(board.shape, custom.RoughConfig):
-            own = {"seed": int(stream("roughness").integers(2**32))}
-            board = board.model_copy(update={"shape": board.shape.model_copy(update=own)})
-        material = custom.MaterialConfig(
-            **self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))
-        )
-        placed = self._posed(*within("distance", self.distance_jitter_mm, 1), *pose)
-        config = custom.TargetConfig(board=board, material=material, pose=placed, **common)
         if self.backing is None or self.backing.size_mm is not None:
             return config
         # a backing that fills every hole: the face's shadow on it from the lens, in the extreme
         # poses
-        size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, self.backing)[0, 2]))
-        return config.model_copy(
-            update={"backing": self.backing.model_copy(update={"size_mm": size_mm})}
-        )
+        backing_z_m = float(backing_corners_board_m(config, self.backing)[0, 2])
+        size_mm = _backing_size_mm(self, backing_z_m)
+        backing = self.backing.model_copy(update={"size_mm": size_mm})
+        return config.model_copy(update={"backing": backing})
+
+    def _damages(self, stream: Stream) -> tuple[custom.AnyDamage, ...]:
+        """Draw the damage of a board, in the order of size."""
+        damage = self.damage
+        count = damage.per_board
+        size_parts = (np.arange(count) + stream("diameters").random(count)) / count
+        low, high = damage.size_mm
+        sizes_mm = low + (high - low) * size_parts
+        if damage.sizes == "log":
+            sizes_mm = low * (high / low) ** size_parts
+        depth_stream = stream("depths")
+        depth_parts = (np.arange(count) + depth_stream.random(count)) / count
+        depth_parts = depth_stream.permutation(depth_parts)
+        place_stream = stream("places")
+        places_mm = self._edge_places_mm if damage.kind == "chip" else self._places_mm
+        # What is placed first has the freest choice: which size that is, is drawn too.
+        centres_mm = stream("order of places").permutation(places_mm(place_stream)).tolist()
+        damages = []
+        for index, size_mm in enumerate(np.clip(sizes_mm, low, high).tolist()):
+            x_mm, y_mm, *edge_deg = centres_mm[index]
+            facts: dict[str, Any] = {
+                "id": index + 1,
+                f"{damage.size_of}_mm": size_mm,
+                "centre_mm": (x_mm, y_mm),
+            }
+            if damage.depths_mm is not None:
+                facts["depth_mm"] = self._depth_mm(size_mm, float(depth_parts[index]))
+            if edge_deg:
+                facts["angle_deg"] = round(edge_deg[0])
+            damages.append(self._damage(facts, stream))
+        return tuple(damages)
+
+    def _depth_mm(self, size_mm: float, part: float) -> float:
+        """Return the depth at a part, 0..1, of the range that a damage of this size can have."""
+        least_mm, most_mm = self.damage.depths_mm or (0.0, 0.0)
+        if self.damage.kind == "dent":
+            legal_mm = _dent_depths_mm(size_mm, _tightest_per_mm(self.board))
+            least_mm = max(least_mm, legal_mm[0])
+            most_mm = min(most_mm, legal_mm[1])
+        return float(min(least_mm + (most_mm - least_mm) * part, most_mm))
+
+    def _damage(self, facts: dict[str, Any], stream: Stream) -> custom.AnyDamage:
+        """Return the declaration of a damage with its id, place, size and depth."""
+        damage = self.damage
+        if isinstance(damage, DrawnFlaws):
+            declared = damage.declare(facts, stream)
+            flaw: custom.AnyDamage = TypeAdapter(flaws.AnyFlawConfig).validate_python(declared)
+            return flaw
+        if damage.kind == "dent":
+            return custom.DentConfig(**facts)
+        return custom.HoleConfig(**facts, kind=damage.kind, chamfer_mm=damage.chamfer_mm)
+
+    def _board(self, stream: Stream) -> custom.BoardConfig:
+        """Return the board; each has roughness of its own."""
+        shape = self.board.shape
+        if not isinstance(shape, custom.RoughConfig):
+            return self.board
+        seed = int(stream("roughness").integers(2**32))
+        rough = shape.model_copy(update={"seed": seed})
+        return self.board.model_copy(update={"shape": rough})
+
+    def _pose(self, stream: Stream) -> custom.PoseConfig:
+        """Draw the pose."""
+
+        def within(
+            quantity: str,
+            limit: float,
+            count: int,
+        ) -> list[float]:
+            values: list[float] = (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
+            return values
+
+        (jitter_mm,) = within("distance", self.distance_jitter_mm, 1)
+        offset_mm = within("offset", self.offset_mm, 2)
+        tilt_deg = within("tilt", self.tilt_deg, 2)
+        (roll_deg,) = within("roll", self.roll_deg, 1)
+        return self._posed(jitter_mm, offset_mm, tilt_deg, roll_deg)
 
     def extreme_poses(self) -> tuple[custom.PoseConfig, ...]:
         """Return the corners of what poses can be drawn, with the rolls at which the board reaches
         farthest sideways and upwards: a point in view in all of these is in view in every pose."""
         diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
-        rolls = [
-            self.roll_deg,
-            *(roll for roll in (diagonal_deg, 90 - diagonal_deg) if roll < self.roll_deg),
-        ]
-        limits = (
-            self.distance_jitter_mm,
-            self.offset_mm,
-            self.offset_mm,
-            self.tilt_deg,
-            self.tilt_deg,
+        rolls_deg = [self.roll_deg]
+        for roll_deg in (diagonal_deg, 90 - diagonal_deg):
+            if roll_deg < self.roll_deg:
+                rolls_deg.append(roll_deg)
+        signed_rolls_deg = [sign * roll_deg for roll_deg in rolls_deg for sign in (-1, 1)]
+        corners = product(
+            _ends(self.distance_jitter_mm),
+            product(_ends(self.offset_mm), repeat=2),
+            product(_ends(self.tilt_deg), repeat=2),
+            dict.fromkeys(signed_rolls_deg),  # one of each
         )
-        signed = ((-limit, limit) if limit else (0.0,) for limit in limits)
-        both_rolls = dict.fromkeys(sign * roll for roll in rolls for sign in (-1, 1))
-        return tuple(self._posed(*corner) for corner in product(*signed, both_rolls))
+        return tuple(self._posed(*corner) for corner in corners)
+
+    def _posed(
+        self,
+        jitter_mm: float,
+        offset_mm: Sequence[float],
+        tilt_deg: Sequence[float],
+        roll_deg: float,
+    ) -> custom.PoseConfig:
+        """Return the pose at a jitter of the distance, with offset and tilt in x and y, and a
+        roll."""
+        return custom.PoseConfig(
+            distance_m=self.distance_m + jitter_mm * MM,
+            offset_x_mm=offset_mm[0],
+            offset_y_mm=offset_mm[1],
+            tilt_x_deg=tilt_deg[0],
+            tilt_y_deg=tilt_deg[1],
+            roll_deg=roll_deg,
+        )
 
     def _places_mm(self, rng: np.random.Generator) -> np.ndarray:
         """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is
         free."""
-        board, count, best, (rim_mm, _, margin_mm) = (
-            self.board,
-            self.damage.per_board,
-            0,
-            self._room_mm(),
-        )
-        half = np.array([board.width_mm, board.height_mm]) / 2 - margin_mm
+        board = self.board
+        count = self.damage.per_board
+        room = self._room()
+        half_mm = np.array([board.width_mm, board.height_mm]) / 2 - room.margin_mm
+        fullest = 0
         for _ in range(ATTEMPTS):
-            places = np.empty((0, 2))
-            while len(places) < count:
-                tried = half * rng.uniform(-1.0, 1.0, (TRIES, 2))
-                free = np.all([off_tape_mm(tape, tried) > rim_mm for tape in self.tapes], axis=0)
-                if isinstance(board.shape, custom.MeshConfig):  # what is not in front has no place
-                    ring = np.exp(2j * np.pi * np.arange(16) / 16) * rim_mm
-                    x = tried[:, :1] + ring.real
-                    y = tried[:, 1:] + ring.imag
-                    free = free & np.isfinite(face_of(board).height_m(x * MM, y * MM)).all(axis=1)
-                free = free & (
-                    np.linalg.norm(tried[:, None] - places, axis=-1) >= self.apart_mm
-                ).all(axis=1)
+            places_mm = np.empty((0, 2))
+            while len(places_mm) < count:
+                tried_mm = half_mm * rng.uniform(-1.0, 1.0, (TRIES, 2))
+                free = self._off_tapes_on_front(tried_mm, room.rim_mm)
+                apart_mm = np.linalg.norm(tried_mm[:, None] - places_mm, axis=-1)
+                free &= (apart_mm >= self.apart_mm).all(axis=1)
                 if not free.any():
                     break
-                places = np.vstack([places, tried[np.argmax(free)]])
-            best = max(best, len(places))
-            if best == count:
-                return places
-        full = f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too small for {count} damages with centres "
-        full += f"{self.apart_mm:g} mm apart and {margin_mm:.4g} mm from its edge: only {best} fit on the "
-        full += f"{2 * half[0]:g} x {2 * half[1]:g} mm that are left"
-        fix = "lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board"
+                places_mm = np.vstack([places_mm, tried_mm[np.argmax(free)]])
+            if len(places_mm) == count:
+                return places_mm
+            fullest = max(fullest, len(places_mm))
         raise UserError(
-            full, legal=f"fewer than {best} damages on this board" if best > 1 else None, fix=fix
+            f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too small for {count} "
+            f"damages with centres {self.apart_mm:g} mm apart and {room.margin_mm:.4g} mm from its "
+            f"edge: only {fullest} fit on the {2 * half_mm[0]:g} x {2 * half_mm[1]:g} mm that are "
+            "left",
+            legal=f"fewer than {fullest} damages on this board" if fullest > 1 else None,
+            fix="lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, "
+            "or declare a larger board",
         )
+
+    def _off_tapes_on_front(
+        self,
+        places_mm: np.ndarray,
+        rim_mm: float,
+    ) -> np.ndarray:
+        """Return at which places (n, 2) a rim lies beside all tapes and, of a part from a mesh, on
+        its front."""
+        free = np.ones(len(places_mm), bool)
+        for tape in self.tapes:
+            free &= off_tape_mm(tape, places_mm) > rim_mm
+        if isinstance(self.board.shape, custom.MeshConfig):
+            ring = np.exp(2j * np.pi * np.arange(16) / 16) * rim_mm
+            x_mm = places_mm[:, :1] + ring.real
+            y_mm = places_mm[:, 1:] + ring.imag
+            height_m = face_of(self.board).height_m(x_mm * MM, y_mm * MM)
+            free &= np.isfinite(height_m).all(axis=1)
+        return free
 
     def _edge_places_mm(self, rng: np.random.Generator) -> np.ndarray:
         """Draw (per_board, 3): points on the board's edges in plan, apart and off corners, with
         the edge's angle."""
-        half = np.array([self.board.width_mm, self.board.height_mm]) / 2
+        half_mm = np.array([self.board.width_mm, self.board.height_mm]) / 2
         corner_mm = self.damage.widest_mm / 2 + LEAST_WEB_MM
         places = np.empty((0, 3))
         for _ in range(ATTEMPTS * TRIES):
             if len(places) == self.damage.per_board:
                 return places
-            turn = int(rng.choice([0, 90, 180, -90], p=np.tile(half / half.sum() / 2, 2)))
-            outward = np.round([-math.sin(math.radians(turn)), math.cos(math.radians(turn))])
-            along = rng.uniform(-1, 1) * (half[0 if turn in (0, 180) else 1] - corner_mm)
-            place = np.array([*(outward * half + along * np.abs(outward[::-1])), turn])
-            if (
-                not len(places)
-                or np.linalg.norm(places[:, :2] - place[:2], axis=1).min() >= self.apart_mm
-            ):
-                places = np.vstack([places, place])
-        fix = "lower damage.per_board, damage.length_mm or apart_mm, or declare a larger board"
+            share = half_mm / half_mm.sum() / 2
+            turn_deg = int(rng.choice([0, 90, 180, -90], p=np.tile(share, 2)))
+            turn_rad = math.radians(turn_deg)
+            outward = np.round([-math.sin(turn_rad), math.cos(turn_rad)])
+            half_edge_mm = half_mm[0] if turn_deg in (0, 180) else half_mm[1]
+            along_mm = rng.uniform(-1, 1) * (half_edge_mm - corner_mm)
+            centre_mm = outward * half_mm + along_mm * np.abs(outward[::-1])
+            apart_mm = np.linalg.norm(places[:, :2] - centre_mm, axis=1)
+            if (apart_mm >= self.apart_mm).all():
+                places = np.vstack([places, np.append(centre_mm, turn_deg)])
         raise UserError(
-            f"the board's edges are too short for {self.damage.per_board} chips", fix=fix
+            f"the board's edges are too short for {self.damage.per_board} chips",
+            fix="lower damage.per_board, damage.length_mm or apart_mm, or declare a larger board",
         )
 
-    def _posed(self, jitter_mm: float, *others: float) -> custom.PoseConfig:
-        """Return the pose at a jitter of the distance, with offsets x and y, tilts x and y and a
-        roll."""
-        names = ("offset_x_mm", "offset_y_mm", "tilt_x_deg", "tilt_y_deg", "roll_deg")
-        return custom.PoseConfig(
-            distance_m=self.distance_m + jitter_mm * MM, **dict(zip(names, others, strict=True))
-        )
+
+def _ends(limit: float) -> tuple[float, ...]:
+    """Return the ends of what is drawn between plus and minus a limit; 0 alone if that is 0."""
+    return (-limit, limit) if limit else (0.0,)
 
 
 def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
     """Return the ends of a dent's depth: of a ball of `SHALLOWEST_BEND` radii of curvature, and
     the dent's radius."""
-    reach = diameter_mm / 2 * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
+    radius_mm = diameter_mm / 2
+    reach = radius_mm * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
     least = 1.0 if reach >= 1 else reach / (1 + math.sqrt(1 - reach**2))
-    return diameter_mm / 2 * least, diameter_mm / 2
+    return radius_mm * least, radius_mm
 
 
 @lru_cache(maxsize=256)
@@ -481,8 +595,9 @@ def _tightest_per_mm(board: custom.BoardConfig) -> float:
     if face_of(board).rough or isinstance(board.shape, custom.MeshConfig):
         return 0.0
     x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T
-    tightest = float(np.abs(face_of(board).curvatures(x_m, y_m)).max()) * MM
-    return tightest if math.isfinite(tightest) else 0.0
+    curvatures = face_of(board).curvatures(x_m, y_m)
+    tightest_per_mm = float(np.abs(curvatures).max()) * MM
+    return tightest_per_mm if math.isfinite(tightest_per_mm) else 0.0
 
 
 @lru_cache(maxsize=256)
@@ -494,8 +609,7 @@ def _backing_size_mm(family: DrawnTargetConfig, z_m: float) -> tuple[float, floa
     for pose in family.extreme_poses():
         lens = invert(pose.T_camera_board)[:3, 3]
         steps = (z_m - lens[2]) / (outline[:, 2] - lens[2])
-        half_m = np.maximum(
-            half_m, np.abs(lens + steps[:, None] * (outline - lens))[:, :2].max(axis=0)
-        )
+        shadow = lens + steps[:, None] * (outline - lens)
+        half_m = np.maximum(half_m, np.abs(shadow)[:, :2].max(axis=0))
     width, height = np.minimum(2 * half_m / MM, WIDEST_BACKING_MM).tolist()
     return width, height

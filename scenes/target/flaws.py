@@ -40,15 +40,16 @@ CHIP_ARC = 0.998
 
 @dataclass(frozen=True)
 class Relief:
-    """The depth of a damage over its own frame, metres. ``s_m``, ``t_m``, ``depth_m`` (rows,
-    columns): a grid whose border is the outline; ``depth_m`` is negative where the damage stands
-    out of the face, and NaN through the board. ``open_row``: whether the last row lies on the
-    board's edge, beyond which a cutter goes on."""
+    """The depth of a damage over its own frame, on a grid whose border is the outline."""
 
     s_m: np.ndarray
+    """(rows, columns): position along the damage."""
     t_m: np.ndarray
+    """(rows, columns): position across it."""
     depth_m: np.ndarray
+    """(rows, columns): negative where the damage stands out of the face, NaN through the board."""
     open_row: bool = False
+    """True if the last row lies on the board's edge, beyond which a cutter goes on."""
 
 
 class PlacedConfig(Config):
@@ -105,17 +106,17 @@ class _LongConfig(_FlawConfig):
     def _grid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return s and t (rows, columns) in metres, and the part of the half-width at which each
         row lies."""
-        part = np.linspace(-1.0, 1.0, ACROSS + 1)
-        s = np.linspace(-0.5, 0.5, ALONG + 1)
+        share = np.linspace(-0.5, 0.5, ALONG + 1)
         turns, weights = random_stream(self.seed, "centre line").uniform(size=(2, 3))
-        waves = [
-            w * np.sin(2 * np.pi * (k * s + turn))
-            for k, turn, w in zip((1, 2, 3), turns, weights, strict=True)
-        ]
+        waves = []
+        for k in range(3):
+            waves.append(weights[k] * np.sin(2 * np.pi * ((k + 1) * share + turns[k])))
         line = np.sum(waves, axis=0)
-        line = self.wander_mm * MM * (line - line.mean()) / max(float(line.std()), 1e-12)
-        across, along = np.broadcast_arrays(part[:, None], s * self.length_mm * MM)
-        return along, line + across * self.width_mm * MM / 2, across
+        line_m = self.wander_mm * MM * (line - line.mean()) / max(float(line.std()), 1e-12)
+        half_widths = np.linspace(-1.0, 1.0, ACROSS + 1)[:, None]
+        across, s_m = np.broadcast_arrays(half_widths, share * self.length_mm * MM)
+        t_m = line_m + across * self.width_mm * MM / 2
+        return s_m, t_m, across
 
 
 class SlotConfig(_LongConfig):
@@ -128,10 +129,9 @@ class SlotConfig(_LongConfig):
     depth_mm: Depth | None = Field(None, description="null: through the board")
 
     def relief(self) -> Relief:
-        s, t, _ = self._grid()
-        return Relief(
-            s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM)
-        )
+        s_m, t_m, _ = self._grid()
+        depth_m = np.nan if self.depth_mm is None else self.depth_mm * MM
+        return Relief(s_m, t_m, np.full(s_m.shape, depth_m))
 
 
 class GougeConfig(_LongConfig):
@@ -146,11 +146,12 @@ class GougeConfig(_LongConfig):
     run_out_mm: Annotated[float, Field(ge=0.1, le=1e3)] = 5.0
 
     def relief(self) -> Relief:
-        s, t, across = self._grid()
+        s_m, t_m, across = self._grid()
         section = 1 - np.abs(across) if self.section == "v" else 1 - across**2
-        run_out = min(self.run_out_mm, self.length_mm / 2) * MM
-        ramp = np.clip((self.length_mm * MM / 2 - np.abs(s)) / run_out, 0.0, 1.0)
-        return Relief(s, t, self.depth_mm * MM * section * ramp)
+        run_out_m = min(self.run_out_mm, self.length_mm / 2) * MM
+        to_end_m = self.length_mm * MM / 2 - np.abs(s_m)
+        ramp = np.clip(to_end_m / run_out_m, 0.0, 1.0)
+        return Relief(s_m, t_m, self.depth_mm * MM * section * ramp)
 
 
 class RoundConfig(_FlawConfig):
@@ -171,11 +172,10 @@ class RoundConfig(_FlawConfig):
         return self.kind != "protrusion"
 
     def relief(self) -> Relief:
-        s, t, ring = _disc(self.diameter_mm * MM / 2)
+        s_m, t_m, ring = _disc(self.diameter_mm * MM / 2)
         height = (1 + np.cos(np.pi * ring)) / 2 if self.pressed else 1 - ring**2
-        return Relief(
-            s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height
-        )
+        sign = 1.0 if self.kind == "pressed_dent" else -1.0
+        return Relief(s_m, t_m, sign * self.depth_mm * MM * height)
 
 
 class CorrosionConfig(_FlawConfig):
@@ -196,28 +196,27 @@ class CorrosionConfig(_FlawConfig):
 
     def relief(self) -> Relief:
         rng = random_stream(self.seed, "corrosion")
-        radius_m = self.diameter_mm * MM / 2
         s, t, ring = _disc(1.0)
-        angle = np.arctan2(t, s)
-        turn = np.linspace(0, 2 * np.pi, 721)
         turns = rng.uniform(0, 2 * np.pi, 4)
         weights = rng.uniform(0.3, 1.0, 4)
         spread = self.uneven / np.sqrt((weights**2).sum() / 2)
-        waves = [*zip((2, 3, 4, 5), weights, turns, strict=True)]
 
-        def outline(at: np.ndarray) -> np.ndarray:
-            return 1 + spread * sum(w * np.cos(k * at + p) for k, w, p in waves)
+        def outline(angle: np.ndarray) -> np.ndarray:
+            waves = [weights[k] * np.cos((k + 2) * angle + turns[k]) for k in range(4)]
+            return 1 + spread * sum(waves)
 
-        stretch = radius_m * outline(angle) / np.sqrt(np.mean(outline(turn[:-1]) ** 2))
-        noise = gaussian_filter(
-            rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2)
-        )
+        once_round = np.linspace(0, 2 * np.pi, 721)[:-1]
+        mean_radius = np.sqrt(np.mean(outline(once_round) ** 2))
+        radius_m = self.diameter_mm * MM / 2
+        stretch_m = radius_m * outline(np.arctan2(t, s)) / mean_radius
+        grain_cells = self.grain_mm / self.diameter_mm * ROUND
+        noise = gaussian_filter(rng.standard_normal(s.shape), grain_cells / np.sqrt(2))
         noise *= self.rough_mm * MM / max(float(noise.std()), 1e-12)
         ramp = np.clip((1 - ring) / 0.1, 0.0, 1.0)
-        depth = np.maximum(self.depth_mm * MM + noise, 0.0) * ramp
-        s = s * stretch
-        t = t * stretch
-        return Relief(s, t, depth * self.depth_mm * MM / _mean(s, t, depth))
+        depth_m = np.maximum(self.depth_mm * MM + noise, 0.0) * ramp
+        s_m = s * stretch_m
+        t_m = t * stretch_m
+        return Relief(s_m, t_m, depth_m * self.depth_mm * MM / _mean(s_m, t_m, depth_m))
 
 
 class ChipConfig(_FlawConfig):
@@ -233,19 +232,13 @@ class ChipConfig(_FlawConfig):
     angle_deg: Literal[0, 90, 180, -90]
 
     def relief(self) -> Relief:
-        u, v = np.meshgrid(
-            CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2),
-            np.linspace(1, 0, ACROSS + 1),
-        )
-        v = np.sin(v * np.pi / 2)
-        s = u * self.length_mm * MM / 2
-        t = -v * np.sqrt(1 - u**2) * self.width_mm * MM
-        return Relief(
-            s,
-            t,
-            self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)),
-            open_row=True,
-        )
+        along = CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2)
+        u, inwards = np.meshgrid(along, np.linspace(1, 0, ACROSS + 1))
+        v = np.sin(inwards * np.pi / 2)
+        s_m = u * self.length_mm * MM / 2
+        t_m = -v * np.sqrt(1 - u**2) * self.width_mm * MM
+        height = np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0))
+        return Relief(s_m, t_m, self.depth_mm * MM * height, open_row=True)
 
 
 FlawConfig = SlotConfig | GougeConfig | RoundConfig | CorrosionConfig | ChipConfig
@@ -255,64 +248,89 @@ AnyFlawConfig = Annotated[FlawConfig, Field(discriminator="kind")]
 def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return s and t of a square grid mapped onto a disc, border on the rim, and each point's
     share of the radius."""
-    u, v = np.meshgrid(np.linspace(-1, 1, ROUND + 1), np.linspace(-1, 1, ROUND + 1))
+    ticks = np.linspace(-1, 1, ROUND + 1)
+    u, v = np.meshgrid(ticks, ticks)
     s = u * np.sqrt(1 - v**2 / 2)
     t = v * np.sqrt(1 - u**2 / 2)
     return radius_m * s, radius_m * t, np.minimum(np.hypot(s, t), 1.0)
 
 
-def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
+def _mean(
+    s: np.ndarray,
+    t: np.ndarray,
+    values: np.ndarray,
+) -> float:
     """Return the mean of a grid's values over its area."""
-    across, down = (
-        np.stack([each[1:, 1:] - each[:-1, :-1], each[1:, :-1] - each[:-1, 1:]]) for each in (s, t)
-    )
-    areas = np.abs(across[0] * down[1] - across[1] * down[0])
-    middles = (values[1:, 1:] + values[:-1, :-1] + values[1:, :-1] + values[:-1, 1:]) / 4
+    # twice the area of a cell is the product of its diagonals
+    falling_s = s[1:, 1:] - s[:-1, :-1]
+    rising_s = s[1:, :-1] - s[:-1, 1:]
+    falling_t = t[1:, 1:] - t[:-1, :-1]
+    rising_t = t[1:, :-1] - t[:-1, 1:]
+    areas = np.abs(falling_s * rising_t - rising_s * falling_t)
+    ends_of_falling = values[1:, 1:] + values[:-1, :-1]
+    middles = (ends_of_falling + values[1:, :-1] + values[:-1, 1:]) / 4
     return float((areas * middles).sum() / areas.sum())
 
 
 def turned(angle_rad: float) -> np.ndarray:
     """Return the 2x2 matrix that turns from x towards y."""
-    return np.array(
-        [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
-    )
+    cosine = np.cos(angle_rad)
+    sine = np.sin(angle_rad)
+    return np.array([[cosine, -sine], [sine, cosine]])
 
 
 def border(grid: np.ndarray) -> np.ndarray:
     """Return the border (n, ...) of a grid (rows, columns, ...), once round, from its first corner
     along the row."""
-    return np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
+    sides = [
+        grid[0, :-1],
+        grid[:-1, -1],
+        grid[-1, :0:-1],
+        grid[:0:-1, 0],
+    ]
+    return np.concatenate(sides)
 
 
-def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closed_grid(
+    upper: np.ndarray,
+    lower: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and outward triangles (m, 3) of the solid between two grids (rows,
     columns, 3) of points, columns running with x and rows with y as seen from above, closed by
     walls between their borders."""
     rows, columns = upper.shape[:2]
     grid = np.arange(rows * columns).reshape(rows, columns)
+    below = grid.size
     a = grid[:-1, :-1].ravel()
     b = grid[:-1, 1:].ravel()
     c = grid[1:, 1:].ravel()
     d = grid[1:, :-1].ravel()
-    top = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    half_cells = np.column_stack([a, b, c])
+    other_half_cells = np.column_stack([a, c, d])
+    top = np.concatenate([half_cells, other_half_cells])
+    bottom = top[:, ::-1] + below
     rim = border(grid)
-    below = grid.size
-    following = np.roll(rim, -1)
-    corners = (rim + below, following + below, following), (rim + below, following, rim)
+    after = np.roll(rim, -1)
+    wall = np.column_stack([rim + below, after + below, after])
+    other_wall = np.column_stack([rim + below, after, rim])
     vertices = np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)])
-    return vertices, np.concatenate([top, top[:, ::-1] + below, *map(np.column_stack, corners)])
+    return vertices, np.concatenate([top, bottom, wall, other_wall])
 
 
 def volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Return the volume that closed, outward triangles enclose."""
-    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
+    centred = vertices - vertices.mean(axis=0)
+    a = centred[faces[:, 0]]
+    b = centred[faces[:, 1]]
+    c = centred[faces[:, 2]]
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
 def outside_m(outline_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of places (n, 2) from a closed polygon (k, 2), negative inside it."""
+    """Return the distance (n,) of places (n, 2) from a closed polygon (k, 2), negative inside."""
     outline = outline_m.astype(np.float32)
-    return np.array([-cv2.pointPolygonTest(outline, (x, y), True) for x, y in places_m.tolist()])
+    inside_m = [cv2.pointPolygonTest(outline, point, True) for point in places_m.tolist()]
+    return -np.array(inside_m)
 
 
 def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
@@ -320,8 +338,9 @@ def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
     point (1, 2)."""
     if len(line_m) == 1:
         return np.asarray(np.linalg.norm(places_m - line_m[0], axis=-1))
-    way = np.diff(line_m, axis=0)
-    to = places_m[:, None] - line_m[:-1]
-    square = np.maximum((way**2).sum(axis=1), 1e-30)
-    part = np.clip((to * way).sum(axis=-1) / square, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(to - part[..., None] * way, axis=-1).min(axis=1))
+    piece = np.diff(line_m, axis=0)
+    from_start = places_m[:, None] - line_m[:-1]
+    square = np.maximum((piece**2).sum(axis=1), 1e-30)
+    share = np.clip((from_start * piece).sum(axis=-1) / square, 0.0, 1.0)
+    apart = from_start - share[..., None] * piece
+    return np.asarray(np.linalg.norm(apart, axis=-1).min(axis=1))

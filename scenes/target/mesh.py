@@ -23,7 +23,14 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
-from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, MeshConfig, TargetConfig
+from scenes.target.custom import (
+    DentConfig,
+    HoleConfig,
+    MaterialConfig,
+    MeshConfig,
+    TapeConfig,
+    TargetConfig,
+)
 from scenes.target.flaws import FlawConfig, RoundConfig, closed_grid, turned
 from scenes.target.part import part_of
 from scenes.target.truth import (
@@ -36,9 +43,8 @@ from scenes.target.truth import (
     truth_of,
 )
 
-TEXEL_MM = (
-    0.6  # finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
-)
+# finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
+TEXEL_MM = 0.6
 MAX_TEXELS = 4096  # along a side: a board of metres gets coarser texels instead of gigabytes
 MOST_IMAGE_BYTES = 1 << 28
 # of growth lines and fibres in the pattern: guesses, as are the lengths below
@@ -48,53 +54,73 @@ FIBRE_WEIGHT = 0.6
 WANDER_MM = 6.0
 WANDER_ACROSS_MM = 60.0
 WANDER_ALONG_MM = 240.0
-FIBRE_MM = 0.5, 12.0  # correlation lengths of the fibres across and along x
+# correlation lengths of the fibres
+FIBRE_ACROSS_MM = 0.5
+FIBRE_ALONG_MM = 12.0
 
 
-def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
+def grain(
+    material: MaterialConfig,
+    width_mm: float,
+    height_mm: float,
+) -> np.ndarray:
     """Return a board's grain: (rows, columns) float64, mean 0, deviation 1. Not modelled: knots,
     seams."""
     texel_mm = max(TEXEL_MM, width_mm / MAX_TEXELS, height_mm / MAX_TEXELS)
-    shape = tuple(max(2, round(size / texel_mm)) for size in (height_mm, width_mm))
+    rows = max(2, round(height_mm / texel_mm))
+    columns = max(2, round(width_mm / texel_mm))
     stream = random_stream(material.grain_seed, "grain")
-    # coarse noise through a cubic spline
-    knots = [
-        2 + round(n * texel_mm / s)
-        for n, s in zip(shape, (WANDER_ACROSS_MM, WANDER_ALONG_MM), strict=True)
-    ]
-    coarse = stream.standard_normal(knots)
-    finer = [n / k for n, k in zip(shape, knots, strict=True)]
-    # along each axis in turn, by the spline's weights of the knots: zooming the array itself takes
-    # five times as long
-    down, across = (
-        zoom(np.eye(k), (s, 1), order=3, mode="nearest") for k, s in zip(knots, finer, strict=True)
-    )
+    # coarse noise through a cubic spline, along each axis in turn by the spline's weights of the
+    # knots: zooming the array itself takes five times as long
+    coarse_rows = 2 + round(rows * texel_mm / WANDER_ACROSS_MM)
+    coarse_columns = 2 + round(columns * texel_mm / WANDER_ALONG_MM)
+    coarse = stream.standard_normal((coarse_rows, coarse_columns))
+    down = _spline_weights(coarse_rows, rows)
+    across = _spline_weights(coarse_columns, columns)
     wander = _normalised(down @ coarse @ across.T)
-    across_mm = (np.arange(shape[0])[:, None] + 0.5) * texel_mm + WANDER_MM * wander
+    across_mm = (np.arange(rows)[:, None] + 0.5) * texel_mm + WANDER_MM * wander
     turns = across_mm / material.grain_period_mm + stream.uniform()
     # late wood: a thin dark line at the end of each ring, after a slow fall
     rise = turns % 1.0
     lines = _normalised(-rise * rise * rise)
-    noise = stream.standard_normal(shape, dtype=np.float32)
-    across, along = (
-        cv2.getGaussianKernel(2 * int(3 * s + 0.5) + 1, s) for s in np.divide(FIBRE_MM, texel_mm)
-    )
-    fibres = cv2.sepFilter2D(noise, -1, along, across, borderType=cv2.BORDER_REFLECT)
+    noise = stream.standard_normal((rows, columns), dtype=np.float32)
+    along_kernel = _gaussian_kernel(FIBRE_ALONG_MM / texel_mm)
+    across_kernel = _gaussian_kernel(FIBRE_ACROSS_MM / texel_mm)
+    fibres = cv2.sepFilter2D(noise, -1, along_kernel, across_kernel, borderType=cv2.BORDER_REFLECT)
     return _normalised(LINE_WEIGHT * lines + FIBRE_WEIGHT * _normalised(fibres))
 
 
-def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray:
+def _spline_weights(knots: int, count: int) -> np.ndarray:
+    """Return the weights (count, knots) of a cubic spline's knots in evenly spaced values."""
+    weights: np.ndarray = zoom(
+        np.eye(knots),
+        (count / knots, 1),
+        order=3,
+        mode="nearest",
+    )
+    return weights
+
+
+def _gaussian_kernel(deviation: float) -> np.ndarray:
+    return cv2.getGaussianKernel(2 * int(3 * deviation + 0.5) + 1, deviation)
+
+
+def reflectance(
+    pattern: np.ndarray,
+    mean: float,
+    contrast: float,
+) -> np.ndarray:
     """Return albedo (rows, columns) float32 with exactly this mean: mean (1 + contrast pattern),
     clipped to 0..1. Where clipping would move the mean, the pattern is lifted to bring it back;
     the contrast then falls short."""
     raw = mean * (1 + contrast * pattern)
+
+    def excess(lift: float) -> float:
+        return float(np.clip(raw + lift, 0.0, 1.0).mean()) - mean
+
     lift = 0.0
     if raw.min() < 0.0 or raw.max() > 1.0:
-        lift = float(
-            brentq(
-                lambda up: float(np.clip(raw + up, 0.0, 1.0).mean()) - mean, -2.0, 2.0, xtol=1e-9
-            )
-        )
+        lift = float(brentq(excess, -2.0, 2.0, xtol=1e-9))
     return np.clip(raw + lift, 0.0, 1.0).astype(np.float32)
 
 
@@ -102,23 +128,26 @@ def image_pattern(file: str) -> np.ndarray:
     """Return an image's brightness in linear light over its mean, less 1: (rows, columns),
     `MAX_TEXELS` at most."""
     try:
-        image = cv2.imdecode(
-            np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8),
-            cv2.IMREAD_ANYDEPTH,
-        )
+        content = np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8)
+        image = cv2.imdecode(content, cv2.IMREAD_ANYDEPTH)
     except (OSError, cv2.error) as error:
         raise UserError(f"target.material.texture: {file} cannot be read ({error})") from error
     if image is None or image.dtype.kind != "u" or min(image.shape) < 2 or not image.any():
-        what = f"target.material.texture: {file} is not a readable image, or it is black"
-        raise UserError(what, legal="a PNG, JPEG or TIFF image of 8 or 16 bits")
+        raise UserError(
+            f"target.material.texture: {file} is not a readable image, or it is black",
+            legal="a PNG, JPEG or TIFF image of 8 or 16 bits",
+        )
     encoded = image / (2.0 ** (8 * image.itemsize) - 1)
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    fewer = min(1.0, MAX_TEXELS / max(linear.shape))
-    linear = (
-        cv2.resize(linear, None, fx=fewer, fy=fewer, interpolation=cv2.INTER_AREA)
-        if fewer < 1
-        else linear
-    )
+    fewer = MAX_TEXELS / max(linear.shape)
+    if fewer < 1:
+        linear = cv2.resize(
+            linear,
+            None,
+            fx=fewer,
+            fy=fewer,
+            interpolation=cv2.INTER_AREA,
+        )
     return np.asarray(linear / linear.mean() - 1)
 
 
@@ -126,13 +155,27 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Return bilinear values (...[, channels]) of a texture (rows, columns[, channels]) at ``uv``
     (..., 2)."""
     rows, columns = texture.shape[:2]
-    places = np.stack([uv[..., 1] * rows - 0.5, uv[..., 0] * columns - 0.5])
-    channels = texture.reshape(rows, columns, -1)
-    values = [
-        map_coordinates(channels[..., i], places, order=1, mode="nearest")
-        for i in range(channels.shape[2])
-    ]
-    return np.stack(values, axis=-1) if texture.ndim == 3 else values[0]
+    texels = np.stack([uv[..., 1] * rows - 0.5, uv[..., 0] * columns - 0.5])
+    if texture.ndim == 2:
+        return np.asarray(
+            map_coordinates(
+                texture,
+                texels,
+                order=1,
+                mode="nearest",
+            )
+        )
+    values = []
+    for channel in np.moveaxis(texture, -1, 0):
+        values.append(
+            map_coordinates(
+                channel,
+                texels,
+                order=1,
+                mode="nearest",
+            )
+        )
+    return np.stack(values, axis=-1)
 
 
 def _normalised(values: np.ndarray) -> np.ndarray:
@@ -145,35 +188,37 @@ COARSEST_SAGITTA_M = 2e-6
 FINEST_SAGITTA_M = 0.1e-6
 ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
 TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
-# by which corners of a circle's polygon, of the same area, may stand out: 28 for 2 mm, 104 for 1
-# in
+# by which corners of a circle's polygon, of the same area, may stand out: 28 corners for 2 mm, 104
+# for 1 in
 CORNER_M = 4e-6
 RINGS = 48  # steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %
-CELL_M = 0.03
-MOST_ALONG = 64
-"""Longest edge of a damaged board's triangles, and the largest number of these along a side;
-beyond it, edges are longer. Longer edges slow rays down, and a renderer in float32 misses their
-plane, by 0.1 mm at 1 m."""
+# Longer edges slow rays down, and a renderer in float32 misses their plane, by 0.1 mm at 1 m.
+CELL_M = 0.03  # longest edge of a damaged board's triangles
+MOST_ALONG = 64  # and the largest number of these along a side; beyond it, edges are longer
 SPARE_M = 0.2 * MM  # least distance by which a cutter reaches beyond the face
 MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
 
 
 @dataclass(frozen=True)
 class TargetPart:
-    """A surface. ``mesh``: camera frame, metres, normals outwards; sharp edges share vertices, so
-    use face normals. ``albedo_850`` and ``rgb`` (3,) are the means of ``texture_850`` (h, w) and
-    ``texture_rgb`` (h, w, 3), float32 linear reflectances, placed by ``uv`` (n_vertices, 2) in
-    0..1 (see the module); all None if the part is plain. ``gloss``: share and exponent of its
-    Phong lobe (`scenes.target.custom.GlossConfig`)."""
+    """A surface of a target."""
 
     name: str
+    """Name, as in `Target.parts`."""
     mesh: trimesh.Trimesh
+    """Camera frame, metres, normals outwards; sharp edges share vertices, so use face normals."""
     albedo_850: float
+    """Mean of ``texture_850``."""
     rgb: np.ndarray
+    """(3,): mean of ``texture_rgb``."""
     uv: np.ndarray | None = None
+    """(n_vertices, 2): texture co-ordinates in 0..1 (see the module); None if the part is plain."""
     texture_850: np.ndarray | None = None
+    """(h, w) float32: linear reflectance at 850 nm; None if the part is plain."""
     texture_rgb: np.ndarray | None = None
+    """(h, w, 3) float32: linear reflectance; None if the part is plain."""
     gloss: tuple[float, float] = (0.0, 1.0)
+    """Share and exponent of its Phong lobe (`scenes.target.custom.GlossConfig`)."""
 
     def rgb_at(self, uv: np.ndarray) -> np.ndarray:
         """Return red, green and blue albedo (..., 3) at ``uv`` (..., 2); the mean where the part
@@ -185,15 +230,18 @@ class TargetPart:
 
 @dataclass(frozen=True)
 class Target:
-    """A built target. ``parts``: "board", then "tape_1".., "backing", "floor", "back_wall" as
-    declared. ``truth``: all damage in its order. ``outline_board_m`` (n, 3): the face's rim,
-    counter-clockwise seen from the camera."""
+    """A built target."""
 
     config: TargetConfig
+    """Its declaration."""
     parts: tuple[TargetPart, ...]
+    """"board", then "tape_1".., "backing", "floor", "back_wall" as declared."""
     truth: tuple[Damage, ...]
+    """All damage in the order of the declaration."""
     T_camera_board: np.ndarray
+    """(4, 4): from the board's frame to the camera's."""
     outline_board_m: np.ndarray
+    """(n, 3): the face's rim, counter-clockwise seen from the camera."""
 
 
 def build_target(config: TargetConfig) -> Target:
@@ -201,70 +249,122 @@ def build_target(config: TargetConfig) -> Target:
     (`scenes.target.checks`)."""
     check_target(config)
     T_camera_board = config.pose.T_camera_board
-    board = config.board
-    material = config.material
     truth = truth_of(config, T_camera_board)
-    sagitta_m = _sagitta_m(config)
-    mesh = board_solid(config, truth)
-    plan = mesh.vertices[:, :2] / (board.width_mm * MM, board.height_mm * MM)
-    mesh.apply_transform(T_camera_board)
-    uv = texture_850 = texture_rgb = None
-    if (image := material.texture) is not None or material.grain_contrast != 0:
-        uv = np.clip(np.column_stack([0.5 + plan[:, 0], 0.5 - plan[:, 1]]), 0.0, 1.0)
-        pattern = (
-            grain(material, board.width_mm, board.height_mm)
-            if image is None
-            else image_pattern(image.file)
-        )
-        contrast = material.grain_contrast if image is None else 1.0
-        texture_850 = reflectance(pattern, material.albedo_850, contrast)
-        texture_rgb = np.stack(
-            [reflectance(pattern, mean, contrast) for mean in material.rgb], axis=-1
-        )
-    own = material.albedo_850, np.array(material.rgb), uv, texture_850, texture_rgb
-    gloss = (material.gloss.share, material.gloss.exponent) if material.gloss else (0.0, 1.0)
-    parts = [TargetPart("board", mesh, *own, gloss)]
+    parts = [_board_part(config, truth)]
     for number, tape in enumerate(config.tapes, start=1):
-        (width, height), (x, y), top_m = tape.size_mm, tape.centre_mm, tape.thickness_mm * MM
-        size_m = (width * MM, height * MM)
-        at = ((x * MM, y * MM), float(np.deg2rad(tape.angle_deg)))
-        strip = sheet(face_of(board), size_m, top_m, -TAPE_SINK_M, sagitta_m, *at)
+        strip = _tape_strip(config, tape)
         strip.apply_transform(T_camera_board)
         parts.append(TargetPart(f"tape_{number}", strip, tape.albedo_850, np.array(tape.rgb)))
     for name, corners, albedo_850, rgb in planes_of(config):
-        plane = trimesh.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False)
+        plane = trimesh.Trimesh(
+            vertices=corners,
+            faces=[(0, 1, 2), (0, 2, 3)],
+            process=False,
+        )
         parts.append(TargetPart(name, plane, albedo_850, np.array(rgb)))
-    return Target(config, tuple(parts), truth, T_camera_board, outline_board_m(board))
+    outline = outline_board_m(config.board)
+    return Target(
+        config=config,
+        parts=tuple(parts),
+        truth=truth,
+        T_camera_board=T_camera_board,
+        outline_board_m=outline,
+    )
 
 
-def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
+def _board_part(config: TargetConfig, truth: tuple[Damage, ...]) -> TargetPart:
+    """Return the board with its reflectance, in the camera's frame."""
+    board = config.board
+    material = config.material
+    mesh = board_solid(config, truth)
+    plan = mesh.vertices[:, :2] / (board.width_mm * MM, board.height_mm * MM)
+    mesh.apply_transform(config.pose.T_camera_board)
+    uv = None
+    texture_850 = None
+    texture_rgb = None
+    pattern = None
+    contrast = material.grain_contrast
+    if material.texture is not None:
+        pattern = image_pattern(material.texture.file)
+        contrast = 1.0
+    elif contrast != 0:
+        pattern = grain(material, board.width_mm, board.height_mm)
+    if pattern is not None:
+        uv = np.clip(np.column_stack([0.5 + plan[:, 0], 0.5 - plan[:, 1]]), 0.0, 1.0)
+        texture_850 = reflectance(pattern, material.albedo_850, contrast)
+        colours = [reflectance(pattern, mean, contrast) for mean in material.rgb]
+        texture_rgb = np.stack(colours, axis=-1)
+    gloss = (0.0, 1.0)
+    if material.gloss:
+        gloss = (material.gloss.share, material.gloss.exponent)
+    return TargetPart(
+        name="board",
+        mesh=mesh,
+        albedo_850=material.albedo_850,
+        rgb=np.array(material.rgb),
+        uv=uv,
+        texture_850=texture_850,
+        texture_rgb=texture_rgb,
+        gloss=gloss,
+    )
+
+
+def _tape_strip(config: TargetConfig, tape: TapeConfig) -> trimesh.Trimesh:
+    """Return a strip of tape, board frame."""
+    width_mm, height_mm = tape.size_mm
+    x_mm, y_mm = tape.centre_mm
+    return sheet(
+        face_of(config.board),
+        (width_mm * MM, height_mm * MM),
+        top_m=tape.thickness_mm * MM,
+        bottom_m=-TAPE_SINK_M,
+        sagitta_m=_sagitta_m(config),
+        centre_m=(x_mm * MM, y_mm * MM),
+        angle_rad=float(np.deg2rad(tape.angle_deg)),
+    )
+
+
+def board_solid(
+    config: TargetConfig,
+    truth: tuple[Damage, ...],
+) -> trimesh.Trimesh:
     """Return the board without its damage, watertight, board frame."""
-    size_m = (config.board.width_mm * MM, config.board.height_mm * MM)
-    thickness_m = config.board.thickness_mm * MM
-    face = face_of(config.board)
+    board = config.board
+    thickness_m = board.thickness_mm * MM
+    face = face_of(board)
+    if isinstance(board.shape, MeshConfig):
+        vertices, faces = part_of(board.shape)
+        body = trimesh.Trimesh(vertices, faces, process=False)
+    else:
+        body = sheet(
+            face,
+            (board.width_mm * MM, board.height_mm * MM),
+            top_m=0.0,
+            bottom_m=-thickness_m,
+            sagitta_m=_sagitta_m(config),
+            flat_back=face.rough,
+        )
     added: list[trimesh.Trimesh] = []
     cutters: list[trimesh.Trimesh] = []
-    if isinstance(config.board.shape, MeshConfig):
-        body = trimesh.Trimesh(*part_of(config.board.shape), process=False)
-    else:
-        body = sheet(face, size_m, 0.0, -thickness_m, _sagitta_m(config), flat_back=face.rough)
     for damage, item in zip(truth, config.damages, strict=True):
         if isinstance(item, FlawConfig):
-            more, less = solids_of(item, face, thickness_m)
-            added = added + more
-            cutters = cutters + less
+            item_added, item_cutters = solids_of(item, face, thickness_m)
+            added += item_added
+            cutters += item_cutters
         else:
             cutters.append(cutter(damage, item))
     return subtract(body, cutters, added) if truth else body
 
 
 def _sagitta_m(config: TargetConfig) -> float:
+    """Return how far facets may lie off the face."""
     if face_of(config.board).rough:
         return ROUGH_SAGITTA_M
-    depths_m = [
-        bowl.depth_mm * MM for bowl in (*config.dents, *config.flaws) if bowl.depth_mm is not None
-    ]
-    return float(np.clip(min(depths_m, default=np.inf) / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
+    shallowest_m = np.inf
+    for bowl in (*config.dents, *config.flaws):
+        if bowl.depth_mm is not None:
+            shallowest_m = min(shallowest_m, bowl.depth_mm * MM)
+    return float(np.clip(shallowest_m / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
 
 
 def sheet(
@@ -284,45 +384,69 @@ def sheet(
     turn = turned(angle_rad)
 
     def plan(columns: int, rows: int) -> np.ndarray:
-        steps = (
-            np.linspace(-0.5, 0.5, n + 1) * size
-            for n, size in zip((columns, rows), size_m, strict=True)
-        )
-        return np.stack(np.meshgrid(*steps), axis=-1) @ turn.T + centre_m
+        x = np.linspace(-0.5, 0.5, columns + 1) * size_m[0]
+        y = np.linspace(-0.5, 0.5, rows + 1) * size_m[1]
+        return np.stack(np.meshgrid(x, y), axis=-1) @ turn.T + centre_m
 
-    # Linear interpolation on a right triangle of legs a, b errs by (|f_aa| a^2 + 2 |f_ab| ab +
-    # |f_bb| b^2) / 8 or less. Legs with a^2 (|f_aa| + |f_ab|) = b^2 (|f_bb| + |f_ab|) = 4 sagitta
-    # keep that below the
-    # sagitta.
-    places = plan(64, 64)
-    fxx, fxy, fyy = np.moveaxis(face.bend(places[..., 0], places[..., 1]), -1, 0)
-    hessian = turn.T @ np.stack([np.stack([fxx, fxy], -1), np.stack([fxy, fyy], -1)], -2) @ turn
-    bends = np.abs(hessian).sum(axis=-1).max(axis=(0, 1))
-    # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
-    lengths = np.where(bends > 1e-9, np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9)), np.inf)
-    columns, rows = (
-        max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True)
-    )
-    if columns * rows > MAX_CELLS:
-        needs = f"{columns} x {rows} cells for an error below {sagitta_m / MM * 1e3:.3g} um"
-        fix = "make the board smaller or bend it less"
-        raise UserError(
-            f"board: its face needs {needs}", legal=f"at most {MAX_CELLS} cells", fix=fix
-        )
+    columns, rows = _cells(face, plan(64, 64), turn, size_m, sagitta_m)
     places = plan(columns, rows)
     points = face.point(places[..., 0], places[..., 1])
     normals = face.normal(places[..., 0], places[..., 1])
-    lower = (
-        np.dstack([places, np.full(places.shape[:2], bottom_m)])
-        if flat_back
-        else points + bottom_m * normals
-    )
+    lower = points + bottom_m * normals
+    if flat_back:
+        lower = np.dstack([places, np.full(places.shape[:2], bottom_m)])
     vertices, faces = closed_grid(points + top_m * normals, lower)
-    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    return trimesh.Trimesh(
+        vertices=vertices,
+        faces=faces,
+        process=False,
+    )
+
+
+def _cells(
+    face: Face,
+    places: np.ndarray,
+    turn: np.ndarray,
+    size_m: tuple[float, float],
+    sagitta_m: float,
+) -> tuple[int, int]:
+    """Return the numbers of columns and rows of a sheet's grid that keep its facets close to the
+    face.
+
+    Linear interpolation on a right triangle of legs a, b errs by (|f_aa| a^2 + 2 |f_ab| ab +
+    |f_bb| b^2) / 8 or less. Legs with a^2 (|f_aa| + |f_ab|) = b^2 (|f_bb| + |f_ab|) = 4 sagitta
+    keep that below the sagitta.
+
+    ``places`` (n, m, 2): where the face's bend is looked at. ``turn`` (2, 2): the sheet's axes in
+    plan."""
+    fxx, fxy, fyy = np.moveaxis(face.bend(places[..., 0], places[..., 1]), -1, 0)
+    first_row = np.stack([fxx, fxy], -1)
+    second_row = np.stack([fxy, fyy], -1)
+    hessian = np.stack([first_row, second_row], -2)
+    along_sheet = np.abs(turn.T @ hessian @ turn)
+    bends = along_sheet.sum(axis=-1).max(axis=(0, 1))
+    counts = []
+    for bend, size in zip(bends, size_m, strict=True):
+        count = 1
+        # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
+        if bend > 1e-9:
+            count = max(1, int(np.ceil(size / np.sqrt(4 * sagitta_m / bend))))
+        counts.append(count)
+    columns, rows = counts
+    if columns * rows > MAX_CELLS:
+        raise UserError(
+            f"board: its face needs {columns} x {rows} cells "
+            f"for an error below {sagitta_m / MM * 1e3:.3g} um",
+            legal=f"at most {MAX_CELLS} cells",
+            fix="make the board smaller or bend it less",
+        )
+    return columns, rows
 
 
 def solids_of(
-    item: FlawConfig, face: Face, thickness_m: float
+    item: FlawConfig,
+    face: Face,
+    thickness_m: float,
 ) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
     """Return the solids that a flaw adds to the board and those that it takes away, in this order,
     board frame. A pressed sheet moves its back too: the volume that one side loses, the other side
@@ -334,81 +458,98 @@ def solids_of(
         points = np.concatenate([points, points[-1:] + spare_m * across])
         depth_m = np.concatenate([depth_m, depth_m[-1:]])
 
-    def between(upper_m: np.ndarray | float, lower_m: np.ndarray | float) -> trimesh.Trimesh:
+    def between(
+        upper_m: np.ndarray | float,
+        lower_m: np.ndarray | float,
+    ) -> trimesh.Trimesh:
         """Return the solid between two heights over the face, along the axis."""
-        heights = (
-            np.broadcast_to(height, depth_m.shape)[..., None] for height in (upper_m, lower_m)
-        )
-        return trimesh.Trimesh(
-            *closed_grid(*(points + height * axis for height in heights)), process=False
-        )
+        upper = np.broadcast_to(upper_m, depth_m.shape)[..., None]
+        lower = np.broadcast_to(lower_m, depth_m.shape)[..., None]
+        return _solid(points + upper * axis, points + lower * axis)
 
-    out = bool(depth_m.min() < 0)
+    raised = bool(depth_m.min() < 0)
     if not (isinstance(item, RoundConfig) and item.pressed):
-        if out:
+        if raised:
             return [between(-depth_m, -min(spare_m, thickness_m / 2))], []
-        return [], [
-            between(spare_m, -depth_m - (spare_m if np.isnan(relief.depth_m).any() else 0.0))
-        ]
+        beyond_back_m = spare_m if np.isnan(relief.depth_m).any() else 0.0
+        return [], [between(spare_m, -depth_m - beyond_back_m)]
     # the back is the face moved by the thickness along its own normals
     normals = face.normal(points[..., 0], points[..., 1])
     back = points - thickness_m * normals
+    moved_back = back - depth_m[..., None] * axis
+    if raised:
+        front = between(-depth_m, -thickness_m / 2)
+        return [front], [_solid(moved_back, back - spare_m * axis)]
     middle = points + -thickness_m / 2 * normals
-    moved = back - depth_m[..., None] * axis
-    front = between(-depth_m, -thickness_m / 2) if out else between(spare_m, -depth_m)
-    rear = closed_grid(moved, back - spare_m * axis) if out else closed_grid(middle, moved)
-    solid = trimesh.Trimesh(*rear, process=False)
-    return ([front], [solid]) if out else ([solid], [front])
+    return [_solid(middle, moved_back)], [between(spare_m, -depth_m)]
+
+
+def _solid(upper: np.ndarray, lower: np.ndarray) -> trimesh.Trimesh:
+    """Return the solid between two grids of points (rows, columns, 3)."""
+    vertices, faces = closed_grid(upper, lower)
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh:
     """Return the solid that a damage takes away, board frame; it sticks out of the face, a
     through-hole's of the back. Its radius is the declared one: on a bent face a dent's rim, which
     the truth holds, is not that of its ball."""
-    depth_m = damage.depth_m
     radius_m = declared.radius_m
     # A face or back that bends to a radius of twice the damage's lies 0.27 radius off the tangent
     # plane at the rim.
     spare_m = SPARE_M + 0.5 * radius_m
     if isinstance(declared, DentConfig):
-        # a ball from pole to rim and on above the face, then straight up, then a lid
-        ball_m = declared.ball_m
-        middle_m = declared.ball_m - depth_m
-        rim = np.arctan2(radius_m, middle_m)
-        top = np.arccos(max(middle_m - spare_m, 0.0) / ball_m)
-        angles = np.linspace(0.0, rim, RINGS + 1)
-        if top > rim + 1e-6:
-            angles = np.concatenate([angles, np.linspace(rim, top, RINGS // 4)[1:]])
-        profile = np.column_stack([ball_m * np.sin(angles), middle_m - ball_m * np.cos(angles)])
-        profile[0, 0] = 0.0
-        if profile[-1, 1] < spare_m:
-            profile = np.vstack([profile, (profile[-1, 0], spare_m)])
-        profile = np.vstack([profile, (0.0, spare_m)])
+        profile = _ball_profile(declared, damage.depth_m, spare_m)
     else:
-        bottom_m = -depth_m - (spare_m if damage.kind == "through" else 0.0)
+        bottom_m = -damage.depth_m
+        if damage.kind == "through":
+            bottom_m -= spare_m
         mouth_m = declared.mouth_m
-        edge = [(radius_m, radius_m - mouth_m), (mouth_m, 0.0)] if mouth_m > radius_m else []
-        profile = np.array(
-            [(0.0, bottom_m), (radius_m, bottom_m), *edge, (mouth_m, spare_m), (0.0, spare_m)]
-        )
+        corners = [(0.0, bottom_m), (radius_m, bottom_m)]
+        if mouth_m > radius_m:
+            corners += [(radius_m, radius_m - mouth_m), (mouth_m, 0.0)]
+        corners += [(mouth_m, spare_m), (0.0, spare_m)]
+        profile = np.array(corners)
     sides = 4 * int(np.ceil(np.pi / 2 * np.sqrt(radius_m / (12 * CORNER_M))))
     angle = 2 * np.pi / sides
     equal_area = np.sqrt(angle / np.sin(angle))
     # In millimetres: trimesh takes areas below 1e-8 for nothing, and in m2 that is a facet of a
     # small hole.
     solid = trimesh.creation.revolve(profile / MM * (equal_area, 1.0), sections=sides)
-    across = np.cross([0.0, 1.0, 0.0], damage.axis_board)
+    axis = damage.axis_board
+    across = np.cross([0.0, 1.0, 0.0], axis)
     across /= np.linalg.norm(across)
     pose = np.eye(4)
-    pose[:3, :3] = MM * np.column_stack(
-        [across, np.cross(damage.axis_board, across), damage.axis_board]
-    )
+    pose[:3, :3] = MM * np.column_stack([across, np.cross(axis, across), axis])
     pose[:3, 3] = damage.centre_board_m
     return solid.apply_transform(pose)
 
 
+def _ball_profile(
+    dent: DentConfig,
+    depth_m: float,
+    spare_m: float,
+) -> np.ndarray:
+    """Return the profile (n, 2) of a dent's cutter, radius and height: a ball from pole to rim and
+    on above the face, then straight up, then a lid at ``spare_m``."""
+    ball_m = dent.ball_m
+    middle_m = ball_m - depth_m
+    rim = np.arctan2(dent.radius_m, middle_m)
+    top = np.arccos(max(middle_m - spare_m, 0.0) / ball_m)
+    angles = np.linspace(0.0, rim, RINGS + 1)
+    if top > rim + 1e-6:
+        angles = np.concatenate([angles, np.linspace(rim, top, RINGS // 4)[1:]])
+    profile = np.column_stack([ball_m * np.sin(angles), middle_m - ball_m * np.cos(angles)])
+    profile[0, 0] = 0.0
+    if profile[-1, 1] < spare_m:
+        profile = np.vstack([profile, (profile[-1, 0], spare_m)])
+    return np.vstack([profile, (0.0, spare_m)])
+
+
 def subtract(
-    body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh], added: Sequence[trimesh.Trimesh] = ()
+    body: trimesh.Trimesh,
+    cutters: Sequence[trimesh.Trimesh],
+    added: Sequence[trimesh.Trimesh] = (),
 ) -> trimesh.Trimesh:
     """Return body and what is added, minus cutters, by Manifold, watertight; not by trimesh's
     wrapper, which rounds to float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in
@@ -416,30 +557,32 @@ def subtract(
     import manifold3d  # type: ignore[import-not-found]
 
     longest_m = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG)
-    solids = []
-    for mesh in (body, *added, *cutters):
-        vertices = np.array(mesh.vertices, float)
-        faces = np.array(mesh.faces, np.uint64)
-        if mesh is body:
-            fine = (
-                manifold3d.Manifold(manifold3d.Mesh64(vertices, faces))
-                .refine_to_length(longest_m)
-                .to_mesh64()
-            )
-            vertices = np.array(fine.vert_properties[:, :3], order="C")
-            faces = np.array(fine.tri_verts, order="C")
-        # edges between faces of different numbers stay; others within a plane are dissolved
-        numbers = np.arange(len(faces), dtype=np.uint64)
-        solids.append(manifold3d.Manifold(manifold3d.Mesh64(vertices, faces, face_id=numbers)))
+    fine = _manifold(body.vertices, body.faces).refine_to_length(longest_m).to_mesh64()
+    solids = [_manifold(fine.vert_properties[:, :3], fine.tri_verts)]
+    solids += [_manifold(mesh.vertices, mesh.faces) for mesh in (*added, *cutters)]
     broken = [solid.status() for solid in solids if solid.status() != manifold3d.Error.NoError]
     if broken:
         raise RuntimeError(f"a solid is not closed: {broken}")
-    whole = manifold3d.Manifold.batch_boolean(solids[: 1 + len(added)], manifold3d.OpType.Add)
-    left = [whole, *solids[1 + len(added) :]]
-    result = manifold3d.Manifold.batch_boolean(left, manifold3d.OpType.Subtract).to_mesh64()
-    return trimesh.Trimesh(
-        result.vert_properties[:, :3], result.tri_verts.astype(np.int64), process=False
+    count = 1 + len(added)
+    whole = manifold3d.Manifold.batch_boolean(solids[:count], manifold3d.OpType.Add)
+    cut = manifold3d.Manifold.batch_boolean([whole, *solids[count:]], manifold3d.OpType.Subtract)
+    result = cut.to_mesh64()
+    vertices = result.vert_properties[:, :3]
+    return trimesh.Trimesh(vertices, result.tri_verts.astype(np.int64), process=False)
+
+
+def _manifold(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Return a Manifold solid. Edges between faces of different numbers stay; others within a
+    plane are dissolved."""
+    import manifold3d
+
+    numbers = np.arange(len(faces), dtype=np.uint64)
+    mesh = manifold3d.Mesh64(
+        np.array(vertices, float, order="C"),
+        np.array(faces, np.uint64, order="C"),
+        face_id=numbers,
     )
+    return manifold3d.Manifold(mesh)
 
 
 MESH_SUFFIXES = (".glb", ".ply")
@@ -462,10 +605,11 @@ def write_mesh(target: Target, path: Path) -> None:
 def write_truth(target: Target, path: Path) -> None:
     """Write as JSON: version, declaration, ``T_camera_board`` (metres) and one row in millimetres
     per damage."""
-    data = {"results_version": RESULTS_VERSION, "target": target.config.to_data()}
-    data |= {
+    data = {
+        "results_version": RESULTS_VERSION,
+        "target": target.config.to_data(),
         "T_camera_board": target.T_camera_board.tolist(),
-        "damages": [each.to_row() for each in target.truth],
+        "damages": [damage.to_row() for damage in target.truth],
     }
     write_json(path, data)
 
@@ -473,12 +617,15 @@ def write_truth(target: Target, path: Path) -> None:
 def _ply(target: Target) -> bytes:
     coloured = []
     for part in target.parts:
-        colours = np.tile(
-            np.append(_srgb_bytes(part.rgb), np.uint8(255)), (len(part.mesh.vertices), 1)
-        )
+        mesh = part.mesh
+        opaque = np.append(_srgb_bytes(part.rgb), np.uint8(255))
+        colours = np.tile(opaque, (len(mesh.vertices), 1))
         coloured.append(
             trimesh.Trimesh(
-                part.mesh.vertices, part.mesh.faces, vertex_colors=colours, process=False
+                mesh.vertices,
+                mesh.faces,
+                vertex_colors=colours,
+                process=False,
             )
         )
     return trimesh.util.concatenate(coloured).export(None, file_type="ply")
@@ -498,18 +645,25 @@ def _glb(target: Target) -> bytes:
             uv = part.uv * (1, -1) + (0, 1)  # trimesh counts v upwards from the image's lower edge
         material = PBRMaterial(**colour, metallicFactor=0.0, roughnessFactor=1.0, name=part.name)
         visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-        mesh = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, visual=visual, process=False)
+        mesh = trimesh.Trimesh(
+            part.mesh.vertices,
+            part.mesh.faces,
+            visual=visual,
+            process=False,
+        )
         # No normals: glTF viewers then shade each facet flat, which keeps the rims of holes sharp.
-        scene.add_geometry(mesh, node_name=part.name, geom_name=part.name, transform=upright)
+        scene.add_geometry(
+            mesh,
+            node_name=part.name,
+            geom_name=part.name,
+            transform=upright,
+        )
     return scene.export(file_type="glb", include_normals=False)
 
 
 def _srgb_bytes(linear: np.ndarray) -> np.ndarray:
     """Return linear reflectance in 0..1 as 8-bit sRGB (IEC 61966-2-1)."""
     linear = np.asarray(linear, dtype=float)
-    encoded = np.where(
-        linear <= 0.0031308,
-        12.92 * linear,
-        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
-    )
+    bright = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, bright)
     return np.round(255 * encoded).astype(np.uint8)

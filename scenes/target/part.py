@@ -11,7 +11,7 @@ within a step of the grid; pressed dents and chips, which need a sheet's back or
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numba
 import numpy as np
@@ -32,7 +32,12 @@ class MeshTargetConfig(custom.SetUpConfig):
 
     name: Literal["mesh"]
     file: Annotated[
-        str, Field(min_length=1, max_length=1000, description="a .stl, .ply, .obj or .glb file")
+        str,
+        Field(
+            min_length=1,
+            max_length=1000,
+            description="a .stl, .ply, .obj or .glb file",
+        ),
     ]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
@@ -40,13 +45,29 @@ class MeshTargetConfig(custom.SetUpConfig):
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Raises UserError if the file cannot be used."""
-        shape = custom.MeshConfig(kind="mesh", file=self.file, unit=self.unit, front=self.front)
+        shape = custom.MeshConfig(
+            kind="mesh",
+            file=self.file,
+            unit=self.unit,
+            front=self.front,
+        )
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
-        board = dict(zip(("width_mm", "height_mm", "thickness_mm"), sizes.tolist(), strict=True))
-        kept: dict[str, Any] = {
-            key: getattr(self, key) for key in custom.SetUpConfig.model_fields if key != "name"
-        }
-        return custom.TargetConfig(board=custom.BoardConfig(**board, shape=shape), **kept)
+        width_mm, height_mm, thickness_mm = sizes.tolist()
+        board = custom.BoardConfig(
+            width_mm=width_mm,
+            height_mm=height_mm,
+            thickness_mm=thickness_mm,
+            shape=shape,
+        )
+        return custom.TargetConfig(
+            board=board,
+            flaws=self.flaws,
+            material=self.material,
+            backing=self.backing,
+            room=self.room,
+            pose=self.pose,
+            other_wavelengths=self.other_wavelengths,
+        )
 
 
 @lru_cache(maxsize=8)
@@ -59,15 +80,26 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
 
-    def refuse(wrong: np.ndarray, what: str, fix: str) -> None:
+    def refuse(
+        wrong: np.ndarray,
+        what: str,
+        fix: str,
+    ) -> None:
         if len(wrong):
-            place = ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong[0]].mean(axis=0))
-            where = f"{shape.file}: {what}: {len(wrong)}, the first at ({place}) {shape.unit} of the file"
+            first = mesh.vertices[wrong[0]].mean(axis=0)
+            position = ", ".join(f"{value:.4g}" for value in first)
             raise UserError(
-                where, legal="a closed surface", fix=f"{fix} in a mesh editor, such as MeshLab"
+                f"{shape.file}: {what}: {len(wrong)}, "
+                f"the first at ({position}) {shape.unit} of the file",
+                legal="a closed surface",
+                fix=f"{fix} in a mesh editor, such as MeshLab",
             )
 
-    edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    edges, counts = np.unique(
+        mesh.edges_sorted,
+        axis=0,
+        return_counts=True,
+    )
     refuse(edges[counts > 2], "edges that three faces or more share", "split them")
     refuse(edges[counts == 1], "open edges", "close them")
     if not len(mesh.faces):
@@ -75,22 +107,20 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
             f"{shape.file}: is not a mesh: it holds no triangles", legal="a closed surface"
         )
     if not mesh.is_winding_consistent:
-        what = f"{shape.file}: neighbouring triangles face opposite sides"
         raise UserError(
-            what,
-            fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)",
+            f"{shape.file}: neighbouring triangles face opposite sides",
+            fix="orient its faces in a mesh editor, "
+            "such as MeshLab (Re-Orient All Faces Coherently)",
         )
-    refuse(
-        mesh.faces[crossing(mesh.triangles)],
-        "triangles that cross others",
-        "unite its overlapping shells",
-    )
+    crossed = mesh.faces[crossing(mesh.triangles)]
+    refuse(crossed, "triangles that cross others", "unite its overlapping shells")
     if mesh.volume < 0:
         mesh.invert()
     points = front_first(mesh, shape.unit, shape.front)
     low = points.min(axis=0)
     high = points.max(axis=0)
-    return points - [*(low[:2] + high[:2]) / 2, high[2]], np.asarray(mesh.faces, np.int64)
+    middle = (low[:2] + high[:2]) / 2
+    return points - np.append(middle, high[2]), np.asarray(mesh.faces, np.int64)
 
 
 def crossing(corners: np.ndarray) -> np.ndarray:
@@ -99,42 +129,50 @@ def crossing(corners: np.ndarray) -> np.ndarray:
     extents overlap."""
     low = corners.min(axis=1)
     high = corners.max(axis=1)
-    strip_m = max(float(np.ptp(corners[..., 1])) / max(1, int(np.sqrt(len(corners)) / 8)), 1e-12)
-    first = ((low[:, 1] - low[:, 1].min()) / strip_m).astype(np.int64)
-    last = ((high[:, 1] - low[:, 1].min()) / strip_m).astype(np.int64)
-    counts = last - first + 1
-    index = np.repeat(np.arange(len(corners)), counts)
-    strips = first[index] + np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
-    order = np.lexsort((low[index, 0], strips))
-    found = np.zeros(len(index), bool)
-    index = index[order]
-    _sweep(corners[index], low[index], high[index], strips[order], found)
-    return np.unique(index[found])
+    lowest = low[:, 1].min()
+    strip_count = max(1, int(np.sqrt(len(corners)) / 8))
+    strip_m = max(float(np.ptp(corners[..., 1])) / strip_count, 1e-12)
+    # each triangle stands once in every strip that it meets
+    first_strip = ((low[:, 1] - lowest) / strip_m).astype(np.int64)
+    last_strip = ((high[:, 1] - lowest) / strip_m).astype(np.int64)
+    counts = last_strip - first_strip + 1
+    triangle = np.repeat(np.arange(len(corners)), counts)
+    begins = np.repeat(np.cumsum(counts) - counts, counts)
+    strips = first_strip[triangle] + np.arange(len(triangle)) - begins
+    order = np.lexsort((low[triangle, 0], strips))
+    triangle = triangle[order]
+    crosses = np.zeros(len(triangle), bool)
+    _sweep(corners[triangle], low[triangle], high[triangle], strips[order], crosses)
+    return np.unique(triangle[crosses])
 
 
 @numba.njit(cache=True, nogil=True)
 def _sweep(
-    corners: np.ndarray, low: np.ndarray, high: np.ndarray, strips: np.ndarray, found: np.ndarray
+    corners: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    strips: np.ndarray,
+    crosses: np.ndarray,
 ) -> None:
+    """Mark in ``crosses`` (n,) the triangles that cross another of their strip; sorted by strip,
+    then by their least x."""
     for i in range(len(corners)):
         for j in range(i + 1, len(corners)):
             if strips[j] != strips[i] or low[j, 0] > high[i, 0]:
                 break
-            if (
-                low[j, 1] > high[i, 1]
-                or low[i, 1] > high[j, 1]
-                or low[j, 2] > high[i, 2]
-                or low[i, 2] > high[j, 2]
-            ):
+            if low[j, 1] > high[i, 1] or low[i, 1] > high[j, 1]:
+                continue
+            if low[j, 2] > high[i, 2] or low[i, 2] > high[j, 2]:
                 continue
             joined = False
             for a in range(3):
                 for b in range(3):
                     joined |= (corners[i, a] == corners[j, b]).all()
-            if not joined and (
-                _pierces(corners[i], corners[j]) or _pierces(corners[j], corners[i])
-            ):
-                found[i] = found[j] = True
+            if joined:
+                continue
+            if _pierces(corners[i], corners[j]) or _pierces(corners[j], corners[i]):
+                crosses[i] = True
+                crosses[j] = True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -150,15 +188,20 @@ def _pierces(edged: np.ndarray, triangle: np.ndarray) -> bool:
             first = _volume(p, q, a, b)
             second = _volume(p, q, b, c)
             third = _volume(p, q, c, a)
-            if (first > 0.0 and second > 0.0 and third > 0.0) or (
-                first < 0.0 and second < 0.0 and third < 0.0
-            ):
+            if first > 0.0 and second > 0.0 and third > 0.0:
+                return True
+            if first < 0.0 and second < 0.0 and third < 0.0:
                 return True
     return False
 
 
 @numba.njit(cache=True, nogil=True)
-def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
+def _volume(
+    a: np.ndarray,
+    b: np.ndarray,
+    c: np.ndarray,
+    d: np.ndarray,
+) -> float:
     """Return six times the signed volume of a tetrahedron."""
     u = b - a
     v = c - a
@@ -176,8 +219,9 @@ def front_of(shape: custom.MeshConfig) -> tuple[np.ndarray, float]:
     vertices, faces = part_of(shape)
     half = np.abs(vertices[:, :2]).max(axis=0)
     step_m = 2 * float(half.max()) / NODES
-    counts = [2 * int(np.ceil(each / step_m)) + 3 for each in half]
-    heights = np.full((counts[1], counts[0]), -np.inf)
+    columns = 2 * int(np.ceil(half[0] / step_m)) + 3
+    rows = 2 * int(np.ceil(half[1] / step_m)) + 3
+    heights = np.full((rows, columns), -np.inf)
     _raise_to_triangles(heights, vertices[faces], step_m)
     heights[np.isinf(heights)] = np.nan
     slope_y, slope_x = np.gradient(heights, step_m)
@@ -185,21 +229,34 @@ def front_of(shape: custom.MeshConfig) -> tuple[np.ndarray, float]:
 
 
 def front_derivatives(
-    shape: custom.MeshConfig, x_m: np.ndarray, y_m: np.ndarray
+    shape: custom.MeshConfig,
+    x_m: np.ndarray,
+    y_m: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return z, its slopes and its second derivatives (taken as 0) of a part's front; NaN beyond
     it."""
     images, step_m = front_of(shape)
     rows, columns = images.shape[1:]
-    places = [np.ravel(y_m) / step_m + rows // 2, np.ravel(x_m) / step_m + columns // 2]
-    found = [
-        map_coordinates(image, places, order=1, cval=np.nan).reshape(x_m.shape) for image in images
-    ]
-    return (*found, *(np.zeros(x_m.shape) for _ in range(3)))
+    nodes = [np.ravel(y_m) / step_m + rows // 2, np.ravel(x_m) / step_m + columns // 2]
+    derivatives = []
+    for image in images:
+        values = map_coordinates(
+            image,
+            nodes,
+            order=1,
+            cval=np.nan,
+        )
+        derivatives.append(values.reshape(x_m.shape))
+    none = np.zeros(x_m.shape)
+    return (*derivatives, none, none, none)
 
 
 @numba.njit(cache=True, nogil=True)
-def _raise_to_triangles(heights: np.ndarray, corners: np.ndarray, step: float) -> None:
+def _raise_to_triangles(
+    heights: np.ndarray,
+    corners: np.ndarray,
+    step: float,
+) -> None:
     """Raise each node (rows, columns) to the highest of the triangles (n, 3, 3) above it."""
     rows, columns = heights.shape
     for n in range(len(corners)):
@@ -213,12 +270,16 @@ def _raise_to_triangles(heights: np.ndarray, corners: np.ndarray, step: float) -
         right = max(a[0], b[0], c[0]) / step + columns // 2
         low = min(a[1], b[1], c[1]) / step + rows // 2
         high = max(a[1], b[1], c[1]) / step + rows // 2
-        for i in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)), rows - 1) + 1):
-            for j in range(max(int(np.ceil(left)), 0), min(int(np.floor(right)), columns - 1) + 1):
-                x = (j - columns // 2) * step
-                y = (i - rows // 2) * step
+        first_row = max(int(np.ceil(low)), 0)
+        last_row = min(int(np.floor(high)), rows - 1)
+        first_column = max(int(np.ceil(left)), 0)
+        last_column = min(int(np.floor(right)), columns - 1)
+        for row in range(first_row, last_row + 1):
+            for column in range(first_column, last_column + 1):
+                x = (column - columns // 2) * step
+                y = (row - rows // 2) * step
                 u = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
                 v = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
                 if u >= -1e-9 and v >= -1e-9 and u + v <= 1 + 1e-9:
                     z = a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2])
-                    heights[i, j] = max(heights[i, j], z)
+                    heights[row, column] = max(heights[row, column], z)

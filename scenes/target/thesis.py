@@ -18,6 +18,7 @@ from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.part import MeshTargetConfig
 
 THICKNESS_MM = 12.7  # half an inch (stated)
+# stated, Table I
 DIAMETERS_IN = (
     1 / 16,
     1 / 8,
@@ -30,7 +31,7 @@ DIAMETERS_IN = (
     5 / 8,
     3 / 4,
     1.0,
-)  # stated, Table I
+)
 Degrees = Annotated[float, Field(ge=-70.0, le=70.0)]
 NonNegativeMm = Annotated[float, Field(ge=0.0, le=5e3)]
 
@@ -53,13 +54,15 @@ class ThesisTargetConfig(Config):
     )
     backing_distance_mm: NonNegativeMm | None = _open(
         20.0,
-        "Distance of a surface behind the board; null: nothing. The thesis keeps points with z < 1.1 m and range < 1 m "
-        "and still shows points in the holes, so something stood close behind, as when a sheet leans on a wall.",
+        "Distance of a surface behind the board; null: nothing. The thesis keeps points with "
+        "z < 1.1 m and range < 1 m and still shows points in the holes, so something stood close "
+        "behind, as when a sheet leans on a wall.",
     )
     backing_albedo_850: custom.Albedo = _open(0.6, "A guess; typical of painted walls and wood.")
     hole_spacing_mm: Annotated[float, Field(ge=30.0, le=100.0)] = _open(
         50.8,
-        "2 in, from the ruler readings of holes 4 to 11; holes 1 to 3 are assumed to be as far apart.",
+        "2 in, from the ruler readings of holes 4 to 11; "
+        "holes 1 to 3 are assumed to be as far apart.",
     )
     board_width_mm: Annotated[float, Field(ge=100.0, le=5e3)] = _open(
         609.6, "24 in, a stock size; the row takes 20."
@@ -70,7 +73,8 @@ class ThesisTargetConfig(Config):
     row_offset_y_mm: Annotated[float, Field(ge=-2e3, le=2e3)] = _open(0.0, "The row is centred.")
     distance_m: Annotated[float, Field(ge=0.3, le=5.0)] = _open(
         0.7,
-        "About midway from the camera's minimum (0.5 m) to 0.95 m, where the board's ends have a range of 1 m.",
+        "About midway from the camera's minimum (0.5 m) to 0.95 m, "
+        "where the board's ends have a range of 1 m.",
     )
     offset_x_mm: custom.Coordinate = _open(0.0, "The board is centred in front of the camera.")
     offset_y_mm: custom.Coordinate = _open(0.0, "The board is centred in front of the camera.")
@@ -118,66 +122,83 @@ class ThesisTargetConfig(Config):
     other_wavelengths: custom.OtherWavelengths = ()
 
     def declare(self) -> custom.TargetConfig:
-        """Return the full declaration. Whether the parts fit together is checked when it is built."""
-        middle = (len(DIAMETERS_IN) - 1) / 2
-        room = {
-            key: getattr(self, key) for key in custom.RoomConfig.model_fields if hasattr(self, key)
-        }
+        """Return the full declaration. That the parts fit together is checked when it is built."""
+        board = custom.BoardConfig(
+            width_mm=self.board_width_mm,
+            height_mm=self.board_height_mm,
+            thickness_mm=THICKNESS_MM,
+            shape=custom.FlatConfig(),
+        )
+        material = custom.MaterialConfig(
+            albedo_850=self.plywood_albedo_850,
+            rgb=self.plywood_rgb,
+            grain_contrast=self.grain_contrast,
+            grain_period_mm=self.grain_period_mm,
+            grain_seed=self.grain_seed,
+        )
         backing = None
         if self.backing_distance_mm is not None:
             backing = custom.BackingConfig(
-                distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850
+                distance_mm=self.backing_distance_mm,
+                albedo_850=self.backing_albedo_850,
             )
-        sizes = {
-            "width_mm": self.board_width_mm,
-            "height_mm": self.board_height_mm,
-            "thickness_mm": THICKNESS_MM,
-        }
-        strip: dict[str, Any] = {
-            key: getattr(self, f"tape_{key}") for key in ("rgb", "albedo_850", "thickness_mm")
-        }
+        room = None
+        if self.floor_below_lens_m or self.back_wall_distance_m:
+            room = custom.RoomConfig(
+                floor_below_lens_m=self.floor_below_lens_m,
+                floor_albedo_850=self.floor_albedo_850,
+                back_wall_distance_m=self.back_wall_distance_m,
+                back_wall_albedo_850=self.back_wall_albedo_850,
+            )
+        pose = custom.PoseConfig(
+            distance_m=self.distance_m,
+            offset_x_mm=self.offset_x_mm,
+            offset_y_mm=self.offset_y_mm,
+            tilt_x_deg=self.tilt_x_deg,
+            tilt_y_deg=self.tilt_y_deg,
+            roll_deg=self.roll_deg,
+        )
         return custom.TargetConfig(
-            board=custom.BoardConfig(**sizes, shape=custom.FlatConfig()),
-            # hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle
-            holes=tuple(
-                custom.HoleConfig(
-                    id=number,
-                    diameter_mm=round(diameter_in * INCH / MM, 6),
-                    centre_mm=(
-                        round((number - 1 - middle) * self.hole_spacing_mm, 6),
-                        self.row_offset_y_mm,
-                    ),
-                    kind=self.hole_kind,
-                    depth_mm=self.blind_depth_mm if self.hole_kind == "blind" else None,
-                )
-                for number, diameter_in in enumerate(DIAMETERS_IN, start=1)
-            ),
-            tapes=tuple(
-                custom.TapeConfig(
-                    centre_mm=(side_x * self.tape_x_mm, side_y * self.tape_y_mm),
-                    size_mm=(self.tape_length_mm, self.tape_width_mm),
-                    **strip,
-                )
-                for side_y in (1, -1)
-                for side_x in (-1, 1)
-            ),
-            material=custom.MaterialConfig(
-                albedo_850=self.plywood_albedo_850,
-                rgb=self.plywood_rgb,
-                **{
-                    key: getattr(self, key)
-                    for key in ("grain_contrast", "grain_period_mm", "grain_seed")
-                },
-            ),
+            board=board,
+            holes=self._holes(),
+            tapes=self._tapes(),
+            material=material,
             backing=backing,
-            room=custom.RoomConfig(**room)
-            if room["floor_below_lens_m"] or room["back_wall_distance_m"]
-            else None,
-            pose=custom.PoseConfig(
-                **{key: getattr(self, key) for key in custom.PoseConfig.model_fields}
-            ),
+            room=room,
+            pose=pose,
             other_wavelengths=self.other_wavelengths,
         )
+
+    def _holes(self) -> tuple[custom.HoleConfig, ...]:
+        """Return hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle."""
+        middle = (len(DIAMETERS_IN) - 1) / 2
+        holes = []
+        for index, diameter_in in enumerate(DIAMETERS_IN):
+            x_mm = round((index - middle) * self.hole_spacing_mm, 6)
+            hole = custom.HoleConfig(
+                id=index + 1,
+                diameter_mm=round(diameter_in * INCH / MM, 6),
+                centre_mm=(x_mm, self.row_offset_y_mm),
+                kind=self.hole_kind,
+                depth_mm=self.blind_depth_mm if self.hole_kind == "blind" else None,
+            )
+            holes.append(hole)
+        return tuple(holes)
+
+    def _tapes(self) -> tuple[custom.TapeConfig, ...]:
+        """Return the strips: upper left, upper right, lower left, lower right."""
+        tapes = []
+        for side_y in (1, -1):
+            for side_x in (-1, 1):
+                tape = custom.TapeConfig(
+                    centre_mm=(side_x * self.tape_x_mm, side_y * self.tape_y_mm),
+                    size_mm=(self.tape_length_mm, self.tape_width_mm),
+                    rgb=self.tape_rgb,
+                    albedo_850=self.tape_albedo_850,
+                    thickness_mm=self.tape_thickness_mm,
+                )
+                tapes.append(tape)
+        return tuple(tapes)
 
 
 _AnyTarget = ThesisTargetConfig | custom.TargetConfig | DrawnTargetConfig | MeshTargetConfig

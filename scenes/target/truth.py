@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
@@ -21,30 +22,49 @@ OUTLINE_STEPS = 64  # points along each side of the outline
 LINE_STEP = 8  # columns of a flaw's grid between two points of its centre line
 # reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m
 OPEN_FLOOR_M = 3.0
-ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of a face's derivatives in x and y
-_UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+# of a face's derivatives in x and y
+ORDERS = (
+    (0, 0),  # z
+    (1, 0),  # dz/dx
+    (0, 1),  # dz/dy
+    (2, 0),  # d2z/dx2
+    (1, 1),  # d2z/dxdy
+    (0, 2),  # d2z/dy2
+)
+_UNIT_CORNERS = np.array(
+    [
+        (-0.5, -0.5),
+        (0.5, -0.5),
+        (0.5, 0.5),
+        (-0.5, 0.5),
+    ]
+)
+
+
+Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Derivatives = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+"""Give z, or z and its derivatives (`ORDERS`), above x and y, each of their shape; NaN beyond the
+face's reach."""
 
 
 @dataclass(frozen=True)
 class Face:
-    """A smooth height field with z(0, 0) = 0. ``derivatives``: gives z and its derivatives
-    (`ORDERS`), each of the shape of x and y, NaN beyond its reach; ``height``: z alone, if that is
-    much quicker. On a ``rough`` face, slope and curvature at one place do not describe the places
-    around it. Arguments of the methods broadcast."""
+    """A smooth height field with z(0, 0) = 0. Arguments of the methods broadcast."""
 
-    derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+    derivatives: Derivatives
+    """Gives z and its derivatives."""
     rough: bool = False
-    height: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """True if slope and curvature at one place do not describe the places around it."""
+    height: Heights | None = None
+    """Gives z alone, if that is much quicker."""
 
     def _derived(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
-        return self.derivatives(
-            *np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
-        )
+        return self.derivatives(*_broadcast(x_m, y_m))
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return z of the face; NaN where the shape does not reach."""
         if self.height is not None:
-            return self.height(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
+            return self.height(*_broadcast(x_m, y_m))
         return self._derived(x_m, y_m)[0]
 
     def slope(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
@@ -57,20 +77,26 @@ class Face:
 
     def point(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return (..., 3): the face's points above plan positions."""
-        x, y = np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
+        x, y = _broadcast(x_m, y_m)
         return np.stack([x, y, self.height_m(x, y)], axis=-1)
 
     def normal(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return (..., 3): unit normals out of the face."""
         slope = self.slope(x_m, y_m)
         upward = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
-        return upward / np.linalg.norm(upward, axis=-1, keepdims=True)
+        return upward / np.linalg.norm(
+            upward,
+            axis=-1,
+            keepdims=True,
+        )
 
     def axis(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return (..., 3): the direction from which a damage's depth counts: the normal, or z for
         a rough face."""
         normal = self.normal(x_m, y_m)
-        return np.broadcast_to([0.0, 0.0, 1.0], normal.shape).copy() if self.rough else normal
+        if self.rough:
+            return np.broadcast_to([0.0, 0.0, 1.0], normal.shape).copy()
+        return normal
 
     def curvatures(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return (..., 2): principal curvatures in 1/m, positive where the face bulges to the
@@ -78,98 +104,130 @@ class Face:
         Differential Geometry, section 3-3, example 5)."""
         _, fx, fy, fxx, fxy, fyy = self._derived(x_m, y_m)
         metric = 1 + fx**2 + fy**2
-        mean = ((1 + fx**2) * fyy - 2 * fx * fy * fxy + (1 + fy**2) * fxx) / (2 * metric**1.5)
+        bent = (1 + fx**2) * fyy - 2 * fx * fy * fxy + (1 + fy**2) * fxx
+        mean = bent / (2 * metric**1.5)
         gaussian = (fxx * fyy - fxy**2) / metric**2
         spread = np.sqrt(np.maximum(mean**2 - gaussian, 0.0))
         return np.stack([spread - mean, -spread - mean], axis=-1)
+
+
+def _broadcast(x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
+    return np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
 
 
 @lru_cache(maxsize=64)
 def face_of(board: custom.BoardConfig) -> Face:
     """Return the face that a board's declaration describes."""
     shape = board.shape
+    size_m = (board.width_mm * MM, board.height_mm * MM)
     if isinstance(shape, custom.RoughConfig):
-        return _rough_face(shape, (board.width_mm * MM, board.height_mm * MM))
+        return _rough_face(shape, size_m)
     if isinstance(shape, custom.MeshConfig):
         return Face(partial(front_derivatives, shape))
     if isinstance(shape, custom.CorrugatedConfig):
-        bent_along = shape.straight_along
-        wave = 2 * np.pi / (shape.period_mm * MM)
-        high_m = shape.depth_mm * MM / 2
-
-        def corrugated(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-            across = (x if bent_along == "y" else y) * wave
-            none = np.zeros(x.shape)
-            slope = -high_m * wave * np.sin(across)
-            bend = -high_m * wave**2 * np.cos(across)
-            height = high_m * (np.cos(across) - 1)
-            along_x = (height, slope, none, bend, none, none)
-            return along_x if bent_along == "y" else (height, none, slope, none, none, bend)
-
-        return Face(corrugated)
+        return _corrugated_face(shape)
     if isinstance(shape, custom.PanelConfig):
-        bends = -1 / (shape.radius_x_mm * MM), -1 / (shape.radius_y_mm * MM)
-        high_m = shape.swage_mm * MM / 2
-        y0 = shape.swage_y_mm * MM
-        wide_m = shape.swage_width_mm * MM
-
-        def panel(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-            step = np.tanh((y - y0) / wide_m)
-            height = (bends[0] * x**2 + bends[1] * y**2) / 2 + high_m * (
-                step + np.tanh(y0 / wide_m)
-            )
-            slope_y = bends[1] * y + high_m / wide_m * (1 - step**2)
-            bend_y = bends[1] - 2 * high_m / wide_m**2 * step * (1 - step**2)
-            return (
-                height,
-                bends[0] * x,
-                slope_y,
-                np.full(x.shape, bends[0]),
-                np.zeros(x.shape),
-                bend_y,
-            )
-
-        return Face(panel)
+        return _panel_face(shape)
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
-        straight = shape.straight_along if isinstance(shape, custom.CylinderConfig) else ""
-        radius_m = shape.radius_mm * MM
-        sign = 1.0 if shape.bulge == "towards" else -1.0
-        bent_x = float(straight != "x")
-        bent_y = float(straight != "y")
+        return _round_face(shape)
+    if isinstance(shape, custom.PolynomialConfig):
+        return _polynomial_face(shape, size_m)
+    return Face(_flat)
 
-        def round_face(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-            square = radius_m**2 - bent_x * np.square(x) - bent_y * np.square(y)
-            root = np.sqrt(np.where(square > 0, square, np.nan))
-            return (
-                sign * (root - radius_m),
-                -sign * (bent_x * x / root),
-                -sign * (bent_y * y / root),
-                -sign * (bent_x * (1 / root + x**2 / root**3)),
-                -sign * (bent_x * bent_y * x * y / root**3),
-                -sign * (bent_y * (1 / root + y**2 / root**3)),
-            )
 
-        return Face(round_face)
-    half_x = board.width_mm * MM / 2
-    half_y = board.height_mm * MM / 2
-    terms = shape.terms if isinstance(shape, custom.PolynomialConfig) else ()
-    powers = np.array([(0, 0), *((term.power_x, term.power_y) for term in terms)])
-    coefficients = np.zeros(powers.max(axis=0) + 1)
-    for term in terms:
+def _flat(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(np.zeros(x.shape) for _ in ORDERS)
+
+
+def _corrugated_face(shape: custom.CorrugatedConfig) -> Face:
+    """Return the face with z = depth / 2 (cos(wave s) - 1), s across the straight direction."""
+    wave = 2 * np.pi / (shape.period_mm * MM)
+    high_m = shape.depth_mm * MM / 2
+
+    def corrugated(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        none = np.zeros(x.shape)
+        phase = (x if shape.straight_along == "y" else y) * wave
+        height = high_m * (np.cos(phase) - 1)
+        slope = -high_m * wave * np.sin(phase)
+        bend = -high_m * wave**2 * np.cos(phase)
+        if shape.straight_along == "y":
+            return height, slope, none, bend, none, none
+        return height, none, slope, none, none, bend
+
+    return Face(corrugated)
+
+
+def _panel_face(shape: custom.PanelConfig) -> Face:
+    """Return a face bent in both directions with a step along x (`scenes.target.custom`)."""
+    bend_x = -1 / (shape.radius_x_mm * MM)
+    bend_y = -1 / (shape.radius_y_mm * MM)
+    high_m = shape.swage_mm * MM / 2
+    y0_m = shape.swage_y_mm * MM
+    width_m = shape.swage_width_mm * MM
+
+    def panel(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        step = np.tanh((y - y0_m) / width_m)
+        bowl = (bend_x * x**2 + bend_y * y**2) / 2
+        return (
+            bowl + high_m * (step + np.tanh(y0_m / width_m)),
+            bend_x * x,
+            bend_y * y + high_m / width_m * (1 - step**2),
+            np.full(x.shape, bend_x),
+            np.zeros(x.shape),
+            bend_y - 2 * high_m / width_m**2 * step * (1 - step**2),
+        )
+
+    return Face(panel)
+
+
+def _round_face(shape: custom.CylinderConfig | custom.SphereConfig) -> Face:
+    """Return the face with z = +-(sqrt(R^2 - x^2 - y^2) - R), of a cylinder without the direction
+    along which it is straight."""
+    straight = shape.straight_along if isinstance(shape, custom.CylinderConfig) else ""
+    radius_m = shape.radius_mm * MM
+    sign = 1.0 if shape.bulge == "towards" else -1.0
+    bent_x = float(straight != "x")
+    bent_y = float(straight != "y")
+
+    def round_(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        square = radius_m**2 - bent_x * np.square(x) - bent_y * np.square(y)
+        root = np.sqrt(np.where(square > 0, square, np.nan))
+        return (
+            sign * (root - radius_m),
+            -sign * (bent_x * x / root),
+            -sign * (bent_y * y / root),
+            -sign * (bent_x * (1 / root + x**2 / root**3)),
+            -sign * (bent_x * bent_y * x * y / root**3),
+            -sign * (bent_y * (1 / root + y**2 / root**3)),
+        )
+
+    return Face(round_)
+
+
+def _polynomial_face(
+    shape: custom.PolynomialConfig,
+    size_m: tuple[float, float],
+) -> Face:
+    """Return the face whose height is the sum of the declared terms."""
+    half_x = size_m[0] / 2
+    half_y = size_m[1] / 2
+    highest_x = max(term.power_x for term in shape.terms)
+    highest_y = max(term.power_y for term in shape.terms)
+    coefficients = np.zeros((highest_x + 1, highest_y + 1))
+    for term in shape.terms:
         scale = MM / half_x**term.power_x / half_y**term.power_y
         coefficients[term.power_x, term.power_y] += term.coefficient_mm * scale
+    if not coefficients.any():
+        return Face(_flat)
+    derived = []
+    for order_x, order_y in ORDERS:
+        in_x = polynomial.polyder(coefficients, order_x, axis=0)
+        derived.append(polynomial.polyder(in_x, order_y, axis=1))
 
-    def polynomial(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        if not coefficients.any():
-            return tuple(np.zeros(x.shape) for _ in ORDERS)
-        derived = (np.polynomial.polynomial.polyder(coefficients, dx, axis=0) for dx, _ in ORDERS)
-        along = (
-            np.polynomial.polynomial.polyder(c, dy, axis=1)
-            for c, (_, dy) in zip(derived, ORDERS, strict=True)
-        )
-        return tuple(np.asarray(np.polynomial.polynomial.polyval2d(x, y, c)) for c in along)
+    def sum_of_terms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        return tuple(np.asarray(polynomial.polyval2d(x, y, terms)) for terms in derived)
 
-    return Face(polynomial)
+    return Face(sum_of_terms)
 
 
 # beyond the board; knots of the spline to the shortest wavelength
@@ -182,23 +240,37 @@ def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
     from scipy.interpolate import RectBivariateSpline
 
     step_m = shape.inner_mm * MM / ROUGH_STEPS
-    counts = [2 * math.ceil((side / 2 + ROUGH_MARGIN_M) / step_m) + 1 for side in size_m]
-    k = np.hypot(
-        *np.meshgrid(*(2 * np.pi * np.fft.fftfreq(n, step_m) for n in counts), indexing="ij")
-    )
+    middles = [math.ceil((side / 2 + ROUGH_MARGIN_M) / step_m) for side in size_m]
+    counts = [2 * middle + 1 for middle in middles]
+    waves = [2 * np.pi * np.fft.fftfreq(count, step_m) for count in counts]
+    k = np.hypot(*np.meshgrid(*waves, indexing="ij"))
     outer = 2 * np.pi / (shape.outer_mm * MM)
     inner = 2 * np.pi / (shape.inner_mm * MM)
-    amplitude = np.where((k > 0) & (k <= inner), (k**2 + outer**2) ** (-(1 + shape.hurst) / 2), 0.0)
+    spectrum = (k**2 + outer**2) ** (-(1 + shape.hurst) / 2)
+    amplitude = np.where((k > 0) & (k <= inner), spectrum, 0.0)
     noise = random_stream(shape.seed, "rough face").standard_normal(counts)
     heights = np.fft.ifft2(np.fft.fft2(noise) * amplitude).real
     heights *= shape.deviation_mm * MM / heights.std()
-    places = [step_m * (np.arange(n) - n // 2) for n in counts]
-    spline = RectBivariateSpline(*places, heights - heights[counts[0] // 2, counts[1] // 2])
+    heights -= heights[middles[0], middles[1]]
+    knots = [step_m * (np.arange(count) - count // 2) for count in counts]
+    spline = RectBivariateSpline(knots[0], knots[1], heights)
 
     def rough(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(spline.ev(x, y, dx=dx, dy=dy) for dx, dy in ORDERS)
+        return tuple(
+            spline.ev(
+                x,
+                y,
+                dx=dx,
+                dy=dy,
+            )
+            for dx, dy in ORDERS
+        )
 
-    return Face(rough, rough=True, height=spline.ev)
+    return Face(
+        rough,
+        rough=True,
+        height=spline.ev,
+    )
 
 
 def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
@@ -219,22 +291,28 @@ def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
 
 
 @lru_cache(maxsize=100)
-def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
+def face_grid_m(
+    board: custom.BoardConfig,
+    depth_m: float = 0.0,
+    steps: int = 32,
+) -> np.ndarray:
     """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the
     board; board frame."""
     face = face_of(board)
-    places = np.linspace(-0.5, 0.5, steps + 1)
-    x, y = np.meshgrid(places * board.width_mm * MM, places * board.height_mm * MM)
-    points = face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
+    shares = np.linspace(-0.5, 0.5, steps + 1)
+    x, y = np.meshgrid(shares * board.width_mm * MM, shares * board.height_mm * MM)
+    points = face.point(x, y)
+    if depth_m:
+        points = points - depth_m * face.normal(x, y)
     if isinstance(board.shape, custom.MeshConfig):  # where its front is not, its bounds count
-        points = np.where(
-            np.isnan(points[..., 2:]), np.dstack([x, y, np.full(x.shape, -depth_m)]), points
-        )
+        bounds = np.dstack([x, y, np.full(x.shape, -depth_m)])
+        points = np.where(np.isnan(points[..., 2:]), bounds, points)
     return points
 
 
 def backing_corners_board_m(
-    config: custom.TargetConfig, backing: custom.BackingConfig
+    config: custom.TargetConfig,
+    backing: custom.BackingConfig,
 ) -> np.ndarray:
     """Return the backing's corners in the board's frame; it faces the board."""
     deepest_m = -float(face_grid_m(config.board, config.board.thickness_mm * MM)[..., 2].min())
@@ -251,55 +329,67 @@ def planes_of(config: custom.TargetConfig) -> Iterator[tuple[str, np.ndarray, fl
     floor, is centred on the axis."""
     backing = config.backing
     room = config.room
-    across = _UNIT_CORNERS[:, 0]
-    up = _UNIT_CORNERS[:, 1] + 0.5
     if backing is not None:
-        corners = transform_points(
-            config.pose.T_camera_board, backing_corners_board_m(config, backing)
-        )
+        on_board = backing_corners_board_m(config, backing)
+        corners = transform_points(config.pose.T_camera_board, on_board)
         yield "backing", corners, backing.albedo_850, backing.rgb
     if room is None:
         return
     floor_m = room.floor_below_lens_m
     wall_m = room.back_wall_distance_m
-    across_m = room.width_m * across
+    across_m = room.width_m * _UNIT_CORNERS[:, 0]
+    up = _UNIT_CORNERS[:, 1] + 0.5
     if floor_m is not None:
-        corners = np.column_stack([across_m, np.full(4, floor_m), (wall_m or OPEN_FLOOR_M) * up])
+        z_m = (wall_m or OPEN_FLOOR_M) * up
+        corners = np.column_stack([across_m, np.full(4, floor_m), z_m])
         yield "floor", corners, room.floor_albedo_850, room.floor_rgb
     if wall_m is not None:
         foot_m = room.height_m / 2 if floor_m is None else floor_m
-        corners = np.column_stack([across_m, foot_m - room.height_m * up, np.full(4, wall_m)])
+        y_m = foot_m - room.height_m * up
+        corners = np.column_stack([across_m, y_m, np.full(4, wall_m)])
         yield "back_wall", corners, room.back_wall_albedo_850, room.back_wall_rgb
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A hole, a dent or another damage. ``centre_*`` (3,): on the undamaged face. ``axis_*`` (3,):
-    the face's unit normal there, out of the board. ``diameter_m``: of the drill, of a dent's rim
-    on this face (by equal area), or of other kinds the size in plan that ``size_of`` names.
-    ``depth_m``: along the axis; for corrosion the mean, for ``raised`` damage its height, for
-    through-damage the board's thickness. ``volume_m3`` of holes and dents: exact on a flat face,
-    to second order in diameter over radius of curvature on a curved one; of other kinds as
-    `scenes.target.flaws` meshes them, of a pressed sheet on its front. Kinds with an outline of
-    their own have it and their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m``
-    (k, 2), else None), and their sides."""
+    """A hole, a dent or another damage: its true place and size."""
 
     id: int
+    """Its number in the declaration."""
     kind: str
+    """Its kind: "through", "blind", "dent" or a kind of `scenes.target.flaws`."""
     diameter_m: float
+    """Diameter of the drill, of a dent's rim on this face (by equal area), or of other kinds the
+    size in plan that ``size_of`` names."""
     depth_m: float
+    """Depth along the axis; for corrosion the mean, for ``raised`` damage its height, for
+    through-damage the board's thickness."""
     volume_m3: float
+    """Volume of holes and dents: exact on a flat face, to second order in diameter over radius of
+    curvature on a curved one; of other kinds as `scenes.target.flaws` meshes them, of a pressed
+    sheet on its front."""
     centre_board_m: np.ndarray
+    """(3,): centre on the undamaged face."""
     axis_board: np.ndarray
+    """(3,): the face's unit normal there, out of the board."""
     centre_camera_m: np.ndarray
+    """(3,): the same centre in the camera's frame."""
     axis_camera: np.ndarray
+    """(3,): the same axis in the camera's frame."""
     size_of: str = "diameter"
+    """The size in plan that a limit states."""
     raised: bool = False
+    """True if it stands out of the face."""
     outline_board_m: np.ndarray | None = None
+    """(n, 2): outline in plan of kinds with an outline of their own."""
     line_board_m: np.ndarray | None = None
+    """(k, 2): centre line in plan of kinds that have a length."""
     length_m: float = float("nan")
+    """Length of kinds with an outline of their own."""
     width_m: float = float("nan")
+    """Their width."""
     angle_rad: float = 0.0
+    """Angle of the length from board +x."""
 
     @property
     def reach_m(self) -> float:
@@ -308,16 +398,22 @@ class Damage:
             return self.diameter_m / 2
         return float(np.linalg.norm(self.outline_board_m - self.centre_board_m[:2], axis=1).max())
 
-    def within(self, x_m: np.ndarray, y_m: np.ndarray, margin_m: float = 0.0) -> np.ndarray:
+    def within(
+        self,
+        x_m: np.ndarray,
+        y_m: np.ndarray,
+        margin_m: float = 0.0,
+    ) -> np.ndarray:
         """Return which places in plan lie inside the outline, or within ``margin_m`` of it; shaped
         like ``x_m``."""
-        apart = np.sqrt((x_m - self.centre_board_m[0]) ** 2 + (y_m - self.centre_board_m[1]) ** 2)
+        centre_x, centre_y, _ = self.centre_board_m
+        apart_m = np.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
         with np.errstate(invalid="ignore"):
-            near = np.asarray(apart < self.reach_m + margin_m)
+            inside = np.asarray(apart_m < self.reach_m + margin_m)
         if self.outline_board_m is not None:
-            places = np.column_stack([x_m[near], y_m[near]])
-            near[near] = outside_m(self.outline_board_m, places) <= margin_m
-        return near
+            places_m = np.column_stack([x_m[inside], y_m[inside]])
+            inside[inside] = outside_m(self.outline_board_m, places_m) <= margin_m
+        return inside
 
     @property
     def line_m(self) -> np.ndarray:
@@ -330,116 +426,157 @@ class Damage:
             "id": self.id,
             "kind": self.kind,
             "diameter_mm": self.diameter_m / MM,
+            "depth_mm": self.depth_m / MM,
+            "volume_mm3": self.volume_m3 / MM**3,
         }
-        row |= {"depth_mm": self.depth_m / MM, "volume_mm3": self.volume_m3 / MM**3}
         if self.outline_board_m is not None:
-            row |= {
-                "length_mm": self.length_m / MM,
-                "width_mm": self.width_m / MM,
-                "raised": self.raised,
-            }
-            row |= {"angle_deg": math.degrees(self.angle_rad), "size_of": self.size_of}
-        places = {
+            row["length_mm"] = self.length_m / MM
+            row["width_mm"] = self.width_m / MM
+            row["raised"] = self.raised
+            row["angle_deg"] = math.degrees(self.angle_rad)
+            row["size_of"] = self.size_of
+        poses = {
             "board": (self.centre_board_m, self.axis_board),
             "camera": (self.centre_camera_m, self.axis_camera),
         }
-        for frame, (centre_m, axis) in places.items():
-            row |= {
-                f"{a}_{frame}_mm": float(value) / MM
-                for a, value in zip("xyz", centre_m, strict=True)
-            }
-            row |= {f"axis_{a}_{frame}": float(value) for a, value in zip("xyz", axis, strict=True)}
+        for frame, (centre_m, axis) in poses.items():
+            for name, value_m in zip("xyz", centre_m.tolist(), strict=True):
+                row[f"{name}_{frame}_mm"] = value_m / MM
+            for name, value in zip("xyz", axis.tolist(), strict=True):
+                row[f"axis_{name}_{frame}"] = value
         return row
 
 
-def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[Damage, ...]:
+def truth_of(
+    config: custom.TargetConfig,
+    T_camera_board: np.ndarray,
+) -> tuple[Damage, ...]:
     """Return the truth of a declaration: holes, dents, then other kinds, in the order of their
     declaration."""
     face = face_of(config.board)
+    thickness_m = config.board.thickness_mm * MM
     truth = []
     for item in config.damages:
         centre = face.point(*item.centre_m)
         axis = face.axis(*item.centre_m)
-        bends = face.curvatures(*item.centre_m)
-        in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         if isinstance(item, FlawConfig):
-            sizes, outline = _flaw_truth(item, face, config.board.thickness_mm * MM)
-            truth.append(Damage(item.id, item.kind, *sizes, centre, axis, *in_camera, **outline))
-            continue
-        radius_m = item.radius_m
-        depth_m = (config.board.thickness_mm if item.depth_mm is None else item.depth_mm) * MM
-        if isinstance(item, custom.DentConfig):
-            # The sphere's curvature gives paraboloids of the two principal curvatures the same
-            # volume as the face; exact on flat and spherical faces.
-            bend = (math.sqrt(float(np.prod(1 + item.ball_m * bends))) - 1) / item.ball_m
-            radius_m, volume_m3 = _lens(item, bend)
+            measures = _flaw_measures(item, face, thickness_m)
+        elif isinstance(item, custom.DentConfig):
+            measures = _dent_measures(item, face)
         else:
-            # Over a disc of radius a about the normal a face with principal curvatures k lies a^2
-            # (k1 + k2) / 8 lower on average than at the centre. The back of a through-hole is a
-            # parallel surface,
-            # curvatures k / (1 - t k).
-            back = float((bends / (1 - depth_m * bends)).sum()) if item.kind == "through" else 0.0
-            leg_m = item.mouth_m - radius_m
-            volume_m3 = (
-                math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
-            )
-            volume_m3 += math.pi * leg_m**2 * (radius_m + leg_m / 3)
+            measures = _hole_measures(item, face, thickness_m)
         truth.append(
-            Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera)
+            Damage(
+                id=item.id,
+                kind=item.kind,
+                centre_board_m=centre,
+                axis_board=axis,
+                centre_camera_m=transform_points(T_camera_board, centre),
+                axis_camera=rotate_vectors(T_camera_board, axis),
+                **measures,
+            )
         )
     return tuple(truth)
 
 
+def _dent_measures(item: custom.DentConfig, face: Face) -> dict[str, Any]:
+    """Return the size, depth and volume of a dent, by field of `Damage`.
+
+    The sphere's curvature gives paraboloids of the two principal curvatures the same volume as the
+    face; exact on flat and spherical faces."""
+    bends = face.curvatures(*item.centre_m)
+    sphere_bend = (math.sqrt(float(np.prod(1 + item.ball_m * bends))) - 1) / item.ball_m
+    rim_m, volume_m3 = _lens(item, sphere_bend)
+    return {"diameter_m": 2 * rim_m, "depth_m": item.depth_mm * MM, "volume_m3": volume_m3}
+
+
+def _hole_measures(
+    item: custom.HoleConfig,
+    face: Face,
+    thickness_m: float,
+) -> dict[str, Any]:
+    """Return the size, depth and volume of a drilled hole, by field of `Damage`.
+
+    Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) /
+    8 lower on average than at the centre. The back of a through-hole is a parallel surface,
+    curvatures k / (1 - t k)."""
+    bends = face.curvatures(*item.centre_m)
+    radius_m = item.radius_m
+    depth_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
+    front = float(bends.sum())
+    back = 0.0
+    if item.kind == "through":
+        back = float((bends / (1 - depth_m * bends)).sum())
+    mean_depth_m = depth_m + radius_m**2 / 8 * (back - front)
+    chamfer_m = item.mouth_m - radius_m
+    volume_m3 = math.pi * radius_m**2 * mean_depth_m
+    volume_m3 += math.pi * chamfer_m**2 * (radius_m + chamfer_m / 3)
+    return {"diameter_m": 2 * radius_m, "depth_m": depth_m, "volume_m3": volume_m3}
+
+
 def relief_points(
-    item: FlawConfig, face: Face, thickness_m: float
+    item: FlawConfig,
+    face: Face,
+    thickness_m: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return a flaw's grid on the face: points (rows, columns, 3) on it, depths (rows, columns)
     along the axis, that axis (3,) out of the board, and the direction (3,) of t; board frame,
     metres."""
-    relief, (x, y) = item.relief(), item.centre_m
-    axis = face.axis(x, y)
+    relief = item.relief()
+    axis = face.axis(*item.centre_m)
     along = np.array([math.cos(item.turn_rad), math.sin(item.turn_rad), 0.0])
     along[2] = -(axis[:2] @ along[:2]) / axis[2]
     along /= np.linalg.norm(along)
     across = np.cross(axis, along)
-    plan = relief.s_m[..., None] * along[:2] + relief.t_m[..., None] * across[:2] + (x, y)
+    from_centre = relief.s_m[..., None] * along[:2] + relief.t_m[..., None] * across[:2]
+    plan = from_centre + item.centre_m
     depth_m = np.where(np.isnan(relief.depth_m), thickness_m, relief.depth_m)
     return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
 
 
-def _flaw_truth(
-    item: FlawConfig, face: Face, thickness_m: float
-) -> tuple[tuple[float, float, float], dict[str, Any]]:
-    """Return size, depth and volume of a flaw, and the fields that kinds with an outline of their
-    own have."""
+def _flaw_measures(
+    item: FlawConfig,
+    face: Face,
+    thickness_m: float,
+) -> dict[str, Any]:
+    """Return what describes a damage with an outline of its own, by field of `Damage`."""
     points, depth_m, axis, _ = relief_points(item, face, thickness_m)
     plan = points[..., :2]
     moved = points - depth_m[..., None] * axis
     raised = bool(depth_m.min() < 0)
+    solid = closed_grid(moved, points) if raised else closed_grid(points, moved)
     length_mm, width_mm = item.sides_mm
-    deepest_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
-    removed_m3 = volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved)))
-    line_board_m = plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None
-    outline = {
+    line_board_m = None
+    if item.size_of != "diameter":
+        line_board_m = plan[len(plan) // 2, ::LINE_STEP]
+    return {
+        "diameter_m": item.size_mm * MM,
+        "depth_m": thickness_m if item.depth_mm is None else item.depth_mm * MM,
+        "volume_m3": volume_m3(*solid),
         "size_of": item.size_of,
         "raised": raised,
         "outline_board_m": border(plan),
         "line_board_m": line_board_m,
+        "length_m": length_mm * MM,
+        "width_m": width_mm * MM,
+        "angle_rad": item.turn_rad,
     }
-    outline |= {"length_m": length_mm * MM, "width_m": width_mm * MM, "angle_rad": item.turn_rad}
-    return (item.size_mm * MM, deepest_m, removed_m3), outline
 
 
 def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
-    """Return rim radius and volume that a dent's ball shares with a sphere of curvature ``bend``."""
+    """Return rim radius and volume that a dent's ball shares with a sphere of a curvature."""
     depth_m = dent.depth_mm * MM
     half_square = dent.radius_m**2 / (2 * (1 + bend * (dent.ball_m - depth_m)))
     sphere_cap_m = bend * half_square
+    ball_cap_m = depth_m - sphere_cap_m
     rim_square = 2 * half_square - sphere_cap_m**2
-    caps = [
-        math.pi * h * (3 * rim_square + h**2) / 6 for h in (depth_m - sphere_cap_m, sphere_cap_m)
-    ]
-    return math.sqrt(rim_square), sum(caps)
+    volume_m3 = _cap_m3(ball_cap_m, rim_square) + _cap_m3(sphere_cap_m, rim_square)
+    return math.sqrt(rim_square), volume_m3
+
+
+def _cap_m3(height_m: float, rim_square: float) -> float:
+    """Return the volume of a spherical cap with the square of its rim's radius."""
+    return math.pi * height_m * (3 * rim_square + height_m**2) / 6
 
 
 def widest_rim_m(item: custom.AnyDamage, face: Face) -> float:

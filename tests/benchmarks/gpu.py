@@ -101,7 +101,7 @@ def apart(first: Path, second: Path) -> np.ndarray:
     deviation of what their noise makes of it; pixels with less light than 0.03 of a white plane at
     1 m are left out."""
     from scenes.render.cache import read_view
-    from scenes.render.view import range_change_m
+    from scenes.render.range_noise import range_change_m
 
     one = read_view(first)
     two = read_view(second)

@@ -183,7 +183,7 @@ def peers_of_clusters(runs: int) -> None:
     from scipy.spatial import cKDTree
     from sklearn.cluster import DBSCAN
 
-    from detectors.findings.clusters import euclidean_clusters
+    from detectors.pixels.clusters import euclidean_clusters
 
     points = noisy_board(120_000).reshape(-1, 3)
     points = np.ascontiguousarray(points[np.random.default_rng(1).random(len(points)) < 0.02])
@@ -383,10 +383,12 @@ def trials(runs: int) -> None:
             "thesis (the default)": (),
             "local": ("detector={name: local, settings: {crop: {kind: auto, inset_px: 4}}}",),
         }
-        for name, said in detectors.items():
+        for name, detector in detectors.items():
             for way, exact in WAYS.items():
                 spent = seconds(
-                    partial(run_all, trials_of(Path(folder), 1, *said, f"capture.exact={exact}")),
+                    partial(
+                        run_all, trials_of(Path(folder), 1, *detector, f"capture.exact={exact}")
+                    ),
                     runs,
                 )
                 print(

@@ -18,7 +18,7 @@ from detectors.crop import (
     choice_of,
     crop,
 )
-from detectors.masks import holes_filled
+from detectors.pixels.masks import holes_filled
 from detectors.surfaces.smooth_surfaces import smooth_surfaces
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region

@@ -205,7 +205,7 @@ def test_settings_reach_the_way_from_views_to_a_cloud(views: list[str], tmp_path
         "mapping.crop.inset_px=5",
         "surface.degree=1",
     )
-    more = [word for each in settings for word in ("--set", each)]
+    more = [word for setting in settings for word in ("--set", setting)]
     assert detect.main([*views, "--register", "marks", "--out", str(out), *more]) == 0
     facts = json.loads((out / "findings.json").read_text())["settings"]
     assert facts["mapping"]["merge"]["cell_mm"] == 4 and facts["mapping"]["crop"]["inset_px"] == 5

@@ -124,7 +124,8 @@ def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
     light by r^-2."""
     from harness.vocabulary.geometry import Region
     from scenes.optics import NoiseFreeView
-    from scenes.sensor.camera import CameraConfig, load_camera
+    from scenes.sensor.camera import load_camera
+    from scenes.sensor.common.config import CameraConfig
     from scenes.sensor.source import SimulatedUnit
 
     camera, (h, w) = stranger.camera, (stranger.camera.height, stranger.camera.width)

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from harness.runs.processes import ONE_THREAD
-from harness.trials.setup import SetUpRef, load_set_up
+from harness.trials.board import BoardRef, load_board
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD = 600.0
@@ -173,6 +173,6 @@ def pid_after(seconds: float) -> int:
     return os.getpid()
 
 
-def probes_of(set_up: SetUpRef) -> int:
+def probes_of(board: BoardRef) -> int:
     """Load a set-up; how many probes it has."""
-    return len(load_set_up(set_up).probes)
+    return len(load_board(board).probes)

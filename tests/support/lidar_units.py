@@ -9,9 +9,9 @@ import numpy as np
 
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Region
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
+from scenes.sensor.camera import camera_of, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.lidar.facts import ScannedLidar
-from scenes.sensor.source import SimulatedUnit
 
 CAMERA = load_camera("realsense_l515")
 QUIET = CameraConfig(
@@ -20,11 +20,9 @@ QUIET = CameraConfig(
 )
 PATCH = Region(372, 422, 500, 560)
 RAW: dict[str, float | list[float]] = {
-    **{
-        "engine.smoothing_px": [0.0, 0.0],
-        "engine.least_agreeing": 0.0,
-        "engine.confidence_electrons": 0.0,
-    }
+    "engine.smoothing_px": [0.0, 0.0],
+    "engine.least_agreeing": 0.0,
+    "engine.confidence_electrons": 0.0,
 }
 """No smoothing and no gate that looks at neighbours."""
 FINE = {"engine.output_step_mm": 1e-3}
@@ -36,14 +34,6 @@ def changed(numbers: dict[str, float | list[float]]) -> ScannedLidar:
     camera = camera_of(CameraConfig(name="realsense_l515", numbers=numbers))
     assert isinstance(camera, ScannedLidar)
     return camera
-
-
-def z_of(unit: SimulatedUnit, frames: int = 1, seed: int = 1) -> np.ndarray:
-    return np.stack([f.z_m for f in unit.capture(frames, seed).frames()]).astype(float)
-
-
-def true_z_m(unit: SimulatedUnit) -> np.ndarray:
-    return (unit.view.range_m / np.sqrt(1 + (unit.view.slopes**2).sum(-1)))[unit.cut]
 
 
 def mixed(first: NoiseFreeView, second: NoiseFreeView, share: np.ndarray | float) -> NoiseFreeView:

@@ -51,8 +51,8 @@ def strips(
 
     def paint(xy: np.ndarray) -> np.ndarray:
         colours = np.broadcast_to(np.array(wood, float), (*xy.shape[:-1], 3)).copy()
-        for place in places:
-            local = np.abs((xy - place) @ turn)
+        for position in places:
+            local = np.abs((xy - position) @ turn)
             colours[(local[..., 0] < half_size[0]) & (local[..., 1] < half_size[1])] = colour
         return colours
 

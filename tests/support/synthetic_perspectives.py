@@ -1,4 +1,4 @@
-"""Result tables of an experiment with maps whose answers are known, and a map of them to look at."""
+"""Result tables of an experiment with maps whose answers are known, and a map to look at."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from harness.evaluation.maps import MERGE, REGISTRATION, VIEWS
-from harness.report.clouds import MappedExample
-from harness.report.view3d import Circle3d, Scene3d
+from harness.records.examples import Circle3d, MappedExample, Scene3d
 from tests.support.synthetic_tables import DIAMETERS_MM, OFFSETS_MM, Tables, World, joined, tables
 
 MAP_AXES = pd.DataFrame(
@@ -104,7 +103,7 @@ def with_variation(
 ) -> Tables:
     """The same tables with one more variation."""
     views, method, merge = place
-    more = placed(
+    variation = placed(
         mapped(world, views, method, merge, frames, label),
         views,
         method,
@@ -112,16 +111,16 @@ def with_variation(
         of=of,
         is_variation=True,
     )
-    own = (
+    new_registrations = (
         registrations(world, (views,), method, frames, merge, label)
         if views > 1
         else pd.DataFrame()
     )
     return replace(
-        joined(replace(found, noise=more.noise), more),
+        joined(replace(found, noise=variation.noise), variation),
         axes=MAP_AXES,
         noise=pd.DataFrame(),
-        registrations=pd.concat([found.registrations, own], ignore_index=True),
+        registrations=pd.concat([found.registrations, new_registrations], ignore_index=True),
     )
 
 

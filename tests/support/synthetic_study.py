@@ -107,12 +107,12 @@ def study_record(study: Study | None = None) -> StudyRecord:
             "seed": study.seed,
             "versions": {"tofpod": "0.1.0"},
         },
-        set_ups=tuple(_record(study, one) for one in study.set_ups),
+        set_ups=tuple(_record(study, set_up) for set_up in study.set_ups),
     )
 
 
-def _record(study: Study, one: SetUp) -> SetUpRecord:
-    calls = _calls(study, one, "hole_free")
+def _record(study: Study, set_up: SetUp) -> SetUpRecord:
+    calls = _calls(study, set_up, "hole_free")
     calls = calls[calls["score"] > THRESHOLD]
     board, repeat = _runs(study, "hole_free")
     count = [
@@ -120,18 +120,18 @@ def _record(study: Study, one: SetUp) -> SetUpRecord:
         for b, r in zip(board, repeat, strict=True)
     ]
     return SetUpRecord(
-        variant=one.variant,
-        frames=one.frames,
-        axes=dict(one.axes),
-        detector=one.detector,
-        detector_version=one.detector_version,
+        variant=set_up.variant,
+        frames=set_up.frames,
+        axes=dict(set_up.axes),
+        detector=set_up.detector,
+        detector_version=set_up.detector_version,
         threshold=THRESHOLD,
         threshold_mm=1.0,
         calibration_runs=60,
         failed=0,
         targets_digest=f"targets-{study.seed}-{study.boards}-{study.holes}",
-        frames_digest=f"{one.frames_digest}-{study.seed}",
-        inspected=_inspected(study, one),
+        frames_digest=f"{set_up.frames_digest}-{study.seed}",
+        inspected=_inspected(study, set_up),
         unflawed=Unflawed(board, repeat, np.array(count, int), np.full(len(board), AREA_M2)),
         calibrated=CALIBRATED,
     )
@@ -150,10 +150,10 @@ def _places(study: Study) -> pd.DataFrame:
     rng = np.random.default_rng([study.seed, 1])
     n = study.boards * study.holes
     cells = [(x, y) for x in (-180.0, -60.0, 60.0, 180.0) for y in (-180.0, -60.0, 60.0, 180.0)]
-    at = np.array(
+    centre_mm = np.array(
         [[cells[k] for k in rng.permutation(16)[: study.holes]] for _ in range(study.boards)]
     ).reshape(n, 2)
-    at += rng.uniform(-30.0, 30.0, (n, 2))
+    centre_mm += rng.uniform(-30.0, 30.0, (n, 2))
     depth = np.full(n, 5.0) if study.depths_mm is None else rng.uniform(*study.depths_mm, n)
     return pd.DataFrame(
         {
@@ -161,55 +161,59 @@ def _places(study: Study) -> pd.DataFrame:
             "hole": np.tile([str(1 + k) for k in range(study.holes)], study.boards),
             "true_diameter_mm": rng.permutation(np.linspace(*study.sizes_mm, n)),
             "true_depth_mm": depth,
-            "true_x_mm": at[:, 0],
-            "true_y_mm": at[:, 1],
+            "true_x_mm": centre_mm[:, 0],
+            "true_y_mm": centre_mm[:, 1],
         }
     )
 
 
-def _signals(study: Study, one: SetUp) -> pd.DataFrame:
+def _signals(study: Study, set_up: SetUp) -> pd.DataFrame:
     """Every inspection of every damage, with its signal."""
-    places = _places(study)
-    n = len(places)
+    damages = _places(study)
+    n = len(damages)
     common = np.random.default_rng([study.seed, 2]).standard_normal((n, study.repeats))
-    own = np.random.default_rng([study.seed, 3, one.frames, *one.variant.encode()]).standard_normal(
-        (n, study.repeats)
-    )
+    own_luck = np.random.default_rng(
+        [study.seed, 3, set_up.frames, *set_up.variant.encode()]
+    ).standard_normal((n, study.repeats))
     luck = stats.logistic.ppf(
-        stats.norm.cdf(np.sqrt(1 - one.own_noise) * common + np.sqrt(one.own_noise) * own)
+        stats.norm.cdf(
+            np.sqrt(1 - set_up.own_noise) * common + np.sqrt(set_up.own_noise) * own_luck
+        )
     )
-    shift = one.boards_mm * np.random.default_rng([study.seed, 4]).standard_normal(study.boards)
-    easier = one.mm_per_depth_mm * (places["true_depth_mm"] - 5.0)
-    above = places["true_diameter_mm"] - one.a50_mm - shift[places["board"]] + easier
-    signal = THRESHOLD + SIGNAL_PER_MM * (above.to_numpy()[:, None] + one.width_mm * luck)
+    shift = set_up.boards_mm * np.random.default_rng([study.seed, 4]).standard_normal(study.boards)
+    easier = set_up.mm_per_depth_mm * (damages["true_depth_mm"] - 5.0)
+    above = damages["true_diameter_mm"] - set_up.a50_mm - shift[damages["board"]] + easier
+    signal = THRESHOLD + SIGNAL_PER_MM * (above.to_numpy()[:, None] + set_up.width_mm * luck)
     noise = np.random.default_rng([study.seed, 5]).normal(2.5, 0.4, (n, study.repeats))
-    rows = places.loc[np.repeat(np.arange(n), study.repeats)].reset_index(drop=True)
+    rows = damages.loc[np.repeat(np.arange(n), study.repeats)].reset_index(drop=True)
     rows["repeat"] = np.tile(np.arange(study.repeats), n)
     rows["signal"] = np.maximum(signal, noise).ravel()
     return rows
 
 
-def _inspected(study: Study, one: SetUp) -> Inspected:
-    rows = _signals(study, one)
-    truth = (rows[f"true_{name}_mm"].to_numpy(float) for name in ("diameter", "depth", "x", "y"))
-    hit = (rows["signal"] > THRESHOLD).to_numpy()
-    signal = rows["signal"].to_numpy(float)
+def _inspected(study: Study, set_up: SetUp) -> Inspected:
+    rows = _signals(study, set_up)
     return Inspected(
-        rows["board"].to_numpy(),
-        rows["hole"].to_numpy(str),
-        rows["repeat"].to_numpy(),
-        *truth,
-        hit,
-        signal,
+        board=rows["board"].to_numpy(),
+        hole=rows["hole"].to_numpy(str),
+        repeat=rows["repeat"].to_numpy(),
+        diameter_mm=rows["true_diameter_mm"].to_numpy(float),
+        depth_mm=rows["true_depth_mm"].to_numpy(float),
+        x_mm=rows["true_x_mm"].to_numpy(float),
+        y_mm=rows["true_y_mm"].to_numpy(float),
+        hit=(rows["signal"] > THRESHOLD).to_numpy(),
+        signal=rows["signal"].to_numpy(float),
     )
 
 
-def _calls(study: Study, one: SetUp, role: str) -> pd.DataFrame:
+def _calls(study: Study, set_up: SetUp, role: str) -> pd.DataFrame:
     """False findings above `LOWEST` of every run of a role, evenly over the face."""
     label = {"damaged": 6, "hole_free": 7}[role]
-    rng = np.random.default_rng([study.seed, label, one.frames, *one.variant.encode()])
+    rng = np.random.default_rng([study.seed, label, set_up.frames, *set_up.variant.encode()])
     board, repeat = _runs(study, role)
-    count = rng.poisson(one.false_calls_per_m2 * np.exp(THRESHOLD - LOWEST) * AREA_M2, len(board))
+    count = rng.poisson(
+        set_up.false_calls_per_m2 * np.exp(THRESHOLD - LOWEST) * AREA_M2, len(board)
+    )
     n = int(count.sum())
     return pd.DataFrame(
         {
@@ -227,19 +231,18 @@ def _calls(study: Study, one: SetUp, role: str) -> pd.DataFrame:
 def study_tables(study: Study | None = None) -> ResultTables:
     """The tables of the same study as `study_record`'s: the same hits, false calls and signals."""
     study = study or Study()
-    parts = [_tables(study, one) for one in study.set_ups]
+    parts = [_tables(study, set_up) for set_up in study.set_ups]
     names = ("holes", "sites", "runs", "findings", "operating", "pixels")
-    found = {
-        name: pd.concat([part[k] for part in parts], ignore_index=True)
-        for k, name in enumerate(names)
-    }
-    return ResultTables(
-        **dict.fromkeys(("probes", "variants", "noise", "axes"), pd.DataFrame()), **found
-    )
+    tables = {}
+    for index, name in enumerate(names):
+        tables[name] = pd.concat([part[index] for part in parts], ignore_index=True)
+    for name in ("probes", "variants", "noise", "axes"):
+        tables[name] = pd.DataFrame()
+    return ResultTables(**tables)
 
 
-def _tables(study: Study, one: SetUp) -> tuple[pd.DataFrame, ...]:
-    holes = _signals(study, one)
+def _tables(study: Study, set_up: SetUp) -> tuple[pd.DataFrame, ...]:
+    holes = _signals(study, set_up)
     holes["detected"] = holes["signal"] > THRESHOLD
     holes["kind"] = "hole"
     # errors of 0.1 to 0.5 mm; of the largest no diameter is known
@@ -250,18 +253,18 @@ def _tables(study: Study, one: SetUp) -> tuple[pd.DataFrame, ...]:
         np.abs(error_mm) < 0.45
     )
     calls = pd.concat(
-        [_calls(study, one, role) for role in ("hole_free", "damaged")], ignore_index=True
+        [_calls(study, set_up, role) for role in ("hole_free", "damaged")], ignore_index=True
     )
-    found = holes[holes["signal"] > LOWEST]
+    findings = holes[holes["signal"] > LOWEST]
     matched = pd.DataFrame(
         {
             "role": "damaged",
-            "board": found["board"],
-            "repeat": found["repeat"],
-            "x_mm": found["true_x_mm"],
-            "y_mm": found["true_y_mm"],
-            "score": found["signal"],
-            "hole": found["hole"],
+            "board": findings["board"],
+            "repeat": findings["repeat"],
+            "x_mm": findings["true_x_mm"],
+            "y_mm": findings["true_y_mm"],
+            "score": findings["signal"],
+            "hole": findings["hole"],
         }
     )
     findings = pd.concat([calls, matched], ignore_index=True)
@@ -271,9 +274,9 @@ def _tables(study: Study, one: SetUp) -> tuple[pd.DataFrame, ...]:
         _run_rows(study, findings),
         findings[findings["score"] > THRESHOLD],
         _operating(study, findings),
-        _pixels(study, one, holes),
+        _pixels(study, set_up, holes),
     )
-    return tuple(table.assign(variant=one.variant, frames=one.frames) for table in out)
+    return tuple(table.assign(variant=set_up.variant, frames=set_up.frames) for table in out)
 
 
 def _sites(study: Study, calls: pd.DataFrame) -> pd.DataFrame:
@@ -284,13 +287,16 @@ def _sites(study: Study, calls: pd.DataFrame) -> pd.DataFrame:
     sites = sites.merge(pd.DataFrame({"repeat": np.arange(study.repeats)}), how="cross")
     noise = np.random.default_rng([study.seed, 8]).normal(2.5, 0.4, len(sites))
     highest = np.full(len(sites), -np.inf)
-    names = ("board", "repeat", "x_mm", "y_mm", "score")
-    boards, repeats, x_mm, y_mm, scores = (calls[name].to_numpy() for name in names)
-    for row, (board, repeat, x, y) in enumerate(
-        sites[["board", "repeat", "true_x_mm", "true_y_mm"]].to_numpy()
-    ):
-        near = (boards == board) & (repeats == repeat) & (np.hypot(x_mm - x, y_mm - y) <= RADIUS_MM)
-        highest[row] = scores[near].max(initial=-np.inf)
+    boards = calls["board"].to_numpy()
+    repeats = calls["repeat"].to_numpy()
+    x_mm = calls["x_mm"].to_numpy()
+    y_mm = calls["y_mm"].to_numpy()
+    scores = calls["score"].to_numpy()
+    columns = ["board", "repeat", "true_x_mm", "true_y_mm"]
+    for row, (board, repeat, x, y) in enumerate(sites[columns].to_numpy()):
+        same_run = (boards == board) & (repeats == repeat)
+        within_radius = same_run & (np.hypot(x_mm - x, y_mm - y) <= RADIUS_MM)
+        highest[row] = scores[within_radius].max(initial=-np.inf)
     return sites.assign(signal=np.maximum(highest, noise), detected=highest > THRESHOLD)
 
 
@@ -299,12 +305,15 @@ def _of_runs(
 ) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
     """Every run's role, board and repeat, and the scores and holes of its findings (as arrays,
     which is fast)."""
-    names = ("role", "board", "repeat", "score", "hole")
-    roles, boards, repeats, scores, holes = (findings[name].to_numpy() for name in names)
+    roles = findings["role"].to_numpy()
+    boards = findings["board"].to_numpy()
+    repeats = findings["repeat"].to_numpy()
+    scores = findings["score"].to_numpy()
+    holes = findings["hole"].to_numpy()
     for role in ("hole_free", "damaged"):
         for board, repeat in zip(*_runs(study, role), strict=True):
-            here = (roles == role) & (boards == board) & (repeats == repeat)
-            yield role, board, repeat, scores[here], holes[here]
+            of_run = (roles == role) & (boards == board) & (repeats == repeat)
+            yield role, board, repeat, scores[of_run], holes[of_run]
 
 
 def _run_rows(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
@@ -312,14 +321,23 @@ def _run_rows(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
     for role, board, repeat, score, hole in _of_runs(
         study, findings[findings["score"] > THRESHOLD]
     ):
-        false_calls = int((hole == "").sum())
         rows.append(
-            (role, board, repeat, THRESHOLD, AREA_M2, len(score), false_calls, 0.2, 0.3, 0.01, 0.05)
+            {
+                "role": role,
+                "board": board,
+                "repeat": repeat,
+                "threshold": THRESHOLD,
+                "inspected_m2": AREA_M2,
+                "detections": len(score),
+                "false_calls": int((hole == "").sum()),
+                "scale_mm": 0.2,
+                "surface_noise_mm": 0.3,
+                "seconds_frames": 0.01,
+                "seconds_detect": 0.05,
+                "quiet_threshold": 4.5,
+            }
         )
-    names = "role board repeat threshold inspected_m2 detections false_calls scale_mm surface_noise_mm seconds_frames "
-    return pd.DataFrame(rows, columns=[*names.split(), "seconds_detect"]).assign(
-        quiet_threshold=4.5
-    )
+    return pd.DataFrame(rows)
 
 
 def _operating(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
@@ -332,14 +350,13 @@ def _operating(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["role", "board", "repeat", "threshold", "findings", "hits"])
 
 
-def _pixels(study: Study, one: SetUp, holes: pd.DataFrame) -> pd.DataFrame:
-    """Scores of pixels as normal distributions, counted exactly: face at 0, damage at ``pixel_d``."""
-    face = pd.DataFrame(
-        {"board": (runs := _runs(study, "damaged"))[0], "repeat": runs[1], "hole": ""}
-    )
+def _pixels(study: Study, set_up: SetUp, holes: pd.DataFrame) -> pd.DataFrame:
+    """Scores of pixels as normal distributions, counted exactly: face 0, damage ``pixel_d``."""
+    board, repeat = _runs(study, "damaged")
+    face = pd.DataFrame({"board": board, "repeat": repeat, "hole": ""})
     damaged = holes[["board", "repeat", "hole"]]
     tables = []
-    for rows, pixels, mean in ((face, FACE_PIXELS, 0.0), (damaged, 1000, one.pixel_d)):
+    for rows, pixels, mean in ((face, FACE_PIXELS, 0.0), (damaged, 1000, set_up.pixel_d)):
         above = np.round(pixels * stats.norm.sf(PIXEL_GRID - mean)).astype(int)
         tables.append(
             rows.assign(

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from harness.evaluation.profile import HoleInView
-from harness.report.clouds import ExampleCloud
+from harness.records.examples import ExampleCloud, HoleInView
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,12 @@ import sys
 import numpy as np
 
 from detectors.averages.average import AverageConfig
-from harness.trials.trial import averages_of
+from harness.trials.averages import averages_of
 from scenes.optics import RenderConfig
 from scenes.render.view import render_view
 from scenes.sensor.amcw.at_once import EVEN, UNEVEN, AtOnce
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.mesh import build_target
 from scenes.target.thesis import ThesisTargetConfig

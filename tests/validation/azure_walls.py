@@ -38,7 +38,8 @@ from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
+from scenes.sensor.camera import load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 
 LENS_CENTRE_PX = (332.0, 326.0)

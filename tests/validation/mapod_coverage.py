@@ -128,7 +128,7 @@ def coverage(
     hits = random.random((campaigns, len(cases), holes)) < chances
     studies = drawn_studies(curve, campaigns, targets, random)
     limits = np.stack(
-        [combined_limits(study, size, some) for study, some in zip(studies, hits, strict=True)]
+        [combined_limits(study, size, hit) for study, hit in zip(studies, hits, strict=True)]
     )
     rows = []
     for number, (case, truth) in enumerate(zip(cases, truths, strict=True)):

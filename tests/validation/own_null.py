@@ -29,12 +29,13 @@ from detectors import load_detector
 from detectors.averages.average import AverageConfig
 from detectors.findings.null import own_threshold
 from detectors.interface import Detector
-from harness.trials.trial import averages_of
+from harness.trials.averages import averages_of
 from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose

@@ -29,14 +29,10 @@ if __name__ == "__main__":
 from harness.vocabulary.geometry import MM, Lens
 from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig, wave_numbers
 from scenes.render.direct import OffFace, cast
+from scenes.render.indirect import PathWork, gather_in_pixels
+from scenes.render.range_noise import range_change_m, range_noise_m
 from scenes.render.scene import LitScene, lit_scene, load_mitsuba
-from scenes.render.view import (
-    PathWork,
-    gather_in_pixels,
-    range_change_m,
-    range_noise_m,
-    render_view,
-)
+from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.mesh import Target, build_target
 from scenes.target.thesis import ThesisTargetConfig
@@ -58,36 +54,43 @@ be credited with."""
 
 @dataclass(frozen=True)
 class Error:
-    """Error of range over some pixels against the reference, mm: root mean square with the
-    reference's own noise taken off, mean with its standard error, and what the render itself told
-    of its noise."""
+    """Error of range over some pixels against the reference."""
 
     title: str
+    """Which pixels."""
     pixels: int
+    """Their number."""
     rms_mm: float
+    """Root mean square, the reference's own noise taken off."""
     mean_mm: float
+    """Mean."""
     mean_error_mm: float
+    """Standard error of the mean."""
     reported_mm: float
+    """Noise that the render reports."""
     reference_mm: float
+    """Noise of the reference."""
 
     def row(self) -> str:
         mean = f"{self.mean_mm:+.4f} +- {self.mean_error_mm:.4f}"
         return (
-            f"| {self.title} | {self.pixels} | **{self.rms_mm:.4f}** | {mean} | {self.reported_mm:.4f} | "
-            f"{self.reference_mm:.4f} |"
+            f"| {self.title} | {self.pixels} | **{self.rms_mm:.4f}** | {mean} | "
+            f"{self.reported_mm:.4f} | {self.reference_mm:.4f} |"
         )
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A target that was rendered, and the seconds that it took: wall, and of all cores together."""
+    """A target that was rendered."""
 
     target: Target
     optics: Optics
     lit: LitScene
     view: NoiseFreeView
     wall_s: float
+    """Seconds that it took."""
     cpu_s: float
+    """Processor seconds of all cores together."""
 
 
 def rendered(facts: dict[str, Any], *, holes: bool = True) -> Scene:
@@ -99,14 +102,25 @@ def rendered(facts: dict[str, Any], *, holes: bool = True) -> Scene:
     render_view(target, optics, config)
     (view, cpu_s), wall_s = _timed(lambda: _cpu(lambda: render_view(target, optics, config)))
     return Scene(
-        target, optics, lit_scene(load_mitsuba(), target.parts, optics), view, wall_s, cpu_s
+        target,
+        optics,
+        lit_scene(load_mitsuba(), target.parts, optics),
+        view,
+        wall_s,
+        cpu_s,
     )
 
 
-def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) -> Error:
+def compared(
+    scene: Scene,
+    title: str,
+    mask: np.ndarray,
+    paths: int,
+    most: int,
+) -> Error:
     """The render against the reference over (at most so many, evenly picked) pixels of a mask (h,
     w)."""
-    rows, cols = np.nonzero(here)
+    rows, cols = np.nonzero(mask)
     picked = slice(None, None, max(len(rows) // most, 1))
     rows = rows[picked]
     cols = cols[picked]
@@ -144,25 +158,22 @@ def in_holes(scene: Scene) -> np.ndarray:
     normal = scene.target.T_camera_board[:3, 2]
     middle = scene.target.T_camera_board[:3, 3]
     on_plane = rays * ((middle @ normal) / (rays @ normal))[..., None]
-    apart = [
-        np.linalg.norm(on_plane - hole.centre_camera_m, axis=-1) for hole in scene.target.truth
-    ]
-    return np.any(
-        [far < hole.diameter_m / 2 for far, hole in zip(apart, scene.target.truth, strict=True)],
-        axis=0,
-    )
+    masks = []
+    for hole in scene.target.truth:
+        off_axis_m = np.linalg.norm(on_plane - hole.centre_camera_m, axis=-1)
+        masks.append(off_axis_m < hole.diameter_m / 2)
+    return np.any(masks, axis=0)
 
 
 def face_parts(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masks (h, w) of a hole-free board: whole pixels of one surface, pixels at edges of tape,
     pixels on its rim."""
     names = scene.view.surface_names
-    board = np.isin(
-        scene.view.surface, [k for k, name in enumerate(names) if name == "board" or "tape" in name]
-    )
-    whole = scene.view.coverage == 1
+    on_board = [k for k, name in enumerate(names) if name == "board" or "tape" in name]
+    board = np.isin(scene.view.surface, on_board)
+    is_whole = scene.view.coverage == 1
     inner = ndimage.binary_erosion(board, np.ones((3, 3), bool), iterations=2)
-    return board & whole & inner, board & ~whole & inner, board & ~inner
+    return board & is_whole & inner, board & ~is_whole & inner, board & ~inner
 
 
 @dataclass(frozen=True)
@@ -176,7 +187,11 @@ class Rival:
     wall_s: float
 
 
-def rival(scene: Scene, paths: int, runs: int = 8) -> Rival:
+def rival(
+    scene: Scene,
+    paths: int,
+    runs: int = 8,
+) -> Rival:
     """Spread of mitransient's range over seeds, on whole pixels of the board, by a lens as wide as
     the region."""
     from transport_oracle import oracle
@@ -184,16 +199,23 @@ def rival(scene: Scene, paths: int, runs: int = 8) -> Rival:
     view = scene.view
     lens = scene.optics.lens
     h, w = view.range_m.shape
-    narrow = Lens(w, h, lens.fx, lens.fx, (w - 1) / 2, (h - 1) / 2)
+    narrow = Lens(
+        w,
+        h,
+        lens.fx,
+        lens.fx,
+        (w - 1) / 2,
+        (h - 1) / 2,
+    )
     optics = replace(scene.optics, lens=narrow)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        other = oracle(scene.lit, optics, optics.frequencies_hz)
+        tracer = oracle(scene.lit, optics, optics.frequencies_hz)
         bounces = RenderConfig().bounces
-        other.phasors(paths, 0, bounces)
+        tracer.phasors(paths, 0, bounces)
         seeds = range(1, runs + 1)
         (phasors, cpu_s), wall_s = _timed(
-            lambda: _cpu(lambda: np.stack([other.phasors(paths, s, bounces) for s in seeds]))
+            lambda: _cpu(lambda: np.stack([tracer.phasors(paths, s, bounces) for s in seeds]))
         )
     middle = phasors[:, :, h // 4 : -h // 4, w // 8 : -w // 8].reshape(
         runs, len(optics.frequencies_hz), -1
@@ -218,13 +240,18 @@ def _cpu(work: Callable[[], Any]) -> tuple[Any, float]:
     return work(), time.process_time() - began
 
 
-def errors(free: Scene, holed: dict[str, Scene], paths: int, most: int) -> list[Error]:
+def errors(
+    free: Scene,
+    holed: dict[str, Scene],
+    paths: int,
+    most: int,
+) -> list[Error]:
     """The table of errors: parts of the hole-free face, then the holes of each kind."""
     titles = ("face, whole pixels", "face, edges of tape", "face, outermost pixels")
-    many = FACE_TIMES * paths
+    face_paths = FACE_TIMES * paths
     rows = [
-        compared(free, title, here, many, most)
-        for title, here in zip(titles, face_parts(free), strict=True)
+        compared(free, title, mask, face_paths, most)
+        for title, mask in zip(titles, face_parts(free), strict=True)
     ]
     for title, scene in holed.items():
         inside = in_holes(scene)
@@ -246,8 +273,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=1 << 16,
         help="of each pixel in holes in the reference, an eighth of those on the face",
     )
-    parser.add_argument("--pixels", type=int, default=300, help="compared of each kind at most")
-    parser.add_argument("--rival-paths", type=int, default=64, help="of each pixel by mitransient")
+    parser.add_argument(
+        "--pixels",
+        type=int,
+        default=300,
+        help="compared of each kind at most",
+    )
+    parser.add_argument(
+        "--rival-paths",
+        type=int,
+        default=64,
+        help="of each pixel by mitransient",
+    )
     options = parser.parse_args(arguments)
     load_mitsuba()
     free = rendered({}, holes=False)
@@ -257,7 +294,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "backing at 50 mm": rendered({"backing_distance_mm": 50.0}),
     }
     print(
-        "| where | pixels | error, mm rms | mean error, mm | reported noise, mm | reference's noise, mm |"
+        "| where | pixels | error, mm rms | mean error, mm | reported noise, mm | "
+        "reference's noise, mm |"
     )
     print("|---|---|---|---|---|---|")
     table = errors(free, holed, options.paths, options.pixels)
@@ -265,18 +303,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\n| view | seconds | processor seconds |\n|---|---|---|")
     for title, scene in {"hole-free": free, **holed}.items():
         print(f"| {title} | {scene.wall_s:.2f} | {scene.cpu_s:.2f} |")
-    other = rival(free, options.rival_paths)
+    tracer = rival(free, options.rival_paths)
     ours_mm = table[0].rms_mm
-    needed = other.paths * (other.noise_mm / ours_mm) ** 2
-    cpu_s = other.cpu_s * needed / other.paths
+    needed = tracer.paths * (tracer.noise_mm / ours_mm) ** 2
+    cpu_s = tracer.cpu_s * needed / tracer.paths
     print(
-        f"\nmitransient: {other.paths} paths a pixel leave {other.noise_mm:.3f} mm in {other.cpu_s:.2f} processor s"
+        f"\nmitransient: {tracer.paths} paths a pixel leave {tracer.noise_mm:.3f} mm "
+        f"in {tracer.cpu_s:.2f} processor s"
     )
     print(
-        f"({other.wall_s:.2f} s); our {ours_mm:.4f} mm would take {needed:.3g} paths, {cpu_s:.3g} processor s by 1/n:"
+        f"({tracer.wall_s:.2f} s); our {ours_mm:.4f} mm would take {needed:.3g} paths, "
+        f"{cpu_s:.3g} processor s by 1/n:"
     )
     print(
-        f"{cpu_s / free.cpu_s:.0f} times ours, {cpu_s / free.cpu_s / FILTER_PIXELS:.0f} with the filter credited."
+        f"{cpu_s / free.cpu_s:.0f} times ours, "
+        f"{cpu_s / free.cpu_s / FILTER_PIXELS:.0f} with the filter credited."
     )
     return 0
 

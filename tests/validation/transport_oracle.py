@@ -42,7 +42,12 @@ class Oracle:
     _frequencies: tuple[float, ...]
     _histogram_from_m: float | None
 
-    def phasors(self, paths: int, seed: int, bounces: int) -> np.ndarray:
+    def phasors(
+        self,
+        paths: int,
+        seed: int,
+        bounces: int,
+    ) -> np.ndarray:
         """(f, h, w) phasors of all light, in the units and with the sign of `scenes.optics`, from
         ``paths`` a pixel."""
         import drjit as dr
@@ -56,7 +61,11 @@ class Oracle:
                 "gaussian_stddev": 0.0,
             }
         )
-        _, raw = integrator.render(self._scene, seed=seed, spp=paths)
+        _, raw = integrator.render(
+            self._scene,
+            seed=seed,
+            spp=paths,
+        )
         dr.eval(raw)
         if self._histogram_from_m is not None:
             values = self._transformed(np.array(raw)[..., 0])
@@ -112,7 +121,11 @@ def oracle(
     )
     if not is_histogram:
         film.frequencies = ArrayXf([mi.Float(f / SPEED_OF_LIGHT_AIR) for f in frequencies_hz])
-    upright = mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0])
+    upright = mi.ScalarTransform4f().look_at(
+        origin=[0, 0, 0],
+        target=[0, 0, 1],
+        up=[0, -1, 0],
+    )
     sensor = {
         "type": "perspective",
         "fov": float(np.rad2deg(2 * np.arctan(lens.width / 2 / lens.fx))),
@@ -125,7 +138,12 @@ def oracle(
     }
     shapes = {f"shape_{k}": _mesh(mi, part) for k, part in enumerate(lit.parts)}
     scene = mi.load_dict(
-        {"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes}
+        {
+            "type": "scene",
+            "sensor": sensor,
+            "emitter": _emitter(mi, optics),
+            **shapes,
+        }
     )
     return Oracle(mi, optics, scene, frequencies_hz, histogram_from_m)
 
@@ -135,7 +153,12 @@ def _mesh(mi: Any, part: TargetPart) -> Any:
     reflectance: dict[str, Any] = {"type": "uniform", "value": float(part.albedo_850)}
     if part.texture_850 is not None:
         bitmap = mi.Bitmap(np.ascontiguousarray(part.texture_850[..., None], np.float32))
-        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+        reflectance = {
+            "type": "bitmap",
+            "bitmap": bitmap,
+            "raw": True,
+            "wrap_mode": "clamp",
+        }
     properties = mi.Properties()
     textured = part.uv is not None
     material = {"type": "diffuse", "reflectance": reflectance}
@@ -143,10 +166,15 @@ def _mesh(mi: Any, part: TargetPart) -> Any:
     vertices = np.asarray(part.mesh.vertices, np.float32)
     faces = np.asarray(part.mesh.faces, np.uint32)
     mesh = mi.Mesh(
-        part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties
+        part.name,
+        len(vertices),
+        len(faces),
+        has_vertex_texcoords=textured,
+        props=properties,
     )
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
+    parameters["vertex_positions"] = vertices.ravel()
+    parameters["faces"] = faces.ravel()
     if part.uv is not None:
         parameters["vertex_texcoords"] = np.asarray(part.uv, np.float32).ravel()
     parameters.update()
@@ -160,7 +188,11 @@ def _emitter(mi: Any, optics: Optics) -> dict[str, Any]:
     if optics.full_half_angle_deg >= 179:
         return {"type": "point", "position": where.tolist(), "intensity": intensity}
     x, y, z = where.tolist()
-    ahead = mi.ScalarTransform4f().look_at(origin=[x, y, z], target=[x, y, z + 1], up=[0, -1, 0])
+    ahead = mi.ScalarTransform4f().look_at(
+        origin=[x, y, z],
+        target=[x, y, z + 1],
+        up=[0, -1, 0],
+    )
     return {
         "type": "spot",
         "to_world": ahead,

@@ -41,23 +41,23 @@ def coverage(
     in mm."""
     rng = np.random.default_rng([seed, units, boards, round(1e4 * spread)])
     ln_a90 = np.log(A50_MM) + norm.ppf(0.9) * WIDTH
-    found = []
+    limits_mm = []
     for _ in range(studies):
         size_mm = np.tile(rng.uniform(*SIZES_MM, boards * HOLES), units)
-        own = np.tile(rng.standard_normal(boards * HOLES), units) * WIDTH * np.sqrt(OF_HOLE)
+        of_damage = np.tile(rng.standard_normal(boards * HOLES), units) * WIDTH * np.sqrt(OF_HOLE)
         unit = np.repeat(np.arange(units), boards * HOLES)
         ln_a50 = (np.log(A50_MM) + spread * rng.standard_normal(units))[unit]
         noise = WIDTH * np.sqrt(1 - OF_HOLE) * rng.standard_normal(len(unit))
-        hit = np.log(size_mm) + own + noise > ln_a50
+        hit = np.log(size_mm) + of_damage + noise > ln_a50
         target = np.tile(np.arange(boards * HOLES), units)
         fit = fit_hit_miss(size_mm, hit, link="probit", log_size=True, inspections=target)
         limits = over_units(size_mm, hit, target, unit, fit.curve, bound(fit))
-        found.append((limits.new_unit.value, limits.a90_95_mm[0]))
-    above = np.log(found) - ln_a90
-    kept = norm.cdf(above / spread) if spread else (above >= 0).astype(float)
-    new, one = kept.mean(axis=0).tolist()
-    median_new, median_one = np.median(found, axis=0).tolist()
-    return new, one, median_new, median_one
+        limits_mm.append((limits.new_unit.value, limits.a90_95_mm[0]))
+    above = np.log(limits_mm) - ln_a90
+    covered = norm.cdf(above / spread) if spread else (above >= 0).astype(float)
+    new, of_one_unit = covered.mean(axis=0).tolist()
+    median_new, median_one = np.median(limits_mm, axis=0).tolist()
+    return new, of_one_unit, median_new, median_one
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -71,9 +71,11 @@ def main(arguments: list[str] | None = None) -> int:
     print("units  boards  spread  covered: over units  one unit  median/mm: over units  one unit")
     for units, boards in ((8, 24), (8, 60), (3, 60)):
         for spread in (0.0, 0.02, 0.05, 0.1):
-            new, one, *medians = coverage(units, boards, spread, options.studies, options.seed)
-            said = f"{units:5d}  {boards:6d}  {spread:6.2f}  {new:19.3f}  {one:8.3f}"
-            print(f"{said}  {medians[0]:21.2f}  {medians[1]:8.2f}", flush=True)
+            new, of_one_unit, *medians = coverage(
+                units, boards, spread, options.studies, options.seed
+            )
+            text = f"{units:5d}  {boards:6d}  {spread:6.2f}  {new:19.3f}  {of_one_unit:8.3f}"
+            print(f"{text}  {medians[0]:21.2f}  {medians[1]:8.2f}", flush=True)
     return 0
 
 

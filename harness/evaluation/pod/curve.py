@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import optimize, special
@@ -20,38 +19,45 @@ LARGEST_PREDICTOR = 500.0
 """Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does
 not overflow."""
 
-_F_AND_INVERSE: dict[
-    str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]
-] = {
-    "logit": (special.expit, special.logit),
-    "probit": (special.ndtr, special.ndtri),
-    "cloglog": (lambda t: -np.expm1(-np.exp(t)), lambda p: np.log(-np.log1p(-p))),
-    "loglog": (lambda t: np.exp(-np.exp(-t)), lambda p: -np.log(-np.log(p))),
+Function = Callable[[np.ndarray], np.ndarray]
+_CDF: dict[str, Function] = {
+    "logit": special.expit,
+    "probit": special.ndtr,
+    "cloglog": lambda t: -np.expm1(-np.exp(t)),
+    "loglog": lambda t: np.exp(-np.exp(-t)),
 }
-LINKS = tuple(_F_AND_INVERSE)
-CELLS = (
-    2**17
-)  # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
+_INVERSE: dict[str, Function] = {
+    "logit": special.logit,
+    "probit": special.ndtri,
+    "cloglog": lambda p: np.log(-np.log1p(-p)),
+    "loglog": lambda p: -np.log(-np.log(p)),
+}
+LINKS = tuple(_CDF)
+# curves times targets, or resampled boards times their targets, in one block: 1 MB per array
+CELLS = 2**17
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
     """Return F(t) for one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t))
     (loglog)."""
     with np.errstate(over="ignore"):
-        return np.asarray(_F_AND_INVERSE[link][0](np.asarray(t, float)))
+        return np.asarray(_CDF[link](np.asarray(t, float)))
 
 
 def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
     """Return F^-1(p) for one of `LINKS`."""
-    return np.asarray(_F_AND_INVERSE[link][1](np.asarray(p, float)))
+    return np.asarray(_INVERSE[link](np.asarray(p, float)))
+
+
+def _limited(predictor: np.ndarray) -> np.ndarray:
+    """Return predictors within `LARGEST_PREDICTOR`; `np.clip` takes five times as long."""
+    return np.asarray(np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR))
 
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in
     both tails."""
-    t = np.minimum(
-        np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR
-    )  # `np.clip` takes five times as long
+    t = _limited(predictor)
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
         log_hit = np.minimum(t, 0.0) - tail
@@ -63,39 +69,43 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
     hazard = np.exp(signed)
     log_none = -hazard
     log_any = np.log(-np.expm1(-hazard))
-    return (
-        (log_any, log_none, signed - hazard)
-        if link == "cloglog"
-        else (log_none, log_any, signed - hazard)
-    )
+    log_density = signed - hazard
+    if link == "cloglog":
+        return log_any, log_none, log_density
+    return log_none, log_any, log_density
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of the predictor's shape."""
-    t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)
+    t = _limited(predictor)
     if link == "logit":  # the most common link: the ratios are the probabilities themselves
         hit = special.expit(t)
         miss = special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
-    bend = {
-        "probit": lambda: -t,
-        "cloglog": lambda: 1.0 - np.exp(t),
-        "loglog": lambda: np.exp(-t) - 1.0,
-    }[link]()
+    if link == "probit":
+        bend = -t
+    elif link == "cloglog":
+        bend = 1.0 - np.exp(t)
+    else:
+        bend = np.exp(-t) - 1.0
     return np.exp(log_density - log_hit), np.exp(log_density - log_miss), bend
 
 
 @dataclass(frozen=True)
 class PodCurve:
-    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``:
-    (2, 2)."""
+    """A curve POD(a) = F((x - mu) / sigma)."""
 
     link: str
+    """Name of F, one of `LINKS`."""
     log_size: bool
+    """True if x is the logarithm of the size."""
     mu: float
+    """Middle of the curve, in the unit of x."""
     sigma: float
+    """Width of the curve, in the unit of x."""
     covariance: np.ndarray
+    """Covariance (2, 2) of mu and sigma."""
 
     def pod(self, size: np.ndarray) -> np.ndarray:
         """Return the POD at sizes of any shape."""
@@ -110,14 +120,18 @@ class PodCurve:
 
 @dataclass(frozen=True)
 class Bound:
-    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why``
-    gives the reason."""
+    """An upper confidence bound on a size, such as a90/95."""
 
     pod: float
+    """The POD of that size."""
     confidence: float
+    """One-sided confidence."""
     method: str
+    """Method by which the bound was computed, in words."""
     value: float
+    """The bound, in the unit of sizes; infinite if there is none."""
     why: str = ""
+    """Reason why there is none; else empty."""
 
     @property
     def demonstrated(self) -> bool:
@@ -137,17 +151,21 @@ PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
 
 @dataclass(frozen=True, eq=False)
 class HitsAndMisses:
-    """Hits and misses of one or several (d) studies on the same rows. ``design`` (n, p): columns
-    of the predictor. ``hits``, ``misses``: (n,) or (d, n) counts. ``penalty`` (a number, or (d,)):
-    multiple of Jeffreys' prior, with p = 2 only: None for no penalty, 1 for Firth's, k if every
-    target has k rows."""
+    """Hits and misses of one or several (d) studies on the same rows, and their likelihood."""
 
     design: np.ndarray
+    """Columns (n, p) of the predictor; the second holds the sizes."""
     hits: np.ndarray
+    """Counts of hits (n,) or (d, n)."""
     misses: np.ndarray
+    """Counts of misses (n,) or (d, n)."""
     link: str
+    """Name of F, one of `LINKS`."""
     penalty: np.ndarray | float | None = None
+    """Multiple of Jeffreys' prior, a number or (d,), with p = 2 only: None for no penalty, 1 for
+    Firth's, k if every target has k rows."""
     offset: float = 0.0
+    """A number that is added to every predictor."""
 
     @property
     def z(self) -> np.ndarray:
@@ -157,15 +175,17 @@ class HitsAndMisses:
     def value(self, b: np.ndarray) -> np.ndarray:
         """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several
         studies (d,) at (d, p)."""
-        found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
-        value = (self.hits * found + self.misses * missed).sum(axis=-1)
+        predictor = b @ self.design.T + self.offset
+        log_hit, log_miss, log_density = logs_of_link(self.link, predictor)
+        value = (self.hits * log_hit + self.misses * log_miss).sum(axis=-1)
         if self.penalty is not None:
-            weight = (self.hits + self.misses) * np.exp(2.0 * density - logs[0] - logs[1])
+            weight = (self.hits + self.misses) * np.exp(2.0 * log_density - log_hit - log_miss)
             total = weight.sum(-1)
             cross = weight @ self.z
             square = weight @ self.z**2
             with np.errstate(divide="ignore", invalid="ignore"):
-                prior = 0.5 * (np.log(total) + np.log(np.maximum(square - cross**2 / total, 0.0)))
+                scatter = np.maximum(square - cross**2 / total, 0.0)
+                prior = 0.5 * (np.log(total) + np.log(scatter))
             value = value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf)
         return np.asarray(value)
 
@@ -173,59 +193,69 @@ class HitsAndMisses:
         """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps.
         They are meaningless if the information is singular, in studies that diverge to infinity.
         """
+        with np.errstate(all="ignore"):
+            if self.penalty is None:
+                return self._newton_step(b)
+            return self._penalised_step(b)
+
+    def _newton_step(self, b: np.ndarray) -> np.ndarray:
+        """Solve the observed information for the gradient of the log-likelihood."""
         up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
         slope = self.hits * up - self.misses * down
-        with np.errstate(all="ignore"):
-            if self.penalty is not None:
-                z = self.z
-                weight = (self.hits + self.misses) * up * down
-                total = weight.sum(axis=1)
-                cross = weight @ z
-                square = weight @ z**2
-                determinant = total * (square - cross**2 / total)
-                leverage = weight * (
-                    square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2
-                )
-                leverage /= determinant[:, None]
-                slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (
-                    2.0 * bend - up + down
-                )
-                first = slope.sum(axis=1)
-                second = slope @ z
-                along = np.stack(
-                    [square * first - cross * second, total * second - cross * first], axis=1
-                )
-                return np.asarray(along / determinant[:, None])
-            if self.link == "logit":  # the same in fewer operations
-                weight = (self.hits + self.misses) * up * down
-            else:
-                weight = self.hits * up * np.maximum(
-                    up - bend, 0.0
-                ) + self.misses * down * np.maximum(down + bend, 0.0)
-            p = self.design.shape[1]
-            if p == 1:
-                return np.asarray((slope @ self.design) / (weight @ self.design**2))
-            products = (self.design[:, :, None] * self.design[:, None, :]).reshape(-1, p * p)
-            information = (weight @ products).reshape(-1, p, p)
-            ridge = (
-                1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-300
-            ) * np.eye(p)
-            return np.asarray(
-                np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0]
-            )
+        if self.link == "logit":  # the same in fewer operations
+            weight = (self.hits + self.misses) * up * down
+        else:
+            of_hits = self.hits * up * np.maximum(up - bend, 0.0)
+            of_misses = self.misses * down * np.maximum(down + bend, 0.0)
+            weight = of_hits + of_misses
+        columns = self.design.shape[1]
+        if columns == 1:
+            return np.asarray((slope @ self.design) / (weight @ self.design**2))
+        products = self.design[:, :, None] * self.design[:, None, :]
+        information = weight @ products.reshape(-1, columns * columns)
+        information = information.reshape(-1, columns, columns)
+        trace = np.trace(information, axis1=1, axis2=2)[:, None, None]
+        ridge = (1e-12 * trace + 1e-300) * np.eye(columns)
+        gradient = (slope @ self.design)[:, :, None]
+        return np.asarray(np.linalg.solve(information + ridge, gradient)[:, :, 0])
 
-    def of(self, rows: np.ndarray) -> HitsAndMisses:
-        """Return the studies ``rows``."""
-        penalty = (
-            None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
-        )
-        return replace(self, hits=self.hits[rows], misses=self.misses[rows], penalty=penalty)
+    def _penalised_step(self, b: np.ndarray) -> np.ndarray:
+        """Solve the expected information (total, cross; cross, square) for the gradient of the
+        penalised log-likelihood, whose penalty adds half of each row's leverage times
+        d ln(weight) / dt."""
+        up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
+        slope = self.hits * up - self.misses * down
+        z = self.z
+        weight = (self.hits + self.misses) * up * down
+        total = weight.sum(axis=1)
+        cross = weight @ z
+        square = weight @ z**2
+        determinant = total * (square - cross**2 / total)
+        leverage = weight * (square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2)
+        leverage /= determinant[:, None]
+        half_penalty = 0.5 * np.asarray(self.penalty)[:, None]
+        slope = slope + half_penalty * leverage * (2.0 * bend - up + down)
+        by_intercept = slope.sum(axis=1)
+        by_slope = slope @ z
+        adjugate_times_gradient = [
+            square * by_intercept - cross * by_slope,
+            total * by_slope - cross * by_intercept,
+        ]
+        return np.asarray(np.stack(adjugate_times_gradient, axis=1) / determinant[:, None])
 
-    def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return values and steps of the studies ``which``, for `ascend`."""
-        chosen = self if self.penalty is None and len(which) == len(self.hits) else self.of(which)
-        value = chosen.value(places)
-        return np.where(np.isfinite(value), value, -np.inf), chosen.step(places)
+    def select(self, studies: np.ndarray) -> HitsAndMisses:
+        """Return the data of these ``studies`` (indices or (d,) bool)."""
+        penalty = self.penalty
+        if penalty is not None:
+            penalty = np.broadcast_to(penalty, len(self.hits))[studies]
+        return replace(self, hits=self.hits[studies], misses=self.misses[studies], penalty=penalty)
+
+    def climb(self, b: np.ndarray, studies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return values (k,) and steps (k, p) of k ``studies`` at b (k, p), for `ascend`."""
+        is_all = self.penalty is None and len(studies) == len(self.hits)
+        chosen = self if is_all else self.select(studies)
+        value = chosen.value(b)
+        return np.where(np.isfinite(value), value, -np.inf), chosen.step(b)
 
 
 def ascend(
@@ -234,47 +264,55 @@ def ascend(
     tolerance: float = TOLERANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Climb from ``start`` (d, p) to maxima (d, p) and their values (d,), by
-    ``value_and_step(places (k, p), which (k,))``. A step that lowers the value is halved. A
+    ``value_and_step(b (k, p), problems (k,))``. A step that lowers the value is halved. A
     problem without a maximum ends at its last step."""
-    place = start.copy()
+    b = start.copy()
     moving = np.arange(len(start))
-    best, step = value_and_step(place, moving)
+    best, step = value_and_step(b, moving)
     for _ in range(STEPS):
-        moving = moving[
-            np.abs(step[moving]).max(axis=1) > tolerance * (1.0 + np.abs(place[moving]).max(axis=1))
-        ]
+        length = np.abs(step[moving]).max(axis=1)
+        moving = moving[length > tolerance * (1.0 + np.abs(b[moving]).max(axis=1))]
         if not len(moving):
             break
-        trial = place[moving] + step[moving]
-        value, following = value_and_step(trial, moving)
+        trial = b[moving] + step[moving]
+        value, next_step = value_and_step(trial, moving)
         better = value >= best[moving] - 1e-13 * np.abs(value)
         ahead = moving[better]
-        place[ahead], step[ahead] = trial[better], following[better]
+        b[ahead] = trial[better]
+        step[ahead] = next_step[better]
         best[ahead] = np.maximum(value[better], best[ahead])
         step[moving[~better]] *= 0.5
-    return place, best
+    return b, best
 
 
-def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+def maxima(
+    data: HitsAndMisses,
+    start: np.ndarray,
+    tolerance: float = TOLERANCE,
+) -> np.ndarray:
     """Return the coefficients (d, p) with the largest likelihood of several studies, from
     ``start`` (p,); without a penalty. If hits and misses of a study do not overlap, its
-    coefficients are those of the last step. Plain Newton steps need no values and nearly always
-    reach the maximum. The other studies are searched again, and so are those that end lower than
-    they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
-    place = np.tile(np.asarray(start, float), (len(data.hits), 1))
-    moving = np.arange(len(place))
+    coefficients are those of the last step.
+
+    Plain Newton steps need no values and nearly always reach the maximum. The other studies are
+    searched again, and so are those that end lower than they began: where probabilities are
+    rounded to 0 or 1, steps can be small without a maximum."""
+    begin = np.tile(np.asarray(start, float), (len(data.hits), 1))
+    b = begin.copy()
+    moving = np.arange(len(b))
     for _ in range(PLAIN_STEPS):
         if not len(moving):
             break
+        chosen = data if len(moving) == len(b) else data.select(moving)
         with np.errstate(all="ignore"):
-            step = (data if len(moving) == len(place) else data.of(moving)).step(place[moving])
-            place[moving] += step
+            step = chosen.step(b[moving])
+            b[moving] += step
         moving = moving[~(np.abs(step).max(axis=1) <= tolerance)]
-    begin = np.tile(np.asarray(start, float), (len(place), 1))
     with np.errstate(all="ignore"):
-        again = np.union1d(moving, np.flatnonzero(~(data.value(place) >= data.value(begin))))
-    place[again], _ = ascend(data.of(again).climb, begin[again], tolerance)
-    return place
+        lower = np.flatnonzero(~(data.value(b) >= data.value(begin)))
+        again = np.union1d(moving, lower)
+    b[again], _ = ascend(data.select(again).climb, begin[again], tolerance)
+    return b
 
 
 def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
@@ -284,46 +322,51 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     between largest miss and smallest hit, and the best `CLIMBED` others."""
     z = data.z
     hits = data.hits
-    below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
-    gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
-    # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several
-    # widths through both its ends and its middle.
-    widths = [(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)]
-    widths += [
-        (np.full_like(gap, slope), share)
-        for slope in np.geomspace(1.5, 150.0, 9)
-        for share in (0.0, 0.5, 1.0)
-    ]
-    steep = np.array(
-        [np.stack([-slope * (below + share * gap), slope], axis=1) for slope, share in widths]
-    )
+    largest_miss = np.where(data.misses > 0, z, -np.inf).max(axis=1)
+    gap = np.where(hits > 0, z, np.inf).min(axis=1) - largest_miss
+
+    def crossing_gap(slope: np.ndarray, share: float) -> np.ndarray:
+        """Return curves (d, 2) whose predictor is 0 after this share of the gap."""
+        return np.stack([-slope * (largest_miss + share * gap), slope], axis=1)
+
+    # predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close
+    through_gap = crossing_gap(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)
     if data.link in ("logit", "probit"):
-        return ascend(data.climb, steep[0], tolerance)[0]
-    share = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
-    flat = np.stack([link_ppf(data.link, share), np.ones(len(hits))], axis=1)
-    rows = np.arange(len(hits))
+        return ascend(data.climb, through_gap, tolerance)[0]
+    # several widths through both ends of the gap and its middle
+    steep = [through_gap]
+    for slope in np.geomspace(1.5, 150.0, 9):
+        for share in (0.0, 0.5, 1.0):
+            steep.append(crossing_gap(np.full_like(gap, slope), share))
+    hit_rate = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
+    flat = np.stack([link_ppf(data.link, hit_rate), np.ones(len(hits))], axis=1)
     # the start with the highest value can lie in the basin of a lower maximum, so several of the
     # best are climbed
     order = np.argsort([-data.value(start) for start in steep], axis=0, kind="stable")
-    starts = (flat, steep[0], *(steep[k, rows] for k in order[:CLIMBED]))
-    places, values = zip(*(ascend(data.climb, start, tolerance) for start in starts), strict=True)
-    return np.asarray(np.array(places)[np.argmax(values, axis=0), rows])
+    studies = np.arange(len(hits))
+    starts = [flat, through_gap]
+    for rank in range(CLIMBED):
+        starts.append(np.array(steep)[order[rank], studies])
+    ends = []
+    values = []
+    for start in starts:
+        end, value = ascend(data.climb, start, tolerance)
+        ends.append(end)
+        values.append(value)
+    return np.asarray(np.array(ends)[np.argmax(values, axis=0), studies])
 
 
 def profile(
-    data: HitsAndMisses, z0: float, level: float, slope: float = 1.0
+    data: HitsAndMisses,
+    z0: float,
+    level: float,
+    slope: float = 1.0,
 ) -> tuple[float, float]:
     """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0)
     whose predictor is ``level`` at ``z0``, and the slope there. ``slope``: start of the search,
     such as that of a neighbour."""
-    if data.penalty is not None:  # concavity is not proved, so the search begins with a grid
-
-        def rising(s: np.ndarray) -> np.ndarray:
-            return data.value(np.stack([level - np.exp(s) * z0, np.exp(s)], axis=-1))
-
-        return max(
-            _largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))
-        ), slope
+    if data.penalty is not None:
+        return _penalised_profile(data, z0, level), slope
     line = replace(
         data,
         design=data.z[:, None] - z0,
@@ -333,30 +376,59 @@ def profile(
     )
     # far out, only slopes near that of the line through the mean probability have a likelihood
     # that is not tiny
-    rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
-    starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
-    best, _ = ascend(
-        line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5
-    )
+    mean_level = float(link_ppf(data.link, _hit_rate(data)))
+    starts = np.array([[slope], [(level - mean_level) / max(z0, 1.0)]])
+    values = np.concatenate([line.value(start[None]) for start in starts])
+    best, _ = ascend(line.climb, starts[[np.argmax(values)]], 1e-5)
     best = np.maximum(best, 0.0)
     return float(line.value(best)[0]), float(best[0, 0])
+
+
+def _hit_rate(data: HitsAndMisses) -> np.ndarray:
+    """Return the share of hits in one study, a scalar array."""
+    return np.asarray(data.hits.sum() / (data.hits + data.misses).sum())
+
+
+def _penalised_profile(
+    data: HitsAndMisses,
+    z0: float,
+    level: float,
+) -> float:
+    """Return the profile of a penalised likelihood; concavity is not proved, so the search begins
+    with a grid."""
+
+    def value_at(log_slope: np.ndarray) -> np.ndarray:
+        slope = np.exp(log_slope)
+        return data.value(np.stack([level - slope * z0, slope], axis=-1))
+
+    flat = float(data.value(np.array([level, 0.0])))
+    return max(_largest(value_at, PENALISED_SLOPES), flat)
 
 
 def flat_maximum(data: HitsAndMisses, highest: float) -> float:
     """Return the largest (penalised) log-likelihood of one study's flat curves, with a predictor
     of at most ``highest``: the limit of `profile` as ``z0`` grows to infinity."""
     if data.penalty is None:
-        rate = data.hits.sum() / (data.hits + data.misses).sum()
-        return float(data.value(np.array([min(highest, float(link_ppf(data.link, rate))), 0.0])))
-    levels = np.linspace(highest - 12.0, highest, 400)
-    largest = _largest(lambda level: data.value(np.stack([level, 0.0 * level], axis=-1)), levels)
-    return max(largest, float(data.value(np.array([highest, 0.0]))))
+        mean_level = float(link_ppf(data.link, _hit_rate(data)))
+        return float(data.value(np.array([min(highest, mean_level), 0.0])))
+
+    def value_at(level: np.ndarray) -> np.ndarray:
+        return data.value(np.stack([level, 0.0 * level], axis=-1))
+
+    largest = _largest(value_at, np.linspace(highest - 12.0, highest, 400))
+    return max(largest, float(value_at(np.array(highest))))
 
 
 def _largest(function: Callable[[np.ndarray], np.ndarray], grid: np.ndarray) -> float:
     """Return the largest value of a function of one number, refined around the best point of a
     grid."""
     best = int(np.argmax(function(grid)))
-    ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    how: dict[str, Any] = {"bounds": ends, "method": "bounded", "options": {"xatol": 1e-9}}
-    return -float(optimize.minimize_scalar(lambda at: -float(function(np.asarray(at))), **how).fun)
+    low = grid[max(best - 1, 0)]
+    high = grid[min(best + 1, len(grid) - 1)]
+    lowest = optimize.minimize_scalar(
+        lambda point: -float(function(np.asarray(point))),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 1e-9},
+    )
+    return -float(lowest.fun)

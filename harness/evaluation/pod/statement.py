@@ -4,14 +4,22 @@ and their basis."""
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import stats
 from threadpoolctl import ThreadpoolController
 
 from harness.evaluation.pod import hit_miss
-from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, choose_axes, diagnose
+from harness.evaluation.pod.ahat import (
+    LEVEL,
+    AhatFit,
+    Diagnostic,
+    ahat_band,
+    ahat_bound,
+    choose_axes,
+    diagnose,
+)
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE, Beyond, HitMissFit
 from harness.evaluation.pod.inspections import Inspections
@@ -39,35 +47,49 @@ TESTED: dict[Beyond, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """A model that was tried. ``deviance``: a smaller one fits better. ``near``: whether its bound
-    is among those of which the statement's bound is the largest."""
+    """A model that was tried."""
 
     name: str
+    """Link and axis, such as ``logit, ln size``."""
     deviance: float
+    """-2 times the log-likelihood; a smaller one fits better."""
     a50: float
+    """Size found 50 % of the time."""
     a90: float
+    """Size found 90 % of the time."""
     bound: Bound
+    """Its a90/95."""
     chosen: bool
-    near: bool
+    """True if it is the curve that is stated."""
+    in_bound: bool
+    """True if its bound is among those of which the statement's bound is the largest."""
 
 
 @dataclass(frozen=True)
 class PodStatement:
-    """The statement on the inspections ``read``. ``unit``: of sizes. ``fits``: for hits, the
-    models whose largest bound and widest band are stated, that of the curve first. ``signal``: the
-    regression, None for hits. ``models``: all that were tried. ``numbers``: further results of the
-    fit. ``tests``: (subject, p-value, text)."""
+    """The statement on one set of inspections."""
 
     read: Inspections
+    """The inspections."""
     kind: str
+    """``hit/miss`` or ``signal against size``."""
     unit: str
+    """Unit of sizes; may be empty."""
     fits: tuple[HitMissFit, ...]
+    """Models of hits whose largest bound and widest band are stated, that of the curve first;
+    empty for signals."""
     signal: AhatFit | None
+    """The regression of signals; None for hits."""
     models: tuple[ModelRow, ...]
+    """All models that were tried."""
     bound: Bound
+    """a90/95."""
     numbers: dict[str, float]
+    """Further results of the fit, by name."""
     notes: tuple[str, ...]
+    """Remarks on rows and fit."""
     tests: tuple[tuple[str, float, str], ...]
+    """Tests of the model: subject, p-value, reading."""
 
     @property
     def curve(self) -> PodCurve:
@@ -96,8 +118,10 @@ class PodStatement:
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
         # the envelope of the models: its lower edge crosses 90 % at their `largest_bound`
-        low, high = zip(*(hit_miss.band(fit, self.sizes) for fit in self.fits), strict=True)
-        return np.min(low, axis=0), np.max(high, axis=0)
+        bands = [hit_miss.band(fit, self.sizes) for fit in self.fits]
+        low = np.min([low for low, _ in bands], axis=0)
+        high = np.max([high for _, high in bands], axis=0)
+        return low, high
 
     @property
     def model(self) -> str:
@@ -115,52 +139,77 @@ class PodStatement:
         """Return warnings: near models with a90/95 more than `APART` apart; data that suggest a
         floor or ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
-        most = (
-            min(row.deviance for row in self.models)
-            + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
-        )
-        limits = [row.bound.value for row in self.models if row.deviance <= most]
+        least = min(row.deviance for row in self.models)
+        rows_per_target = len(self.read.size) / self.read.targets
+        near_deviance = least + NEAR_DEVIANCE * rows_per_target
+        limits = [row.bound.value for row in self.models if row.deviance <= near_deviance]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
-        texts = [
-            f"{limit:.3g}" if np.isfinite(limit) else "not demonstrated"
-            for limit in (min(limits), max(limits))
-        ]
-        return [
-            f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}",
-            *doubts,
-        ]
+        span = f"{_limit_text(min(limits))} to {_limit_text(max(limits))}"
+        differ = f"{len(limits)} models fit about equally well, and their a90/95 differ: {span}"
+        return [differ, *doubts]
 
     def to_data(self) -> dict[str, Any]:
         """Return the statement as JSON's types; an infinite size becomes None, and ``why`` gives
         the reason."""
         curve = self.curve
         read = self.read
-        of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
-        models = [
-            {"model": row.name, **{name: getattr(row, name) for name in ("deviance", "a50", "a90")}}
-            | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.near}
-            for row in self.models
-        ]
         data = {
             "file": str(read.path),
-            **{"kind": self.kind, "unit": self.unit, "size_column": read.size_column},
-            **{
-                "response_column": read.response_column,
-                "targets": read.targets,
-                "model": self.model,
-            },
+            "kind": self.kind,
+            "unit": self.unit,
+            "size_column": read.size_column,
+            "response_column": read.response_column,
+            "targets": read.targets,
+            "model": self.model,
             "inspections": len(read.size),
             "hits": None if self.signal else int(read.response.sum()),
-            "curve": {**of_curve, "covariance_mu_sigma": curve.covariance},
-            **{"a50": self.a50, "a90": self.a90},
+            "curve": {
+                "link": curve.link,
+                "log_size": curve.log_size,
+                "mu": curve.mu,
+                "sigma": curve.sigma,
+                "covariance_mu_sigma": curve.covariance,
+            },
+            "a50": self.a50,
+            "a90": self.a90,
             "a90_95": _bound_data(self.bound),
-            "models": models,
+            "models": [_model_data(row) for row in self.models],
             "numbers": self.numbers,
-            "tests": [{"test": what, "p": p, "reads": reads} for what, p, reads in self.tests],
-            **{"notes": self.notes, "warnings": self.doubts},
+            "tests": [
+                {"test": subject, "p": p, "reads": reads} for subject, p, reads in self.tests
+            ],
+            "notes": self.notes,
+            "warnings": self.doubts,
         }
         return dict(jsonable(data))
+
+
+def _limit_text(limit: float) -> str:
+    return f"{limit:.3g}" if np.isfinite(limit) else "not demonstrated"
+
+
+def _model_data(row: ModelRow) -> dict[str, Any]:
+    return {
+        "model": row.name,
+        "deviance": row.deviance,
+        "a50": row.a50,
+        "a90": row.a90,
+        "a90_95": _bound_data(row.bound),
+        "chosen": row.chosen,
+        "in_a90_95": row.in_bound,
+    }
+
+
+def _bound_data(bound: Bound) -> dict[str, Any]:
+    return {
+        "pod": bound.pod,
+        "confidence": bound.confidence,
+        "method": bound.method,
+        "demonstrated": bound.demonstrated,
+        "why": bound.why,
+        "size": bound.value,
+    }
 
 
 def state_hits(
@@ -175,30 +224,30 @@ def state_hits(
     sizes or their logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the
     largest over the `near_models` among these fits. ``tested``: whether to test for hits by chance
     and misses at any size, which takes most of the time."""
+    size = read.size
     # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of
     # 0.6 s on busy cores
     with POOLS().limit(limits=1, user_api="blas"):
-        size = read.size
-        hit = read.response
-        tried = hit_miss.choose_model(size, hit, inspections=read.target)
-        left = [
+        tried = hit_miss.choose_model(size, read.response, inspections=read.target)
+        allowed = [
             fit
             for fit in tried
             if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)
         ]
-        fit = left[0]
-        near = hit_miss.near_models(left)
-        curve = fit.curve
-        notes = [*read.notes, *fit.notes]
+        fit = allowed[0]
+        close_fits = hit_miss.near_models(allowed)
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
-        models = [(fit, hit_miss.bound(fit, POD, CONFIDENCE)) for fit in tried]
-        limit = max((limit for fit, limit in models if fit in near), key=lambda limit: limit.value)
+        bounds = [hit_miss.bound(fit, POD, CONFIDENCE) for fit in tried]
+    of_near = [limit for fit, limit in zip(tried, bounds, strict=True) if fit in close_fits]
+    limit = max(of_near, key=lambda limit: limit.value)
 
+    notes = [*read.notes, *fit.notes]
     if fit.targets < LEAST_TARGETS:
         notes.append(
             f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}"
         )
-    if limit.demonstrated and limit.value > (largest := float(size.max())):
+    largest = float(size.max())
+    if limit.demonstrated and limit.value > largest:
         notes.append(
             f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}"
         )
@@ -206,29 +255,41 @@ def state_hits(
         likeliest = min(tests, key=lambda test: test.p_value)
         suggests = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
         notes.append(f"the curve has no floor or ceiling, and {suggests}{DOUBTED}")
-    texts = []
-    for test in tests:
-        fitted = f"(floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"
-        texts.append(
-            (
-                TESTED[test.beyond],
-                test.p_value,
-                f"{'needed' if test.needed else 'not needed'} {fitted}",
-            )
-        )
-    errors = np.sqrt(np.diag(fit.covariance)).tolist()
+    error_of_b0, error_of_b1 = np.sqrt(np.diag(fit.covariance)).tolist()
     numbers = {
         "b0": fit.b0,
-        "b0's standard error": errors[0],
+        "b0's standard error": error_of_b0,
         "b1": fit.b1,
-        "b1's standard error": errors[1],
+        "b1's standard error": error_of_b1,
+        "mu": fit.curve.mu,
+        "sigma": fit.curve.sigma,
+        "deviance": fit.deviance,
+        "deviance of a constant": fit.null_deviance,
+        "log likelihood": fit.log_likelihood,
+        "inspections": float(fit.n),
+        "targets": float(fit.targets),
+        "hits": float(fit.hits),
+        **false_positives(read),
     }
-    numbers |= {"mu": curve.mu, "sigma": curve.sigma, "deviance": fit.deviance}
-    numbers |= {"deviance of a constant": fit.null_deviance, "log likelihood": fit.log_likelihood}
-    numbers |= {"inspections": float(fit.n), "targets": float(fit.targets), "hits": float(fit.hits)}
-    numbers |= false_positives(read)
-    what = (read, "hit/miss", unit, near, None, _models(models, near), limit)
-    return PodStatement(*what, numbers, tuple(notes), tuple(texts))
+    return PodStatement(
+        read=read,
+        kind="hit/miss",
+        unit=unit,
+        fits=close_fits,
+        signal=None,
+        models=_models(tried, bounds, close_fits),
+        bound=limit,
+        numbers=numbers,
+        notes=tuple(notes),
+        tests=tuple(_test_row(test) for test in tests),
+    )
+
+
+def _test_row(test: hit_miss.FloorCeilingTest) -> tuple[str, float, str]:
+    """Return a test of a floor or a ceiling as subject, p-value and reading."""
+    verdict = "needed" if test.needed else "not needed"
+    reading = f"{verdict} (floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"
+    return TESTED[test.beyond], test.p_value, reading
 
 
 def state_signals(
@@ -256,44 +317,74 @@ def state_signals(
         fix = "leave out --log or --log-signal"
         raise UserError(f"{read.path}: the requested axes need logarithms of values <= 0", fix=fix)
     fit = fits[0]
-    curve = fits[0].curve
-    limit = ahat_bound(fit, POD, CONFIDENCE)
-    (of_mu, common), (_, of_sigma) = curve.covariance.tolist()
-    numbers = {"b0": fit.b0, "b1": fit.b1, "tau": fit.tau, "mu": curve.mu, "sigma": curve.sigma}
-    numbers |= {
-        "variance of mu": of_mu,
-        "covariance of mu, sigma": common,
-        "variance of sigma": of_sigma,
+    curve = fit.curve
+    (variance_of_mu, covariance), (_, variance_of_sigma) = curve.covariance.tolist()
+    numbers = {
+        "b0": fit.b0,
+        "b1": fit.b1,
+        "tau": fit.tau,
+        "mu": curve.mu,
+        "sigma": curve.sigma,
+        "variance of mu": variance_of_mu,
+        "covariance of mu, sigma": covariance,
+        "variance of sigma": variance_of_sigma,
+        "signals at or below --left": float(fit.below.sum()),
+        "signals at or above --right": float(fit.above.sum()),
+        "decision": fit.decision,
+        **false_positives(read, fit),
     }
-    numbers |= {"signals at or below --left": float(fit.below.sum())}
-    numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
-    numbers |= false_positives(read, fit)
-    models = [(fit, ahat_bound(fit, POD, CONFIDENCE)) for fit in tried]
-    reads = {True: f"doubtful at {LEVEL:.0%}", False: f"not rejected at {LEVEL:.0%}"}
-    tests = [
-        (f"{test.assumption} ({test.test})", test.p_value, reads[test.p_value < LEVEL])
-        for test in diagnose(fit)
-    ]
-    what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
-    return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(tests))
-
-
-def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[ModelRow, ...]:
-    """Return rows of fits with their limits; the first of the ``near`` fits is that of the curve."""
-
-    def name(fit: HitMissFit | AhatFit) -> str:
-        size = "ln size" if fit.curve.log_size else "size"
-        if isinstance(fit, AhatFit):
-            return f"{'ln signal' if fit.log_signal else 'signal'} against {size}"
-        return f"{fit.curve.link}, {size}"
-
-    return tuple(
-        ModelRow(
-            *(name(fit), fit.deviance, fit.curve.size_at(0.5), fit.curve.size_at(POD)),
-            *(limit, fit is near[0], any(fit is each for each in near)),
-        )
-        for fit, limit in tried
+    bounds = [ahat_bound(fit, POD, CONFIDENCE) for fit in tried]
+    return PodStatement(
+        read=read,
+        kind="signal against size",
+        unit=unit,
+        fits=(),
+        signal=fit,
+        models=_models(tried, bounds, (fit,)),
+        bound=ahat_bound(fit, POD, CONFIDENCE),
+        numbers=numbers,
+        notes=(*read.notes, *fit.notes),
+        tests=tuple(_diagnostic_row(test) for test in diagnose(fit)),
     )
+
+
+def _diagnostic_row(test: Diagnostic) -> tuple[str, float, str]:
+    """Return a test of an assumption as subject, p-value and reading."""
+    reading = "doubtful" if test.p_value < LEVEL else "not rejected"
+    return f"{test.assumption} ({test.test})", test.p_value, f"{reading} at {LEVEL:.0%}"
+
+
+Fit = TypeVar("Fit", HitMissFit, AhatFit)
+
+
+def _models(
+    tried: Sequence[Fit],
+    bounds: Sequence[Bound],
+    close_fits: Sequence[Fit],
+) -> tuple[ModelRow, ...]:
+    """Return rows of fits with their ``bounds``; the first of the ``near`` fits is that of the
+    curve."""
+    rows = []
+    for fit, limit in zip(tried, bounds, strict=True):
+        row = ModelRow(
+            name=_model_name(fit),
+            deviance=fit.deviance,
+            a50=fit.curve.size_at(0.5),
+            a90=fit.curve.size_at(POD),
+            bound=limit,
+            chosen=fit is close_fits[0],
+            in_bound=any(fit is close_fit for close_fit in close_fits),
+        )
+        rows.append(row)
+    return tuple(rows)
+
+
+def _model_name(fit: HitMissFit | AhatFit) -> str:
+    size = "ln size" if fit.curve.log_size else "size"
+    if isinstance(fit, HitMissFit):
+        return f"{fit.curve.link}, {size}"
+    signal = "ln signal" if fit.log_signal else "signal"
+    return f"{signal} against {size}"
 
 
 def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:
@@ -304,40 +395,56 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
     sites = read.unflawed
     if not sites.size:
         return {}
-    calls = int((sites > (0.5 if fit is None else fit.decision)).sum())
-    upper = stats.beta.ppf(CONFIDENCE, calls + 1, len(sites) - calls) if calls < len(sites) else 1.0
-    found = {"unflawed sites": float(len(sites)), "false positives": float(calls)}
-    found |= {"PFP": calls / len(sites), f"PFP's {100 * CONFIDENCE:g} % upper bound": float(upper)}
-    if fit is None or (fit.log_signal and not (sites > 0).all()) or len(sites) < FEWEST_SITES:
-        return found
+    decision = 0.5 if fit is None else fit.decision
+    calls = int((sites > decision).sum())
+    upper = 1.0
+    if calls < len(sites):
+        upper = float(stats.beta.ppf(CONFIDENCE, calls + 1, len(sites) - calls))
+    numbers = {
+        "unflawed sites": float(len(sites)),
+        "false positives": float(calls),
+        "PFP": calls / len(sites),
+        f"PFP's {100 * CONFIDENCE:g} % upper bound": upper,
+    }
+    by_noise = None if fit is None else _false_positives_by_noise(sites, fit)
+    if by_noise is not None:
+        numbers["PFP by the noise's normal law"] = by_noise
+    return numbers
+
+
+def _false_positives_by_noise(sites: np.ndarray, fit: AhatFit) -> float | None:
+    """Return the probability that a normal law of the ``sites``' noise exceeds the decision; None
+    if there are too few to fit it, or some have no logarithm."""
+    if fit.log_signal and not (sites > 0).all():
+        return None
     limit = -np.inf if fit.left is None else fit.left
     below = sites <= limit
     if len(np.unique(sites[~below])) < FEWEST_SITES:
-        return found
-    put: np.ufunc = np.log if fit.log_signal else np.positive
-    noise = stats.CensoredData(put(sites[~below]), left=put(np.full(int(below.sum()), limit)))
-    law = stats.norm(*stats.norm.fit(noise))
-    return found | {"PFP by the noise's normal law": float(law.sf(put(fit.decision)))}
+        return None
+    on_axis: np.ufunc = np.log if fit.log_signal else np.positive
+    at_limit = np.full(int(below.sum()), limit)
+    noise = stats.CensoredData(on_axis(sites[~below]), left=on_axis(at_limit))
+    mean, std = stats.norm.fit(noise)
+    return float(stats.norm(mean, std).sf(on_axis(fit.decision)))
 
 
-def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> np.ndarray:
+def drawn_sizes(
+    size: np.ndarray,
+    log_size: bool,
+    marks: tuple[float, ...],
+) -> np.ndarray:
     """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond
     those ``marks`` that are at most twice the largest size; in equal steps, or in equal ratios if
     ``log_size``."""
     low = float(size.min())
     high = float(size.max())
-    high = max([high, *(mark for mark in marks if np.isfinite(mark) and high < mark < 2 * high)])
+    shown = [mark for mark in marks if np.isfinite(mark) and high < mark < 2 * high]
+    high = max([high, *shown])
     if log_size:
         margin = (high / low) ** 0.04
         return np.geomspace(low / margin, high * margin, DRAWN)
     margin = 0.04 * (high - low)
-    start = max(low - margin, 0.0) if low >= 0 else low - margin
+    start = low - margin
+    if low >= 0:
+        start = max(start, 0.0)
     return np.linspace(start, high + margin, DRAWN)
-
-
-def _bound_data(bound: Bound) -> dict[str, Any]:
-    facts = {
-        name: getattr(bound, name)
-        for name in ("pod", "confidence", "method", "demonstrated", "why")
-    }
-    return {**facts, "size": bound.value}

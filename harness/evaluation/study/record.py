@@ -24,43 +24,47 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from harness.vocabulary.declaration.diagnose import nearest, shown
+from harness.vocabulary.declaration.diagnose import shown
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
+from harness.vocabulary.words import nearest
 
-RECORD_VERSION = (
-    2  # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
-)
-OLDEST_VERSION = (
-    1  # still read: if no damage is found only by missing returns, its hits are those of today
-)
+# 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
+RECORD_VERSION = 2
+# still read: if no damage is found only by missing returns, its hits are those of today
+OLDEST_VERSION = 1
 LEGAL = "a study.json, or a baseline that tofpod check --update wrote"
+KEYS = ("board", "repeat", "hole")  # columns that identify an inspection
 AGAIN = "run the study again, which rewrites the file; do not edit it by hand"
 
 
 @dataclass(frozen=True)
 class StoredColumn:
-    """A column of a table: an array in memory, a list of ``value`` in JSON, where null stands for
-    NaN."""
+    """A column of a table: an array in memory, a list in JSON, where null stands for NaN."""
 
     dtype: type
+    """Type of the array's elements."""
     value: Any
+    """Declared type of the list's elements."""
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         listed = core_schema.list_schema(handler.generate_schema(self.value), strict=True)
+        written = core_schema.plain_serializer_function_ser_schema(_listed)
         return core_schema.no_info_after_validator_function(
-            lambda values: np.array(
-                [np.nan if value is None else value for value in values], self.dtype
-            ),
-            listed,
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda column: [None if value != value else value for value in column.tolist()]
-            ),
+            self._array, listed, serialization=written
         )
+
+    def _array(self, values: list[Any]) -> np.ndarray:
+        return np.array([np.nan if value is None else value for value in values], self.dtype)
+
+
+def _listed(column: np.ndarray) -> list[Any]:
+    """Return a column as JSON's types; only NaN differs from itself."""
+    return [None if value != value else value for value in column.tolist()]
 
 
 def _one_table(table: Any) -> Any:
@@ -71,10 +75,8 @@ def _one_table(table: Any) -> Any:
     lengths = {len(column): f"{name} {len(column)}" for name, column in columns.items()}
     if len(lengths) > 1:
         raise ValueError(f"columns of different lengths: {', '.join(lengths.values())}")
-    named = [
-        column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")
-    ]
-    if len(set(zip(*named, strict=True))) < len(table.board):
+    keys = [column.tolist() for name, column in columns.items() if name in KEYS]
+    if len(set(zip(*keys, strict=True))) < len(table.board):
         raise ValueError("the same inspection occurs twice")
     return table
 
@@ -107,36 +109,43 @@ FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """Inspections of damage, one per row: each damage of each board for every repeat of the noise.
-    True values: ``diameter_mm`` (of long damage the width or length, as ``size_of`` says),
-    ``depth_mm`` removed, ``x_mm``, ``y_mm`` on the board. ``signal`` (n,): the highest score
-    within the hit radius; NaN if no pixel there was judged. ``by_depth``, ``by_no_return`` (n,)
-    bool: hits by each kind of finding; None if hits were counted by depth alone."""
+    """Inspections of damage, one per row: each damage of each board for every repeat of the
+    noise."""
 
     __pydantic_config__ = FORM
     board: Counts
+    """Board (n,)."""
     hole: Names
+    """Name (n,) of the damage on its board."""
     repeat: Counts
+    """Repeat (n,) of the noise."""
     diameter_mm: Sizes
+    """True diameter (n,); of long damage the width or length, as ``size_of`` says."""
     depth_mm: Depths
+    """True depth (n,) removed."""
     x_mm: Numbers
+    """True centre (n,) on the board, to the right."""
     y_mm: Numbers
+    """True centre (n,) on the board, upwards."""
     hit: Truths
+    """True if the damage was found (n,)."""
     signal: NumbersOrNull
+    """Highest score (n,) within the hit radius; NaN if no pixel there was judged."""
     by_depth: Truths | None = None
+    """Hits (n,) by a finding of depth; None if hits were counted by depth alone."""
     by_no_return: Truths | None = None
+    """Hits (n,) by a finding of missing returns; None likewise."""
     size_of: Name = "diameter"
+    """Name of what ``diameter_mm`` holds: diameter, width or length."""
 
     @property
     def limit_of(self) -> str:
         """The name of the limits' size: depth if only depth varies, else diameter, width or
         length."""
         one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
-        return (
-            "depth"
-            if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max()
-            else self.size_of
-        )
+        if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max():
+            return "depth"
+        return self.size_of
 
     @property
     def size_mm(self) -> np.ndarray:
@@ -146,62 +155,80 @@ class Inspected:
 
 @dataclass(frozen=True, eq=False)
 class Unflawed:
-    """Runs on boards of one kind, hole-free or damaged, that set no threshold, (m,) each.
-    ``calls``: false calls on ``area_m2`` of judged face. ``no_return_calls``: those without return
-    among them, or None."""
+    """Runs (m,) on boards of one kind, hole-free or damaged, that set no threshold."""
 
     __pydantic_config__ = FORM
     board: Counts
+    """Board (m,)."""
     repeat: Counts
+    """Repeat (m,) of the noise."""
     calls: Counts
+    """False calls (m,)."""
     area_m2: Sizes
+    """Judged face (m,)."""
     no_return_calls: Counts | None = None
+    """Calls (m,) by missing returns among them, or None."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int. ``score`` (k,): of the
-    highest pixel; above it, the run has no finding. ``x_mm``, ``y_mm`` (k,): place of that pixel
-    on the board, NaN if it is off the board. ``u_px``, ``v_px`` (k,): its column and row on the
-    sensor, or None."""
+    """Hole-free runs (k,) that set a threshold, and each run's highest pixel."""
 
     __pydantic_config__ = FORM
     board: Counts
+    """Board (k,)."""
     repeat: Counts
+    """Repeat (k,) of the noise."""
     score: Numbers
+    """Score (k,) of the highest pixel; with a threshold above it, the run has no finding."""
     x_mm: NumbersOrNull
+    """Position (k,) of that pixel on the board, to the right; NaN if it is off the board."""
     y_mm: NumbersOrNull
+    """Position (k,) of that pixel on the board, upwards; NaN likewise."""
     u_px: NumbersOrNull | None = None
+    """Its column (k,) on the sensor, or None."""
     v_px: NumbersOrNull | None = None
+    """Its row (k,) on the sensor, or None."""
 
 
 @dataclass(frozen=True, eq=False)
 class SetUpRecord:
-    """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold``:
-    in the detector's units; ``threshold_mm``: NaN without a scale. ``calibration_runs``: number of
-    hole-free runs on separate boards that set it (0: given). ``failed``: trials that raised.
-    ``targets_digest``: identifies boards and damage; ``frames_digest``: also camera, noise seed
-    and simulating code. ``calibrated``, ``beside``: findings of calibration runs, and of runs on
-    the damaged boards, if kept. ``units``: if more than one, repeat r of a damaged board shows
-    unit r modulo ``units``, and every other board has a unit of its own."""
+    """One set-up at one number of frames."""
 
     __pydantic_config__ = FORM
     variant: Name
+    """Name of the set-up."""
     frames: Annotated[Whole, Field(ge=1)]
+    """Number of averaged frames."""
     axes: Mapping[str, Any]
+    """Values of the swept axes by dotted path, without frames."""
     detector: Name
+    """Name of the detector."""
     detector_version: Whole
+    """Version of the detector."""
     threshold: Real
+    """Threshold in the detector's units."""
     threshold_mm: Annotated[float, Field(allow_inf_nan=True, strict=True), NULL_IS_NAN, NAN_IS_NULL]
+    """Threshold in mm; NaN without a scale."""
     calibration_runs: Number
+    """Number of hole-free runs on separate boards that set it; 0 if it was given."""
     failed: Number
+    """Number of trials that raised."""
     targets_digest: Name
+    """Identifies boards and damage."""
     frames_digest: Name
+    """Identifies boards, damage, camera, noise seed and simulating code."""
     inspected: Annotated[Inspected, AfterValidator(_one_table)]
+    """Inspections of damage."""
     unflawed: Annotated[Unflawed, AfterValidator(_one_table)]
+    """Runs on hole-free boards."""
     calibrated: Annotated[Calibrated, AfterValidator(_one_table)] | None = None
+    """Runs that set the threshold, if kept."""
     beside: Annotated[Unflawed, AfterValidator(_one_table)] | None = None
+    """Findings on the damaged boards that match no damage, if kept."""
     units: Annotated[Whole, Field(ge=1)] = 1
+    """Number of units of the camera. If more than one, repeat r of a damaged board shows unit r
+    modulo ``units``, and every other board has a unit of its own."""
 
     @property
     def label(self) -> str:
@@ -212,28 +239,33 @@ class SetUpRecord:
 
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
-    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not used): the rule for a hit.
-    ``false_calls_per_m2``: the thresholds' rate; None if they were given. ``provenance``: commit,
-    dirty, versions, seed."""
+    """A whole study."""
 
     __pydantic_config__ = FORM
     name: Name
+    """Name of the experiment."""
     digest: Name
+    """Identifies its result folder."""
     hit_radius_mm: Size
+    """Largest distance from a damage to the centre of a finding that hits it."""
     false_calls_per_m2: Size | None
+    """The thresholds' rate; None if they were given."""
     provenance: Mapping[str, Any]
+    """Commit, dirty, versions, seed."""
     set_ups: Annotated[
         tuple[SetUpRecord, ...], Field(min_length=1), AfterValidator(_no_set_up_twice)
     ]
+    """Set-ups in the experiment's order."""
     hit_overlap: Size | None = None
+    """Share of a finding's pixels on a damage from which it is a hit; None if not used."""
 
     @property
     def hit_rule(self) -> str:
         """Rule for a hit, as the end of a sentence that begins with a damage."""
         long = any(set_up.inspected.size_of != "diameter" for set_up in self.set_ups)
-        centre = (
-            "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
-        )
+        centre = "its own" if self.hit_overlap is None else "its centre"
+        if long:
+            centre = "its centre line"
         rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {centre}"
         if self.hit_overlap is None:
             return rule
@@ -262,11 +294,13 @@ def read_record(path: Path) -> StudyRecord:
     it has another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
-        data = strict_json(
-            bounded_bytes(file, RECORD_BYTES), nan=True
-        )  # NaN is allowed in the record's columns
+        # NaN is allowed in the record's columns
+        data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)
     except OSError as error:
-        fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
+        fix = (
+            "name a folder that a sweep with a `study` wrote, "
+            "such as results/detection_limit/<digest>"
+        )
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error
     except ValueError as error:
         raise UserError(f"{file}: is not JSON ({error})", legal=LEGAL, fix=AGAIN) from error
@@ -290,32 +324,34 @@ def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
     """Return the set-up with this label, or the only one. Raises UserError if there is none, or
     none is named."""
     by_label = {record.label: record for record in study.set_ups}
-    name = name or (next(iter(by_label)) if len(by_label) == 1 else None)
-    known = "; ".join(by_label)
-    if name is None:
-        raise UserError(
-            f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."'
-        )
+    legal = "; ".join(by_label)
+    if not name:
+        if len(by_label) > 1:
+            count = f"{study.name} has {len(by_label)} set-ups"
+            raise UserError(count, legal=legal, fix='name one: --set-up "..."')
+        (name,) = by_label
     if name not in by_label:
-        near = nearest(name, by_label)
-        meant = f"; did you mean {near!r}?" if near else ""
-        raise UserError(f"{study.name} has no set-up {name!r}{meant}", legal=known)
+        similar = nearest(name, by_label)
+        meant = f"; did you mean {similar!r}?" if similar else ""
+        raise UserError(f"{study.name} has no set-up {name!r}{meant}", legal=legal)
     return by_label[name]
 
 
 def _mistake(error: ValidationError, data: Any) -> str:
     """Describe the first mistake in a study's data in one sentence, with its place, and count the
     rest."""
-    first, *others = error.errors(include_url=False)
+    first, *remaining = error.errors(include_url=False)
     path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
     where = ".".join(map(str, path))
-    value = first.get("input")
-    if (
-        path[:1] == ["set_ups"]
-        and len(path) > 1
-        and isinstance(set_up := data["set_ups"][path[1]], dict)
-    ):
-        where += f" (set-up {set_up.get('variant')}, frames {set_up.get('frames')})"
-    given = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
+    if path[:1] == ["set_ups"] and len(path) > 1:
+        set_up = data["set_ups"][path[1]]
+        if isinstance(set_up, dict):
+            where += f" (set-up {set_up.get('variant')}, frames {set_up.get('frames')})"
     text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]
-    return f"{where}: {text}{given}" + (f"; and {len(others)} more" if others else "")
+    sentence = f"{where}: {text}"
+    value = first.get("input")
+    if value is None or isinstance(value, str | int | float):
+        sentence += f", not {shown(value)}"
+    if remaining:
+        sentence += f"; and {len(remaining)} more"
+    return sentence

@@ -25,15 +25,17 @@ METHOD = "prediction of a new unit over units and boards"
 
 @dataclass(frozen=True, eq=False)
 class OverUnits:
-    """``a90_mm``, ``a90_95_mm`` (u,): of each unit alone, with the link and axis of all units;
-    infinite for a unit without one. ``spread``: standard deviation of ln a90 between units,
-    including the noise of their hits. ``new_unit``: upper bound, at 95 % confidence, on the a90 of
-    a new unit."""
+    """Limits of each unit, and of a new one."""
 
     a90_mm: np.ndarray
+    """a90 (u,) of each unit alone, with the link and axis of all units; infinite for a unit
+    without one."""
     a90_95_mm: np.ndarray
+    """a90/95 (u,) of each unit alone, likewise."""
     spread: float
+    """Standard deviation of ln a90 between units, including the noise of their hits."""
     new_unit: Bound
+    """Upper bound, at 95 % confidence, on the a90 of a new unit."""
 
     @property
     def units(self) -> int:
@@ -52,28 +54,54 @@ def over_units(
     """Judge inspections, one per row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``.
     ``curve``: of all units; ``limit``: its a90/95 over boards. If a unit found all or nothing, no
     limit of a new unit is demonstrated."""
-    found = []
+    a90_of_units = []
+    a90_95_of_units = []
     for number in np.unique(unit):
-        own = unit == number
-        options = {"link": curve.link, "log_size": curve.log_size, "inspections": target[own]}
+        rows = unit == number
+        a90 = np.inf
+        a90_95 = np.inf
         try:
-            fit = fit_hit_miss(size_mm[own], hit[own], **options)
-            found.append((fit.curve.size_at(POD), bound(fit).value))
+            fit = fit_hit_miss(
+                size_mm[rows],
+                hit[rows],
+                link=curve.link,
+                log_size=curve.log_size,
+                inspections=target[rows],
+            )
+            a90 = fit.curve.size_at(POD)
+            a90_95 = bound(fit).value
         except UserError:
-            found.append((np.inf, np.inf))
-    a90_mm, a90_95_mm = np.array(found, float).T
-    units = len(a90_mm)
-    with np.errstate(invalid="ignore"):
-        spread = float(np.log(a90_mm).std(ddof=1)) if np.isfinite(a90_mm).all() else np.inf
-    margin = float(t.ppf(CONFIDENCE, units - 1)) * spread * np.sqrt(1 + 1 / units)
-    value = np.inf
-    why = f"not demonstrated: {limit.why.removeprefix('not demonstrated: ')}"
+            pass  # the unit found all or nothing
+        a90_of_units.append(a90)
+        a90_95_of_units.append(a90_95)
+    a90_mm = np.array(a90_of_units, float)
+    spread = np.inf
+    if np.isfinite(a90_mm).all():
+        with np.errstate(invalid="ignore"):
+            spread = float(np.log(a90_mm).std(ddof=1))
+    return OverUnits(
+        a90_mm=a90_mm,
+        a90_95_mm=np.array(a90_95_of_units, float),
+        spread=spread,
+        new_unit=_new_unit(len(a90_mm), spread, float(curve.size_at(POD)), limit),
+    )
+
+
+def _new_unit(
+    units: int,
+    spread: float,
+    a90: float,
+    limit: Bound,
+) -> Bound:
+    """Return the bound on the a90 of a new unit: ln a90 plus the root of the sum of squares of the
+    margin of boards, ln(limit / a90), and that of units."""
     if not np.isfinite(spread):
-        why = (
-            "not demonstrated: a unit found every damage or none, so that units cannot be compared"
-        )
-    elif limit.demonstrated:
-        a90 = float(curve.size_at(POD))
-        value = a90 * float(np.exp(np.hypot(np.log(limit.value / a90), margin)))
-        why = ""
-    return OverUnits(a90_mm, a90_95_mm, spread, Bound(POD, CONFIDENCE, METHOD, value, why))
+        why = "a unit found every damage or none, so that units cannot be compared"
+        return Bound(POD, CONFIDENCE, METHOD, np.inf, f"not demonstrated: {why}")
+    if not limit.demonstrated:
+        why = limit.why.removeprefix("not demonstrated: ")
+        return Bound(POD, CONFIDENCE, METHOD, np.inf, f"not demonstrated: {why}")
+    of_units = float(t.ppf(CONFIDENCE, units - 1)) * spread * np.sqrt(1 + 1 / units)
+    of_boards = np.log(limit.value / a90)
+    value = a90 * float(np.exp(np.hypot(of_boards, of_units)))
+    return Bound(POD, CONFIDENCE, METHOD, value)

@@ -27,8 +27,6 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import with_number
 from scenes.sensor.camera import (
     AnyCamera,
-    CameraConfig,
-    EffectsConfig,
     camera_names,
     camera_of,
     guessed_precision,
@@ -37,9 +35,10 @@ from scenes.sensor.camera import (
     numbers_of_lens,
     read_camera,
 )
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
+from scenes.sensor.common.unit import taps_of
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.unit import taps_of
 
 SEED = 1
 UNIT = CameraConfig(
@@ -62,7 +61,9 @@ def camera_of_size(lens: Lens) -> str:
     raise UserError."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [
-        name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)
+        name
+        for name, size in sizes.items()
+        if (size.width, size.height) == (lens.width, lens.height)
     ]
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:
@@ -73,7 +74,7 @@ def camera_of_size(lens: Lens) -> str:
         f"several cameras have {wrong}: {', '.join(fitting)}"
         if fitting
         else f"no simulated camera has {wrong}",
-        legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
+        legal=", ".join(f"{name} {size.width} x {size.height}" for name, size in sizes.items()),
         fix="name the capture's camera with --camera"
         if fitting
         else f"{size} colour camera or of another mode",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from detectors.averages.noise import rounding_left_m2
+from detectors.pixels.noise import rounding_left_m2
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import StudyRecord
 from harness.programs.camera.measure import Characteristics

@@ -2,7 +2,7 @@
 
 The files are for simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc):
 ``NAME.npz`` with the table, and ``depth_noise.py`` (NumPy or torch), a copy of
-`scenes.sensor.tabled`, which states what is not modelled. The full model is measured on planes of
+`scenes.sensor.common.tabled`, which states what is not modelled. The full model is measured on planes of
 many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.vocabulary.files import write_bytes, write_text
-    from scenes.sensor import tabled
     from scenes.sensor.camera import load_camera
+    from scenes.sensor.common import tabled
 
     camera = load_camera(options.camera)
     print(f"measuring the noise of {camera.title} ..", flush=True)
@@ -72,7 +72,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
-    """Return the arrays of `scenes.sensor.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are
+    """Return the arrays of `scenes.sensor.common.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are
     the deviation and the probability of a return over log2 of intensity / range^2, from ``first``
     on, with ``per_octave`` entries each. There are filters of the noise and of the pattern, whose
     deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w), each pixel's light
@@ -158,7 +158,7 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
     """Return the range (units, h, w) that the fixed pattern of several units adds on a plane."""
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
-    from scenes.sensor.camera import NO_EFFECTS, CameraConfig
+    from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
     from scenes.sensor.source import SimulatedUnit
 
     lens = camera.nominal_lens
@@ -185,7 +185,7 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
 def _filter(images: np.ndarray, axis: int) -> np.ndarray:
     """Return the filter taps that give white noise the mean correlation of the images (n, h, w)
     along an axis."""
-    from scenes.sensor.unit import taps_of
+    from scenes.sensor.common.unit import taps_of
 
     images = np.moveaxis(np.nan_to_num(images), axis, -1)
     products = [
@@ -200,7 +200,7 @@ def _pixels(camera: AnyCamera) -> tuple[np.ndarray, np.ndarray]:
     pixels."""
     from scenes.sensor.amcw.facts import AmcwCamera
     from scenes.sensor.amcw.imager import AmcwImager
-    from scenes.sensor.camera import CameraConfig
+    from scenes.sensor.common.config import CameraConfig
 
     lens = camera.nominal_lens
     slopes = lens.region_slopes(lens.whole)

@@ -155,7 +155,7 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
 
 
 def _halves(recording: Recording) -> Iterator[Recording]:
-    from detectors.averages.noise import LEAST_FRAMES
+    from detectors.pixels.noise import LEAST_FRAMES
 
     count = sum(1 for _ in recording.selected())
     if count < 2 * LEAST_FRAMES:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage, optimize, stats
 
 from detectors.averages.flat_captures import SMOOTH, Separated, flattened, separated
-from detectors.averages.noise import LEAST_FRAMES, rounding_left_m2
+from detectors.pixels.noise import LEAST_FRAMES, rounding_left_m2
 from detectors.recordings import Recording
 from detectors.surfaces.surface import fit_surface
 from harness.stills import statistics
@@ -499,7 +499,7 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
             off_m = np.abs(capture.mean_m - plane.z_along_m(capture.slopes))
             labels[mask & (share >= 0.5) & (off_m <= statistics.GROWN * TOLERANCE_M)] = number
         images = labels, share, capture.mean_m
-        for axis, (image, share, z_m) in enumerate((images, tuple(each.T for each in images))):
+        for axis, (image, share, z_m) in enumerate((images, tuple(image.T for image in images))):
             for row, line in enumerate(image):
                 (known,) = np.nonzero(line)
                 for at in np.flatnonzero(
@@ -515,7 +515,7 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
                     if counts[2] > LEAST_STEP_M:
                         lines[capture.name, frozenset(line[[last, first]])][axis].append(counts)
     # use the axis that crosses more of the edge; the other axis crosses it at a small angle
-    rows = np.array([row for both in lines.values() for row in max(both, key=len)])
+    rows = np.array([row for line in lines.values() for row in max(line, key=len)])
     if len(rows) < LEAST_BIN_PX // 10:
         return None
     return EdgeFigures(

@@ -21,11 +21,12 @@ from harness.runs.estimate import progress_display
 from harness.runs.job_batches import render_missing, values_of
 from harness.runs.jobs import JobEngine
 from harness.runs.journal import Journal
-from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
+from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, trial_point
 from harness.runs.run import run_plan
+from harness.trials.board import load_board
+from harness.trials.clouds import TrialPoint
 from harness.trials.judge import detector_of
-from harness.trials.setup import load_set_up
-from harness.trials.trial import PointTask, TrialTask, cloud_of
+from harness.trials.trial import Trial, cloud_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
 from scenes.target.custom import BoardConfig, PoseConfig
@@ -59,7 +60,7 @@ class Survey:
     ``seen``: by pose."""
 
     point: Point
-    task: PointTask
+    task: TrialPoint
     patches: Patches
     found: Findable
     seen: dict[Pose, Seen]
@@ -79,9 +80,9 @@ def survey(
         outcome = run_plan(plan, journal, engine, report)
     for entry in map(journal.read, outcome.finished):
         for row in (entry.record or {}).get("holes", ()) if entry else ():
-            place = (row["variant"], row["frames"], row["board"], row["hole"])
+            damage_key = (row["variant"], row["frames"], row["board"], row["hole"])
             missed = np.inf if row["no_return"] else np.nan
-            scores.setdefault(place, []).append(row["score"] if row["detected"] else missed)
+            scores.setdefault(damage_key, []).append(row["score"] if row["detected"] else missed)
     surveys = []
     for group in plan.groups:
         source, family = declared(group.points[0].config)
@@ -104,22 +105,34 @@ def survey(
                     (failure.in_short for failure in outcome.failures), "no hole-free run ended"
                 )
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
-            task = point_task(
+            task = trial_point(
                 point, outcome.thresholds[point.digest], group.learned.get(point.digest)
             )
             pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
             boards = values_of(_board_seen, pairs, engine)
-            inspections = _inspections([each for each in boards if each is not None], point, scores)
-            found = findable(inspections, outcome.thresholds[point.digest])
+            inspections = _inspections(
+                [board for board in boards if board is not None], point, scores
+            )
+            findable_sizes = findable(inspections, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
-            seen = values_of(
+            seen_of_views = values_of(
                 _part_seen, [(view, task, group.seed, patches) for view in views], engine
             )
-            seen = [
-                Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each
-                for each in seen
+            seen_of_views = [
+                Seen(blind, np.ones(len(blind)), np.ones(len(blind)))
+                if seen_of_view is None
+                else seen_of_view
+                for seen_of_view in seen_of_views
             ]
-            surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
+            surveys.append(
+                Survey(
+                    point,
+                    task,
+                    patches,
+                    findable_sizes,
+                    dict(zip(poses, seen_of_views, strict=True)),
+                )
+            )
     return surveys
 
 
@@ -149,7 +162,10 @@ def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConf
         and source.views is None
     ):
         return source, source.target
-    fix = "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as experiments/pipe.yaml does"
+    fix = (
+        "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as "
+        "experiments/pipe.yaml does"
+    )
     raise UserError(f"{config.name}: is not a study of drawn damage in single views", fix=fix)
 
 
@@ -162,9 +178,12 @@ def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
     if high - low < SAME_MM and damage.depths_mm:
         word, (low, high) = "depth", damage.depths_mm
     if size_mm is not None and not low <= size_mm <= high:
-        fix = "change the damage's range in the experiment: sizes that are not inspected have no limit"
-        what = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
-        raise UserError(what, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
+        fix = (
+            "change the damage's range in the experiment: sizes that are not inspected have no "
+            "limit"
+        )
+        message = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
+        raise UserError(message, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
 
 
 def _widened(group: Group, poses: Sequence[Pose]) -> Group:
@@ -196,10 +215,11 @@ def _widened(group: Group, poses: Sequence[Pose]) -> Group:
 
 def _bare(batch: Batch) -> Batch:
     """Return a damaged batch's board without its damage."""
-    (job,), (ref,) = batch.renders, batch.set_ups
+    (job,) = batch.renders
+    (ref,) = batch.views
     job = replace(job, target=job.target.hole_free())
     ref = replace(ref, view_path=str(job.path), damaged=False)
-    return replace(batch, role="hole_free", renders=(job,), set_ups=(ref,))
+    return replace(batch, role="hole_free", renders=(job,), views=(ref,))
 
 
 def _inspections(
@@ -208,74 +228,81 @@ def _inspections(
     """Return all inspections of the damages of boards (`_board_seen`)."""
     facts = list[tuple[float, ...]]()
     for number, damages in boards:
-        for damage, seen in damages:
-            place = (point.variant, point.config.capture.frames, number, str(damage.id))
-            own = len(facts)
+        for damage, seen_damage in damages:
+            damage_key = (point.variant, point.config.capture.frames, number, str(damage.id))
+            own_index = len(facts)
             sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
-            facts += [(own, *sizes_mm, *seen, score) for score in scores.get(place, ())]
+            facts += [
+                (own_index, *sizes_mm, *seen_damage, score) for score in scores.get(damage_key, ())
+            ]
     if not facts:
         raise UserError(
             f"{point.label or point.variant}: no damaged board was judged",
             fix="check the detector's crop",
         )
-    numbers, plan_mm, depth_mm, *seen, score = np.array(facts).T
+    numbers, plan_mm, depth_mm, *seen_damage, score = np.array(facts).T
     size_of = boards[0][1][0][0].size_of
     word, size_mm = (
         ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
     )
-    return ScoredDamage(word, numbers, size_mm, Seen(*seen), score)
+    return ScoredDamage(word, numbers, size_mm, Seen(*seen_damage), score)
 
 
-def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
+def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
     """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over
     score, rms around each pixel; larger if some pixels or averages are not judged, infinite if
     most are not."""
     fields = []
     for repeat in range(DRAWS):
-        task = TrialTask(
-            batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board
+        task = Trial(
+            views=batch.before(repeat),
+            seed=seed,
+            role="hole_free",
+            repeat=repeat,
+            points=(point,),
+            board=batch.board,
         )
-        evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(
-            cloud_of(task, point)
-        )
-        known = np.isfinite(evidence.score)
+        criteria = point.criteria
+        detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
+        evidence = detector.analyse(cloud_of(task, point))
+        is_known = np.isfinite(evidence.score)
         fields.append(
             [
-                known,
+                is_known,
                 *(
-                    np.where(known, image**2, 0.0)
+                    np.where(is_known, image**2, 0.0)
                     for image in (evidence.residual_m, evidence.score)
                 ),
             ]
         )
-    known, *squares = np.mean(fields, axis=0)
+    is_known, *squares = np.mean(fields, axis=0)
     square, of_score = (ndimage.uniform_filter(image, AROUND_PX) for image in squares)
-    judged = (known >= 0.5) & (square > 0) & (of_score > 0)
+    judged = (is_known >= 0.5) & (square > 0) & (of_score > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(
-            judged, np.sqrt(square / of_score / ndimage.uniform_filter(known, NEAR_PX)), np.inf
+            judged, np.sqrt(square / of_score / ndimage.uniform_filter(is_known, NEAR_PX)), np.inf
         )
 
 
 def _board_seen(
-    batch: Batch, whole: Batch, point: PointTask, seed: int
+    batch: Batch, whole_batch: Batch, point: TrialPoint, seed: int
 ) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
     """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board
     without damage."""
-    set_up = load_set_up(batch.set_ups[0])
-    unit_m = _unit_m(whole, point, seed)
-    found = []
+    set_up = load_board(batch.views[0])
+    unit_m = _unit_m(whole_batch, point, seed)
+    seen_damages = []
     for damage in set_up.truth:
         range_m = float(np.linalg.norm(damage.centre_camera_m))
         cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
         about_m = float(np.median(unit_m.ravel()[set_up.outlines[damage.id]]))
-        found.append((damage, (about_m, cosine, range_m)))
-    return batch.board or 0, found
+        seen_damages.append((damage, (about_m, cosine, range_m)))
+    return batch.board or 0, seen_damages
 
 
-def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
+def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> Seen:
     """Return the view and the noise of the patches of an undamaged part."""
-    set_up = load_set_up(view.set_ups[0])
+    set_up = load_board(view.views[0])
     deviation_m = _unit_m(view, point, seed)
     points_m = transform_points(set_up.T_camera_board, patches.points_m)
     range_m = np.linalg.norm(points_m, axis=1)
@@ -286,7 +313,7 @@ def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Se
     camera = set_up.unit.camera
     lens = camera.nominal_lens
     u, v = np.rint(lens.project(points_m)).astype(int).T - [[region.col0], [region.row0]]
-    seen = (
+    is_seen = (
         camera.images(points_m)
         & (cosine > 0)
         & (u >= 0)
@@ -294,10 +321,10 @@ def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Se
         & (u < region.shape[1])
         & (v < region.shape[0])
     )
-    u = np.where(seen, u, 0)
-    v = np.where(seen, v, 0)
+    u = np.where(is_seen, u, 0)
+    v = np.where(is_seen, v, 0)
     # an object in front of a patch has another z
     slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
     reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
-    seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
-    return Seen(np.where(seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)
+    is_seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
+    return Seen(np.where(is_seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from detectors.masks import shrunk
+from detectors.pixels.masks import shrunk
 from detectors.recordings.arrays import load_npz
 from harness.experiment.schema import Experiment, Point
 from harness.programs.dataset.exchange import depth_units, on_window, picture_bytes, run_lengths
-from harness.runs.plan import RenderJob, batch_of, point_task, unit_of
-from harness.trials.setup import known_view, load_set_up
-from harness.trials.trial import Role, TrialTask, cloud_of
+from harness.records.rows import Role
+from harness.runs.plan import RenderJob, batch_of, trial_point, unit_of
+from harness.trials.board import load_board
+from harness.trials.trial import Trial, cloud_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import (
     RECORD_BYTES,
@@ -34,7 +35,8 @@ from harness.vocabulary.path_names import differing, names_of, value_text
 from harness.vocabulary.provenance import check_version
 from harness.vocabulary.seeds import canonical_json
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import truth_of
@@ -67,7 +69,7 @@ class Sample:
     label: str
     number: int
     render: RenderJob
-    task: TrialTask
+    task: Trial
 
     @property
     def name(self) -> str:
@@ -128,8 +130,13 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
                 label = (
                     "good" if role != "damaged" else kinds.pop() if len(kinds) == 1 else "combined"
                 )
-                task = TrialTask(
-                    (ref,), seed, role, 0, (point_task(point, None, None),), None, number
+                task = Trial(
+                    views=(ref,),
+                    seed=seed,
+                    role=role,
+                    repeat=0,
+                    points=(trial_point(point, None, None),),
+                    board=number,
                 )
                 samples.append(Sample(category, split, label, number, job, task))
     return samples
@@ -145,8 +152,9 @@ def seen_region(render: RenderJob) -> Region:
 def write_board(out: Path, sample: Sample, window: Region) -> None:
     """Write all files of a board on the ``window`` that its category shares; the truth last, to
     allow resuming."""
-    set_up, (point,) = load_set_up(sample.task.set_ups[0]), sample.task.points
-    known = known_view(set_up, cloud_of(sample.task, point), hole_free=sample.task.hole_free)
+    (point,) = sample.task.points
+    set_up = load_board(sample.task.views[0])
+    known = set_up.labelled(cloud_of(sample.task, point))
     cloud = known.cloud
     truth = () if sample.task.hole_free else known.truth
 
@@ -196,7 +204,7 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         files[mvtec / "gt" / f"{file}.png"] = picture_bytes(".png", np.uint8(255) * (mask > 0))
     for path, content in files.items():
         write_bytes(path, content, durable=False)
-    camera = sample.task.set_ups[0].camera
+    camera = sample.task.views[0].camera
     damages = []
     for flaw in truth:
         own = np.zeros(damage.shape, bool)

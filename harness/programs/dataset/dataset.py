@@ -122,7 +122,7 @@ def _about(
     categories: dict[str, Any] = {}
     for name, point in categories_of(experiment).items():
         own = [sample for sample in samples if sample.category == name]
-        cameras = [sample.task.set_ups[0].camera for sample in own]
+        cameras = [sample.task.views[0].camera for sample in own]
         categories[name] = {
             "camera": cameras[0].name,
             "units": len({camera.unit_seed for camera in cameras}),
@@ -201,9 +201,9 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
     for category in about["categories"]:
         for split in dict.fromkeys(split for split, _, _ in SPLITS):
             pictures = [
-                truths[each.name]
-                for each in samples
-                if (each.category, each.split) == (category, split)
+                truths[sample.name]
+                for sample in samples
+                if (sample.category, sample.split) == (category, split)
             ]
             text = json.dumps(coco_data(pictures, kinds, info), separators=(",", ":"))
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")

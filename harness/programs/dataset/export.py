@@ -14,7 +14,7 @@ from harness.vocabulary.program import program, whole_number
 if TYPE_CHECKING:
     from harness.experiment.schema import Experiment
     from harness.programs.dataset.exchange import ExportedView
-    from harness.trials.trial import Role
+    from harness.records.rows import Role
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")
@@ -89,7 +89,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
             captures.append(unit.capture(frames, seed, role, REPEAT, *labels))
         targets = [job.target for job in batch.renders[:count]]
         rate = camera.unit.frames_per_second.value
-        views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
+        views = in_turn(captures, [target.pose.T_camera_board for target in targets], frames, rate)
         if arguments.format == "tum":
             write_tum(folder, views)
         for exported in () if arguments.format == "tum" else views:

@@ -203,8 +203,8 @@ def _judged(
     from harness.evaluation.study.limit import limit_of
     from harness.programs.dataset.boards import read_arrays, read_truth
     from harness.runs.study_record import set_up_of
+    from harness.trials.board import highest_within, pixel_areas
     from harness.trials.judge import matched_places, smeared
-    from harness.trials.setup import highest_within, pixel_areas
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Yield the boards of a split: name, scores (NaN if not inspected), places, damage,
@@ -305,8 +305,8 @@ def _judged(
 def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
     """Return the findings of pixels ``above`` (h, w), without scores; their centres (m, 2) lie on
     the face."""
-    from detectors.findings.clusters import euclidean_clusters
     from detectors.findings.measure import centres_of
+    from detectors.pixels.clusters import euclidean_clusters
     from detectors.score_map import Findings
 
     pixels = np.flatnonzero(above & np.isfinite(places_m[..., 0]))

@@ -278,9 +278,9 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
         mec="white",
         label="median, 10–90 %",
     )
-    for place, bound, end in zip(places, bounds, ends, strict=True):
+    for position, bound, end in zip(places, bounds, ends, strict=True):
         label = "none" if not np.isfinite(bound) else "↑" if end > top else ""
-        left.text(place, top, label, ha="center", va="top", color=blocks.BLUE)
+        left.text(position, top, label, ha="center", va="top", color=blocks.BLUE)
     label = plain(f"the guess's a90: {design.text(true_size)}")
     left.axhline(true_size, color=blocks.RED, lw=1.2, label=label)
     if design.goal is not None:

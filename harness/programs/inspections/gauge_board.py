@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from detectors.rigid_motion import kabsch
 from detectors.views.marks.find import find_marks
 from detectors.views.marks.mark import CodedMarks
-from detectors.views.marks.pairing import kabsch
 from harness.evaluation.match import match
 from harness.records.outputs import GAUGE_ROWS
 from harness.records.schema import Column, Table
@@ -239,7 +239,7 @@ def _matched(
             (lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2]
         )
 
-    places = on_face(np.array([each.centre_m for each in judged.detections]))
+    places = on_face(np.array([detection.centre_m for detection in judged.detections]))
     centres = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes]) * MM
     pairs = match(centres, places, radius_m)
     score = judged.evidence.score

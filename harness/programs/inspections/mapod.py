@@ -252,7 +252,7 @@ class Mapod:
         if not curves:
             raise UserError("the simulated curve's a50 is not above 0: its sizes cannot be scaled")
         transfers = tuple(Transfer(curve, read.size, read.response == 1, names) for curve in curves)
-        boards_of = zip(*(each.steps() for each in transfers), strict=True)
+        boards_of = zip(*(transfer.steps() for transfer in transfers), strict=True)
         steps = tuple(
             replace(same[0], a90_95=max(step.a90_95 for step in same)) for same in boards_of
         )
@@ -294,7 +294,7 @@ class Mapod:
     @cached_property
     def band(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The combined curve at ``sizes``, and the widest band over the simulated models."""
-        bands = [each.band(self.sizes) for each in self.transfers]
+        bands = [transfer.band(self.sizes) for transfer in self.transfers]
         return (
             bands[0][0],
             np.min([low for _, low, _ in bands], axis=0),

@@ -172,9 +172,9 @@ def measured(
         residual_mm = (z - basis @ surface) / MM
         peaks[number] = float(np.nanmax(residual_mm[from_centre < PEAK_MM]))
         noises.append(z_m[:, *cut][:, ring])
-        for size, found in patterns.items():
+        for size, pattern in patterns.items():
             whole = ndimage.uniform_filter(ring.astype(float), size) > 1 - 1e-6
-            found.append(ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)[whole])
+            pattern.append(ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)[whole])
     if not noises:
         raise UserError(
             "no hole is in view together with the face around it", fix="check the declared pose"
@@ -328,8 +328,8 @@ def _answer(rows: list[Beside]) -> str:
                 row.simulated.value / row.measured.value
             )
     off = {
-        where: {k: r for k, r in found.items() if abs(r - 1) > CLOSE}
-        for where, found in ratios.items()
+        where: {k: r for k, r in ratio.items() if abs(r - 1) > CLOSE}
+        for where, ratio in ratios.items()
     }
     best = min(
         off,

@@ -201,7 +201,7 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
         families.setdefault(
             FAMILIES.get(score.figure.camera.partition("_")[0], "other cameras"), []
         ).append(score)
-    by_family = ", ".join(f"{name} {share(own)}" for name, own in families.items())
+    by_family = ", ".join(f"{name} {share(family)}" for name, family in families.items())
     values = [score for score in blind if score.figure.published.value is not None]
     bounds = [score for score in blind if score.figure.published.value is None]
     wide = sum(score.passes_by_tolerance for score in blind)

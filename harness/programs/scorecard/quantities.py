@@ -33,7 +33,7 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import digest
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.camera import CameraConfig, EffectsConfig
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 
 PATCH = (40, 24)
 """Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by

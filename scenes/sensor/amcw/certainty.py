@@ -4,46 +4,69 @@ simulate one by one.
 Each gate's quantity has a mean and a deviation to first order in the noise
 (`scenes.sensor.amcw.linear`). A pixel is sure if the engine's table of gates
 (`ranging.first_failed`) gives the same result for the worst and the best values within
-`DEVIATIONS`. If noise is too large for that, bounds that hold at any noise are used. If a window
-shows one even surface, noise lowers the weight of all neighbours by the same share, which a table
-gives by the phase noise."""
+`DEVIATIONS`. If noise is too large for that, bounds that hold at any noise are used."""
 
 from typing import NamedTuple
 
 import cv2
-import numba
 import numpy as np
 from scipy import ndimage
 
 from scenes.sensor.amcw import ranging
-from scenes.sensor.amcw.kernels import FilterSettings
-from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, unknown_filtered
-from scenes.sensor.normals import FAST
+from scenes.sensor.amcw.linear import DEVIATIONS, Filtered
 
 f4 = np.float32
-MOST_LEFT_OUT = (
-    # most variance not of first order: it is then right to 1 %; beyond, frames are simulated
-    0.025
-)
+# most variance not of first order: it is then right to 1 %; beyond, frames are simulated
+MOST_HIGHER = 0.025
 # in place of an unknown deviation: of a phase in radians, of an amplitude in units
-MOST_TURNED = 1e3
-MOST_SPREAD = 1e9
+LARGEST_PHASE_NOISE = 1e3
+LARGEST_AMPLITUDE_NOISE = 1e9
+WORST = -1
+BEST = 1
 
 
 class Certainty(NamedTuple):
-    """Sorted pixels, (n,) bool: ``always`` a range, to first order in the noise; ``never`` a
-    range. Without noise, (n,) float32: ``z_m`` before rounding, and its change per metre of half
-    path; ``deviation_m`` of a frame's z; ``amplitude``, the mean over frequencies, and its
-    deviation; ``reason`` uint8."""
+    """Sorted pixels of a view, (n,) each."""
 
     always: np.ndarray
+    """bool: a range in every frame, to first order in the noise."""
     never: np.ndarray
+    """bool: no range in any frame."""
     z_m: np.ndarray
+    """float32: z without noise, before rounding."""
     z_by_path: np.ndarray
+    """float32: change of z per metre of half path."""
     deviation_m: np.ndarray
+    """float32: deviation of a frame's z."""
     amplitude: np.ndarray
+    """float32: mean over frequencies, without noise."""
     amplitude_deviation: np.ndarray
+    """float32: deviation of a frame's amplitude."""
     reason: np.ndarray
+    """uint8: `Reason` of the pixel without noise."""
+
+
+class _Spans(NamedTuple):
+    """Means of the quantities of the gates, and how far noise and displacements may carry them."""
+
+    amplitude: np.ndarray
+    """(f, n): mean amplitude."""
+    amplitude_reach: np.ndarray
+    """(f, n): `DEVIATIONS` of it."""
+    total_reach: np.ndarray
+    """(n,): `DEVIATIONS` of the sum over the frequencies."""
+    edge: np.ndarray
+    """(n,): largest edge sum."""
+    residual: np.ndarray
+    """(n,): lattice residual of the mean phases in turns."""
+    residual_reach: np.ndarray
+    """(n,): `DEVIATIONS` of the noisiest phase in turns."""
+    range_m: np.ndarray
+    """(n,): range along the ray."""
+    limited_m: np.ndarray
+    """(n,): range in the direction that the engine limits."""
+    range_reach_m: np.ndarray
+    """(n,): `DEVIATIONS` of the range, and the largest displacement of a frame."""
 
 
 def certainty(
@@ -54,272 +77,147 @@ def certainty(
     farthest_error_m: float,
 ) -> Certainty:
     """Sort the pixels of a view of ``shape`` whose frames are displaced by at most
-    ``farthest_error_m``."""
+    ``farthest_error_m``. ``lost`` (n,) bool: always saturated."""
     gates = engine.gates
     lattice = engine.lattice
     amplitude = filtered.amplitude
     f, n = amplitude.shape
-    turns = np.minimum(filtered.turned, f4(MOST_TURNED)) / f4(2 * np.pi)
-    spread = np.minimum(filtered.spread, f4(MOST_SPREAD))
+    phase_noise = np.minimum(filtered.phase_noise, f4(LARGEST_PHASE_NOISE))
+    noise_turns = phase_noise / f4(2 * np.pi)
+    amplitude_noise = np.minimum(filtered.amplitude_noise, f4(LARGEST_AMPLITUDE_NOISE))
 
-    # the engine on the mean phasors, and the change of z by half a path: the range is that at
-    # which range and distance to the emitter come to twice as much
+    # the engine on the mean phasors
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1)
-    mean_m, reason, _ = ranging.ranges_of(
+    z_m, reason, _ = ranging.ranges_of(
         planes, filtered.edge_least, lost.astype(np.uint8), engine, np.zeros(n)
     )
-    (along, square, cosine), weights = engine.geometry, lattice.metres_per_turn[:, None]
-    range_m = mean_m / cosine
+    # change of z by half a path: the range is that at which range and distance to the emitter come
+    # to twice as much
+    along, square, cosine = engine.geometry
+    range_m = z_m / cosine
     emitter_m = np.sqrt(range_m * range_m - 2 * range_m * along + square)
-    by_path = cosine * 2 * emitter_m / (range_m + emitter_m - along)
-    deviation_m = by_path * np.sqrt(((weights * turns) ** 2).sum(axis=0))
+    z_by_path = cosine * 2 * emitter_m / (range_m + emitter_m - along)
+    metres_per_turn = lattice.metres_per_turn[:, None]
+    deviation_m = z_by_path * np.sqrt(((metres_per_turn * noise_turns) ** 2).sum(axis=0))
 
-    # the lattice residual of the mean phases in turns, and whether the wrap counts are certain
+    # the lattice residual of the mean phases, and whether the wrap counts are certain
     turn = np.angle(filtered.phasor) / f4(2 * np.pi)
     turn[turn < 0] += 1
     sums = lattice.combination @ turn
-    sway = np.sqrt(lattice.combination**2 @ turns**2)
-    margin = (0.5 - np.abs(sums - np.round(sums)) > DEVIATIONS * sway).all(axis=0)
+    sums_noise = np.sqrt(lattice.combination**2 @ noise_turns**2)
+    to_next_key = 0.5 - np.abs(sums - np.round(sums))
+    one_key = (to_next_key > DEVIATIONS * sums_noise).all(axis=0)
     residual2 = np.empty(n, f4)
     ranging.half_path(turn, n, lattice, np.empty(n, f4), residual2)
-    residual = np.sqrt(residual2)
-    unwraps = margin & np.isfinite(residual2)
+    unwraps = one_key & np.isfinite(residual2)
 
-    # each gate at the worst (-1) and the best (+1) values that noise and displacements allow
-    both = DEVIATIONS * np.sqrt((spread**2).sum(axis=0))
-    reach = DEVIATIONS * turns.max(axis=0)
-    slack_m = DEVIATIONS * deviation_m + farthest_error_m
-    far_m = mean_m if gates.axial > 0 else range_m
-    if gates.edge_mean > 0:  # the frequencies' noise is independent
-        steepest = (
-            filtered.edge.mean(axis=0)
-            + DEVIATIONS * np.sqrt((filtered.edge_spread**2).sum(axis=0)) / f
-        )
-    else:
-        steepest = (filtered.edge + DEVIATIONS * filtered.edge_spread).max(axis=0)
+    # each gate at the worst and the best values that noise and displacements allow
+    total_noise = np.sqrt((amplitude_noise**2).sum(axis=0))
+    spans = _Spans(
+        amplitude=amplitude,
+        amplitude_reach=DEVIATIONS * amplitude_noise,
+        total_reach=DEVIATIONS * total_noise,
+        edge=_largest_edge(filtered, gates),
+        residual=np.sqrt(residual2),
+        residual_reach=DEVIATIONS * noise_turns.max(axis=0),
+        range_m=range_m,
+        limited_m=z_m if gates.axial > 0 else range_m,
+        range_reach_m=DEVIATIONS * deviation_m + farthest_error_m,
+    )
+    at_worst = _first_failed(gates, spans, WORST)
+    at_best = _first_failed(gates, spans, BEST)
 
-    def first_failed(end: int) -> np.ndarray:
-        low = amplitude + end * DEVIATIONS * spread
-        high = amplitude - end * DEVIATIONS * spread
-        inputs = ranging.GateInputs(
-            edge=steepest if end < 0 else np.full(n, -np.inf, f4),
-            least=low.min(axis=0),
-            greatest=high.max(axis=0),
-            total=amplitude.sum(axis=0) + end * both,
-            residual2=np.maximum(residual - end * reach, 0.0) ** 2,
-            brightest=np.maximum(low.max(axis=0), 1e-9),
-            range_m=np.maximum(range_m + end * slack_m, 0.0),
-            low_m=far_m + end * slack_m,
-            high_m=far_m - end * slack_m,
-        )
-        return np.asarray(ranging.first_failed_each(gates, inputs))
-
-    at_worst = first_failed(-1)
-    at_best = first_failed(1)
-    known = np.asarray((filtered.left_out <= MOST_LEFT_OUT).all(axis=0))
+    linear = np.asarray((filtered.higher_share <= MOST_HIGHER).all(axis=0))
     # a dim pixel's mean over its window, at its brightest
     dim = np.isfinite(filtered.edge).all(axis=0) & (at_best == ranging.LOW_AMPLITUDE)
-    fails = (at_best == ranging.AMPLITUDE_RATIO) | ((at_best == ranging.UNWRAP) & margin)
-    unmeasured = engine.outside_mask | lost | _edge_fails(filtered, gates) | dim | (known & fails)
-    too_far = (at_best == ranging.OUT_OF_RANGE) | (at_best == ranging.LOW_REFLECTIVITY)
-    never = unmeasured | (known & unwraps & too_far)
-    always = known & unwraps & (at_worst == ranging.VALID) & ~never
+    wrong_phases = (at_best == ranging.UNWRAP) & one_key
+    fails = (at_best == ranging.AMPLITUDE_RATIO) | wrong_phases
+    unmeasured = engine.outside_mask | lost | _edge_fails(filtered, gates) | dim | (linear & fails)
+    out_of_limits = (at_best == ranging.OUT_OF_RANGE) | (at_best == ranging.LOW_REFLECTIVITY)
+    never = unmeasured | (linear & unwraps & out_of_limits)
+    always = linear & unwraps & (at_worst == ranging.VALID) & ~never
     if engine.flying is not None:
-        images = (
-            each.reshape(shape) for each in (mean_m, DEVIATIONS * deviation_m, known, unmeasured)
+        always &= ~_may_fly(
+            engine.flying,
+            z_m.reshape(shape),
+            (DEVIATIONS * deviation_m).reshape(shape),
+            linear.reshape(shape),
+            unmeasured.reshape(shape),
         )
-        always &= ~_may_fly(engine.flying, *images)
-    of_amplitude = np.sqrt((spread**2).sum(axis=0)) / f
     return Certainty(
-        always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason
+        always=always,
+        never=never,
+        z_m=z_m,
+        z_by_path=z_by_path,
+        deviation_m=deviation_m,
+        amplitude=amplitude.mean(axis=0),
+        amplitude_deviation=total_noise / f,
+        reason=reason,
     )
 
 
+def _largest_edge(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
+    """Return the largest edge sum (n,) of any frequency, or of their mean, within `DEVIATIONS`."""
+    if gates.edge_mean == 0:
+        return np.asarray((filtered.edge + DEVIATIONS * filtered.edge_noise).max(axis=0))
+    # the frequencies' noise is independent
+    mean_noise = np.sqrt((filtered.edge_noise**2).sum(axis=0))
+    return np.asarray(filtered.edge.mean(axis=0) + DEVIATIONS * mean_noise / len(filtered.edge))
+
+
+def _first_failed(gates: ranging.Gates, spans: _Spans, end: int) -> np.ndarray:
+    """Return the code (n,) of the first gate that fails at the `WORST` or `BEST` ``end``."""
+    low = spans.amplitude + end * spans.amplitude_reach
+    high = spans.amplitude - end * spans.amplitude_reach
+    inputs = ranging.GateInputs(
+        edge=spans.edge if end == WORST else np.full(spans.edge.shape, -np.inf, f4),
+        least=low.min(axis=0),
+        greatest=high.max(axis=0),
+        total=spans.amplitude.sum(axis=0) + end * spans.total_reach,
+        residual2=np.maximum(spans.residual - end * spans.residual_reach, 0.0) ** 2,
+        brightest=np.maximum(low.max(axis=0), 1e-9),
+        range_m=np.maximum(spans.range_m + end * spans.range_reach_m, 0.0),
+        low_m=spans.limited_m + end * spans.range_reach_m,
+        high_m=spans.limited_m - end * spans.range_reach_m,
+    )
+    return np.asarray(ranging.first_failed_each(gates, inputs))
+
+
 def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
-    """Find pixels whose edge sum, in one frequency or in the mean of all, always exceeds the
+    """Find pixels (n,) whose edge sum, in one frequency or in the mean of all, always exceeds the
     limit."""
     limit = float(gates.edge)
     least = filtered.edge_least
-    loose = np.maximum(filtered.edge_loose, 1e-9)
+    noise = np.maximum(filtered.edge_least_noise, 1e-9)
     if np.isinf(limit):
         return np.zeros(least.shape[1], bool)
     if gates.edge_mean > 0:
-        return np.asarray(
-            least.sum(axis=0) - DEVIATIONS * np.sqrt((loose**2).sum(axis=0)) > limit * len(least)
-        )
-    return np.asarray((np.maximum((least - limit) / loose, 0.0) ** 2).sum(axis=0) > DEVIATIONS**2)
+        lowest = least.sum(axis=0) - DEVIATIONS * np.sqrt((noise**2).sum(axis=0))
+        return np.asarray(lowest > limit * len(least))
+    # all frequencies below the limit at once
+    deviations = np.maximum((least - limit) / noise, 0.0)
+    return np.asarray((deviations**2).sum(axis=0) > DEVIATIONS**2)
 
 
 def _may_fly(
     gate: ranging.FlyingGate,
     z_m: np.ndarray,
-    slack_m: np.ndarray,
-    known: np.ndarray,
+    reach_m: np.ndarray,
+    linear: np.ndarray,
     unmeasured: np.ndarray,
 ) -> np.ndarray:
     """Find pixels (h, w), flat, that the gate on the finished image may remove in some frame."""
-    slack_m = np.nan_to_num(slack_m)
+    reach_m = np.nan_to_num(reach_m)
     z_m = np.nan_to_num(z_m)
-    measured = known & ~unmeasured
-    low = np.where(measured, z_m - slack_m, np.inf)
-    high = np.where(measured, z_m + slack_m, -np.inf)
+    measured = linear & ~unmeasured
+    low = np.where(measured, z_m - reach_m, np.inf)
+    high = np.where(measured, z_m + reach_m, -np.inf)
     square = np.ones((3, 3), np.uint8)
     nearest = np.asarray(cv2.erode(low, square))
     farthest = np.asarray(cv2.dilate(high, square))
-    wild = (~known & ~unmeasured).astype(int)
-    count = ndimage.convolve(wild, np.ones((3, 3), int), mode="constant")
-    before = z_m + slack_m - nearest > gate.near_m
-    behind = farthest - z_m + slack_m > gate.far_m
-    return np.asarray(before.astype(int) + behind + count >= 2).ravel()
-
-
-# a window with a smaller edge sum is even: a neighbour 0.13 rad off changes its weight by 3 %
-MOST_EDGE = 0.004
-MOST_UNLIKE = (
-    0.005  # largest difference of c s^2 in a window with even noise: that share of a weight
-)
-MOST_NOISE = 0.15  # largest phase noise in radians of the table, beyond what `certainty` accepts
-NOISES = np.linspace(0.0, MOST_NOISE, 33)
-
-
-def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Return a neighbour's share, and the variance of higher order over the noise's, by phase
-    noise `NOISES`."""
-    # windows with one noise each, below one another
-    side = window.space.shape[0]
-    k = window.space.size
-    count = len(NOISES)
-    weights = window.space.ravel() / window.space.sum()
-    each = np.repeat(NOISES, k)[None].astype(f4)
-    bright = np.full((1, count * k), 1e3 * max(window.dim, 1.0), f4)
-    light = Light(np.ones_like(each, np.complex64), bright, bright, each, each / f4(1e3))
-    middles = np.arange(count) * k + k // 2
-    out = unknown_filtered(1, count * k)
-    lost = np.zeros(count * k, bool)
-    moved = linearised(middles[1:], light, window, (count * side, side), lost, out)[0]
-    neighbours = np.ones(count)
-    rest = np.zeros(count)
-    neighbours[1:] = moved[:, 0] / NOISES[1:] / weights[0]
-    rest[1:] = out.left_out[0, middles[1:]] * (out.turned[0, middles[1:]] / NOISES[1:]) ** 2
-    return neighbours, rest
-
-
-def even_pixels(
-    edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], lost: np.ndarray
-) -> np.ndarray:
-    """Return (n,) bool: pixels before one even surface. ``edge`` (f, n): noise-free edge sum;
-    ``lost`` (n,) bool."""
-    size = window.space.shape[0]
-    half = size // 2
-    unlike = lost | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
-    unlike |= (light.turn > MOST_NOISE).any(axis=0)
-    square = np.ones((size, size), np.uint8)
-    even = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
-    even[:half], even[-half:], even[:, :half], even[:, -half:] = False, False, False, False
-    for f, plane in enumerate(window.concentration * light.turn.reshape(-1, *shape) ** 2):
-        even &= (
-            np.asarray(cv2.dilate(plane, square)) - np.asarray(cv2.erode(plane, square))
-            < MOST_UNLIKE
-        )
-        even &= edge[f].reshape(shape) < MOST_EDGE
-    return even.ravel()
-
-
-def fill_even(
-    even: np.ndarray,
-    filtered: np.ndarray,
-    edge: np.ndarray,
-    light: Light,
-    window: FilterSettings,
-    shape: tuple[int, int],
-    out: Filtered,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fill ``out`` at the ``even`` pixels (n,) bool, from the noise-free ``filtered`` (f, 3, n)
-    and ``edge`` (f, n). Return, (f, m) each, the change of the phase by a neighbour's noise at
-    weight and amplitude 1, over its deviation, and by one deviation of the centre's noise in
-    total."""
-    at = np.flatnonzero(even)
-    tables = _shares_of(window)
-    middle = len(window.space) // 2
-    each, centre = np.empty((2, len(edge), len(at)), f4)
-    # the weights are a product of those along rows and along columns
-    taps = window.space[middle] / np.sqrt(window.space[middle, middle])
-
-    def summed(values: np.ndarray, taps: np.ndarray) -> np.ndarray:
-        return cv2.sepFilter2D(
-            values.reshape(shape), -1, taps, taps, borderType=cv2.BORDER_CONSTANT
-        ).ravel()
-
-    for f in range(len(edge)):
-        ours = Light(*(part[f] for part in light))
-        theirs = Filtered(*(part[f] for part in out))
-        carried = ours.amplitude if window.by_amplitude else np.ones_like(ours.amplitude)
-        squares = (carried * ours.turn) ** 2
-        spreads = (ours.amplitude * ours.swell) ** 2
-        sums = summed(carried, taps), summed(squares, taps**2), summed(spreads, taps**2)
-        inputs = (
-            at,
-            filtered[f],
-            edge[f],
-            ours,
-            carried,
-            *sums,
-            window.space,
-            tables,
-            window.by_amplitude,
-        )
-        _fill_even(*inputs, theirs, each[f], centre[f])
-    return each, centre
-
-
-@numba.njit(**FAST)
-def _fill_even(  # type: ignore[no-untyped-def]
-    at,
-    filtered,
-    edge,
-    light,
-    carried,
-    weights,
-    squares,
-    spreads,
-    space,
-    tables,
-    by_amplitude,
-    out,
-    each,
-    centre,
-):
-    """Do the work of `fill_even` for one frequency; sums over windows are (n,)."""
-    middle = space[len(space) // 2, len(space) // 2]
-    kept = space.size - 1
-    whole = space.sum()
-    (of_neighbours, of_rest), step = tables, MOST_NOISE / (len(tables[0]) - 1)
-    for m in range(at.size):
-        i = at[m]
-        own = light.turn[i]
-        own2 = own * own
-        low = min(int(own / step), len(of_rest) - 2)
-        part = own / step - low
-        share = of_neighbours[low] + part * (of_neighbours[low + 1] - of_neighbours[low])
-        rest = own2 * (of_rest[low] + part * (of_rest[low + 1] - of_rest[low]))
-        each[m] = share / weights[i]
-        mine = middle * carried[i] / weights[i]
-        centre2 = (1 - share * (1 - mine)) ** 2 * own2 + rest
-        variance = each[m] ** 2 * (squares[i] - (middle * carried[i] * own) ** 2) + centre2
-        centre[m] = np.sqrt(centre2)
-        # noise moves the mean towards the centre's own phase, as it does the shares
-        alone = complex(filtered[0, i], filtered[1, i])
-        mean = light.phasor[i] * (1 - share) + alone * (
-            share / np.sqrt(alone.real**2 + alone.imag**2)
-        )
-        out.phasor[i] = mean / np.sqrt(mean.real**2 + mean.imag**2)
-        # noise perpendicular to a mean phasor lengthens it
-        out.amplitude[i] = filtered[2, i] * (1 + 0.5 * variance if by_amplitude else 1.0)
-        out.turned[i] = np.sqrt(variance)
-        out.spread[i] = np.sqrt(spreads[i]) / whole
-        out.left_out[i] = rest / variance
-        out.edge[i] = edge[i] + 0.5 * kept * (1 - np.exp(-own2))
-        out.edge_spread[i] = np.sqrt(
-            (kept * 6 / 16 + kept**2 / 8) * own2 * own2 + (1 + kept) * edge[i] * own2
-        )
-        out.edge_least[i], out.edge_loose[i] = out.edge[i], out.edge_spread[i]
+    undecided = (~linear & ~unmeasured).astype(int)
+    undecided_count = ndimage.convolve(undecided, np.ones((3, 3), int), mode="constant")
+    before = z_m + reach_m - nearest > gate.near_m
+    behind = farthest - z_m + reach_m > gate.far_m
+    # an undecided neighbour may be nearer or farther
+    return np.asarray(before.astype(int) + behind + undecided_count >= 2).ravel()

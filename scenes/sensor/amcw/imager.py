@@ -13,7 +13,6 @@ pattern and offset."""
 
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -21,52 +20,50 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Lens, Region
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw import kernels, ranging
-from scenes.sensor.amcw.at_once import windows_of
-from scenes.sensor.amcw.facts import AmcwCamera, ScatterFacts, unwrap_table
-from scenes.sensor.camera import CameraConfig
-from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
+from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.amcw.facts import (
+    AmcwCamera,
+    EngineFacts,
+    FlyingPixelFacts,
+    ScatterFacts,
+    unwrap_table,
+)
+from scenes.sensor.amcw.windows import windows_of
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.facts import Fact
+from scenes.sensor.common.normals import standard_normals
+from scenes.sensor.common.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
 HIGHEST_HARMONIC = 31  # higher harmonics change the phase by less than 0.1 mrad in total
 
 
-class AmcwExposure(NamedTuple):
-    """Light of a view at the converter, before noise, in converter units, flat over n = h w
-    pixels.
-
-    ``means`` (f, k, n): noise-free samples. ``sigma`` (n,): deviation of each sample. ``limit``
-    (n,): the largest sample that wells and converter hold; infinite if saturation is off.
-    ``shape``: (h, w)."""
-
-    means: np.ndarray
-    sigma: np.ndarray
-    limit: np.ndarray
-    shape: tuple[int, int]
-
-
 def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.ndarray:
     """Return the signal (f, h, w) with the harmonics that N ``phases`` alias onto the fundamental,
-    times ``residual`` (f,). Square light under square demodulation correlates to a triangle: odd
-    harmonics n of 1/n^2. N equidistant samples see harmonic n as the fundamental if n = +1 mod N,
-    and as its conjugate if n = -1. Approximation: a pixel that sees several paths has the
-    harmonics of their sum, not the sum of their harmonics."""
-    apart = phases if phases % 2 == 0 else 2 * phases
+    times ``residual`` (f,).
+
+    Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N
+    equidistant samples see harmonic n as the fundamental if n = +1 mod N, and as its conjugate if
+    n = -1. Approximation: a pixel that sees several paths has the harmonics of their sum, not the
+    sum of their harmonics.
+    """
+    # the odd harmonics that are aliased lie one below and one above multiples of this
+    period = phases if phases % 2 == 0 else 2 * phases
     changed = np.ones_like(signal)
     # frequency by frequency, so that all stays in the processor's cache
-    for light, share, out in zip(signal, residual, changed, strict=True):
+    for light, share, factor in zip(signal, residual, changed, strict=True):
         direction = light / np.maximum(np.abs(light), 1e-300)
-        wave = direction.copy()
+        turned_by_period = direction.copy()
+        for _ in range(period - 1):
+            turned_by_period *= direction
         power = np.ones_like(light)
-        for _ in range(apart - 1):
-            wave *= direction
-        for centre in range(apart, HIGHEST_HARMONIC, apart):
-            power *= wave
+        for centre in range(period, HIGHEST_HARMONIC, period):
+            power *= turned_by_period
             of_conjugate = share / (centre - 1) ** 2
             of_signal = share / (centre + 1) ** 2
-            out.real += (of_signal + of_conjugate) * power.real
-            out.imag += (of_signal - of_conjugate) * power.imag
-        out *= light
+            factor.real += (of_signal + of_conjugate) * power.real
+            factor.imag += (of_signal - of_conjugate) * power.imag
+        factor *= light
     return changed
 
 
@@ -75,16 +72,18 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
     light of its border continues. The fall-off of light towards the corners is assumed to be equal
     at its source and its destination."""
     share = facts.stray_share.value
+    sharp = _spread(image, facts.blur_px.value)
+    if share == 0:
+        return sharp
+    return (1 - share) * sharp + share * _spread(image, facts.stray_px.value)
 
-    def spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
-        return (
-            ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1))
-            if sigma_px > 0
-            else light
-        )
 
-    sharp = spread(image, facts.blur_px.value)
-    return (1 - share) * sharp + share * spread(image, facts.stray_px.value) if share > 0 else sharp
+def _spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Return light (..., h, w) after a Gaussian blur."""
+    if sigma_px == 0:
+        return light
+    blurred = ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1))
+    return np.asarray(blurred)
 
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
@@ -94,18 +93,18 @@ def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     x = slopes[..., 0]
     y = slopes[..., 1]
     r2 = x**2 + y**2
-    above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = above / below
-    # twice the radial factor's derivative by r^2
-    grows = (
-        2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
-    )
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = numerator / denominator
+    # derivatives by r^2, and twice that of the radial factor
+    numerator_slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    denominator_slope = k4 + r2 * (2 * k5 + r2 * 3 * k6)
+    radial_slope = 2 * (numerator_slope - radial * denominator_slope) / denominator
     # derivatives of u / fx and v / fy by the slopes
-    ux = radial + x * x * grows + 2 * p1 * y + 6 * p2 * x
-    vy = radial + y * y * grows + 6 * p1 * y + 2 * p2 * x
-    both = x * y * grows + 2 * p1 * x + 2 * p2 * y
-    return np.asarray(1 / np.abs(ux * vy - both**2))
+    ux = radial + x * x * radial_slope + 2 * p1 * y + 6 * p2 * x
+    vy = radial + y * y * radial_slope + 6 * p1 * y + 2 * p2 * x
+    uy = x * y * radial_slope + 2 * p1 * x + 2 * p2 * y
+    return np.asarray(1 / np.abs(ux * vy - uy**2))
 
 
 class AmcwImager(UnitModel[AmcwCamera]):
@@ -116,10 +115,8 @@ class AmcwImager(UnitModel[AmcwCamera]):
         self, camera: AmcwCamera, config: CameraConfig, region: Region, slopes: np.ndarray
     ) -> None:
         super().__init__(camera, config, region, slopes)
-        phases = (
-            2 * np.pi * np.arange(camera.modulation.phases.value) / camera.modulation.phases.value
-        )
-        self._waves = np.cos(phases).astype(f4), np.sin(phases).astype(f4)
+        phases = camera.modulation.phases.value
+        self._phase_steps = 2 * np.pi * np.arange(phases) / phases
         self.gains = np.array(camera.engine.amplitude_gains.value, f4)
         self.unwrap = unwrap_table(camera.frequencies_hz, camera.engine.fusion.value)
 
@@ -132,8 +129,9 @@ class AmcwImager(UnitModel[AmcwCamera]):
         outside = self.camera.lens.outside_field(self.region)
         if self.camera.emitter.mask_slopes is not None:
             corners = np.array(self.camera.emitter.mask_slopes.value)
-            for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                outside |= (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) < 0
+            next_corners = np.roll(corners, -1, axis=0)
+            for (x0, y0), (x1, y1) in zip(corners, next_corners, strict=True):
+                outside |= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) < 0
         return outside
 
     @cached_property
@@ -141,72 +139,88 @@ class AmcwImager(UnitModel[AmcwCamera]):
         """Light (h, w) that a pixel gathers from a surface of given radiance, relative to the
         axis: |d slopes / d pixel| cos^4. Not modelled: mechanical vignetting, and growth of the
         pupil with angle."""
-        return (
-            pixel_spans(self.camera.nominal_lens, self.slopes)
-            / (1 + (self.slopes**2).sum(axis=-1)) ** 2
-        )
+        spans = pixel_spans(self.camera.nominal_lens, self.slopes)
+        return spans / (1 + (self.slopes**2).sum(axis=-1)) ** 2
 
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
         """Draw smooth and pixel-wise range errors, before the filter."""
         facts = self.camera.fixed_pattern
         smooth, pixel = rng.standard_normal((2, *shape), dtype=f4)
-        return (
-            facts.smooth_mm.value * smooth_field(smooth, facts.smooth_length_px.value)
-            + facts.pixel_mm.value * pixel
-        )
+        field = smooth_field(smooth, facts.smooth_length_px.value)
+        return facts.smooth_mm.value * field + facts.pixel_mm.value * pixel
 
     def expose(self, view: NoiseFreeView) -> AmcwExposure:
         """Return the noise-free samples of a view that covers this imager's region."""
-        if self.camera.scatter is not None:
-            light = (view.phasor, view.phasor_direct, view.intensity)
-            facts = self.camera.scatter
-            phasor, direct, intensity = (scattered(image, facts) for image in light)
-            view = replace(view, phasor=phasor, phasor_direct=direct, intensity=intensity)
-        camera = self.camera
-        photons = self.camera.photons
-        phases = self.camera.modulation.phases.value
-        phasor, intensity = light_of(view, self.config.effects)
-        electrons = photons.signal_electrons.value * self.gathered
-        contrast = np.array(camera.modulation.contrast.value)[:, None, None]
-        # range errors that all frames share act as a delay of the light
-        turns = np.array(camera.frequencies_hz)[:, None, None] * (
-            2 * self.static_error_m / SPEED_OF_LIGHT_AIR
-        )
-        delay = np.empty(phasor.shape, complex)
-        delay.real, delay.imag = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
-        signal = phasor * delay * (contrast * electrons)
-        if self.config.effects.wiggling:
-            signal = with_harmonics(
-                signal, phases, np.array(camera.modulation.wiggling_residual.value)
+        scatter = self.camera.scatter
+        if scatter is not None:
+            view = replace(
+                view,
+                phasor=scattered(view.phasor, scatter),
+                phasor_direct=scattered(view.phasor_direct, scatter),
+                intensity=scattered(view.intensity, scatter),
             )
+        effects = self.config.effects
+        photons = self.camera.photons
+        phasor, intensity = light_of(view, effects)
+        electrons = photons.signal_electrons.value * self.gathered
+        signal = self._demodulated(phasor, electrons)
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
         # an exposure that ends early is scaled to the full length, with its noise
-        share = 1.0
+        share: float | np.ndarray = 1.0
         if photons.exposure_ends_electrons is not None:
-            share = np.minimum(
-                1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9)
-            )
-        variance = both_wells / share + 2 * (photons.read_noise_electrons.value / share) ** 2
-        sigma = np.sqrt(variance) if self.config.effects.noise else np.zeros_like(variance)
-        # the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
-        samples = np.empty((len(signal), phases, both_wells.size), f4)
-        units = (signal / photons.electrons_per_unit.value).reshape(len(signal), -1)
-        for k, step in enumerate(2 * np.pi * np.arange(phases) / phases):
-            samples[:, k] = units.real * np.cos(step) + units.imag * np.sin(step)
-        # the largest sample that fits: the fuller well holds half of both wells' electrons and
-        # half the sample
-        limit = np.full(both_wells.shape, np.inf)
-        if self.config.effects.saturation:
-            limit = np.full(both_wells.shape, float(camera.converter.full_scale_units.value))
-            if photons.full_well_electrons is not None:
-                room = 2 * photons.full_well_electrons.value / share - both_wells
-                limit = np.clip(room / photons.electrons_per_unit.value, 0, limit)
+            ends = photons.exposure_ends_electrons.value
+            share = np.minimum(1.0, ends / np.maximum(both_wells, 1e-9))
+        # shot noise of both wells, and the read noise of each
+        read_noise = photons.read_noise_electrons.value / share
+        variance = both_wells / share + 2 * read_noise**2
+        sigma = np.sqrt(variance) if effects.noise else np.zeros_like(variance)
+        limit = self._largest_sample(both_wells, share)
+        per_unit = photons.electrons_per_unit.value
         return AmcwExposure(
-            samples,
-            (sigma / photons.electrons_per_unit.value).ravel().astype(f4),
-            limit.ravel().astype(f4),
-            intensity.shape,
+            means=self._samples(signal / per_unit),
+            sigma=(sigma / per_unit).ravel().astype(f4),
+            limit=limit.ravel().astype(f4),
+            shape=intensity.shape,
         )
+
+    def _demodulated(self, phasor: np.ndarray, electrons: np.ndarray) -> np.ndarray:
+        """Return the demodulated signal (f, h, w) in electrons of light ``phasor`` (f, h, w), with
+        the errors that all frames share."""
+        modulation = self.camera.modulation
+        contrast = np.array(modulation.contrast.value)[:, None, None]
+        frequencies_hz = np.array(self.camera.frequencies_hz)[:, None, None]
+        # range errors that all frames share act as a delay of the light
+        turns = frequencies_hz * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
+        delay = np.empty(phasor.shape, complex)
+        delay.real = np.cos(2 * np.pi * turns)
+        delay.imag = np.sin(2 * np.pi * turns)
+        signal = phasor * delay * (contrast * electrons)
+        if not self.config.effects.wiggling:
+            return signal
+        residual = np.array(modulation.wiggling_residual.value)
+        return with_harmonics(signal, modulation.phases.value, residual)
+
+    def _samples(self, signal: np.ndarray) -> np.ndarray:
+        """Return the samples (f, k, n) float32: Re(S exp(-2 pi i j / k)) of the demodulated signal
+        S (f, h, w) in converter units, at phase steps j = 0 .. k - 1."""
+        flat = signal.reshape(len(signal), -1)
+        samples = np.empty((len(signal), len(self._phase_steps), flat.shape[1]), f4)
+        for k, step in enumerate(self._phase_steps):
+            samples[:, k] = flat.real * np.cos(step) + flat.imag * np.sin(step)
+        return samples
+
+    def _largest_sample(self, both_wells: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+        """Return the largest sample (h, w) that fits, in converter units; infinite if saturation is
+        off. ``both_wells`` (h, w): electrons. ``share``: of the exposure, before it ends."""
+        if not self.config.effects.saturation:
+            return np.full(both_wells.shape, np.inf)
+        photons = self.camera.photons
+        limit = np.full(both_wells.shape, float(self.camera.converter.full_scale_units.value))
+        if photons.full_well_electrons is None:
+            return limit
+        # the fuller well holds half of both wells' electrons and half the sample
+        room = 2 * photons.full_well_electrons.value / share - both_wells
+        return np.clip(room / photons.electrons_per_unit.value, 0, limit)
 
     def ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
         """Return the electrons (h, w) of ambient light in both wells of one exposure: those of the
@@ -217,15 +231,13 @@ class AmcwImager(UnitModel[AmcwCamera]):
         if not config.effects.ambient:
             return np.zeros(intensity.shape)
         irradiance = config.ambient_uw_cm2_nm * UW_CM2 * photons.band_nm.value
-        one_metre = (
-            photons.signal_electrons.value * irradiance / self.camera.emitter.irradiance_w_m2.value
-        )
-        nearest_m = ndimage.minimum_filter(
-            np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest"
-        )
+        emitter_irradiance = self.camera.emitter.irradiance_w_m2.value
+        at_one_metre = photons.signal_electrons.value * irradiance / emitter_irradiance
+        finite_m = np.where(np.isfinite(view.range_m), view.range_m, np.inf)
+        nearest_m = ndimage.minimum_filter(finite_m, 3, mode="nearest")
         nearest_m = np.where(np.isfinite(nearest_m), nearest_m, 0.0)
         range_m = np.where(view.coverage < 1, nearest_m, np.nan_to_num(view.range_m))
-        return np.asarray(one_metre * self.gathered * intensity * range_m**2)
+        return np.asarray(at_one_metre * self.gathered * intensity * range_m**2)
 
     def frame(
         self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0
@@ -233,7 +245,8 @@ class AmcwImager(UnitModel[AmcwCamera]):
         """Draw a frame with noise from ``rng`` on the samples, then run the engine. ``error_m``
         displaces the frame."""
         unit, amplitude, saturated = self.phasors(exposure, rng)
-        return self._decode(*self.filter(unit, amplitude, exposure.shape), saturated, error_m)
+        filtered, edge = self.filter(unit, amplitude, exposure.shape)
+        return self._decode(filtered, edge, saturated, error_m)
 
     def phasors(
         self, exposure: AmcwExposure, rng: np.random.Generator
@@ -244,10 +257,18 @@ class AmcwImager(UnitModel[AmcwCamera]):
         unit = np.empty((2, n_frequencies, n), f4)
         amplitude = np.empty((n_frequencies, n), f4)
         saturated = np.empty(n, np.uint8)
-        normals = standard_normals(rng, exposure.means.shape)
-        knee = f4(self.camera.converter.knee_units.value)
         kernels.expose(
-            *exposure[:3], normals, knee, self.gains, *self._waves, unit, amplitude, saturated
+            exposure.means,
+            exposure.sigma,
+            exposure.limit,
+            standard_normals(rng, exposure.means.shape),
+            f4(self.camera.converter.knee_units.value),
+            self.gains,
+            np.cos(self._phase_steps).astype(f4),
+            np.sin(self._phase_steps).astype(f4),
+            unit,
+            amplitude,
+            saturated,
         )
         return unit, amplitude, saturated
 
@@ -267,29 +288,39 @@ class AmcwImager(UnitModel[AmcwCamera]):
         self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float
     ) -> DecodedFrame:
         """Unwrap, correct, gate and round: the remaining steps of the depth engine."""
-        (n_frequencies, _, *shape), n, engine = filtered.shape, saturated.size, self.engine
-        filtered = filtered.reshape(n_frequencies, 3, -1)
-        edge = edge.reshape(n_frequencies, -1)
+        n_frequencies = len(filtered)
+        shape = edge.shape[1:]
+        n = saturated.size
+        flying_gate = self.engine.flying
         z_m, reason, total = ranging.ranges_of(
-            filtered, edge, saturated, engine, np.full(n, error_m)
+            filtered.reshape(n_frequencies, 3, -1),
+            edge.reshape(n_frequencies, -1),
+            saturated,
+            self.engine,
+            np.full(n, error_m),
         )
-        if engine.flying:
+        if flying_gate is not None:
             flying = np.empty((n, 1), bool)
-            planes = (plane[:, None] for plane in (z_m, total, reason))
-            ranging.find_flying(*planes, np.arange(n), self._near, engine.flying, flying)
+            ranging.find_flying(
+                z_m[:, None],
+                total[:, None],
+                reason[:, None],
+                np.arange(n),
+                self._neighbours,
+                flying_gate,
+                flying,
+            )
             reason[flying[:, 0]] = ranging.EDGE
         ranging.round_valid(z_m, reason, f4(self.camera.z_step_m))
-        return DecodedFrame(
-            z_m.reshape(shape), reason.reshape(shape), total.reshape(shape) / f4(n_frequencies)
-        )
+        amplitude = total.reshape(shape) / f4(n_frequencies)
+        return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude)
 
     @cached_property
-    def _near(self) -> np.ndarray:
-        """Return (n, 9) int32: each pixel's neighbours and itself, -1 beyond the region's border."""
+    def _neighbours(self) -> np.ndarray:
+        """Return (n, 9) int32: the pixels of windows of 3 x 3, -1 beyond the region's border."""
         h, w = self.region.shape
-        return np.ascontiguousarray(
-            windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1, np.arange(h * w))
-        )
+        numbers = np.arange(h * w, dtype=np.int32).reshape(h, w)
+        return np.ascontiguousarray(windows_of(numbers, 3, -1, np.arange(h * w)))
 
     @cached_property
     def filter_settings(self) -> kernels.FilterSettings:
@@ -297,50 +328,68 @@ class AmcwImager(UnitModel[AmcwCamera]):
         engine = self.camera.engine
         half = engine.window_px.value // 2
         sigma_px = engine.spatial_sigma_px
-        across = np.exp(
-            -(np.arange(-half, half + 1) ** 2) / (2 * sigma_px.value**2 if sigma_px else np.inf)
+        twice_variance = 2 * sigma_px.value**2 if sigma_px else np.inf
+        taps = np.exp(-(np.arange(-half, half + 1) ** 2) / twice_variance)
+        return kernels.FilterSettings(
+            space=np.outer(taps, taps).astype(f4),
+            concentration=f4(engine.concentration.value),
+            dim=f4(engine.dim_amplitude_units.value),
+            drop_dim=engine.drop_dim_neighbours.value,
+            dim_edges=engine.edges_to_dim.value,
+            by_amplitude=engine.filter_on.value == "phasors",
         )
-        space = np.outer(across, across).astype(f4)
-        limits = f4(engine.concentration.value), f4(engine.dim_amplitude_units.value)
-        by_amplitude = engine.filter_on.value == "phasors"
-        rules = engine.drop_dim_neighbours.value, engine.edges_to_dim.value, by_amplitude
-        return kernels.FilterSettings(space, *limits, *rules)
 
     @cached_property
     def engine(self) -> ranging.DepthEngine:
         """The engine's steps after the filter."""
-        facts = self.camera.engine
-        emitter = self.camera.optics.emitter_m
-        along, cosine = rays_of(self.slopes, emitter)
-        geometry = (
-            np.stack([along, np.full_like(along, emitter @ emitter), cosine])
-            .reshape(3, -1)
-            .astype(f4)
-        )
-        edge = facts.edge_threshold
-        lattice = facts.lattice_residual_turns
-        by_amplitude = facts.residual_by_amplitude
-        gates = ranging.Gates(
-            edge=f4(edge.value if edge and self.config.edge_gate else np.inf),
-            edge_mean=f4(facts.edges_in.value == "mean"),
-            residual=f4(lattice.value if lattice else np.inf),
-            residual_most=f4(by_amplitude.greatest_turns.value if by_amplitude else np.inf),
-            residual_scale=f4(by_amplitude.scale_turns.value if by_amplitude else 0.0),
-            residual_slope=f4(by_amplitude.slope.value if by_amplitude else 0.0),
-            ratio=f4(facts.amplitude_ratio.value if facts.amplitude_ratio else np.inf),
-            least=f4(facts.min_amplitude_units.value),
-            total=f4(facts.min_amplitude_sum_units.value),
-            reflectivity=f4((r.value if (r := facts.min_reflectivity_units_mm2) else 0.0) * MM**2),
-            nearest_m=f4(facts.min_range_mm.value * MM),
-            farthest_m=f4(facts.max_range_mm.value * MM),
-            axial=f4(facts.limits_along.value == "axis"),
-        )
-        flying = None
-        if (fly := facts.flying_pixels) is not None:
-            lengths_m = (f4(mm.value * MM) for mm in (fly.near_mm, fly.far_mm, fly.most_mm))
-            flying = ranging.FlyingGate(
-                f4(fly.relative_deviation.value), f4(fly.least_mean_units.value), *lengths_m
-            )
+        emitter_m = self.camera.optics.emitter_m
+        along_m, cosine = rays_of(self.slopes, emitter_m)
+        geometry = np.stack([along_m, np.full_like(along_m, emitter_m @ emitter_m), cosine])
         return ranging.DepthEngine(
-            geometry, self.outside_mask.reshape(-1), self.unwrap, gates, flying
+            geometry=geometry.reshape(3, -1).astype(f4),
+            outside_mask=self.outside_mask.reshape(-1),
+            lattice=self.unwrap,
+            gates=_gates(self.camera.engine, self.config.edge_gate),
+            flying=_flying_gate(self.camera.engine.flying_pixels),
         )
+
+
+def _gates(facts: EngineFacts, edge_gate: bool) -> ranging.Gates:
+    """Return the gates of single pixels; those that the camera lacks let everything pass."""
+    by_amplitude = facts.residual_by_amplitude
+    greatest_turns = by_amplitude.greatest_turns if by_amplitude else None
+    scale_turns = by_amplitude.scale_turns if by_amplitude else None
+    slope = by_amplitude.slope if by_amplitude else None
+    return ranging.Gates(
+        edge=_limit(facts.edge_threshold if edge_gate else None, np.inf),
+        edge_mean=f4(facts.edges_in.value == "mean"),
+        residual=_limit(facts.lattice_residual_turns, np.inf),
+        residual_most=_limit(greatest_turns, np.inf),
+        residual_scale=_limit(scale_turns, 0.0),
+        residual_slope=_limit(slope, 0.0),
+        ratio=_limit(facts.amplitude_ratio, np.inf),
+        least=f4(facts.min_amplitude_units.value),
+        total=f4(facts.min_amplitude_sum_units.value),
+        reflectivity=_limit(facts.min_reflectivity_units_mm2, 0.0, MM**2),
+        nearest_m=f4(facts.min_range_mm.value * MM),
+        farthest_m=f4(facts.max_range_mm.value * MM),
+        axial=f4(facts.limits_along.value == "axis"),
+    )
+
+
+def _limit(fact: Fact[float] | None, without: float, unit: float = 1.0) -> np.float32:
+    """Return a fact's value in float32, or that of a gate that the camera lacks."""
+    return f4(without if fact is None else fact.value * unit)
+
+
+def _flying_gate(facts: FlyingPixelFacts | None) -> ranging.FlyingGate | None:
+    """Return the gate on the finished image, if the camera has one."""
+    if facts is None:
+        return None
+    return ranging.FlyingGate(
+        relative_deviation=f4(facts.relative_deviation.value),
+        least_mean=f4(facts.least_mean_units.value),
+        near_m=f4(facts.near_mm.value * MM),
+        far_m=f4(facts.far_mm.value * MM),
+        most_m=f4(facts.most_mm.value * MM),
+    )

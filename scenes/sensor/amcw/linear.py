@@ -1,43 +1,59 @@
-"""The engine's filter to first order in the noise: the mean of each pixel, and its change by
-noise.
+"""The engine's filter to first order in the noise: the mean of each pixel, and its change by noise.
 
-Before the filter, noise turns a pixel's phasor and changes its amplitude (`Light`). The filtered
-phasor S is a sum over the window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's
-phase minus its own. Noise of a neighbour turns t by a normal of variance v, so F acts as F + v
-F''/2 in the mean and, to first order, by its derivative F' + v F'''/2 (Stein: E[f(x) x] = E[f'(x)]
-E[x^2]). The centre's noise is in all differences; the mean over it is taken last, of arg S, by
-three nodes. On a face with phase noise s, the centre's own noise counts for more than its weight,
-by some c s^2 of the window's sum, and a neighbour's for less by c s^2. Terms of second and third
-order are estimated."""
+The filtered phasor of a pixel is a sum over its window,
+
+    S = sum_j s_j F(t_j),    F(t) = exp(i t - c (1 - cos t)),
+
+with s_j the neighbour's weight by distance (times its amplitude, if phasors count by amplitude),
+t_j its phase minus the centre's, and c the filter's concentration. Noise acts in three ways:
+
+* A neighbour's phase is normal of variance v about its mean. In the mean, F acts as
+  F + v F''/2 + v^2 F''''/8, and its derivatives F' and F'' likewise. To first order, its noise x
+  changes S by x E[F'] (Stein: E[f(x) x] = E[f'(x)] E[x^2]), so it changes the phase arg S by
+  x Im(E[F'] / S).
+* The centre's noise is in all differences t_j. The mean over it is taken last, of arg S, by the
+  three nodes of Gauss and Hermite: 0 (weight 2/3) and +-sqrt(3) deviations (weight 1/6 each). By
+  it, the centre's own noise counts for more than its weight, by some c s^2 of the window's sum with
+  phase noise s, and a neighbour's for less by c s^2.
+* Terms of second and third order are estimated; where they are large, frames must be drawn.
+
+`linearised` is the door. `scenes.sensor.amcw.linear_reference` has the same for one pixel, in NumPy
+and double precision. The compiled functions handle `ABREAST` pixels at once, side by side in one
+flat array, so that each inner loop is over one row of it and is vectorised."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
-from scipy import special
 
 from scenes.sensor.amcw.kernels import FilterSettings
-from scenes.sensor.normals import FAST
+from scenes.sensor.amcw.light import NEVER_ZERO, SMALLEST, Light
+from scenes.sensor.common.normals import FAST
 
-if TYPE_CHECKING:
-    from scenes.sensor.amcw.imager import AmcwExposure
-
-DEVIATIONS = (
-    4.5  # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
-)
-NOISY = 0.35  # phase noise in radians above which a pixel's phase is not a normal about its mean
-SMALLEST = 1e-12
+# a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
+DEVIATIONS = 4.5
+# phase noise in radians above which a pixel's phase is not a normal about its mean
+LARGEST_NORMAL = 0.35
 # limit of the phase noise in radians, which would be too large for float32 where there is no light
-MOST_TURN = 1e3
+LARGEST_PHASE_NOISE = 1e3
+# the mean resultant length of a phase is concave in 1 / noise: its slope at 0, sqrt(pi / 8), bounds
+# it
+RESULTANT_SLOPE = 0.6267
+# variance of (1 - cos)/2 of a uniform phase: no other phase scatters more
+UNIFORM_VARIANCE = 0.125
 f4 = np.float32
-LEAST = f4(SMALLEST)
 REACH = f4(DEVIATIONS)
 SQRT_3 = f4(np.sqrt(3.0))
-ZERO = f4(0)
+SIXTEENTH = f4(1 / 16)
+SIXTH = f4(1 / 6)
+FACTORIAL_4 = f4(1 / 24)
+FACTORIAL_5 = f4(1 / 120)
+FACTORIAL_6 = f4(1 / 720)
 QUARTER = f4(0.25)
 HALF = f4(0.5)
+ZERO = f4(0)
 ONE = f4(1)
 TWO = f4(2)
 THREE = f4(3)
@@ -47,113 +63,49 @@ SIX = f4(6)
 TEN = f4(10)
 
 
-class Light(NamedTuple):
-    """Each pixel before the filter, all (f, n) float32. ``phasor``: complex, of length 1.
-    ``amplitude``: without noise; ``bright``: with it. ``turn``: deviation of the phase in radians.
-    ``swell``: that of the amplitude, over it."""
-
-    phasor: np.ndarray
-    amplitude: np.ndarray
-    bright: np.ndarray
-    turn: np.ndarray
-    swell: np.ndarray
-
-
 class Filtered(NamedTuple):
-    """Each pixel after the filter, (f, n) float32: mean ``phasor`` (complex, length 1) and
-    ``amplitude``; ``turned`` and ``spread``: deviations of the phase in radians and of the
-    amplitude. ``left_out``: share of the phase's variance that is not of first order; infinite if
-    neighbours are too noisy, or if it is uncertain whether they count. ``edge``, ``edge_spread``:
-    mean and deviation of the sum over neighbours of (1 - cos)/2, with those of which it is
-    uncertain whether they count; infinite if unknown. ``edge_least``, ``edge_loose``: the same
-    without those; if unknown, a lower bound of the mean and a bound of the deviation that hold at
-    any noise."""
+    """Each pixel after the filter, at f frequencies and n pixels.
+
+    The edge sum is the sum over neighbours of (1 - cos t)/2.
+    """
 
     phasor: np.ndarray
+    """(f, n) complex64: direction of the mean phasor, of length 1."""
     amplitude: np.ndarray
-    turned: np.ndarray
-    spread: np.ndarray
-    left_out: np.ndarray
+    """(f, n) float32: mean amplitude."""
+    phase_noise: np.ndarray
+    """(f, n) float32: deviation of the phase in radians."""
+    amplitude_noise: np.ndarray
+    """(f, n) float32: deviation of the amplitude."""
+    higher_share: np.ndarray
+    """(f, n) float32: share of the phase's variance that is not of first order; infinite if
+    neighbours are too noisy, or if it is uncertain whether they count."""
     edge: np.ndarray
-    edge_spread: np.ndarray
+    """(f, n) float32: mean of the edge sum, with neighbours of which it is uncertain whether they
+    count; infinite if unknown."""
+    edge_noise: np.ndarray
+    """(f, n) float32: its deviation; infinite if unknown."""
     edge_least: np.ndarray
-    edge_loose: np.ndarray
+    """(f, n) float32: mean of the edge sum without uncertain neighbours; if unknown, a lower bound
+    that holds at any noise."""
+    edge_least_noise: np.ndarray
+    """(f, n) float32: its deviation; if unknown, a bound that holds at any noise."""
 
 
 def unknown_filtered(frequencies: int, n: int) -> Filtered:
     """Return n pixels with unknown values."""
     shape = (frequencies, n)
-    start = (0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
-    return Filtered(np.ones(shape, np.complex64), *(np.full(shape, value, f4) for value in start))
-
-
-LENGTHS = np.linspace(0.0, 15.0, 1501)
-RICE = np.sqrt(np.pi / 2) * (
-    (1 + LENGTHS**2 / 2) * special.ive(0, LENGTHS**2 / 4)
-    + LENGTHS**2 / 2 * special.ive(1, LENGTHS**2 / 4)
-)
-"""Mean length, by Rice, of a vector of `LENGTHS` plus normals of deviation 1 both ways; 1e-5
-between them."""
-ABREAST = 32  # pixels that a loop does side by side, in vector registers
-W = np.uint64(ABREAST)
-BETWEEN = W * np.uint64(0)
-AMPLITUDE = W * np.uint64(2)
-BRIGHT = W * np.uint64(3)
-TURN = W * np.uint64(4)
-SWAY = W * np.uint64(5)
-SIZE = W * np.uint64(6)
-WEIGHT = W * np.uint64(7)
-SLOPE = W * np.uint64(8)
-BEND = W * np.uint64(10)
-MOVED = W * np.uint64(12)
-FIELDS = W * np.uint64(13)
-"""Places of a neighbour's values in the room of `_linearise`, each for `ABREAST` pixels, an
-imaginary part `W` behind its real part. exp(i t) of the neighbour's phase minus the centre's; its
-`Light`, and its amplitude's deviation; its weight by distance, 0 if it does not count, and its
-weight in the filter; its part in the sum, differentiated by its phase once and twice; the change
-of the sum's phase."""
-C, LIT, SURE, NOISE, FIT, *ROWS_LEFT = (W * np.uint64(row) for row in range(16))
-ROWS = tuple(ROWS_LEFT)
-"""Places of a pixel's values: the concentration, 0 if the centre is dim; whether the centre is
-bright; whether it is certain which neighbours count; the largest phase noise; whether the linear
-model holds; and room for sums."""
-
-
-def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
-    """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the
-    converter's rounding."""
-    phases = exposure.means.shape[1]
-    angle = 2 * np.pi * np.arange(phases)[:, None] / phases
-    cosines = np.cos(angle).astype(f4)
-    sines = np.sin(angle).astype(f4)
-    shape = (len(gains), exposure.sigma.size)
-    light = Light(np.empty(shape, np.complex64), *(np.empty(shape, f4) for _ in range(4)))
-    for f, means in enumerate(exposure.means):
-        # the companding converter's step at a sample, in knees: its bits without the mantissa
-        step = np.maximum(
-            (np.abs(means / f4(knee)).view(np.uint32) & np.uint32(0x7F800000)).view(f4), ONE
-        )
-        variance = exposure.sigma**2 + step**2 / 12
-        # direction and length of the phasor; without light there is no direction: any will do
-        re = (means * cosines).sum(axis=0)
-        im = (means * sines).sum(axis=0)
-        size = np.maximum(np.sqrt(re * re + im * im), LEAST)
-        re = np.where(size > LEAST, re / size, ONE)
-        im = np.where(size > LEAST, im / size, ZERO)
-        light.phasor[f].real, light.phasor[f].imag = re, im
-        light.amplitude[f] = gains[f] * f4(2 / phases) * size
-        # deviations across and along that direction
-        light.turn[f] = np.sqrt((variance * (re * sines - im * cosines) ** 2).sum(axis=0)) / size
-        light.swell[f] = np.sqrt((variance * (re * cosines + im * sines) ** 2).sum(axis=0)) / size
-    light.bright[:] = light.amplitude * np.sqrt(ONE + light.turn**2)
-    near = light.swell > 0.1
-    deviation = light.amplitude[near] * np.sqrt(
-        (light.turn[near] ** 2 + light.swell[near] ** 2) / 2
+    return Filtered(
+        phasor=np.ones(shape, np.complex64),
+        amplitude=np.zeros(shape, f4),
+        phase_noise=np.full(shape, np.inf, f4),
+        amplitude_noise=np.full(shape, np.inf, f4),
+        higher_share=np.full(shape, np.inf, f4),
+        edge=np.full(shape, np.inf, f4),
+        edge_noise=np.full(shape, np.inf, f4),
+        edge_least=np.zeros(shape, f4),
+        edge_least_noise=np.full(shape, np.inf, f4),
     )
-    light.bright[near] = deviation * np.interp(
-        light.amplitude[near] / np.maximum(deviation, SMALLEST), LENGTHS, RICE
-    )
-    return light
 
 
 def linearised(
@@ -162,279 +114,458 @@ def linearised(
     window: FilterSettings,
     shape: tuple[int, int],
     lost: np.ndarray,
-    out: Filtered,
+    filtered: Filtered,
 ) -> np.ndarray:
-    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``. None of them is ``lost`` (n,)
-    bool: always saturated. Return (f, m, k) float32: the change of a pixel's phase, in radians, by
-    one deviation of each neighbour's noise."""
-    moved = np.zeros((len(light.turn), len(pixels), window.space.size), f4)
-    for f, plane in enumerate(moved):
-        ours = Light(*(part[f] for part in light))
-        theirs = Filtered(*(part[f] for part in out))
-        _linearise(pixels, ours, window, shape, lost, theirs, plane)
-    return moved
+    """Fill ``filtered`` at some pixels of a view, and return how each neighbour's noise turns them.
+
+    Args:
+        pixels: (m,) flat indices; none of them is lost.
+        light: of the whole view, n pixels.
+        window: the filter's settings, with a window of k pixels.
+        shape: (h, w) of the view.
+        lost: (n,) bool, pixels that are always saturated.
+        filtered: of the whole view; written at ``pixels``.
+
+    Returns:
+        (f, m, k) float32: change of a pixel's phase in radians by one deviation of each
+        neighbour's noise.
+    """
+    moves = np.zeros((len(light.phase_noise), len(pixels), window.space.size), f4)
+    for f, moves_of_frequency in enumerate(moves):
+        light_of_frequency = Light._make(part[f] for part in light)
+        filtered_of_frequency = Filtered._make(part[f] for part in filtered)
+        _linearise(
+            pixels,
+            light_of_frequency,
+            window,
+            shape,
+            lost,
+            filtered_of_frequency,
+            moves_of_frequency,
+        )
+    return moves
+
+
+# ---------------------------------------------------------------- layout of the flat arrays
+
+ABREAST = 32  # pixels that a loop does side by side, in vector registers
+ROW = np.uint64(ABREAST)  # indices are unsigned: the compiler gathers by signed ones
+
+# Values of a neighbour, each a row for `ABREAST` pixels. A neighbour's values begin at its slot; a
+# complex value has its imaginary part one row behind its real part.
+DIRECTION = ROW * 0  # complex: exp(i t) of the phase minus the centre's
+AMPLITUDE = ROW * 2  # as in `Light`
+MEAN_AMPLITUDE = ROW * 3  # as in `Light`
+PHASE_NOISE = ROW * 4  # as in `Light`
+AMPLITUDE_NOISE = ROW * 5  # deviation of the amplitude
+SPACE = ROW * 6  # s_j: weight by distance, 0 if the neighbour does not count
+WEIGHT = ROW * 7  # weight in the filter: s_j exp(-c (1 - cos t))
+FIRST = ROW * 8  # complex: s_j E[F'], then over S
+SECOND = ROW * 10  # complex: s_j E[F'']
+MOVE = ROW * 12  # change of arg S by the neighbour's phase
+VALUES = ROW * 13  # from one slot to the next
+
+# Values of a pixel, each a row.
+CONCENTRATION = ROW * 0  # c, or 0 if the centre is dim
+LIT = ROW * 1  # 1 if the centre is certainly bright
+CERTAIN = ROW * 2  # 1 if it is certain which neighbours count
+LARGEST_NOISE = ROW * 3  # largest phase noise of the neighbours that count
+FITS = ROW * 4  # above 0 if the linear model holds
+SUMS = tuple(ROW * row for row in range(5, 16))
+"""Rows for sums over the window, which each function names for itself."""
+END = ROW * 16
+
+
+# ---------------------------------------------------------------- one frequency, all pixels
 
 
 @numba.njit(**FAST)
-def _linearise(pixels, light, window, shape, lost, out, moved):  # type: ignore[no-untyped-def]
+def _linearise(  # type: ignore[no-untyped-def]
+    pixels,
+    light,
+    window,
+    shape,
+    lost,
+    filtered,
+    moves,
+):
     """Do the work of `linearised` for one frequency; arrays have no first axis."""
     k = window.space.size
-    of_pixels = np.empty(ABREAST, np.int64)
+    middle = k // 2
     by_amplitude = window.by_amplitude
-    room = np.empty(np.uint64(k) * FIELDS, f4)
-    sums = np.empty(ROWS[-1] + W, f4)
-    middle = np.uint64(k // 2) * FIELDS
-    others = np.array([np.uint64(q) * FIELDS for q in range(k) if q != k // 2], np.uint64)
+    values = np.empty(np.uint64(k) * VALUES, f4)
+    sums = np.empty(END, f4)
+    centre = np.uint64(middle) * VALUES
+    neighbours = np.array([np.uint64(q) * VALUES for q in range(k) if q != middle], np.uint64)
+    batch = np.empty(ABREAST, np.int64)
     for start in range(0, pixels.size, ABREAST):
-        # the last loop may have fewer pixels: it repeats the last one
-        at = of_pixels[: min(ABREAST, pixels.size - start)]
+        # the last batch may have fewer pixels: it repeats the last one
         for x in range(ABREAST):
-            of_pixels[x] = pixels[min(start + x, pixels.size - 1)]
-        _gather(of_pixels, light, window.space, shape, lost, room)
-        _look_around(window, middle, others, room, sums)
-        _edge_of(at, window, middle, others, room, sums, out)
-        _amplitude_of(at, light.phasor, by_amplitude, middle, others, room, sums, out)
-        if sums[FIT : FIT + W].max() > ZERO:
-            _moves_of(at, light.phasor, by_amplitude, middle, others, room, sums, out)
-            _rest_of(
-                at, by_amplitude, middle, others, room, sums, out, moved[start : start + ABREAST]
+            batch[x] = pixels[min(start + x, pixels.size - 1)]
+        written = batch[: min(ABREAST, pixels.size - start)]
+        _gather(
+            batch,
+            light,
+            window.space,
+            shape,
+            lost,
+            values,
+        )
+        _choose_neighbours(window, centre, neighbours, values, sums)
+        _write_edges(
+            written,
+            window,
+            centre,
+            neighbours,
+            values,
+            sums,
+            filtered,
+        )
+        _write_amplitudes(
+            written,
+            light.phasor,
+            by_amplitude,
+            centre,
+            neighbours,
+            values,
+            sums,
+            filtered,
+        )
+        if sums[FITS : FITS + ROW].max() > ZERO:
+            _write_mean_phasors(
+                written,
+                light.phasor,
+                by_amplitude,
+                centre,
+                neighbours,
+                values,
+                sums,
+                filtered,
+            )
+            moves_of_batch = moves[start : start + ABREAST]
+            _write_phase_noise(
+                written,
+                by_amplitude,
+                centre,
+                neighbours,
+                values,
+                sums,
+                filtered,
+                moves_of_batch,
             )
 
 
 @numba.njit(**FAST)
-def _gather(at, light, space, shape, lost, room):  # type: ignore[no-untyped-def]
-    """Fill the room with the windows of pixels ``at`` (`ABREAST`,)."""
-    (h, w), side = shape, space.shape[0]
+def _gather(  # type: ignore[no-untyped-def]
+    batch,
+    light,
+    space,
+    shape,
+    lost,
+    values,
+):
+    """Fill ``values`` with the windows of the pixels in ``batch`` (`ABREAST`,)."""
+    h, w = shape
+    side = space.shape[0]
     half = side // 2
-    for x in range(at.size):
-        i = at[x]
-        place = np.uint64(x)
-        top = i // w - half
-        left = i % w - half
+    for x in range(batch.size):
+        i = batch[x]
+        slot = np.uint64(x)
+        first_row = i // w - half
+        first_column = i % w - half
         for dy in range(side):
             for dx in range(side):
-                row = top + dy
-                column = left + dx
+                row = first_row + dy
+                column = first_column + dx
                 inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
                 j = row * w + column if inside else i
-                between = light.phasor[j] * light.phasor[i].conjugate()
-                room[place + BETWEEN] = between.real
-                room[place + BETWEEN + W] = between.imag
-                room[place + AMPLITUDE] = light.amplitude[j]
-                room[place + BRIGHT] = light.bright[j]
-                room[place + TURN] = min(light.turn[j], MOST_TURN)
-                room[place + SWAY] = light.amplitude[j] * light.swell[j]
-                room[place + SIZE] = space[dy, dx] if inside and not lost[j] else ZERO
-                room[place + MOVED] = ZERO
-                place += FIELDS
+                direction = light.phasor[j] * light.phasor[i].conjugate()
+                _put(values, slot + DIRECTION, direction.real, direction.imag)
+                values[slot + AMPLITUDE] = light.amplitude[j]
+                values[slot + MEAN_AMPLITUDE] = light.mean_amplitude[j]
+                values[slot + PHASE_NOISE] = min(light.phase_noise[j], LARGEST_PHASE_NOISE)
+                values[slot + AMPLITUDE_NOISE] = light.amplitude[j] * light.relative_noise[j]
+                values[slot + SPACE] = space[dy, dx] if inside and not lost[j] else ZERO
+                values[slot + MOVE] = ZERO
+                slot += VALUES
+
+
+# ---------------------------------------------------------------- which neighbours count
 
 
 @numba.njit(**FAST)
-def _look_around(window, middle, others, room, sums):  # type: ignore[no-untyped-def]
-    """Find which neighbours count, their weights, whether that is certain (`SURE`), and whether
-    the linear model holds (`FIT`): certain, and not too noisy."""
+def _choose_neighbours(window, centre, neighbours, values, sums):  # type: ignore[no-untyped-def]
+    """Find which neighbours count, their weights, whether that is `CERTAIN`, and whether the linear
+    model `FITS`: certain, and not too noisy."""
     dim = window.dim
     drop_dim = window.drop_dim
-    for x in range(W):
-        reach = REACH * room[middle + SWAY + x]
-        amplitude = room[middle + AMPLITUDE + x]
-        lit = amplitude - reach > dim
-        known = lit | (room[middle + BRIGHT + x] + reach < dim)
-        sums[LIT + x] = ONE if lit else ZERO
-        sums[C + x] = window.concentration if lit else ZERO
-        sums[SURE + x] = ONE if known | (not drop_dim) else ZERO
-        sums[NOISE + x] = room[middle + TURN + x]
-        sums[FIT + x] = ONE if known else ZERO
-        room[middle + WEIGHT + x] = room[middle + SIZE + x]
-    for place in others:
-        for x in range(W):
-            reach = REACH * room[place + SWAY + x]
-            size = room[place + SIZE + x]
+    for x in range(ROW):
+        reach = REACH * values[centre + AMPLITUDE_NOISE + x]
+        always_lit = values[centre + AMPLITUDE + x] - reach > dim
+        never_lit = values[centre + MEAN_AMPLITUDE + x] + reach < dim
+        decided = always_lit | never_lit
+        sums[LIT + x] = ONE if always_lit else ZERO
+        sums[CONCENTRATION + x] = window.concentration if always_lit else ZERO
+        sums[CERTAIN + x] = ONE if decided | (not drop_dim) else ZERO
+        sums[LARGEST_NOISE + x] = values[centre + PHASE_NOISE + x]
+        sums[FITS + x] = ONE if decided else ZERO
+        values[centre + WEIGHT + x] = values[centre + SPACE + x]
+    for slot in neighbours:
+        for x in range(ROW):
+            reach = REACH * values[slot + AMPLITUDE_NOISE + x]
+            space = values[slot + SPACE + x]
             if drop_dim:
                 lit = sums[LIT + x] > ZERO
-                size = ZERO if lit & (room[place + BRIGHT + x] + reach < dim) else size
-                doubtful = lit & (size > ZERO) & (room[place + AMPLITUDE + x] - reach <= dim)
-                sums[SURE + x] = ZERO if doubtful else sums[SURE + x]
-                room[place + SIZE + x] = size
-            room[place + WEIGHT + x] = size * _exp(sums[C + x] * (room[place + BETWEEN + x] - ONE))
-            sums[NOISE + x] = max(sums[NOISE + x], room[place + TURN + x] if size > ZERO else ZERO)
-    for x in range(W):
-        sums[FIT + x] = sums[FIT + x] * sums[SURE + x] if sums[NOISE + x] <= f4(NOISY) else ZERO
+                never_counts = lit & (values[slot + MEAN_AMPLITUDE + x] + reach < dim)
+                space = ZERO if never_counts else space
+                may_be_dim = values[slot + AMPLITUDE + x] - reach <= dim
+                doubtful = lit & (space > ZERO) & may_be_dim
+                sums[CERTAIN + x] = ZERO if doubtful else sums[CERTAIN + x]
+                values[slot + SPACE + x] = space
+            # -c (1 - cos t)
+            exponent = sums[CONCENTRATION + x] * (values[slot + DIRECTION + x] - ONE)
+            values[slot + WEIGHT + x] = space * _exp(exponent)
+            noise = values[slot + PHASE_NOISE + x] if space > ZERO else ZERO
+            sums[LARGEST_NOISE + x] = max(sums[LARGEST_NOISE + x], noise)
+    for x in range(ROW):
+        fits = sums[FITS + x] * sums[CERTAIN + x]
+        sums[FITS + x] = fits if sums[LARGEST_NOISE + x] <= f4(LARGEST_NORMAL) else ZERO
 
 
 @numba.njit(inline="always", **FAST)
 def _exp(x):  # type: ignore[no-untyped-def]
     """Return the exponential of -8 <= x <= 0, to 2e-5 of its value: the sixteenth power of a
     series."""
-    t = x * f4(1 / 16)
-    e = ONE + t * (
-        ONE + t * (HALF + t * (f4(1 / 6) + t * (f4(1 / 24) + t * (f4(1 / 120) + t * f4(1 / 720)))))
-    )
+    t = x * SIXTEENTH
+    e = FACTORIAL_5 + t * FACTORIAL_6
+    e = FACTORIAL_4 + t * e
+    e = SIXTH + t * e
+    e = HALF + t * e
+    e = ONE + t * e
+    e = ONE + t * e
     e = e * e
     e = e * e
     e = e * e
     return e * e
 
 
+# ---------------------------------------------------------------- the edge sum
+
+
 @numba.njit(**FAST)
-def _edge_of(at, window, middle, others, room, sums, out):  # type: ignore[no-untyped-def]
+def _write_edges(  # type: ignore[no-untyped-def]
+    written,
+    window,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
+):
     """Write the edge sum's mean, deviation and bounds."""
     dim = window.dim
     dim_edges = window.dim_edges
-    mean, variance, sines, cosines, loose, counted, doubtful, longest = ROWS[:8]
-    sums[mean : longest + W + W] = ZERO
-    for place in others:
-        for x in range(W):
-            turn = room[place + TURN + x]
-            own = room[middle + TURN + x]
-            re = room[place + BETWEEN + x]
-            im = room[place + BETWEEN + W + x]
-            reach = REACH * room[place + SWAY + x]
-            counts = (room[place + SIZE + x] > ZERO) & (
-                dim_edges | (room[place + BRIGHT + x] + reach >= dim)
+    mean = SUMS[0]
+    variance = SUMS[1]
+    sines = SUMS[2]  # sum of sin t / 2: derivative by the centre's phase
+    cosines = SUMS[3]  # sum of cos t / 4: half the second derivative
+    bound_variance = SUMS[4]
+    certain_count = SUMS[5]
+    doubtful_count = SUMS[6]
+    resultant = SUMS[7]  # complex: greatest sum of exp(i t) in the mean over the noise
+    sums[mean : resultant + ROW + ROW] = ZERO
+    for slot in neighbours:
+        for x in range(ROW):
+            noise = values[slot + PHASE_NOISE + x]
+            centre_noise = values[centre + PHASE_NOISE + x]
+            re = values[slot + DIRECTION + x]
+            im = values[slot + DIRECTION + ROW + x]
+            reach = REACH * values[slot + AMPLITUDE_NOISE + x]
+            may_be_lit = values[slot + MEAN_AMPLITUDE + x] + reach >= dim
+            counts = (values[slot + SPACE + x] > ZERO) & (dim_edges | may_be_lit)
+            always_lit = values[slot + AMPLITUDE + x] - reach > dim
+            certain = counts & (dim_edges | always_lit)
+            counted = ONE if counts else ZERO
+            certainly = ONE if certain else ZERO
+            noise2 = noise * noise
+            centre2 = centre_noise * centre_noise
+            shortened = max(ONE - HALF * (noise2 + centre2), ZERO)
+            sums[mean + x] += counted * HALF * (ONE - re * shortened)
+            sums[sines + x] += counted * HALF * im
+            sums[cosines + x] += counted * QUARTER * re
+            first = HALF * im * noise
+            second = QUARTER * re
+            sums[variance + x] += counted * (
+                first * first + second * second * TWO * noise2 * (noise2 + TWO * centre2)
             )
-            certain = counts & (dim_edges | (room[place + AMPLITUDE + x] - reach > dim))
-            one = ONE if counts else ZERO
-            sure = ONE if certain else ZERO
-            turn2 = turn * turn
-            own2 = own * own
-            sums[mean + x] += one * HALF * (ONE - re * max(ONE - HALF * (turn2 + own2), ZERO))
-            sums[sines + x] += one * HALF * im
-            sums[cosines + x] += one * QUARTER * re
-            across = HALF * im * turn
-            along = QUARTER * re
-            sums[variance + x] += one * (
-                across * across + along * along * TWO * turn2 * (turn2 + TWO * own2)
-            )
-            sums[doubtful + x] += one - sure
-            sums[counted + x] += sure
-            # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi /
-            # 8), bounds it
-            length = sure * min(ONE, f4(0.6267) / max(turn, f4(1e-9)))
-            sums[longest + x] += re * length
-            sums[longest + W + x] += im * length
-            # (1 - cos)/2 of any phase scatters no more than that of a uniform one, 1/8; of a known
-            # phase, by half its noise
-            sums[loose + x] += sure * (QUARTER * turn2 if turn < f4(NOISY) else f4(0.125))
-    for x in range(at.size):
-        i = at[x]
-        own = room[middle + TURN + x]
-        doubt = sums[doubtful + x]
-        spread = np.sqrt(
+            sums[doubtful_count + x] += counted - certainly
+            sums[certain_count + x] += certainly
+            length = certainly * min(ONE, f4(RESULTANT_SLOPE) / max(noise, f4(1e-9)))
+            _add(sums, resultant + x, re * length, im * length)
+            # a phase that is known scatters by half its noise
+            scatter = QUARTER * noise2 if noise < f4(LARGEST_NORMAL) else f4(UNIFORM_VARIANCE)
+            sums[bound_variance + x] += certainly * scatter
+    for x in range(written.size):
+        i = written[x]
+        centre_noise = values[centre + PHASE_NOISE + x]
+        doubtful = sums[doubtful_count + x]
+        deviation = np.sqrt(
             sums[variance + x]
-            + (sums[sines + x] * own) ** 2
-            + 2.0 * (sums[cosines + x] * own * own) ** 2
+            + (sums[sines + x] * centre_noise) ** 2
+            + 2.0 * (sums[cosines + x] * centre_noise * centre_noise) ** 2
         )
-        # ``edge`` and its deviation are right if no neighbour counts, or none is too noisy
-        known = sums[counted + x] + doubt == 0 or sums[NOISE + x] <= NOISY
-        sure = sums[SURE + x] > 0
-        out.edge[i] = sums[mean + x] if known and sure else np.inf
-        out.edge_spread[i] = spread if known and sure else np.inf
-        if known and doubt == 0:
-            out.edge_least[i], out.edge_loose[i] = sums[mean + x], spread
+        # mean and deviation are right if no neighbour counts, or none is too noisy
+        empty = sums[certain_count + x] + doubtful == 0
+        right = empty or sums[LARGEST_NOISE + x] <= LARGEST_NORMAL
+        certain = sums[CERTAIN + x] > 0
+        filtered.edge[i] = sums[mean + x] if right and certain else np.inf
+        filtered.edge_noise[i] = deviation if right and certain else np.inf
+        if right and doubtful == 0:
+            filtered.edge_least[i] = sums[mean + x]
+            filtered.edge_least_noise[i] = deviation
         else:
-            # the centre's own noise turns it at most that far or, where that is large, to any
-            # angle
-            re = sums[longest + x]
-            im = sums[longest + W + x]
-            away = max(abs(np.arctan2(im, re)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
-            out.edge_least[i] = 0.5 * (
-                sums[counted + x] - np.sqrt(re * re + im * im) * np.cos(away)
-            )
-            out.edge_loose[i] = np.sqrt(sums[loose + x])
-        if not sure:
-            out.edge_least[i] = 0.0
+            # the centre's own noise turns the resultant at most that far or, where that is large,
+            # to any angle
+            re = sums[resultant + x]
+            im = sums[resultant + ROW + x]
+            angle = 0.0
+            if centre_noise < LARGEST_NORMAL:
+                angle = max(abs(np.arctan2(im, re)) - DEVIATIONS * centre_noise, 0.0)
+            nearest = np.sqrt(re * re + im * im) * np.cos(angle)
+            filtered.edge_least[i] = 0.5 * (sums[certain_count + x] - nearest)
+            filtered.edge_least_noise[i] = np.sqrt(sums[bound_variance + x])
+        if not certain:
+            filtered.edge_least[i] = 0.0
+
+
+# ---------------------------------------------------------------- the amplitude
 
 
 @numba.njit(**FAST)
-def _amplitude_of(at, phasor, by_amplitude, middle, others, room, sums, out):  # type: ignore[no-untyped-def]
+def _write_amplitudes(  # type: ignore[no-untyped-def]
+    written,
+    phasor,
+    by_amplitude,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
+):
     """Write the filtered amplitude and its deviation, and the filtered phasor if noise leaves the
     phases unchanged."""
-    weights, amplitudes, spread, common, size, total = ROWS[:6]
-    for x in range(W):
-        weight = room[middle + WEIGHT + x]
-        sums[weights + x], sums[amplitudes + x] = weight, weight * room[middle + BRIGHT + x]
-        sums[spread + x], sums[common + x] = (weight * room[middle + SWAY + x]) ** 2, ZERO
-        _put(sums, total + x, complex(weight * room[middle + AMPLITUDE + x], ZERO))
-    for place in others:
-        for x in range(W):
-            c = sums[C + x]
-            turn = room[place + TURN + x]
-            own = room[middle + TURN + x]
-            re = room[place + BETWEEN + x]
-            im = room[place + BETWEEN + W + x]
-            variance = min(turn * turn + own * own, QUARTER)
-            mean = room[place + WEIGHT + x] * (ONE + HALF * variance * (c * im * c * im - c * re))
-            sums[weights + x] += mean
-            sums[amplitudes + x] += mean * room[place + BRIGHT + x]
+    weights = SUMS[0]
+    amplitudes = SUMS[1]
+    variance = SUMS[2]
+    by_centre = SUMS[3]  # change of the sum of amplitudes by the centre's phase
+    length = SUMS[4]
+    total = SUMS[5]  # complex: sum of weighted phasors
+    for x in range(ROW):
+        weight = values[centre + WEIGHT + x]
+        sums[weights + x] = weight
+        sums[amplitudes + x] = weight * values[centre + MEAN_AMPLITUDE + x]
+        sums[variance + x] = (weight * values[centre + AMPLITUDE_NOISE + x]) ** 2
+        sums[by_centre + x] = ZERO
+        _put(sums, total + x, weight * values[centre + AMPLITUDE + x], ZERO)
+    for slot in neighbours:
+        for x in range(ROW):
+            c = sums[CONCENTRATION + x]
+            noise = values[slot + PHASE_NOISE + x]
+            centre_noise = values[centre + PHASE_NOISE + x]
+            re = values[slot + DIRECTION + x]
+            im = values[slot + DIRECTION + ROW + x]
+            # the mean of exp(-c (1 - cos t)) over the noise of t
+            noise2 = min(noise * noise + centre_noise * centre_noise, QUARTER)
+            weight = values[slot + WEIGHT + x] * (ONE + HALF * noise2 * (c * im * c * im - c * re))
+            sums[weights + x] += weight
+            sums[amplitudes + x] += weight * values[slot + MEAN_AMPLITUDE + x]
             # noise across lengthens a phasor by what it takes from its mean
-            sums[total + x] += mean * room[place + AMPLITUDE + x] * re
-            sums[total + W + x] += mean * room[place + AMPLITUDE + x] * im
-            sums[spread + x] += (mean * room[place + SWAY + x]) ** 2
-    for x in range(W):
-        length = np.sqrt(_power(_at(sums, total + x)))
-        whole = max(sums[weights + x], LEAST)
-        sums[size + x], sums[weights + x] = max(length, LEAST), whole
-        sums[amplitudes + x] = (length if by_amplitude else sums[amplitudes + x]) / whole
+            size = weight * values[slot + AMPLITUDE + x]
+            _add(sums, total + x, size * re, size * im)
+            sums[variance + x] += (weight * values[slot + AMPLITUDE_NOISE + x]) ** 2
+    for x in range(ROW):
+        size = np.sqrt(_squared(_complex_at(sums, total + x)))
+        weight_sum = max(sums[weights + x], NEVER_ZERO)
+        sums[length + x] = max(size, NEVER_ZERO)
+        sums[weights + x] = weight_sum
+        sums[amplitudes + x] = (size if by_amplitude else sums[amplitudes + x]) / weight_sum
     # noise of phases changes weights and how phasors add up: its variance, times the squared sum
     # of weights
-    for place in others:
-        for x in range(W):
-            re = room[place + BETWEEN + x]
-            im = room[place + BETWEEN + W + x]
-            weight = room[place + WEIGHT + x]
-            slope = sums[C + x] * im
+    for slot in neighbours:
+        for x in range(ROW):
+            re = values[slot + DIRECTION + x]
+            im = values[slot + DIRECTION + ROW + x]
+            weight = values[slot + WEIGHT + x]
+            slope = sums[CONCENTRATION + x] * im  # minus the derivative of the weight, over it
             amplitude = sums[amplitudes + x]
             if by_amplitude:
-                along = sums[total + W + x] * (re - slope * im) - sums[total + x] * (
+                along = sums[total + ROW + x] * (re - slope * im) - sums[total + x] * (
                     slope * re + im
                 )
                 change = weight * (
-                    room[place + AMPLITUDE + x] * along / sums[size + x] + slope * amplitude
+                    values[slot + AMPLITUDE + x] * along / sums[length + x] + slope * amplitude
                 )
             else:
-                change = slope * weight * (amplitude - room[place + BRIGHT + x])
-            sums[spread + x] += (change * min(room[place + TURN + x], HALF)) ** 2
-            sums[common + x] += change
-    for x in range(at.size):
-        i = at[x]
-        own = sums[common + x] * min(room[middle + TURN + x], HALF)
-        out.amplitude[i] = sums[amplitudes + x]
-        out.phasor[i] = _at(sums, total + x) * phasor[i] / sums[size + x]
-        out.spread[i] = np.sqrt(sums[spread + x] + own * own) / sums[weights + x]
+                change = slope * weight * (amplitude - values[slot + MEAN_AMPLITUDE + x])
+            sums[variance + x] += (change * min(values[slot + PHASE_NOISE + x], HALF)) ** 2
+            sums[by_centre + x] += change
+    for x in range(written.size):
+        i = written[x]
+        of_centre = sums[by_centre + x] * min(values[centre + PHASE_NOISE + x], HALF)
+        filtered.amplitude[i] = sums[amplitudes + x]
+        filtered.phasor[i] = _complex_at(sums, total + x) * phasor[i] / sums[length + x]
+        filtered.amplitude_noise[i] = (
+            np.sqrt(sums[variance + x] + of_centre * of_centre) / sums[weights + x]
+        )
+
+
+# ---------------------------------------------------------------- complex numbers in rows
 
 
 @numba.njit(inline="always", **FAST)
-def _at(values, place):  # type: ignore[no-untyped-def]
-    return complex(values[place], values[place + W])
+def _complex_at(values, index):  # type: ignore[no-untyped-def]
+    return complex(values[index], values[index + ROW])
 
 
 @numba.njit(inline="always", **FAST)
-def _put(values, place, z):  # type: ignore[no-untyped-def]
-    values[place], values[place + W] = z.real, z.imag
+def _put(values, index, re, im):  # type: ignore[no-untyped-def]
+    values[index] = re
+    values[index + ROW] = im
 
 
 @numba.njit(inline="always", **FAST)
-def _power(z):  # type: ignore[no-untyped-def]
+def _add(values, index, re, im):  # type: ignore[no-untyped-def]
+    values[index] += re
+    values[index + ROW] += im
+
+
+@numba.njit(inline="always", **FAST)
+def _squared(z):  # type: ignore[no-untyped-def]
     return z.real * z.real + z.imag * z.imag
 
 
 @numba.njit(inline="always", **FAST)
-def _inverse(z):  # type: ignore[no-untyped-def]
-    """Return 1 / z, 0 where z is 0."""
-    size = ONE / max(_power(z), LEAST * LEAST)
-    return complex(z.real * size, -z.imag * size)
+def _invert(values, source, target):  # type: ignore[no-untyped-def]
+    """Write 1 / z of the number at ``source`` to ``target``, 0 where z is 0."""
+    re = values[source]
+    im = values[source + ROW]
+    size = ONE / max(re * re + im * im, NEVER_ZERO * NEVER_ZERO)
+    _put(values, target, re * size, -im * size)
+
+
+# ---------------------------------------------------------------- the phase
 
 
 @numba.njit(inline="always", **FAST)
-def _turned(c, between, v):  # type: ignore[no-untyped-def]
-    """Return F, F' and F'' at the angle t whose exp(i t) is ``between``."""
-    cosine = c * between.real
-    sine = c * between.imag
-    # derivatives of ln F: g, then -cosine, sine, cosine, -sine
+def _mean_derivatives(c, direction, v):  # type: ignore[no-untyped-def]
+    """Return the means of F, F' and F'' at the angle t whose exp(i t) is ``direction``, over
+    noise of t of variance ``v``. With g = i - c sin t, the first derivative of ln F, and further
+    ones -c cos t, c sin t, c cos t, -c sin t."""
+    cosine = c * direction.real
+    sine = c * direction.imag
     g = complex(-sine, ONE)
     g2 = complex(sine * sine - ONE, -TWO * sine)
-    half = HALF * v
+    # F'', F''', F'''' and F''''' over F
     second = g2 - cosine
     third = g * (g2 - THREE * cosine) + sine
     fourth = g2 * (g2 - SIX * cosine) + complex(
@@ -442,148 +573,183 @@ def _turned(c, between, v):  # type: ignore[no-untyped-def]
     )
     fifth = g * (g2 * (g2 - TEN * cosine) + FIVE * cosine * (THREE * cosine + ONE))
     fifth += complex(TEN * sine * (g2.real - cosine) - sine, -TEN * TWO * sine * sine)
+    half = HALF * v
     e = _exp(cosine - c)
-    value = complex(e * between.real, e * between.imag)
-    mean = ONE + half * (second + HALF * half * fourth)
-    return (
-        value * mean,
-        value * (g + half * (third + HALF * half * fifth)),
-        value * (second + half * fourth),
-    )
+    value = complex(e * direction.real, e * direction.imag)
+    mean = value * (ONE + half * (second + HALF * half * fourth))
+    mean_first = value * (g + half * (third + HALF * half * fifth))
+    mean_second = value * (second + half * fourth)
+    return mean, mean_first, mean_second
 
 
 @numba.njit(**FAST)
-def _moves_of(at, phasor, by_amplitude, middle, others, room, sums, out):  # type: ignore[no-untyped-def]
-    """Write the mean phasor, and into the room the change of its phase by each neighbour's phase."""
-    node, inverse, squares, total, mean = ROWS[:10:2]
+def _write_mean_phasors(  # type: ignore[no-untyped-def]
+    written,
+    phasor,
+    by_amplitude,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
+):
+    """Write the mean phasor, and into ``values`` the `MOVE` of its phase by each neighbour's
+    phase."""
+    node = SUMS[0]  # complex: exp(i a) of the centre's noise a
+    inverse = SUMS[2]  # complex: 1 / S
+    squares = SUMS[4]  # complex: sum of v (E[F'] / S)^2
+    total = SUMS[6]  # complex: S
+    mean = SUMS[8]  # complex: mean of exp(i arg S) over the nodes
     if by_amplitude:
         # a phasor with noise across is longer: only with that does a cos t keep its mean
-        for q in range(others.size + 1):
-            place = np.uint64(q) * FIELDS
-            for x in range(W):
-                room[place + SIZE + x] *= room[place + AMPLITUDE + x] * (
-                    ONE + HALF * room[place + TURN + x] ** 2
+        for q in range(neighbours.size + 1):
+            slot = np.uint64(q) * VALUES
+            for x in range(ROW):
+                values[slot + SPACE + x] *= values[slot + AMPLITUDE + x] * (
+                    ONE + HALF * values[slot + PHASE_NOISE + x] ** 2
                 )
-    sums[mean : mean + W + W] = ZERO
+    sums[mean : mean + ROW + ROW] = ZERO
     for number in range(3):
         # without the centre's noise, then sqrt(3) deviations of it either way
-        share = f4(1 / 6) if number else f4(2 / 3)
-        for x in range(W):
-            away = SQRT_3 * room[middle + TURN + x]
-            turn = (
-                _at(sums, node + x).conjugate()
-                if number == 2
-                else complex(np.cos(away), np.sin(away))
+        share = SIXTH if number else f4(2 / 3)
+        for x in range(ROW):
+            angle = SQRT_3 * values[centre + PHASE_NOISE + x]
+            if number == 0:
+                turn = complex(ONE, ZERO)
+            elif number == 1:
+                turn = complex(np.cos(angle), np.sin(angle))
+            else:
+                turn = _complex_at(sums, node + x).conjugate()
+            _put(sums, node + x, turn.real, turn.imag)
+            _put(sums, total + x, values[centre + SPACE + x], ZERO)
+        sums[squares : squares + ROW + ROW] = ZERO
+        # S, and each neighbour's derivatives
+        for slot in neighbours:
+            for x in range(ROW):
+                noise = values[slot + PHASE_NOISE + x]
+                space = values[slot + SPACE + x]
+                turn_back = _complex_at(sums, node + x).conjugate()
+                direction = _complex_at(values, slot + DIRECTION + x) * turn_back
+                value, first, second = _mean_derivatives(
+                    sums[CONCENTRATION + x], direction, noise * noise
+                )
+                _add(sums, total + x, space * value.real, space * value.imag)
+                _put(values, slot + FIRST + x, space * first.real, space * first.imag)
+                _put(values, slot + SECOND + x, space * second.real, space * second.imag)
+        for x in range(ROW):
+            _invert(sums, total + x, inverse + x)
+        # E[dS^2] / S^2
+        for slot in neighbours:
+            for x in range(ROW):
+                first = _complex_at(values, slot + FIRST + x) * _complex_at(sums, inverse + x)
+                noise2 = values[slot + PHASE_NOISE + x] ** 2
+                re = first.real
+                im = first.imag
+                _put(values, slot + FIRST + x, re, im)
+                _add(sums, squares + x, noise2 * (re * re - im * im), noise2 * TWO * re * im)
+        # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and
+        # -3 S' S'' / S^2
+        for slot in neighbours:
+            for x in range(ROW):
+                second = _complex_at(values, slot + SECOND + x) * _complex_at(sums, inverse + x)
+                noise2 = values[slot + PHASE_NOISE + x] ** 2
+                together = complex(
+                    ONE + sums[squares + x] - noise2 * second.real,
+                    sums[squares + ROW + x] - noise2 * second.imag,
+                )
+                first = _complex_at(values, slot + FIRST + x)
+                values[slot + MOVE + x] += share * (first * together).imag
+        # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
+        for x in range(ROW):
+            phasor_sum = _complex_at(sums, total + x)
+            correction = complex(ONE, -HALF * sums[squares + ROW + x])
+            size = share / max(np.sqrt(_squared(phasor_sum)), NEVER_ZERO)
+            turned = phasor_sum * correction * _complex_at(sums, node + x)
+            _add(sums, mean + x, size * turned.real, size * turned.imag)
+    for x in range(written.size):
+        if sums[FITS + x] > ZERO:
+            i = written[x]
+            mean_phasor = _complex_at(sums, mean + x)
+            filtered.phasor[i] = (
+                mean_phasor * phasor[i] / max(np.sqrt(_squared(mean_phasor)), NEVER_ZERO)
             )
-            _put(sums, node + x, turn if number else complex(ONE, ZERO))
-            _put(sums, total + x, complex(room[middle + SIZE + x], ZERO))
-        sums[squares : squares + W + W] = ZERO
-        for place in others:
-            for x in range(W):
-                turn = room[place + TURN + x]
-                size = room[place + SIZE + x]
-                between = _at(room, place + BETWEEN + x) * complex(
-                    sums[node + x], -sums[node + W + x]
-                )
-                value, slope, bend = _turned(sums[C + x], between, turn * turn)
-                sums[total + x] += size * value.real
-                sums[total + W + x] += size * value.imag
-                room[place + SLOPE + x], room[place + SLOPE + W + x] = (
-                    size * slope.real,
-                    size * slope.imag,
-                )
-                room[place + BEND + x], room[place + BEND + W + x] = (
-                    size * bend.real,
-                    size * bend.imag,
-                )
-        for x in range(W):
-            _put(sums, inverse + x, _inverse(_at(sums, total + x)))
-        for place in others:
-            for x in range(W):
-                slope = _at(room, place + SLOPE + x) * _at(sums, inverse + x)
-                turn2 = room[place + TURN + x] ** 2
-                _put(room, place + SLOPE + x, slope)
-                sums[squares + x] += turn2 * (slope.real * slope.real - slope.imag * slope.imag)
-                sums[squares + W + x] += turn2 * TWO * slope.real * slope.imag
-        for place in others:
-            for x in range(W):
-                # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3
-                # and -3 S' S'' / S^2
-                bend = _at(room, place + BEND + x) * _at(sums, inverse + x)
-                turn2 = room[place + TURN + x] ** 2
-                more = complex(
-                    ONE + sums[squares + x] - turn2 * bend.real,
-                    sums[squares + W + x] - turn2 * bend.imag,
-                )
-                room[place + MOVED + x] += share * (_at(room, place + SLOPE + x) * more).imag
-        for x in range(W):
-            # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
-            whole = _at(sums, total + x)
-            less = complex(ONE, -HALF * sums[squares + W + x])
-            size = share / max(np.sqrt(_power(whole)), LEAST)
-            turned = whole * less * _at(sums, node + x)
-            sums[mean + x] += size * turned.real
-            sums[mean + W + x] += size * turned.imag
-    for x in range(at.size):
-        if sums[FIT + x] > ZERO:
-            whole = _at(sums, mean + x)
-            out.phasor[at[x]] = whole * phasor[at[x]] / max(np.sqrt(_power(whole)), LEAST)
 
 
 @numba.njit(**FAST)
-def _rest_of(at, by_amplitude, middle, others, room, sums, out, moved):  # type: ignore[no-untyped-def]
+def _write_phase_noise(  # type: ignore[no-untyped-def]
+    written,
+    by_amplitude,
+    centre,
+    neighbours,
+    values,
+    sums,
+    filtered,
+    moves,
+):
     """Write the phase's deviation, the share of its variance that is not of first order in phases,
-    and its changes."""
-    inverse, _, total, _, common, bends, rest, variance = ROWS[:8]
-    for x in range(W):
-        longer = room[middle + AMPLITUDE + x] if by_amplitude else ONE
-        _put(sums, total + x, complex(room[middle + WEIGHT + x] * longer, ZERO))
-    for place in others:
-        for x in range(W):
-            size = room[place + WEIGHT + x] * (room[place + AMPLITUDE + x] if by_amplitude else ONE)
-            sums[total + x] += size * room[place + BETWEEN + x]
-            sums[total + W + x] += size * room[place + BETWEEN + W + x]
-    for x in range(W):
-        _put(sums, inverse + x, _inverse(_at(sums, total + x)))
-    sums[common : variance + W] = ZERO
-    for place in others:
-        for x in range(W):
-            c = sums[C + x]
-            turn2 = room[place + TURN + x] ** 2
-            own2 = room[middle + TURN + x] ** 2
-            cosine = c * room[place + BETWEEN + x]
-            s = c * room[place + BETWEEN + W + x]
-            here = _at(room, place + BETWEEN + x) * _at(sums, inverse + x)
-            longer = room[place + AMPLITUDE + x] if by_amplitude else ONE
-            weight = room[place + WEIGHT + x]
-            size = weight * longer
-            ss = s * s
-            bend = size * (here.imag * (ss - ONE - cosine) - here.real * TWO * s)
-            third = here.real * (THREE * (ss - cosine) - ONE) + here.imag * s * (
-                FOUR + THREE * cosine - ss
+    and its ``moves`` (`ABREAST` or fewer, k) by each neighbour's noise."""
+    inverse = SUMS[0]  # complex: 1 / S without noise
+    total = SUMS[2]  # complex: S without noise
+    by_neighbours = SUMS[4]  # sum of moves
+    bends = SUMS[5]  # sum of the second derivatives of arg S
+    higher_variance = SUMS[6]
+    variance = SUMS[7]
+    for x in range(ROW):
+        amplitude = values[centre + AMPLITUDE + x] if by_amplitude else ONE
+        _put(sums, total + x, values[centre + WEIGHT + x] * amplitude, ZERO)
+    for slot in neighbours:
+        for x in range(ROW):
+            amplitude = values[slot + AMPLITUDE + x] if by_amplitude else ONE
+            size = values[slot + WEIGHT + x] * amplitude
+            direction = _complex_at(values, slot + DIRECTION + x)
+            _add(sums, total + x, size * direction.real, size * direction.imag)
+    for x in range(ROW):
+        _invert(sums, total + x, inverse + x)
+    sums[by_neighbours : variance + ROW] = ZERO
+    for slot in neighbours:
+        for x in range(ROW):
+            c = sums[CONCENTRATION + x]
+            noise2 = values[slot + PHASE_NOISE + x] ** 2
+            centre2 = values[centre + PHASE_NOISE + x] ** 2
+            cosine = c * values[slot + DIRECTION + x]
+            sine = c * values[slot + DIRECTION + ROW + x]
+            sine2 = sine * sine
+            part = _complex_at(values, slot + DIRECTION + x) * _complex_at(sums, inverse + x)
+            amplitude = values[slot + AMPLITUDE + x] if by_amplitude else ONE
+            weight = values[slot + WEIGHT + x]
+            size = weight * amplitude
+            # imaginary parts of F'' / S and F''' / S
+            second = size * (part.imag * (sine2 - ONE - cosine) - part.real * TWO * sine)
+            third = part.real * (THREE * (sine2 - cosine) - ONE) + part.imag * sine * (
+                FOUR + THREE * cosine - sine2
             )
-            sums[bends + x] += bend
-            higher = (size * third) ** 2 * f4(1 / 6) * turn2 * (turn2 + THREE * own2)
-            sums[rest + x] += turn2 * (bend * bend * (HALF * turn2 + own2) + higher)
-            change = room[place + MOVED + x]
-            sums[common + x] += change
-            swollen = weight * here.imag * room[place + SWAY + x] if by_amplitude else ZERO
-            squared = change * change * turn2 + swollen * swollen
-            room[place + MOVED + x] = np.copysign(np.sqrt(squared), change)
+            sums[bends + x] += second
+            of_third = (size * third) ** 2 * SIXTH * noise2 * (noise2 + THREE * centre2)
+            sums[higher_variance + x] += noise2 * (
+                second * second * (HALF * noise2 + centre2) + of_third
+            )
+            move = values[slot + MOVE + x]
+            sums[by_neighbours + x] += move
+            by_length = ZERO
+            if by_amplitude:
+                by_length = weight * part.imag * values[slot + AMPLITUDE_NOISE + x]
+            squared = move * move * noise2 + by_length * by_length
+            values[slot + MOVE + x] = np.copysign(np.sqrt(squared), move)
             sums[variance + x] += squared
-    for x in range(at.size):
-        if sums[FIT + x] == ZERO:
+    for x in range(written.size):
+        if sums[FITS + x] == ZERO:
             continue
-        i = at[x]
-        own2 = room[middle + TURN + x] ** 2
+        i = written[x]
+        centre2 = values[centre + PHASE_NOISE + x] ** 2
         # terms of higher order depend most on the centre, which is in all differences
-        higher = sums[rest + x] + 0.5 * (sums[bends + x] * own2) ** 2
-        centre2 = (1.0 - sums[common + x]) ** 2 * own2 + higher
-        room[middle + MOVED + x] = np.sqrt(centre2)
-        for q in range(others.size + 1):
-            moved[x, q] = room[np.uint64(q) * FIELDS + MOVED + np.uint64(x)]
-        both = sums[variance + x] + centre2
-        out.turned[i], out.left_out[i] = np.sqrt(both), higher / max(both, SMALLEST)
+        higher = sums[higher_variance + x] + 0.5 * (sums[bends + x] * centre2) ** 2
+        by_centre2 = (1.0 - sums[by_neighbours + x]) ** 2 * centre2 + higher
+        values[centre + MOVE + x] = np.sqrt(by_centre2)
+        for q in range(neighbours.size + 1):
+            moves[x, q] = values[np.uint64(q) * VALUES + MOVE + np.uint64(x)]
+        total_variance = sums[variance + x] + by_centre2
+        filtered.phase_noise[i] = np.sqrt(total_variance)
+        filtered.higher_share[i] = higher / max(total_variance, SMALLEST)
         if by_amplitude:
             # noise across a mean phasor lengthens it
-            out.amplitude[i] *= 1.0 + 0.5 * both
+            filtered.amplitude[i] *= 1.0 + 0.5 * total_variance

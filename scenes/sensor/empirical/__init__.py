@@ -1,1 +1,1 @@
-"""The empirical camera: statistics of a real unit's captures, without a model of the measurement."""
+"""The empirical camera: statistics of a unit's captures, without a model of the measurement."""

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.optics import FWHM_PER_DEVIATION, Optics
-from scenes.sensor.facts import (
+from scenes.sensor.common.facts import (
     CameraFacts,
     ConeFacts,
     Fact,
@@ -32,65 +32,79 @@ MW = 1e-3
 
 
 class BeamFacts(Config):
-    """The beam at rest: round, Gaussian in angle. ``power_mw``: mean over the code, a reference
-    for ambient light."""
+    """The beam at rest: round, Gaussian in angle."""
 
     fwhm_mrad: Annotated[
         Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)
     ]
+    """Full width at half of its maximum."""
     power_mw: Positive
+    """Mean over the code, a reference for ambient light."""
 
 
 class ScanFacts(Config):
-    """The raster: a column is one sweep, a point every ``point_ns``. ``sweep_jitter_mm``: error of
-    a whole sweep."""
+    """The raster: a column is one sweep."""
 
     point_ns: Positive
+    """Time from one point to the next."""
     sweep_jitter_mm: NonNegative
+    """Deviation of an error of a whole sweep."""
 
 
 class CodeFacts(Config):
-    """The code, and its correlation's pulse, assumed Gaussian. ``band_floor``: the spectrum ends
-    at the last line above this share of its maximum. ``integration_ns``: duration of the return
-    that makes one point."""
+    """The code, and its correlation's pulse, assumed Gaussian."""
 
     period_ns: Positive
+    """Time after which the code repeats."""
     correlation_fwhm_ns: Positive
+    """Full width of the correlation's pulse at half of its maximum."""
     band_floor: Share
+    """The spectrum ends at the last line above this share of its maximum."""
     integration_ns: Positive
+    """Duration of the return that makes one point."""
 
 
 class LidarPhotonFacts(Config):
-    """The photon budget in primary electrons, before the avalanche, of one point's integration.
-    ``signal_electrons``: from albedo 1 facing the camera at 1 m on the axis.
-    ``amplifier_electrons``: standard deviation. ``room_albedo``: mean over the field, whose
-    ambient light the detector sees. ``calibration_*``: published points to fit."""
+    """The photon budget in primary electrons, before the avalanche, of one point's integration."""
 
     signal_electrons: Positive
+    """Electrons from albedo 1 facing the camera at 1 m on the axis."""
     excess_noise_factor: Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
+    """Factor by which the avalanche multiplies the variance of shot noise."""
     amplifier_electrons: NonNegative
+    """Standard deviation of the amplifier's noise."""
     band_nm: Positive
+    """Width of the filter's band, for ambient light."""
     room_albedo: Share
+    """Mean over the field, whose ambient light the detector sees."""
     full_scale_electrons: Positive
+    """Light from which the detector saturates."""
     calibration_sigma_mm: Positive
+    """Published temporal deviation of single pixels, to fit."""
     calibration_distance_m: Positive
+    """Its distance."""
     calibration_albedo: Share
+    """Its albedo."""
     calibration_reach_m: Positive
+    """Published range at which half of the pixels are valid, to fit."""
     calibration_reach_albedo: Share
+    """Its albedo."""
 
 
 class LidarEngineFacts(OutputFacts):
-    """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights of
-    the average over neighbours along columns, then along rows; 0: none. ``agree_deviations``:
-    largest difference of a neighbour's half path. ``least_agreeing``: share of the weights that
-    must agree. ``confidence_electrons``: least strength."""
+    """Processing on the device."""
 
     smoothing_px: Annotated[
         Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)
     ]
+    """Standard deviations of the Gaussian weights of the average over neighbours along columns,
+    then along rows; 0: none."""
     agree_deviations: Positive
+    """Largest difference of a neighbour's half path, in its deviations."""
     least_agreeing: Share
+    """Share of the weights that must agree."""
     confidence_electrons: NonNegative
+    """Least strength."""
 
 
 class ScannedLidar(CameraFacts):
@@ -98,15 +112,22 @@ class ScannedLidar(CameraFacts):
     transmitter."""
 
     kind: Literal["scanned_lidar"]
+    """Chooses this model."""
     receiver: Annotated[
         ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")
     ]
     beam: BeamFacts
+    """The transmitter's beam."""
     scan: ScanFacts
+    """The raster of its directions."""
     code: CodeFacts
+    """The modulation."""
     photons: LidarPhotonFacts
+    """The photon budget."""
     fixed_pattern: SmoothPatternFacts
+    """Range errors that a unit's frames share."""
     engine: LidarEngineFacts
+    """Processing on the device."""
 
     @model_validator(mode="after")
     def _possible(self) -> ScannedLidar:
@@ -166,34 +187,36 @@ class ScannedLidar(CameraFacts):
         """Return the electrons of an integration from ambient light of that irradiance on the
         whole field. The field's solid angle sends a E / pi times it; the beam of power P sends,
         from albedo 1 at 1 m, P / pi."""
-        irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * self.photons.band_nm.value
-        by_beam = (
-            irradiance_w_m2
-            * self.photons.room_albedo.value
-            * self.field_sr
-            / (self.beam.power_mw.value * MW)
-        )
-        return self.photons.signal_electrons.value * by_beam
+        photons = self.photons
+        irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * photons.band_nm.value
+        from_field_w = irradiance_w_m2 * photons.room_albedo.value * self.field_sr
+        over_beam = from_field_w / (self.beam.power_mw.value * MW)
+        return photons.signal_electrons.value * over_beam
 
     @cached_property
     def smoothing_taps(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (2 r + 1,) float32 weights with sum 1, along columns and along rows."""
-        found = []
-        for deviation_px in self.engine.smoothing_px.value:
-            reach = int(np.ceil(SMOOTHING_REACH * deviation_px))
-            taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(deviation_px, 1e-9)) ** 2)
-            found.append((taps / taps.sum()).astype(np.float32))
-        return found[0], found[1]
+        along_columns_px, along_rows_px = self.engine.smoothing_px.value
+        return _gaussian_taps(along_columns_px), _gaussian_taps(along_rows_px)
 
     @cached_property
     def optics(self) -> Optics:
         """Optics for the render: pixels are beams from the origin; the receiver takes the place of
         an emitter."""
+        smeared_px = int(np.ceil(self.integration_points / 2))
         smoothed_px = max(len(taps) // 2 for taps in self.smoothing_taps)
+        lines = range(1, len(self.weights) + 1)
         return self.optics_with(
             **self.receiver.optics(),
-            frequencies_hz=tuple(float(k / self.period_s) for k in range(1, len(self.weights) + 1)),
+            frequencies_hz=tuple(float(k / self.period_s) for k in lines),
             beam_fwhm_rad=self.beam.fwhm_mrad.value * MRAD,
-            margin_px=int(np.ceil(self.integration_points / 2)) + smoothed_px,
+            margin_px=smeared_px + smoothed_px,
             farthest_m=self.unambiguous_m,
         )
+
+
+def _gaussian_taps(deviation_px: float) -> np.ndarray:
+    """Return (2 r + 1,) float32 weights of sum 1; a single one if the deviation is 0."""
+    reach = int(np.ceil(SMOOTHING_REACH * deviation_px))
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(deviation_px, 1e-9)) ** 2)
+    return np.asarray((taps / taps.sum()).astype(np.float32))

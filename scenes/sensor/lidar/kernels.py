@@ -12,11 +12,10 @@ import numba
 import numpy as np
 
 from harness.vocabulary.geometry import Reason
-from scenes.sensor.normals import FAST, IN_DOUBLE
+from scenes.sensor.common.normals import FAST, IN_DOUBLE
 
-SAMPLES_PER_LINE = (
-    4  # of the correlation per spectral line in a period; two just represent it, four miss no peak
-)
+# samples of the correlation per spectral line in a period; two just represent it, four miss no peak
+SAMPLES_PER_LINE = 4
 # from a sample's parabola: three converge to 1e-7 of a sample even where two pulses almost
 # separate
 NEWTON_STEPS = 4
@@ -24,29 +23,39 @@ NO_PEAK = -1e9  # height of a peak that does not exist
 
 
 class Peaks(NamedTuple):
-    """The two strongest peaks of correlations, the stronger first; all (2, ...) float64.
-    ``delay``: in periods, 0..1. ``height``: `NO_PEAK` if there is none. ``curvature``: minus the
-    second derivative by the angle 2 pi t / T."""
+    """The two strongest peaks of correlations, the stronger first."""
 
     delay: np.ndarray
+    """(2, ...) float64: in periods, 0..1."""
     height: np.ndarray
+    """(2, ...) float64: `NO_PEAK` if there is none."""
     curvature: np.ndarray
+    """(2, ...) float64: minus the second derivative by the angle 2 pi t / T."""
 
 
 def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
     """Find peaks of correlations with phasors (K, ...) on lines 1..K of the comb and the pulse's
     ``weights`` (K,)."""
-    lines, *shape = phasor.shape
-    scaled = (phasor.reshape(lines, -1) * (weights / weights.sum())[:, None].astype(np.float32)).T
+    lines = len(phasor)
+    shape = phasor.shape[1:]
+    shares = (weights / weights.sum())[:, None].astype(np.float32)
+    scaled = (phasor.reshape(lines, -1) * shares).T
     spectrum = np.empty((len(scaled), 2 * lines), np.float32)
-    spectrum[:, :lines], spectrum[:, lines:] = scaled.real, scaled.imag
+    spectrum[:, :lines] = scaled.real
+    spectrum[:, lines:] = scaled.imag
     # cosines and sines of the lines at the samples of one period, (2 K, M)
     samples = SAMPLES_PER_LINE * lines
     angle = 2 * np.pi * np.outer(np.arange(1, lines + 1), np.arange(samples)) / samples
     waves = np.concatenate([np.cos(angle), np.sin(angle)]).astype(np.float32)
-    out = np.empty((3, 2, len(spectrum)))
-    _peaks(spectrum @ waves, spectrum, *out)
-    return Peaks(*out.reshape(3, 2, *shape))
+    delay = np.empty((2, len(spectrum)))
+    height = np.empty((2, len(spectrum)))
+    curvature = np.empty((2, len(spectrum)))
+    _peaks(spectrum @ waves, spectrum, delay, height, curvature)
+    return Peaks(
+        delay=delay.reshape(2, *shape),
+        height=height.reshape(2, *shape),
+        curvature=curvature.reshape(2, *shape),
+    )
 
 
 @numba.njit(**IN_DOUBLE)
@@ -107,28 +116,36 @@ def _peaks(
             y = row[j]
             if y > 0.0 and y > row[j - 1] and y >= row[j + 1 if j + 1 < m else 0]:
                 if first < 0 or y > row[first]:
-                    first, second = j, first
+                    second = first
+                    first = j
                 elif second < 0 or y > row[second]:
                     second = j
-        for rank, at in enumerate((first, second)):
+        for rank, sample in enumerate((first, second)):
             angle = 0.0
             top = NO_PEAK
             bend = 1.0
-            if at >= 0:
-                angle, top, bend = _refined(spectrum[i], at * spacing, spacing)
+            if sample >= 0:
+                angle, top, bend = _refined(spectrum[i], sample * spacing, spacing)
             delay[rank, i] = (angle / (2.0 * np.pi)) % 1.0
             height[rank, i] = top
             curvature[rank, i] = bend
         if height[1, i] > height[0, i]:
-            for out in (delay, height, curvature):
-                out[0, i], out[1, i] = out[1, i], out[0, i]
+            for values in (delay, height, curvature):
+                values[0, i], values[1, i] = values[1, i], values[0, i]
 
 
-VALID, SATURATED, LOW_AMPLITUDE, EDGE, OUT_OF_RANGE = map(
-    np.int32,
-    (Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.EDGE, Reason.OUT_OF_RANGE),
-)
+VALID = np.int32(Reason.VALID)
+SATURATED = np.int32(Reason.SATURATED)
+LOW_AMPLITUDE = np.int32(Reason.LOW_AMPLITUDE)
+EDGE = np.int32(Reason.EDGE)
+OUT_OF_RANGE = np.int32(Reason.OUT_OF_RANGE)
+CHUNK = 256  # columns whose sums stand side by side: a loop that writes to one array is vectorised
 NOWHERE_M = np.float32(1e9)  # half path beyond the picture's border: it agrees with nothing
+ZERO = np.float32(0)
+HALF = np.float32(0.5)
+TWO = np.float32(2)
+FOUR = np.float32(4)
+NAN = np.float32(np.nan)
 
 
 @numba.njit(**FAST)
@@ -151,22 +168,36 @@ def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
 
 @numba.njit(**FAST)
 def stronger_peak(  # type: ignore[no-untyped-def]
-    height, half_m, deviation_m, noise, normals, sweep_m, won_m, won_height, won_deviation_m
+    height,
+    half_m,
+    deviation_m,
+    noise,
+    normals,
+    sweep_m,
+    won_m,
+    won_height,
+    won_deviation_m,
 ):
     """Choose the higher of two peaks after noise is added, with the noise of its range.
-    ``height``, ``half_m``, ``deviation_m`` (2, h, w): of the peaks. ``noise`` (h, w): deviation of
-    a height. ``normals`` (3, h or more, w): for both heights and the winner's range. ``sweep_m``
-    (w,): added to each column. Writes into the last three, (h, w)."""
+
+    Args:
+        height, half_m, deviation_m: (2, h, w) of the peaks.
+        noise: (h, w) deviation of a height.
+        normals: (3, h or more, w) for both heights and the winner's range.
+        sweep_m: (w,) added to each column's half path.
+        won_m, won_height, won_deviation_m: (h, w) half path, height and deviation of the winner;
+            written.
+    """
     h, w = noise.shape
     for v in range(h):
         for u in range(w):
-            a = height[0, v, u] + noise[v, u] * normals[0, v, u]
-            b = height[1, v, u] + noise[v, u] * normals[1, v, u]
-            second = b > a
-            deviation = deviation_m[1, v, u] if second else deviation_m[0, v, u]
-            place = half_m[1, v, u] if second else half_m[0, v, u]
-            won_m[v, u] = place + deviation * normals[2, v, u] + sweep_m[u]
-            won_height[v, u] = b if second else a
+            first_height = height[0, v, u] + noise[v, u] * normals[0, v, u]
+            second_height = height[1, v, u] + noise[v, u] * normals[1, v, u]
+            second_wins = second_height > first_height
+            deviation = deviation_m[1, v, u] if second_wins else deviation_m[0, v, u]
+            half = half_m[1, v, u] if second_wins else half_m[0, v, u]
+            won_m[v, u] = half + deviation * normals[2, v, u] + sweep_m[u]
+            won_height[v, u] = second_height if second_wins else first_height
             won_deviation_m[v, u] = deviation
 
 
@@ -183,33 +214,57 @@ def noise_peaks(  # type: ignore[no-untyped-def]
     won_height,
     won_deviation_m,
 ):
-    """Let the highest maximum of the noise over one period win where it exceeds the return, at
-    flat indices ``weak``. Noise crosses a level of x deviations upwards rate * exp(-x^2 / 2) times
-    in a period (Rice); if Poisson, the highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)).
-    ``averaged``: share of the noise that the mean over neighbours leaves before the peak is found.
-    ``bandwidth_m``: deviation of half the path at one noise deviation."""
+    """Let the highest maximum of the noise over one period win where it exceeds the return.
+
+    Noise crosses a level of x deviations upwards rate * exp(-x^2 / 2) times in a period (Rice); if
+    Poisson, the highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)).
+
+    Args:
+        weak: (m,) flat indices of the pixels where noise may win.
+        noise: (h, w) deviation of a height.
+        averaged: share of it that the mean over neighbours leaves before the peak is found.
+        uniforms: (2, m) random numbers in 0..1, for level and position.
+        rate: upward crossings of 0 in a period.
+        bandwidth_m: deviation of half the path at a height of one noise deviation.
+        unambiguous_m: half the path of one period.
+        won_m, won_height, won_deviation_m: (h, w) of the winner so far; changed.
+    """
     w = noise.shape[1]
     for i in range(weak.size):
         v = weak[i] // w
         u = weak[i] % w
         crossings = -np.log(max(uniforms[0, i], 1e-300))
         level = np.sqrt(2.0 * np.log(rate / crossings)) if crossings < rate else 0.0
-        tall = level * averaged * noise[v, u]
-        if tall > won_height[v, u]:
-            won_height[v, u] = tall
+        height = level * averaged * noise[v, u]
+        if height > won_height[v, u]:
+            won_height[v, u] = height
             won_m[v, u] = uniforms[1, i] * unambiguous_m
             won_deviation_m[v, u] = bandwidth_m / max(level, 1.0)
 
 
 @numba.njit(**FAST)
 def smooth(  # type: ignore[no-untyped-def]
-    half_m, share, height, gate_m, taps, along_rows, out_m, out_share, out_height
+    half_m,
+    share,
+    height,
+    gate_m,
+    taps,
+    along_rows,
+    out_m,
+    out_share,
+    out_height,
 ):
-    """Average the neighbours of a column (or of a row, with ``along_rows``) that agree, with
-    ``taps`` (2 r + 1,). ``half_m``, ``share``, ``height`` (h + 2 p, w + 2 q), with a border of p
-    and q at least r where the taps reach: half path, weight of what has agreed so far, and
-    strength. ``gate_m`` (h, w): largest difference of a neighbour's half path. Writes the mean
-    half path, the weight and the strength of those that agree, (h, w) each."""
+    """Average the neighbours of a column, or of a row, that agree.
+
+    Args:
+        half_m, share, height: (h + 2 p, w + 2 q) half path, weight of what has agreed so far, and
+            strength, with a border of p and q, at least r where the taps reach.
+        gate_m: (h, w) largest difference of a neighbour's half path.
+        taps: (2 r + 1,) weights.
+        along_rows: whether neighbours stand in the same row.
+        out_m, out_share, out_height: (h, w) mean half path, weight and strength of those that
+            agree; written.
+    """
     h, w = gate_m.shape
     p = (half_m.shape[0] - h) // 2
     q = (half_m.shape[1] - w) // 2
@@ -219,11 +274,19 @@ def smooth(  # type: ignore[no-untyped-def]
     for v in range(h):
         for start in range(0, w, CHUNK):
             n = min(CHUNK, w - start)
-            sums[:] = np.float32(0)
+            sums[:] = ZERO
+            pixels = (v + p, q + start)
             for k in range(-r, r + 1):
-                near = (v + p, q + start + k) if along_rows else (v + p + k, q + start)
+                neighbours = (v + p, q + start + k) if along_rows else (v + p + k, q + start)
                 _add_agreeing(
-                    image, gate_m, near, (v + p, q + start), (v, start), n, taps[k + r], sums
+                    image,
+                    gate_m,
+                    neighbours,
+                    pixels,
+                    (v, start),
+                    n,
+                    taps[k + r],
+                    sums,
                 )
             for u in range(n):
                 out_m[v, start + u] = half_m[v + p, q + start + u] + sums[u] / sums[CHUNK + u]
@@ -231,25 +294,50 @@ def smooth(  # type: ignore[no-untyped-def]
                 out_height[v, start + u] = sums[2 * CHUNK + u]
 
 
-CHUNK = 256  # columns whose sums stand side by side: a loop that writes to one array is vectorised
-
-
 @numba.njit(**FAST)
-def _add_agreeing(image, gate_m, near, own, at, n, tap, sums):  # type: ignore[no-untyped-def]
-    """Add n neighbours, from the place ``near`` on, of the pixels from ``own`` on, whose gates
-    begin at ``at``. Images are passed whole, as a slice costs as much as tens of sums."""
-    (half_m, share, height), row, column = image, np.uint64(near[0]), np.uint64(near[1])
-    own_row = np.uint64(own[0])
-    own_column = np.uint64(own[1])
-    v = np.uint64(at[0])
-    start = np.uint64(at[1])
+def _add_agreeing(  # type: ignore[no-untyped-def]
+    image,
+    gate_m,
+    neighbours,
+    pixels,
+    gates,
+    n,
+    tap,
+    sums,
+):
+    """Add n neighbours of n pixels. ``neighbours``, ``pixels`` and ``gates``: (row, column) of the
+    first of each. Images are passed whole, as a slice costs as much as tens of sums."""
+    half_m, share, height = image
+    row = np.uint64(neighbours[0])
+    column = np.uint64(neighbours[1])
+    pixel_row = np.uint64(pixels[0])
+    pixel_column = np.uint64(pixels[1])
+    v = np.uint64(gates[0])
+    start = np.uint64(gates[1])
     for u in range(np.uint64(n)):
-        off = half_m[row, column + u] - half_m[own_row, own_column + u]
-        counted = tap if abs(off) <= gate_m[v, start + u] else np.float32(0)
+        off = half_m[row, column + u] - half_m[pixel_row, pixel_column + u]
+        counted = tap if abs(off) <= gate_m[v, start + u] else ZERO
         weight = counted * share[row, column + u]
         sums[u] += weight * off
         sums[np.uint64(CHUNK) + u] += weight
         sums[np.uint64(2 * CHUNK) + u] += counted * height[row, column + u]
+
+
+class DeviceLimits(NamedTuple):
+    """Limits that the device sets to a smoothed half path."""
+
+    receiver2_m2: np.float32
+    """Squared distance from the transmitter to the receiver."""
+    least_strength: np.float32
+    """Smallest strength, electrons."""
+    least_agreeing: np.float32
+    """Smallest share of the weights that must agree."""
+    nearest_m: np.float32
+    """Smallest range along the ray."""
+    farthest_m: np.float32
+    """Greatest range along the ray."""
+    step_m: np.float32
+    """Step of the output's z."""
 
 
 @numba.njit(**FAST)
@@ -257,7 +345,7 @@ def gated(  # type: ignore[no-untyped-def]
     half_m,
     share,
     height,
-    everyone,
+    whole_share,
     along_m,
     cosine,
     saturated,
@@ -267,25 +355,33 @@ def gated(  # type: ignore[no-untyped-def]
     reason,
     strength,
 ):
-    """Convert smoothed half paths (h, w) to ranges, with gates and rounding. ``share``,
-    ``height``: weight and strength of the neighbours that agree. ``everyone``: weight of all
-    within the picture. Half the path s with a receiver at e gives the range r = (4 s^2 - e.e) / (4
-    s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z. ``limits``: e.e, least
-    strength, least agreeing share, least and greatest range, step."""
+    """Convert smoothed half paths to ranges, with gates and rounding. Half the path s with a
+    receiver at e gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u.
+
+    Args:
+        half_m, share, height: (h, w) half path, weight and strength of the neighbours that agree.
+        whole_share: (h, w) weight of all neighbours within the picture.
+        along_m: (h, w) u.e.
+        cosine: (h, w) u_z.
+        saturated: (h, w) bool.
+        limits: the `DeviceLimits`.
+        error_m: displacement of the frame.
+        z_m, reason, strength: (h, w); written.
+    """
     h, w = cosine.shape
-    e2, least, alike, nearest, farthest, step = limits
+    step_m = limits.step_m
     for v in range(h):
         for u in range(w):
-            support = height[v, u] / everyone[v, u]
+            support = height[v, u] / whole_share[v, u]
             half = half_m[v, u] + error_m
-            range_m = (np.float32(4) * half * half - e2) / (
-                np.float32(4) * half - np.float32(2) * along_m[v, u]
-            )
-            code = VALID if (range_m >= nearest) & (range_m <= farthest) else OUT_OF_RANGE
-            code = code if share[v, u] >= alike * everyone[v, u] else EDGE
-            code = code if support >= least else LOW_AMPLITUDE
+            path2_m2 = FOUR * half * half
+            range_m = (path2_m2 - limits.receiver2_m2) / (FOUR * half - TWO * along_m[v, u])
+            in_range = (range_m >= limits.nearest_m) & (range_m <= limits.farthest_m)
+            code = VALID if in_range else OUT_OF_RANGE
+            code = code if share[v, u] >= limits.least_agreeing * whole_share[v, u] else EDGE
+            code = code if support >= limits.least_strength else LOW_AMPLITUDE
             code = SATURATED if saturated[v, u] else code
-            rounded = np.floor(range_m * cosine[v, u] / step + np.float32(0.5)) * step
-            z_m[v, u] = rounded if code == VALID else np.float32(np.nan)
+            steps = np.floor(range_m * cosine[v, u] / step_m + HALF)
+            z_m[v, u] = steps * step_m if code == VALID else NAN
             reason[v, u] = np.uint8(code)
-            strength[v, u] = max(support, np.float32(0))
+            strength[v, u] = max(support, ZERO)

@@ -25,7 +25,7 @@ from harness import detect
 from harness.experiment.load import load_experiment
 from harness.programs.camera import flatfield
 from harness.runs.plan import plan_of
-from harness.trials.trial import flat_field_of
+from harness.trials.averages import flat_field_of
 from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens, Region

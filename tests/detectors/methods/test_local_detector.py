@@ -241,7 +241,7 @@ def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> Non
     """A metal plate with holes of 5 mm at 0.25 m, with tags and an object on it, seen by an Azure
     Kinect."""
     from detectors.averages.average import AverageConfig, average
-    from detectors.averages.noise import REACH_FRAMES, noise_reach_px
+    from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
     from detectors.recordings import open_capture
 
     folder = shared_data / "azure_drilled_board"

@@ -30,7 +30,6 @@ from detectors.findings.whitening import (
     grid_of,
 )
 from detectors.interface import Detection
-from detectors.masks import grown
 from detectors.methods.local import LocalDetector
 from detectors.methods.matched import (
     CLIP_SIGMAS,
@@ -44,6 +43,7 @@ from detectors.methods.matched import (
     _tamed,
     _without_rim,
 )
+from detectors.pixels.masks import grown
 from harness.testing.synthetic_clouds import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
 

@@ -17,7 +17,11 @@ from harness.evaluation.summary import summarise_holes
 from tests.support.synthetic_tables import World, joined, tables
 
 
-def ladder(rates: list[float], copies: int = 1, repeats: int = 20) -> Ladder:
+def ladder(
+    rates: list[float],
+    copies: int = 1,
+    repeats: int = 20,
+) -> Ladder:
     """Holes of 1, 2, 3 ... mm, found in exactly these shares of the repeats."""
     sizes = np.repeat(np.arange(1.0, len(rates) + 1), copies)
     detected = np.arange(repeats)[:, None] < np.repeat(np.array(rates) * repeats, copies).round()
@@ -47,9 +51,9 @@ def test_half_size_by_hand(rates, expected):
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=12))
 def test_half_size_lies_on_the_ladder_and_falls_when_more_is_found(rates):
     sizes = np.arange(1.0, len(rates) + 1)
-    found = half_size(sizes, np.array([rates]))[0]
-    assert found == np.inf or sizes[0] <= found <= sizes[-1]
-    assert half_size(sizes, np.minimum(1, np.array([rates]) + 0.1))[0] <= found + 1e-9
+    half_mm = half_size(sizes, np.array([rates]))[0]
+    assert half_mm == np.inf or sizes[0] <= half_mm <= sizes[-1]
+    assert half_size(sizes, np.minimum(1, np.array([rates]) + 0.1))[0] <= half_mm + 1e-9
 
 
 def test_interval_is_a_point_without_chance_and_covers_with_it():
@@ -60,9 +64,9 @@ def test_interval_is_a_point_without_chance_and_covers_with_it():
     sizes = np.repeat(np.arange(1.0, 10), 3)
     chance = 1 / (1 + np.exp(-(np.repeat(np.arange(1.0, 10), 3) - 5)))
     covered = [
-        (one := percentiles(Ladder(sizes, rng.random((10, 27)) < chance).half_draws_mm)).low
+        (drawn := percentiles(Ladder(sizes, rng.random((10, 27)) < chance).half_draws_mm)).low
         <= 5
-        <= one.high
+        <= drawn.high
         for _ in range(40)
     ]
     # 95 % nominal; 32 of 40 or fewer would have a chance below 0.001
@@ -82,9 +86,9 @@ def test_limit_needs_every_larger_hole():
 
 def test_ladder_from_the_table_of_holes():
     table = tables(World(rate=lambda hole, frames: float(hole >= 4), repeats=6), (50,)).holes
-    found = ladder_of(table)
-    assert found.detected.shape == (6, 11)
-    assert found.half_mm == pytest.approx((4.7625 + 6.35) / 2)
+    ladder_of_table = ladder_of(table)
+    assert ladder_of_table.detected.shape == (6, 11)
+    assert ladder_of_table.half_mm == pytest.approx((4.7625 + 6.35) / 2)
     assert found_limit_mm(summarise_holes(table)) == pytest.approx(6.35)
 
 
@@ -94,15 +98,17 @@ PLACED = ("holes", "runs", "probes", "variants", "noise")
 def switched(first_found: dict[tuple[str, ...], int], names: tuple[str, ...]):
     """Tables of set-ups by what is on, each finding all holes from a number on."""
     parts = []
-    for on, first in first_found.items():
-        name = "+".join(on) or "none"
+    for effects, first in first_found.items():
+        name = "+".join(effects) or "none"
         part = tables(
             World(rate=lambda hole, frames, first=first: float(hole >= first), repeats=6),
             (1, 50),
             name,
         )
         variants = part.variants.assign(
-            is_variation=False, reference=name, switches=json.dumps({n: n in on for n in names})
+            is_variation=False,
+            reference=name,
+            switches=json.dumps({n: n in effects for n in names}),
         )
         part = replace(part, variants=variants)
         tables_with_axis = {
@@ -139,7 +145,9 @@ def test_a_size_off_the_ladder_gives_a_bound():
     assert noise_alone == np.inf
     assert np.isnan(pattern_last) or pattern_last == np.inf
     # nothing on finds the smallest hole already
-    assert not rows["on_ladder"][0] and not rows["on_ladder"][1] and np.isfinite(pattern_alone)
+    assert not rows["on_ladder"][0]
+    assert not rows["on_ladder"][1]
+    assert np.isfinite(pattern_alone)
 
 
 def test_without_switches_there_are_no_costs():

@@ -201,7 +201,7 @@ def test_the_detectors_version_is_part_of_the_digest(
 def test_digests_do_not_depend_on_the_process(folder: Path) -> None:
     first, second = (loaded(folder, BASE + SWEEP + STUDY) for _ in range(2))
     assert first.digest == second.digest
-    assert [one.digest for one in first.points] == [one.digest for one in second.points]
+    assert [point.digest for point in first.points] == [point.digest for point in second.points]
 
 
 def test_the_results_folder_is_inside_the_results(folder: Path) -> None:

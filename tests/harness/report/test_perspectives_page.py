@@ -11,6 +11,7 @@ import pytest
 
 from harness.evaluation.maps import compare_maps
 from harness.evaluation.summary import summarise_holes
+from harness.programs.thesis.answers import THESIS
 from harness.report.page import write_report
 from harness.report.perspectives import map_files, perspectives_html
 from harness.report.sections import About, ways_grid
@@ -62,7 +63,7 @@ def examples():
 @pytest.fixture(scope="module")
 def page(found):
     return perspectives_html(
-        found, examples(), About(provenance(), YAML, "Several perspectives", True)
+        found, examples(), About(provenance(), YAML, "Several perspectives", THESIS)
     )
 
 
@@ -137,7 +138,7 @@ def test_nothing_finished_is_said(found):
     empty = replace(
         found, **{name: getattr(found, name).iloc[:0] for name in ("holes", "runs", "probes")}
     )
-    page = perspectives_html(empty, [], About(provenance(), YAML, "T", True))
+    page = perspectives_html(empty, [], About(provenance(), YAML, "T", THESIS))
     assert "No trial of any set-up finished" in page
     assert page.count("? undecided</td>") == 4
 

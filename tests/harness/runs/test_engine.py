@@ -24,7 +24,7 @@ from harness.runs.journal import Journal, record_text
 from harness.runs.options import EngineOptions
 from harness.runs.plan import plan_of
 from harness.runs.tables import tables_of
-from harness.trials.setup import SetUp, known_view
+from harness.trials.board import Board
 from harness.trials.trial import run_trial
 from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.target.custom import TargetConfig
@@ -385,14 +385,12 @@ def test_matching_places_findings_on_a_curved_face():
     T_camera_board = target.pose.T_camera_board
     (damage,) = truth_of(target, T_camera_board)
     unit = cast("SimulatedUnit", None)
-    set_up = SetUp(unit, True, (damage,), target, T_camera_board)
+    set_up = Board(unit, True, (damage,), target, T_camera_board)
     deeper = damage.centre_camera_m * 1.02  # along the line of sight, as the points of a hole are
     one = np.ones((1, 1))
     pixels = {1: np.array([0])}
     vars(set_up).update(
         {"outlines": pixels, "intact": one > 0, "seen_depth_m": {1: 0.0}, "on_face_m": one}
     )
-    known = known_view(
-        set_up, cast("Cloud", SimpleNamespace(projection="central")), hole_free=False
-    )
+    known = set_up.labelled(cast("Cloud", SimpleNamespace(projection="central")))
     assert known.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

@@ -91,8 +91,8 @@ def test_boards_of_learning_are_nobody_else_s_and_cost_only_detectors_that_learn
 ):
     group = group_in(study_out, tmp_path, LEARNING)
     (batch,) = group.learning
-    assert (len(batch.renders), len(batch.set_ups)) == (LEARNING_BOARDS, LEARNING_BOARDS)
-    assert not any(ref.damaged for ref in batch.set_ups)
+    assert (len(batch.renders), len(batch.views)) == (LEARNING_BOARDS, LEARNING_BOARDS)
+    assert not any(ref.damaged for ref in batch.views)
     assert not set(batch.paths) & {
         path for other in (*group.first, *group.then) for path in other.paths
     }
@@ -178,13 +178,13 @@ def test_every_unit_inspects_every_damaged_board_and_others_have_units_of_their_
             task for _, task in group.trials(batch, {point.digest: 5.0 for point in group.points})
         ]
         assert len(tasks) == (3 if batch.role == "damaged" else 1)
-        seeds.update(task.set_ups[0].camera.unit_seed for task in tasks)
+        seeds.update(task.views[0].camera.unit_seed for task in tasks)
     boards = Counter(batch.role for batch in (*group.first, *group.then))
     assert (
         sorted(seeds.values())
         == [1] * (boards["calibration"] + boards["hole_free"]) + [boards["damaged"]] * 3
     )
-    taught = {ref.camera.unit_seed for ref in group.learning[0].set_ups}
+    taught = {ref.camera.unit_seed for ref in group.learning[0].views}
     assert len(taught) == LEARNING_BOARDS and not taught & set(seeds)
     assert {batch.paths for batch in more.batches} == {batch.paths for batch in group.batches}, (
         "units share renders"
@@ -245,4 +245,6 @@ def test_one_blob_of_one_unit_decides_its_calibration_and_units_spread_it(study_
     assert set_by(of_one)[0].same_pixels == 4, "of 5 boards"
     assert set_by(of_units)[0].same_pixels == 1
     assert "highest score on the same pixels" in threshold_warnings(of_one)[0]
-    assert not any("same pixels" in said for said in threshold_warnings(of_units))
+    assert not any(
+        "same pixels" in threshold_warning for threshold_warning in threshold_warnings(of_units)
+    )

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from harness.trials.setup import SetUp, board_places_m, face_errors_m, known_map
-from harness.trials.trial import registration_error_m
+from harness.trials.board import Board, board_places_m, face_errors_m
+from harness.trials.clouds import registration_error_m
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.custom import TargetConfig
 from scenes.target.truth import truth_of
@@ -54,9 +54,9 @@ def map_of(
     return cloud, T_CAMERA_BOARD @ T_board_map
 
 
-def first_view() -> SetUp:
+def first_view(damaged: bool = True) -> Board:
     unit = cast("SimulatedUnit", None)
-    set_up = SetUp(unit, True, truth_of(TARGET, T_CAMERA_BOARD), TARGET, T_CAMERA_BOARD)
+    set_up = Board(unit, damaged, truth_of(TARGET, T_CAMERA_BOARD), TARGET, T_CAMERA_BOARD)
     pixels = {7: np.array([0])}
     vars(set_up).update({"pitch_mm": (1.4, 1.4), "outlines": pixels, "seen_depth_m": {7: 0.0}})
     return set_up
@@ -80,7 +80,7 @@ def test_a_registration_error_is_split_into_the_plane_and_across_it():
 
 def test_the_truth_lies_on_a_map_where_its_cells_are():
     cloud, T_reference_cloud = map_of(0.0, missing=True)
-    known = known_map(first_view(), cloud, T_reference_cloud, hole_free=False)
+    known = first_view().labelled_map(cloud, T_reference_cloud)
     places = board_places_m(cloud, known.T_board_cloud)
     inside = places.reshape(-1, 2)[known.outlines[7]]
     # cells without a value count as seeing into the hole as well
@@ -96,7 +96,7 @@ def test_the_truth_lies_on_a_map_where_its_cells_are():
 
 def test_a_finding_at_depth_is_placed_along_the_maps_axis():
     cloud, T_reference_cloud = map_of(0.0)
-    known = known_map(first_view(), cloud, T_reference_cloud, hole_free=False)
+    known = first_view().labelled_map(cloud, T_reference_cloud)
     assert known.on_board(np.array([[0.05, 0.01, 0.73]]))[0] == pytest.approx(
         [0.05, -0.01], abs=1e-12
     )
@@ -105,14 +105,14 @@ def test_a_finding_at_depth_is_placed_along_the_maps_axis():
 @pytest.mark.parametrize("height_m", [0.0, 1e-3, -2e-3])
 def test_errors_of_a_map_are_told_behind_the_face(height_m):
     cloud, T_reference_cloud = map_of(height_m)
-    known = known_map(first_view(), cloud, T_reference_cloud, hole_free=True)
+    known = first_view(damaged=False).labelled_map(cloud, T_reference_cloud)
     errors = face_errors_m(known, np.array([[0.0, 0.0], [0.1, 0.05], [-0.1, 0.0301]]))
     assert errors == pytest.approx(np.full(3, -height_m), abs=1e-9)
 
 
 def test_a_place_that_a_map_does_not_reach_has_no_error():
     cloud, T_reference_cloud = map_of(0.0)
-    known = known_map(first_view(), cloud, T_reference_cloud, hole_free=True)
+    known = first_view(damaged=False).labelled_map(cloud, T_reference_cloud)
     near = np.random.default_rng(1).uniform(-0.08, 0.08, (20, 2))
     errors = face_errors_m(known, np.vstack([near, [[0.3, 0.2]]]))
     assert np.isfinite(errors[:-1]).all()

@@ -143,7 +143,7 @@ def test_serial_runs_here_and_in_order():
     jobs = [Job("pid", "trials", os.getpid, ()), *doubles(3), job(faulty_jobs.raises)]
     found = run(SerialEngine(), jobs)
     assert found["pid"].value == os.getpid()
-    assert list(found) == [one.name for one in jobs]
+    assert list(found) == [job.name for job in jobs]
     assert found["raises"].state == "failed"
 
 
@@ -174,8 +174,8 @@ def test_a_process_killed_between_jobs_costs_nothing():
             while "Z (zombie)" not in Path(f"/proc/{first.value}/status").read_text():
                 time.sleep(0.01)
         states = []
-        for one in doubles(2):
-            engine.submit(one)
+        for double in doubles(2):
+            engine.submit(double)
             states += [ended.state for _, ended in engine.ended()]
     assert states == ["done", "done"]
 

@@ -20,7 +20,7 @@ from harness.runs.plan import Group, SweepPlan, parts_of, plan_of
 from harness.runs.run import run_plan
 from harness.runs.shards import Shard
 from harness.trials.judge import FINDING_OCTAVES, grid
-from harness.trials.trial import TrialTask
+from harness.trials.trial import Trial
 from tests.support.serial_run import trial_count
 from tests.support.tiny_sweep import STUDY, TINY
 
@@ -68,29 +68,29 @@ class Pretended:
         return [(job, Ended("done", made_up(job.arguments[0], self._factor)))]
 
 
-def made_up(task: TrialTask, factor: float = 1.0) -> str:
+def made_up(task: Trial, factor: float = 1.0) -> str:
     """A record. ``factor``: by which this machine's scores differ from another's."""
     word = hashlib.sha256(f"{task.board} {task.repeat} {task.role}".encode()).digest()
     quiet = factor * (3 + word[0] / 256)
     runs = [
         {
-            "point": one.digest,
-            "variant": one.variant,
-            "frames": one.frames,
-            "quiet_threshold": quiet if one.threshold is None else None,
+            "point": point.digest,
+            "variant": point.variant,
+            "frames": point.frames,
+            "quiet_threshold": quiet if point.criteria.threshold is None else None,
             "inspected_m2": 0.06,
-            "threshold": one.threshold,
+            "threshold": point.criteria.threshold,
         }
-        for one in task.points
+        for point in task.points
     ]
     operating = [
         {
-            "variant": one.variant,
-            "frames": one.frames,
-            "threshold": grid(one.threshold, FINDING_OCTAVES).tolist(),
+            "variant": point.variant,
+            "frames": point.frames,
+            "threshold": grid(point.criteria.threshold, FINDING_OCTAVES).tolist(),
         }
-        for one in task.points
-        if one.threshold is not None
+        for point in task.points
+        if point.criteria.threshold is not None
     ]
     return record_text({"runs": runs, "operating": operating})
 
@@ -193,7 +193,7 @@ def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
         outcome = go(plan, folder, Pretended(seed, ends))
         assert outcome.trials.over == outcome.trials.total
         assert outcome.trials.failed <= len(outcome.failures)
-        assert {one.why for one in outcome.failures} <= {
+        assert {failure.why for failure in outcome.failures} <= {
             "a fault",
             *(f.why for f in outcome.failures),
         }
@@ -305,7 +305,9 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
         [id(leader) for leader, parts in zip(leaders, each, strict=True) if parts]
         for each in judged
     ]
-    both = [group for group in leaders if all(id(group) in each for each in shards) and group.first]
+    both = [
+        group for group in leaders if all(id(group) in shard for shard in shards) and group.first
+    ]
     calibrates = any(
         point.config.threshold.calibrate is not None for group in both for point in group.points
     )

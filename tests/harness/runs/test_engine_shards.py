@@ -51,8 +51,8 @@ def test_shards_with_a_common_folder_share_the_calibration(home, tmp_path):
     """One after the other: none runs what another has run, and together they are all."""
     study = plan(home)
     counts = [run_serially(study, tmp_path, shard=Shard(number, 3)).trials for number in (3, 1, 2)]
-    assert [one.failed for one in counts] == [0, 0, 0]
-    assert sum(one.done for one in counts) == trial_count(study)
+    assert [count.failed for count in counts] == [0, 0, 0]
+    assert sum(count.done for count in counts) == trial_count(study)
     whole = run_serially(study, tmp_path)
     assert (whole.trials.done, whole.trials.found) == (0, trial_count(study))
 

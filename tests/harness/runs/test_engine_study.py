@@ -25,7 +25,7 @@ from harness.runs.calibration import threshold_of
 from harness.runs.plan import plan_of
 from harness.runs.study_record import failures_by_point, record_of, without_limit
 from harness.runs.tables import tables_of
-from harness.trials.trial import TrialTask, run_trial
+from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.errors import UserError
 from tests.support.declared_results import assert_declared
@@ -95,7 +95,7 @@ def test_boards_differ_by_purpose_and_number_and_hole_free_ones_show_no_damage(t
     assert len({batch.renders[0].path for batch in group.batches}) == 12
     for batch in group.batches:
         shown = batch.renders[0].target
-        target = batch.set_ups[0].target
+        target = batch.views[0].target
         assert len(target.damages) == 5
         assert shown == (target if batch.role == "damaged" else target.hole_free())
 
@@ -112,13 +112,13 @@ def test_groups_that_differ_in_damage_share_their_trials_before_thresholds(tmp_p
     assert second.leader is first and second.first == () and len(first.first) == 5
     for batch in first.first:
         ((_, task),) = first.trials(batch, {})
-        assert [one.digest for one in task.points] == [
+        assert [point.digest for point in task.points] == [
             point.digest for point in (*first.points, *second.points)
         ]
     for group in (first, second):
         tasks = [task for batch in group.then for _, task in group.trials(batch, AT_5)]
         assert len(tasks) == 7
-        assert {one.digest for task in tasks for one in task.points} == {
+        assert {point.digest for task in tasks for point in task.points} == {
             point.digest for point in group.points
         }
     for apart in ("source.camera.unit_seed: [1, 2]", "source.target.distance_m: [0.6, 0.7]"):
@@ -171,7 +171,7 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
     """With two numbers of frames, one of which no hole-free run of ends: the other is judged all
     the same."""
 
-    def faulty(task: TrialTask) -> object:
+    def faulty(task: Trial) -> object:
         if task.role == "calibration":
             task = replace(task, points=tuple(point for point in task.points if point.frames == 2))
         return run_trial(task)
@@ -188,8 +188,8 @@ def test_a_calibration_that_fails_costs_its_set_up_only(finished, tmp_path, monk
 
 
 def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_path, monkeypatch):
-    def blinded(task: TrialTask) -> object:
-        if task.set_ups[0].camera.unit_seed == 2:
+    def blinded(task: Trial) -> object:
+        if task.views[0].camera.unit_seed == 2:
             raise UserError("the crop leaves none of the cloud's points")
         return run_trial(task)
 

@@ -13,15 +13,11 @@ from hypothesis import strategies as st
 from harness.evaluation.intervals import UNKNOWN, Interval
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, axis_lines
+from harness.records.examples import StudyExample
 from harness.records.schema import Estimate
-from harness.report.clouds import StudyExample, examples_figure
-from harness.report.study_page import (
-    MOST_CURVES,
-    axis_figure,
-    overlay_figure,
-    study_parts,
-    with_room,
-)
+from harness.report.clouds import examples_figure
+from harness.report.study_figures import MOST_CURVES, axis_figure, overlay_figure, with_room
+from harness.report.study_page import study_parts
 from harness.tables.limits import (
     LIMITS,
     is_within_sizes,
@@ -37,12 +33,12 @@ from tests.support.synthetic_study import SetUp, Study, study_record
 
 def limits_of(*set_ups: SetUp, **study: object) -> list[SetUpLimit]:
     record = study_record(Study(set_ups=set_ups, boards=20, hole_free_boards=12, **study))  # type: ignore[arg-type]
-    return [limit_of(one, draws=100) for one in record.set_ups]
+    return [limit_of(set_up, draws=100) for set_up in record.set_ups]
 
 
 def result_of(limits: list[SetUpLimit]) -> StudyResult:
     """A result of limits alone."""
-    set_ups = tuple(SetUpResult(one, None, None, None, None, None, "") for one in limits)
+    set_ups = tuple(SetUpResult(limit, None, None, None, None, None, "") for limit in limits)
     return StudyResult(study_record(), set_ups, tuple(limits), (), (), {})
 
 
@@ -73,13 +69,14 @@ def everything_found() -> SetUpLimit:
 
 def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
     for limit in two:
-        said = limit_sentence(limit)
-        assert said.startswith(
-            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the time"
+        sentence = limit_sentence(limit)
+        assert sentence.startswith(
+            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the "
+            "time"
         )
         assert limit.false_calls is not None
         rate = f"{limit.false_calls.rate_per_m2:.2g}"
-        assert f", at {rate} false call{'' if rate == '1' else 's'} per m² (" in said
+        assert f", at {rate} false call{'' if rate == '1' else 's'} per m² (" in sentence
     second = limit_sentence(two[1], again=True)
     assert second.startswith(f"{two[1].record.label}: {size(two[1].a90_95.value)} mm, at ")
     assert study_answer(two) == f"One unit of the camera: {limit_sentence(two[0])} {second}"
@@ -88,13 +85,13 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
 def test_of_many_set_ups_the_span_and_those_without_a_limit(
     two: list[SetUpLimit], nothing_found: SetUpLimit
 ) -> None:
-    said = study_answer([*two, *two, nothing_found])
-    assert said.startswith(
+    answer = study_answer([*two, *two, nothing_found])
+    assert answer.startswith(
         "One unit of the camera: of 5 set-ups, the smallest limit (a90/95) is "
         f"{size(two[1].a90_95.value)} mm (50 frames)"
     )
-    assert f"the largest {size(two[0].a90_95.value)} mm (1 frame)" in said
-    assert said.endswith("; 1 of 5 set-ups demonstrates no limit within the sizes inspected.")
+    assert f"the largest {size(two[0].a90_95.value)} mm (1 frame)" in answer
+    assert answer.endswith("; 1 of 5 set-ups demonstrates no limit within the sizes inspected.")
     none = (
         "none of 4 set-ups demonstrates a limit (a90/95) within the sizes inspected (1 to 14 mm)."
     )
@@ -114,11 +111,11 @@ def test_what_is_not_demonstrated_is_written_out(nothing_found: SetUpLimit) -> N
 def test_the_answer_is_without_statistics(two: list[SetUpLimit]) -> None:
     why = "not demonstrated: a constant probability is not rejected (ratio 1.79 <= 3.84)"
     limit = replace(two[0], a90_95=replace(two[0].a90_95, value=np.inf, why=why))
-    said = limit_sentence(limit)
-    assert said.startswith(
+    sentence = limit_sentence(limit)
+    assert sentence.startswith(
         "1 frame: a90/95 is not demonstrated: the hits do not grow clearly with diameter; "
     )
-    assert "3.84" not in said
+    assert "3.84" not in sentence
     assert "(ratio 1.79 <= 3.84)" in "; ".join(notes_of(limit))
 
 
@@ -147,7 +144,7 @@ def test_sizes_beyond_those_inspected_are_no_numbers(two: list[SetUpLimit]) -> N
 
 
 def test_what_all_set_ups_have_in_common_is_said_once(two: list[SetUpLimit]) -> None:
-    failed = [replace(one, record=replace(one.record, failed=3)) for one in two]
+    failed = [replace(limit, record=replace(limit.record, failed=3)) for limit in two]
     failed[1] = replace(
         failed[1],
         a90_95=replace(failed[1].a90_95, value=np.inf, why="not demonstrated: of a ceiling"),
@@ -204,15 +201,11 @@ def test_every_number_of_a_limit_stands_in_its_file(
     )
     assert numbers == (limit.a90_95.value, limit.a90_mm, ends.low, ends.high, limit.a50_mm)
     rate = limit.false_calls.interval_per_m2
-    assert (first["false_calls_low_per_m2"], first["false_calls_high_per_m2"]) == (
-        rate.low,
-        rate.high,
-    )
-    assert (first["targets"], first["boards"], first["hits"]) == (
-        limit.targets,
-        limit.boards,
-        limit.hits,
-    )
+    assert first["false_calls_low_per_m2"] == rate.low
+    assert first["false_calls_high_per_m2"] == rate.high
+    assert first["targets"] == limit.targets
+    assert first["boards"] == limit.boards
+    assert first["hits"] == limit.hits
     assert first["a90_95_method"] == "likelihood ratio"
     assert list(frame["a90_95_verdict"]) == ["demonstrated", "demonstrated", "not demonstrated"]
     assert np.isnan(frame["a90_95_mm"].iloc[2])
@@ -246,11 +239,15 @@ def test_few_targets_are_told() -> None:
 
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
-def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
+def test_intervals_as_text_hold_their_numbers(
+    value: float,
+    down: float,
+    up: float,
+) -> None:
     """To two decimals, or to two significant digits of the estimate (of the upper end where that
     is 0), where the interval is wider than a tenth of it."""
     text = with_interval(value, value - down, value + up)
-    numbers = [float(one) for one in re.findall(r"-?\d+(?:\.\d+)?", text)]
+    numbers = [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
     assert np.allclose(
         numbers, [value, value - down, value + up], atol=max(0.0051, 0.051 * abs(value or up))
     )
@@ -281,7 +278,11 @@ def test_intervals_without_ends() -> None:
 
 
 def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
-    def one(camera: str, distance: float, frames: int) -> SetUp:
+    def one(
+        camera: str,
+        distance: float,
+        frames: int,
+    ) -> SetUp:
         axes = {
             "source.camera.name": camera,
             "source.target.distance_m": distance,
@@ -305,10 +306,13 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
         "source.target.distance_m",
         FRAMES,
     ]
-    assert (distance.title, distance.values, distance.numeric) == ("distance (m)", (0.5, 1.0), True)
-    assert (camera.values, camera.numeric) == (("a", "b"), False)
+    assert distance.title == "distance (m)"
+    assert distance.values == (0.5, 1.0)
+    assert distance.numeric is True
+    assert camera.values == ("a", "b")
+    assert camera.numeric is False
     assert list(camera.lines) == [
-        f"distance={at} m, {n}" for at in ("0.5", "1") for n in ("1 frame", "50 frames")
+        f"distance={metres} m, {n}" for metres in ("0.5", "1") for n in ("1 frame", "50 frames")
     ]
     assert list(distance.lines) == ["a, 1 frame", "a, 50 frames", "b, 1 frame", "b, 50 frames"]
     assert distance.lines["b, 50 frames"].limits == (limits[5], limits[7])
@@ -355,7 +359,7 @@ def test_sizes_that_are_all_equal_have_an_axis(recwarn: pytest.WarningsRecorder)
     same = replace(record.inspected, diameter_mm=np.full_like(record.inspected.diameter_mm, 6.0))
     figure = overlay_figure([limit_of(replace(record, inspected=same), draws=50)])
     assert "all sizes are 6" in figure
-    assert [str(one.message) for one in recwarn] == []
+    assert [str(warning.message) for warning in recwarn] == []
 
 
 def test_no_axis_without_two_values(two: list[SetUpLimit]) -> None:
@@ -369,12 +373,12 @@ def test_of_many_set_ups_those_from_the_smallest_limit_to_the_largest_are_shown(
     two: list[SetUpLimit],
 ) -> None:
     sizes = np.random.default_rng(2).permutation(np.arange(1.0, 21.0))
-    many = [replace(two[0], a90_95=replace(two[0].a90_95, value=float(size))) for size in sizes]
-    shown = [one.limit.a90_95.value for one in with_room(result_of(many).set_ups)]
+    twenty = [replace(two[0], a90_95=replace(two[0].a90_95, value=float(size))) for size in sizes]
+    shown = [result.limit.a90_95.value for result in with_room(result_of(twenty).set_ups)]
     assert len(shown) == MOST_CURVES
     assert sorted(shown) == [1.0, 5.0, 9.0, 12.0, 16.0, 20.0]
     assert shown == [size for size in sizes if size in shown]
-    assert [one.limit for one in with_room(result_of(two).set_ups)] == two
+    assert [result.limit for result in with_room(result_of(two).set_ups)] == two
 
 
 def test_curves_without_a_curve_are_drawn(

@@ -10,26 +10,36 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from detectors.interface import Detection, Evidence
+from detectors.interface import Detection, Evidence, Measurement
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
 from harness.evaluation.match import match
-from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, JudgedCloud, grid, study_rows
-from harness.trials.setup import (
+from harness.records.rows import Origin, TrialRecord
+from harness.trials.board import (
     INTACT_MARGIN_PX,
-    KnownCloud,
+    LabelledCloud,
     _eroded,
     highest_within,
     met_on_face,
     pixel_areas,
 )
+from harness.trials.judge import (
+    FINDING_OCTAVES,
+    PIXEL_OCTAVES,
+    SMEARED_PX,
+    Criteria,
+    Judgement,
+    grid,
+    smeared,
+)
+from harness.trials.record import add_judgement
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.custom import BoardConfig, SphereConfig, TargetConfig
 from scenes.target.truth import face_of, truth_of
 
 
-def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud]:
-    """A board of 100 x 60 mm on a grid of 1 mm, two damages; the first's pixel scores 9, one far
-    from both 5."""
+def judgement_of(*, damaged: bool = True, threshold: float = 4.0) -> Judgement:
+    """The judgement of a board of 100 x 60 mm on a grid of 1 mm with two damages: the first's pixel
+    scores 9, one far from both 5."""
     target = TargetConfig.from_data(
         {
             "name": "custom",
@@ -57,8 +67,16 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud
     }
     undamaged = np.ones(x.shape, bool)
     undamaged.ravel()[np.concatenate(list(outlines.values()))] = False
-    known = KnownCloud(
-        cloud, T_board_cloud, target, truth, outlines, places, undamaged, {1: 0.01, 2: 0.01}
+    labelled = LabelledCloud(
+        cloud=cloud,
+        damaged=damaged,
+        T_board_cloud=T_board_cloud,
+        target=target,
+        truth=truth,
+        outlines=outlines,
+        places_m=places,
+        undamaged=undamaged,
+        seen_depth_m={1: 0.01, 2: 0.01},
     )
     score = np.zeros(x.shape)
     score[:, 90:] = np.nan
@@ -66,81 +84,99 @@ def sight_and_judgement(threshold: float = 4.0) -> tuple[KnownCloud, JudgedCloud
     hit = Detection(score[29, 19], np.array([(29, 19)[0] * 100 + (29, 19)[1]]), points[29, 19])
     call = Detection(score[10, 50], np.array([(10, 50)[0] * 100 + (10, 50)[1]]), points[10, 50])
 
-    class Found:
+    class Finder:
         def find(self, cloud: Cloud, evidence: object, threshold: float) -> tuple[Detection, ...]:
             return tuple(one for one in (hit, call) if one.score > threshold)
 
-    evidence = SimpleNamespace(score=score)
-    judgement = JudgedCloud(
-        run={"threshold": threshold},
-        holes=[{"hole": "1"}, {"hole": "2"}],
-        detector=Found(),  # type: ignore[arg-type]
-        evidence=evidence,  # type: ignore[arg-type]
+    return Judgement(
+        labelled=labelled,
+        criteria=Criteria("finder", "{}", threshold, 0.01),
+        detector=Finder(),  # type: ignore[arg-type]
+        evidence=Evidence(score, score, score, 1.0),
         detections=(hit, call),
         places_m=np.array([points[29, 19, :2], points[10, 50, :2]]),
-        pairs={0: 0},
+        hits={0: 0},
+        measurements={0: Measurement(19.0, 29.0, 1, 9.0, 0.006, points[29, 19])},
     )
-    return known, judgement
+
+
+def study_record(judgement: Judgement) -> TrialRecord:
+    """What a study records of a judgement."""
+    record = TrialRecord()
+    origin = Origin(variant="main", frames=1, repeat=0, board=3)
+    role = "damaged" if judgement.labelled.damaged else "hole_free"
+    add_judgement(record, judgement, point="digest", origin=origin, role=role, seconds_frames=0.0)
+    return record
 
 
 def test_what_a_damaged_board_gives():
-    known, judgement = sight_and_judgement()
-    rows = study_rows(known, judgement, 0.01, hole_free=False)
-    assert [row["signal"] for row in rows["holes"]] == [9.0, 0.0]
-    assert rows["runs"][0]["inspected_m2"] == pytest.approx(
-        90 * 60e-6
-    )  # ten columns of 100 were not judged
-    findings = rows["findings"]
-    assert [(one["hole"], one["score"]) for one in findings] == [("1", 9.0), ("", 5.0)]
-    assert (findings[1]["x_mm"], findings[1]["y_mm"]) == pytest.approx((0.5, -19.5))
-    (operating,) = rows["operating"]
-    at = dict(
-        zip(
-            operating["threshold"],
-            zip(operating["findings"], operating["hits"], strict=True),
-            strict=True,
-        )
-    )
-    assert at[4.0] == (2, 1)
-    assert at[8.0] == (1, 1)
-    assert at[16.0] == (0, 0)
-    of_pixels = {row["hole"]: row for row in rows["pixels"]}
-    assert of_pixels["1"]["pixels"] == len(known.outlines[1])
-    assert of_pixels["1"]["above"][of_pixels["1"]["threshold"].index(4.0)] == 1
-    assert of_pixels[""]["above"][of_pixels[""]["threshold"].index(4.0)] == 1
-    assert rows["sites"] == []
+    judgement = judgement_of()
+    record = study_record(judgement)
+    assert [row.signal for row in record.holes] == [9.0, 0.0]
+    assert [row.detected for row in record.holes] == [True, False]
+    # ten columns of 100 were not judged
+    assert record.runs[0].inspected_m2 == pytest.approx(90 * 60e-6)
+    assert [(row.hole, row.score) for row in record.findings] == [("1", 9.0), ("", 5.0)]
+    call = record.findings[1]
+    assert (call.x_mm, call.y_mm) == pytest.approx((0.5, -19.5))
+    (operating,) = record.operating
+    counts = {}
+    for index, threshold in enumerate(operating.threshold):
+        counts[threshold] = (operating.findings[index], operating.hits[index])
+    assert counts[4.0] == (2, 1)
+    assert counts[8.0] == (1, 1)
+    assert counts[16.0] == (0, 0)
+    pixels = {row.hole: row for row in record.pixels}
+    assert pixels["1"].pixels == len(judgement.labelled.outlines[1])
+    assert pixels["1"].above[pixels["1"].threshold.index(4.0)] == 1
+    assert pixels[""].above[pixels[""].threshold.index(4.0)] == 1
+    assert record.sites == []
 
 
 def test_a_hole_free_board_gives_the_same_places_as_sites():
-    known, judgement = sight_and_judgement()
-    rows = study_rows(known, judgement, 0.01, hole_free=True)
-    assert rows["holes"] == []
-    assert [(row["hole"], row["detected"], row["signal"]) for row in rows["sites"]] == [
+    record = study_record(judgement_of(damaged=False))
+    assert record.holes == []
+    assert [(row.hole, row.detected, row.signal) for row in record.sites] == [
         ("1", True, 9.0),
         ("2", False, 0.0),
     ]
-    assert {one["hole"] for one in rows["findings"]} == {""}
-    assert rows["operating"][0]["hits"] == [0] * len(grid(4.0, FINDING_OCTAVES))
-    assert rows["pixels"] == []
+    assert {row.hole for row in record.findings} == {""}
+    assert record.operating[0].hits == [0] * len(grid(4.0, FINDING_OCTAVES))
+    assert record.pixels == []
 
 
 def test_a_place_where_nothing_was_judged_has_no_signal():
-    known, judgement = sight_and_judgement()
+    judgement = judgement_of(damaged=False)
     judgement.evidence.score[:] = np.nan
-    assert np.isnan(study_rows(known, judgement, 0.01, hole_free=True)["sites"][0]["signal"])
+    assert np.isnan(study_record(judgement).sites[0].signal)
 
 
-def test_the_grid_of_thresholds_holds_the_one_in_use():
+@pytest.mark.parametrize("threshold", [0.3, 3.7])
+def test_the_grid_of_thresholds_holds_the_one_in_use(threshold: float):
     for octaves in (FINDING_OCTAVES, PIXEL_OCTAVES):
-        found = grid(3.7, octaves)
-        assert 3.7 in found
-        assert found[1:] / found[:-1] == pytest.approx(2**0.25)
+        thresholds = grid(threshold, octaves)
+        assert threshold in thresholds
+        assert thresholds[1:] / thresholds[:-1] == pytest.approx(2**0.25)
+        lowest, highest = octaves
+        assert thresholds[0] == pytest.approx(threshold * 2.0**lowest)
+        assert thresholds[-1] == pytest.approx(threshold * 2.0**highest)
     assert grid(0.0, FINDING_OCTAVES).tolist() == [0.0]
+
+
+def test_outlines_are_smeared_by_half_a_window_on_a_grid():
+    shape = (9, 11)
+    outline = np.array([4 * 11 + 5])
+    (mask,) = smeared([outline], shape)
+    rows, columns = np.nonzero(mask.reshape(shape))
+    assert (rows.min(), rows.max()) == (4 - SMEARED_PX, 4 + SMEARED_PX)
+    assert (columns.min(), columns.max()) == (5 - SMEARED_PX, 5 + SMEARED_PX)
+    (single,) = smeared([outline], shape, grid=False)
+    assert np.flatnonzero(single).tolist() == outline.tolist()
 
 
 def test_pixels_cover_the_face_however_it_is_tilted():
     """A camera's grid on a plane tilted by 40 degrees: the pixels' areas sum to the face's."""
-    known, _ = sight_and_judgement()
+    known = judgement_of().labelled
     slopes = np.stack(
         np.meshgrid(np.linspace(-0.07, 0.07, 281), np.linspace(-0.05, 0.05, 201)), axis=-1
     )
@@ -207,20 +243,21 @@ class FewerFound(ThesisDetector):
 def test_findings_at_other_thresholds_are_those_of_find(
     kind: type[ThesisDetector], min_points: int
 ):
-    known, judgement = sight_and_judgement()
+    judgement = judgement_of()
+    labelled = judgement.labelled
     detector = kind(ThesisConfig.from_data({"min_points": min_points}))
-    score = np.random.default_rng(2).exponential(2.0, known.cloud.valid.shape)
+    score = np.random.default_rng(2).exponential(2.0, labelled.cloud.valid.shape)
     evidence = Evidence(score, score, score, 1.0)
-    judgement = replace(judgement, detector=detector, evidence=evidence)
-    (operating,) = study_rows(known, judgement, 0.01, hole_free=False)["operating"]
-    found = [detector.find(known.cloud, evidence, one) for one in operating["threshold"]]
-    centres = [
-        known.on_board(np.array([one.centre_m for one in each]).reshape(-1, 3)) for each in found
-    ]
-    truth = np.array([damage.centre_board_m[:2] for damage in known.truth])
-    assert operating["findings"] == [len(each) for each in found]
-    assert operating["hits"] == [len(match(truth, each, 0.01)) for each in centres]
-    assert max(operating["findings"]) == 1 if kind is FewerFound else max(operating["findings"]) > 1
+    (operating,) = study_record(replace(judgement, detector=detector, evidence=evidence)).operating
+    truth = np.array([damage.centre_board_m[:2] for damage in labelled.truth])
+    for index, threshold in enumerate(operating.threshold):
+        detections = detector.find(labelled.cloud, evidence, threshold)
+        centres = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
+        assert operating.findings[index] == len(detections)
+        hits = match(truth, labelled.on_board(centres), 0.01)
+        assert operating.hits[index] == len(hits)
+    most = max(operating.findings)
+    assert most == 1 if kind is FewerFound else most > 1
 
 
 def test_the_margin_is_taken_off_as_by_plain_erosion():

@@ -302,12 +302,12 @@ def test_a_named_detector_shows_its_settings_and_what_is_legal(capsys):
     assert settings["crop.kind"]["about"] == "one of none, box, polygon, auto"
     # the listed defaults are all of the settings: they make the same declaration
     rebuilt: dict = {}
-    for path, one in settings.items():
+    for path, setting in settings.items():
         at = rebuilt
         *groups, leaf = path.split(".")
         for group in groups:
             at = at.setdefault(group, {})
-        at[leaf] = one["value"]
+        at[leaf] = setting["value"]
     assert ThesisConfig.from_data(rebuilt) == ThesisConfig()
     assert main(["detectors", "thesis"]) == 0
     text = capsys.readouterr().out
@@ -316,7 +316,7 @@ def test_a_named_detector_shows_its_settings_and_what_is_legal(capsys):
 
 def test_a_named_camera_shows_every_number_with_its_source(capsys):
     assert main(["cameras", "kinect_v2", "--json"]) == 0
-    numbers = {one["path"]: one for one in json.loads(capsys.readouterr().out)["numbers"]}
+    numbers = {load["path"]: load for load in json.loads(capsys.readouterr().out)["numbers"]}
     facts = load_camera("kinect_v2")
     assert numbers["lens.fx_px"]["value"] == facts.lens.fx_px.value
     assert numbers["lens.fx_px"]["about"].endswith(facts.lens.fx_px.source)

@@ -62,16 +62,18 @@ def forbidden_calls(text: str) -> set[str]:
             continue
         name = ast.unparse(node.func)
         safe = any(
-            one.arg == "allow_pickle" and ast.unparse(one.value) == "False" for one in node.keywords
+            keyword.arg == "allow_pickle" and ast.unparse(keyword.value) == "False"
+            for keyword in node.keywords
         )
         if name in FORBIDDEN and not (name in LOADS and safe):
             found.add(name)
         if any(
-            one.arg == "allow_pickle" and ast.unparse(one.value) != "False" for one in node.keywords
+            keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"
+            for keyword in node.keywords
         ):
             found.add(f"{name}(allow_pickle)")
         if name.endswith("YAML") and any(
-            ast.unparse(one.value) == "'unsafe'" for one in node.keywords
+            ast.unparse(keyword.value) == "'unsafe'" for keyword in node.keywords
         ):
             found.add(f"{name}(unsafe)")
     return found

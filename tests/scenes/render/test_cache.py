@@ -75,38 +75,46 @@ def sealed(path: Path, content: bytes) -> None:
 
 
 def test_a_view_comes_back_bit_by_bit_and_can_be_written_to(stored, view):
-    found = read_view(stored)
-    assert found is not None and equal(found, view)
+    read = read_view(stored)
+    assert read is not None and equal(read, view)
     assert all(
-        getattr(found, name).flags.writeable and getattr(found, name).flags.c_contiguous
+        getattr(read, name).flags.writeable and getattr(read, name).flags.c_contiguous
         for name in ARRAYS
     )
 
 
-def test_the_same_view_gives_the_same_bytes(stored, view, tmp_path):
+def test_the_same_view_gives_the_same_bytes(
+    stored,
+    view,
+    tmp_path,
+):
     again = tmp_path / "again.npz"
     write_view(again, view)
     assert again.read_bytes() == stored.read_bytes()
 
 
 def test_flipped_bits_are_found_wherever_they_are(stored, view):
-    whole = stored.read_bytes()
+    content = stored.read_bytes()
     rng = random.Random(1)
-    for place in (0, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(60))):
-        spoilt = bytearray(whole)
-        spoilt[place] ^= 1 << rng.randrange(8)
+    for position in (0, len(content) - 1, *(rng.randrange(len(content)) for _ in range(60))):
+        spoilt = bytearray(content)
+        spoilt[position] ^= 1 << rng.randrange(8)
         stored.write_bytes(bytes(spoilt))
-        assert read_view(stored) is None, place
+        assert read_view(stored) is None, position
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.999])
 def test_truncated_files_are_absent(stored, share):
-    whole = stored.read_bytes()
-    stored.write_bytes(whole[: int(share * len(whole))])
+    content = stored.read_bytes()
+    stored.write_bytes(content[: int(share * len(content))])
     assert read_view(stored) is None
 
 
-def test_a_file_of_another_version_is_absent(stored, view, monkeypatch):
+def test_a_file_of_another_version_is_absent(
+    stored,
+    view,
+    monkeypatch,
+):
     monkeypatch.setattr(cache, "VIEW_VERSION", cache.VIEW_VERSION + 1)
     write_view(stored, view)
     assert read_view(stored) is not None
@@ -142,7 +150,11 @@ def test_a_file_larger_than_any_render_is_not_read(stored):
     assert read_view(stored) is None
 
 
-def test_folders_links_and_pipes_under_a_renders_name(stored, view, tmp_path):
+def test_folders_links_and_pipes_under_a_renders_name(
+    stored,
+    view,
+    tmp_path,
+):
     name = tmp_path / f"{'1' * 16}.npz"
     name.mkdir()
     assert read_view(name) is None
@@ -152,19 +164,23 @@ def test_folders_links_and_pipes_under_a_renders_name(stored, view, tmp_path):
     name.symlink_to(tmp_path / "nowhere")
     assert read_view(name) is None
     # a link is replaced, and what it points at is left alone
-    other = tmp_path / "other.txt"
-    other.write_text("mine")
+    text_file = tmp_path / "other.txt"
+    text_file.write_text("mine")
     name.unlink()
-    name.symlink_to(other)
+    name.symlink_to(text_file)
     assert read_view(name) is None
     write_view(name, view)
-    assert not name.is_symlink() and read_view(name) is not None and other.read_text() == "mine"
+    assert not name.is_symlink() and read_view(name) is not None and text_file.read_text() == "mine"
     name.unlink()
     os.mkfifo(name)
     assert read_view(name) is None
 
 
-def test_a_damaged_render_is_rendered_again_and_a_found_one_is_not(tmp_path, view, monkeypatch):
+def test_a_damaged_render_is_rendered_again_and_a_found_one_is_not(
+    tmp_path,
+    view,
+    monkeypatch,
+):
     target = ThesisTargetConfig().declare()
     config = RenderConfig()
     rendered = []
@@ -176,8 +192,8 @@ def test_a_damaged_render_is_rendered_again_and_a_found_one_is_not(tmp_path, vie
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
     path.write_bytes(bytes(content))
-    found, was_there = cached_view(target, CAMERA.optics, config, tmp_path)
-    assert not was_there and equal(found, view) and len(rendered) == 2
+    read, was_there = cached_view(target, CAMERA.optics, config, tmp_path)
+    assert not was_there and equal(read, view) and len(rendered) == 2
     assert cached_view(target, CAMERA.optics, config, tmp_path)[1] is True
 
 
@@ -187,8 +203,8 @@ def test_a_render_is_read_whole_while_two_write_it(stored, view):
             pool.submit(lambda: [write_view(stored, view) for _ in range(10)]) for _ in range(2)
         ]
         while not all(write.done() for write in writes):
-            found = read_view(stored)
-            assert found is not None and equal(found, view)
+            read = read_view(stored)
+            assert read is not None and equal(read, view)
     assert [write.exception() for write in writes] == [None, None]
     assert [path.name for path in stored.parent.iterdir()] == [stored.name]
 
@@ -196,7 +212,11 @@ def test_a_render_is_read_whole_while_two_write_it(stored, view):
 # ---------------------------------------------------------------- the folder
 
 
-def shelf(folder: Path, view: NoiseFreeView, ages_days: dict[str, float]) -> dict[str, Path]:
+def shelf(
+    folder: Path,
+    view: NoiseFreeView,
+    ages_days: dict[str, float],
+) -> dict[str, Path]:
     """Renders named by a letter, last used so many days ago."""
     paths = {letter: folder / f"{letter * 16}.npz" for letter in ages_days}
     for letter, path in paths.items():
@@ -207,9 +227,18 @@ def shelf(folder: Path, view: NoiseFreeView, ages_days: dict[str, float]) -> dic
 
 
 def test_the_longest_unused_go_first_and_those_to_keep_never(tmp_path, view):
-    paths = shelf(tmp_path, view, {"a": 3, "b": 9, "c": 1, "d": 5})
+    paths = shelf(
+        tmp_path,
+        view,
+        {
+            "a": 3,
+            "b": 9,
+            "c": 1,
+            "d": 5,
+        },
+    )
     size = paths["a"].stat().st_size
-    assert [one.path for one in stored_renders(tmp_path)] == [paths[k] for k in "bdac"]
+    assert [file.path for file in stored_renders(tmp_path)] == [paths[k] for k in "bdac"]
     assert trim_cache(tmp_path, 3 * size, keep={paths["b"]}) == 3
     assert {k for k in paths if paths[k].exists()} == set("abc")
     read_view(paths["a"])  # now the latest
@@ -230,22 +259,23 @@ def test_nothing_but_renders_and_old_leftovers_is_removed(tmp_path, view):
     write_view(outside, view)
     linked = tmp_path / f"{'b' * 16}.npz"
     linked.symlink_to(outside)
-    others = [
+    foreign = [
         tmp_path / name
         for name in ("notes.npz", "rates.json", f"{'c' * 16}.npy", f"{'D' * 16}.npz")
     ]
-    old, new = (tmp_path / f".{letter * 16}.x1_y2zab.part.npz" for letter in "ef")
-    for path in (*others, old, new):
+    old = tmp_path / f".{'e' * 16}.x1_y2zab.part.npz"
+    new = tmp_path / f".{'f' * 16}.x1_y2zab.part.npz"
+    for path in (*foreign, old, new):
         path.write_bytes(b"x")
     os.utime(old, (time.time() - 2 * DAY_S,) * 2)
-    assert [one.path for one in leftovers(tmp_path)] == [old]
+    assert [file.path for file in leftovers(tmp_path)] == [old]
     assert trim_cache(tmp_path, 0) == 0
     assert not paths["a"].exists() and not old.exists()
     assert (
         new.exists()
         and linked.is_symlink()
         and outside.exists()
-        and all(path.exists() for path in others)
+        and all(path.exists() for path in foreign)
     )
 
 

@@ -17,17 +17,11 @@ from scenes.optics import Quadrilaterals, RenderConfig, footprint_of
 from scenes.render import scene as variant
 from scenes.render.cache import cached_view, render_key
 from scenes.render.direct import OffFace, cast, direct_light
+from scenes.render.face import face_triangles
+from scenes.render.indirect import PathWork, gather_at_points, gather_in_pixels
+from scenes.render.range_noise import range_change_m
 from scenes.render.scene import lit_scene, load_mitsuba
-from scenes.render.view import (
-    PathWork,
-    face_triangles,
-    gather_at_points,
-    gather_in_pixels,
-    indirect_light,
-    range_change_m,
-    render_view,
-    target_region,
-)
+from scenes.render.view import indirect_light, render_view, target_region
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig
@@ -40,7 +34,11 @@ EMITTER = CAMERA.optics.emitter_m
 WAVE = 2 * np.pi * np.array(CAMERA.frequencies_hz) / SPEED_OF_LIGHT_AIR
 
 
-def quad(corners: list[list[float]], name: str = "plane", albedo: float = 0.5) -> TargetPart:
+def quad(
+    corners: list[list[float]],
+    name: str = "plane",
+    albedo: float = 0.5,
+) -> TargetPart:
     mesh = trimesh.Trimesh(np.array(corners), [[0, 1, 2], [0, 2, 3]], process=False)
     return TargetPart(
         name=name,
@@ -54,17 +52,18 @@ def quad(corners: list[list[float]], name: str = "plane", albedo: float = 0.5) -
 
 
 def frontal(
-    z: float, x0: float = -2, x1: float = 2, name: str = "plane", albedo: float = 0.5
+    z: float,
+    x0: float = -2,
+    x1: float = 2,
+    name: str = "plane",
+    albedo: float = 0.5,
 ) -> TargetPart:
     return quad([[x0, -2, z], [x1, -2, z], [x1, 2, z], [x0, 2, z]], name, albedo)
 
 
-def light_on(
-    lit, lens, region, footprint=CAMERA.optics.beam_fwhm_rad, frequencies_hz=CAMERA.frequencies_hz
-):
-    return direct_light(
-        lit, lens.region_slopes(region), footprint_of(lens, region, footprint), frequencies_hz
-    )
+def light_on(lit, lens, region):
+    footprint = footprint_of(lens, region, CAMERA.optics.beam_fwhm_rad)
+    return direct_light(lit, lens.region_slopes(region), footprint, CAMERA.frequencies_hz)
 
 
 def whole_pixels(lens, region, rows, cols):
@@ -89,9 +88,8 @@ SLOPES = np.stack(
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.0), (0.35, -0.2)])
 def test_plane_range_to_micrometres_and_amplitude_by_lambert(a, b):
     """z = 0.8 + a x + b y: range, path and amplitude albedo cos/d^2 in closed form."""
-    corners = [
-        [x, y, 0.8 + a * x + b * y] for x, y in ((-1.5, -1.5), (1.5, -1.5), (1.5, 1.5), (-1.5, 1.5))
-    ]
+    plan = ((-1.5, -1.5), (1.5, -1.5), (1.5, 1.5), (-1.5, 1.5))
+    corners = [[x, y, 0.8 + a * x + b * y] for x, y in plan]
     hits = cast(scene_of(quad(corners, albedo=0.37)), SLOPES)
     z = 0.8 / (1 - a * SLOPES[:, 0] - b * SLOPES[:, 1])
     points = np.column_stack([SLOPES, np.ones(len(SLOPES))]) * z[:, None]
@@ -131,14 +129,21 @@ def test_step_edge_mixes_phasors_by_area():
     roughly = np.ones(region.shape, bool)
     slopes = lens.region_slopes(region)
     footprint = footprint_of(lens, region, None)
-    rough = direct_light(lit, slopes, footprint, CAMERA.frequencies_hz, None, roughly)
+    rough = direct_light(
+        lit,
+        slopes,
+        footprint,
+        CAMERA.frequencies_hz,
+        None,
+        roughly,
+    )
     assert (
         not rough.fine.any()
     )  # 16 sub-rays lie in four columns: the edge is wrong by half of one at most
     assert np.abs(rough.coverage - light.coverage).max() < 1 / 8 + 1 / 256
     assert rough.off_face.share.max() == 1.0
-    near = light_on(scene_of(frontal(0.7)), lens, region).phasor[:, :, column]
-    far = light_on(scene_of(frontal(0.75)), lens, region).phasor[:, :, column]
+    near_light = light_on(scene_of(frontal(0.7)), lens, region).phasor[:, :, column]
+    far_light = light_on(scene_of(frontal(0.75)), lens, region).phasor[:, :, column]
     # the edge stands 0.3 px right of the pixel's left border; the lens sees a little of the far
     # plane shadowed by the plate (emitter 14 mm to the left: 1 mm wide, 0.7 px), so between 0.3
     # and 1.0 px nothing comes
@@ -146,8 +151,8 @@ def test_step_edge_mixes_phasors_by_area():
     assert light.coverage[:, column] == pytest.approx(1 - 0.3, abs=1 / 16)
     shadow_px = (EMITTER[0] * -1 * 0.05 / 0.7) / (0.75 / lens.fx)
     lit_share = max(0.7 - shadow_px, 0)
-    expected = 0.3 * near + lit_share * far
-    assert np.abs(light.phasor[:, :, column] - expected).max() < 0.07 * np.abs(near).max()
+    expected = 0.3 * near_light + lit_share * far_light
+    assert np.abs(light.phasor[:, :, column] - expected).max() < 0.07 * np.abs(near_light).max()
 
 
 def test_hole_walls_shadow_the_floor():
@@ -178,7 +183,7 @@ def test_hole_walls_shadow_the_floor():
     camera = AmcwCamera.from_data(data)
     emitter = camera.optics.emitter_m
     grid = np.linspace(-0.019, 0.019, 41)
-    x, y = (a.ravel() for a in np.meshgrid(grid, grid))
+    x, y = np.stack(np.meshgrid(grid, grid)).reshape(2, -1)
     keep = np.hypot(x, y) < 0.0185
     x = x[keep]
     y = y[keep]
@@ -239,7 +244,12 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
 
 
 SMALL = ThesisTargetConfig.from_data({"name": "thesis"}).declare()
-QUICK = RenderConfig(face_samples=1024, hole_samples=64, rest_samples=16, bounces=3)
+QUICK = RenderConfig(
+    face_samples=1024,
+    hole_samples=64,
+    rest_samples=16,
+    bounces=3,
+)
 
 
 @pytest.fixture(scope="module")
@@ -254,7 +264,15 @@ def test_albedo_texture_is_looked_up_where_the_target_says(thesis_view):
     slopes = thesis_view.slopes[40:60:2, 30:120:3].reshape(-1, 2)
     hits = cast(lit, slopes)
     rays = np.column_stack([slopes, np.ones(len(slopes))])
-    points = rays / np.linalg.norm(rays, axis=1, keepdims=True) * hits.range_m[:, None]
+    points = (
+        rays
+        / np.linalg.norm(
+            rays,
+            axis=1,
+            keepdims=True,
+        )
+        * hits.range_m[:, None]
+    )
     to_emitter = EMITTER - points
     leg = np.linalg.norm(to_emitter, axis=1)
     normal = target.T_camera_board[:3, 2]
@@ -293,18 +311,32 @@ def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
     config = QUICK.model_copy(update={"face_samples": 64})
     gathered = [
         indirect_light(
-            lit, target, optics, slopes, direct, inside, config.model_copy(update={"seed": seed})
+            lit,
+            target,
+            optics,
+            slopes,
+            direct,
+            inside,
+            config.model_copy(update={"seed": seed}),
         )
         for seed in range(8)
     ]
     backing = direct.surface == [part.name for part in lit.parts].index("backing")
-    seen = backing & (np.abs(direct.phasor[0]) > 0.1)
+    lit_backing = backing & (np.abs(direct.phasor[0]) > 0.1)
     shifts = [
-        range_change_m(light[:-1, seen], direct.phasor[:, seen], optics.frequencies_hz)
+        range_change_m(
+            light[:-1, lit_backing], direct.phasor[:, lit_backing], optics.frequencies_hz
+        )
         for light, _ in gathered
     ]
-    spread = np.sqrt(np.var(shifts, axis=0, ddof=1).mean())
-    reported = np.sqrt(np.mean([noise_m[seen] ** 2 for _, noise_m in gathered]))
+    spread = np.sqrt(
+        np.var(
+            shifts,
+            axis=0,
+            ddof=1,
+        ).mean()
+    )
+    reported = np.sqrt(np.mean([noise_m[lit_backing] ** 2 for _, noise_m in gathered]))
     assert spread / reported == pytest.approx(1, abs=0.35)
 
 
@@ -316,7 +348,8 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
     target = build_target(SMALL)
     lit = scene_of(*target.parts)
     lens = CAMERA.nominal_lens
-    rows, cols = (a.ravel() for a in np.meshgrid([22, 70], np.arange(30, 400, 4), indexing="ij"))
+    pixels = np.meshgrid([22, 70], np.arange(30, 400, 4), indexing="ij")
+    rows, cols = np.stack(pixels).reshape(2, -1)
     work = PathWork(CAMERA.frequencies_hz, QUICK.bounces, seed=9)
     traced = gather_in_pixels(lit, whole_pixels(lens, thesis_view.region, rows, cols), work, 2048)
     direct = thesis_view.phasor_direct[:, rows, cols]
@@ -328,7 +361,8 @@ def test_nodes_on_the_face_agree_with_paths_through_each_pixel(thesis_view):
 
 
 def test_target_out_of_view_is_refused():
-    aside = SMALL.model_copy(update={"pose": SMALL.pose.model_copy(update={"offset_x_mm": 2000.0})})
+    pose = SMALL.pose.model_copy(update={"offset_x_mm": 2000.0})
+    aside = SMALL.model_copy(update={"pose": pose})
     with pytest.raises(UserError, match="the target is out of view of Azure Kinect"):
         target_region(build_target(aside), CAMERA.optics)
 
@@ -340,7 +374,13 @@ def test_a_board_that_exceeds_the_view_is_rendered_as_far_as_it_is_seen():
     large = TargetConfig.from_data({
         "name": "custom",
         "board": {"width_mm": 1700.0, "height_mm": 1200.0, "thickness_mm": 10.0},
-        "holes": [{"id": 1, "diameter_mm": 30.0, "centre_mm": [-60.0, 20.0], "kind": "blind", "depth_mm": 8.0}],
+        "holes": [{
+            "id": 1,
+            "diameter_mm": 30.0,
+            "centre_mm": [-60.0, 20.0],
+            "kind": "blind",
+            "depth_mm": 8.0,
+        }],
         "material": {"albedo_850": 0.6, "grain_contrast": 0.0},
         "pose": {"distance_m": 0.6, "tilt_x_deg": 12.0, "tilt_y_deg": -16.0},
     })  # fmt: skip
@@ -349,7 +389,14 @@ def test_a_board_that_exceeds_the_view_is_rendered_as_far_as_it_is_seen():
     normal = large.pose.T_camera_board[:3, 2]
     slope_x = -normal[0] / normal[2]
     slope_y = -normal[1] / normal[2]
-    plane = plane_view(camera, camera.nominal_lens.whole, 0.6, 0.6, slope_x, slope_y)
+    plane = plane_view(
+        camera,
+        camera.nominal_lens.whole,
+        0.6,
+        0.6,
+        slope_x,
+        slope_y,
+    )
     lit = ~hole_pixels(view, large) & (
         np.hypot(view.slopes[..., 0], view.slopes[..., 1]) < np.tan(np.deg2rad(34))
     )
@@ -369,11 +416,14 @@ def test_a_board_that_exceeds_the_view_is_rendered_as_far_as_it_is_seen():
 def hole_pixels(view, target) -> np.ndarray:
     """(h, w) bool: pixels within 3 pixels of the target's only hole."""
     centre = target.pose.T_camera_board[:3] @ [*target.holes[0].centre_m, 0.0, 1.0]
-    apart = np.linalg.norm(view.slopes - centre[:2] / centre[2], axis=-1)
-    return apart < 0.035
+    off_hole = np.linalg.norm(view.slopes - centre[:2] / centre[2], axis=-1)
+    return off_hole < 0.035
 
 
-def test_renders_repeat_exactly_and_the_cache_returns_the_same_view(tmp_path, thesis_view):
+def test_renders_repeat_exactly_and_the_cache_returns_the_same_view(
+    tmp_path,
+    thesis_view,
+):
     first, hit = cached_view(SMALL, CAMERA.optics, QUICK, tmp_path)
     assert not hit
     second, hit = cached_view(SMALL, CAMERA.optics, QUICK, tmp_path)
@@ -396,7 +446,12 @@ def test_cache_key_changes_with_what_matters_only():
 @pytest.mark.slow  # a process that loads both, to see what this machine's libraries do
 def test_open3d_before_mitsuba_is_told_apart_from_a_missing_llvm():
     code = "import open3d\nfrom scenes.render.scene import load_mitsuba\nload_mitsuba()\n"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     if "cannot open shared object file" in done.stderr:
         pytest.skip("Open3D lacks a system library")
     assert done.returncode == 0 or "Open3D was imported before it" in done.stderr
@@ -420,10 +475,7 @@ def test_direct_light_on_the_face_is_exact_to_ten_micrometres(thesis_view):
     region = thesis_view.region
     f = np.array(CAMERA.frequencies_hz)[:, None]
     for top in (15, 30, 72):
-        rows, cols = (
-            a.ravel()
-            for a in np.meshgrid(np.arange(top, top + 4), np.arange(20, 400), indexing="ij")
-        )
+        rows, cols = np.mgrid[top : top + 4, 20:400].reshape(2, -1)
         footprint = Quadrilaterals(lens, region)
         hits = cast(lit, footprint.slopes(rows, cols, footprint.grid(32)).reshape(-1, 2))
         fine = (

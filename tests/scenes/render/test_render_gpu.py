@@ -1,4 +1,4 @@
-"""The render on a GPU gives what it gives on the processor. Skipped where there is no NVIDIA GPU."""
+"""The render on a GPU gives what it gives on the processor. Skipped without an NVIDIA GPU."""
 
 from __future__ import annotations
 
@@ -24,8 +24,13 @@ from harness.runs.plan import plan_of
 from harness.experiment.load import load_experiment
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import camera_of
-changes = ["source.render.bounces=1", "source.render.face_samples=64", "source.render.hole_samples=16"]
-job = plan_of(load_experiment(Path("experiments/smoke.yaml"), changes), Path(sys.argv[2])).groups[0].damaged.renders[0]
+changes = [
+    "source.render.bounces=1",
+    "source.render.face_samples=64",
+    "source.render.hole_samples=16",
+]
+experiment = load_experiment(Path("experiments/smoke.yaml"), changes)
+job = plan_of(experiment, Path(sys.argv[2])).groups[0].damaged.renders[0]
 cached_view(job.target, camera_of(job.camera).optics, job.config, job.folder)
 """
 
@@ -46,9 +51,9 @@ def test_a_gpu_renders_the_same_view(tmp_path):
         view = read_view(path)
         assert view is not None and view.variant == variant
         views.append(view)
-    apart = np.abs(views[0].phasor - views[1].phasor) / np.abs(views[1].phasor).max()
-    assert np.median(apart) < 1e-6
+    difference = np.abs(views[0].phasor - views[1].phasor) / np.abs(views[1].phasor).max()
+    assert np.median(difference) < 1e-6
     # a ray that grazes an edge may hit it in one variant only: one of 256 or more sub-rays, or one
     # path, of few pixels
-    assert np.mean(apart > 1e-4) < 0.01
-    assert apart.max() < 0.05
+    assert np.mean(difference > 1e-4) < 0.01
+    assert difference.max() < 0.05

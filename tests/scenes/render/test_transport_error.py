@@ -26,7 +26,14 @@ def test_holes_before_a_backing_are_right_within_a_fifth_of_a_millimetre():
     )
     optics = load_camera("azure_kinect_nfov").optics
     view = render_view(target, optics, RenderConfig(face_samples=1024, rest_samples=8))
-    scene = Scene(target, optics, lit_scene(load_mitsuba(), target.parts, optics), view, 0.0, 0.0)
+    scene = Scene(
+        target,
+        optics,
+        lit_scene(load_mitsuba(), target.parts, optics),
+        view,
+        0.0,
+        0.0,
+    )
     error = compared(scene, "holes", in_holes(scene), 1 << 14, 60)
     assert error.pixels >= 60
     assert error.rms_mm < 0.25
@@ -40,8 +47,15 @@ def test_the_face_is_right_within_three_micrometres():
     target = build_target(ThesisTargetConfig.from_data({"name": "thesis"}).declare().hole_free())
     optics = load_camera("azure_kinect_nfov").optics
     view = render_view(target, optics, RenderConfig(hole_samples=64, rest_samples=8))
-    scene = Scene(target, optics, lit_scene(load_mitsuba(), target.parts, optics), view, 0.0, 0.0)
-    whole, _, _ = face_parts(scene)
-    error = compared(scene, "face", whole, 1 << 17, 30)
+    scene = Scene(
+        target,
+        optics,
+        lit_scene(load_mitsuba(), target.parts, optics),
+        view,
+        0.0,
+        0.0,
+    )
+    whole_pixels, _, _ = face_parts(scene)
+    error = compared(scene, "face", whole_pixels, 1 << 17, 30)
     assert np.hypot(error.rms_mm, error.reference_mm) < 0.005
     assert error.rms_mm < 0.003

@@ -12,8 +12,9 @@ import trimesh
 from harness.vocabulary.geometry import Lens
 from scenes.optics import Optics, RenderConfig, footprint_of
 from scenes.render.direct import direct_light
+from scenes.render.indirect import PathWork, gather_in_pixels
 from scenes.render.scene import lit_scene, load_mitsuba
-from scenes.render.view import PathWork, gather_in_pixels, render_view
+from scenes.render.view import render_view
 from scenes.sensor.camera import load_camera
 from scenes.target.custom import TargetConfig
 from scenes.target.mesh import TargetPart, build_target
@@ -28,10 +29,21 @@ BOTH = pytest.mark.parametrize(
 )
 
 
-def optics_of(width: int, height: int, focal_px: float) -> Optics:
+def optics_of(
+    width: int,
+    height: int,
+    focal_px: float,
+) -> Optics:
     """A small lens and an emitter that shines in all directions alike, so that both programs have
     the same one."""
-    lens = Lens(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    lens = Lens(
+        width,
+        height,
+        focal_px,
+        focal_px,
+        (width - 1) / 2,
+        (height - 1) / 2,
+    )
     return replace(
         CAMERA.optics,
         lens=lens,
@@ -49,8 +61,10 @@ def its_phasors(lit, optics, paths, histogram):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         starts = [-BIN_M * run / RUNS if histogram else None for run in range(RUNS)]
-        others = [oracle(lit, optics, FREQUENCIES, histogram_from_m=start) for start in starts]
-        return np.stack([other.phasors(paths, seed, BOUNCES) for seed, other in enumerate(others)])
+        tracers = [oracle(lit, optics, FREQUENCIES, histogram_from_m=start) for start in starts]
+        return np.stack(
+            [tracer.phasors(paths, seed, BOUNCES) for seed, tracer in enumerate(tracers)]
+        )
 
 
 def assert_agree(ours, theirs, here, largest_error):
@@ -117,7 +131,13 @@ def test_inside_a_blind_hole(histogram):
     )
     optics = optics_of(56, 56, 420.0)
     view = render_view(
-        target, optics, RenderConfig(bounces=BOUNCES, hole_noise_mm=0.02, hole_samples=1024)
+        target,
+        optics,
+        RenderConfig(
+            bounces=BOUNCES,
+            hole_noise_mm=0.02,
+            hole_samples=1024,
+        ),
     )
     theirs = its_phasors(lit_scene(load_mitsuba(), target.parts, optics), optics, 160, histogram)
     theirs = theirs[:, :, view.region.row0 : view.region.row1, view.region.col0 : view.region.col1]
@@ -142,7 +162,10 @@ def test_the_thesis_scene(histogram):
     target = build_target(ThesisTargetConfig.from_data(plain).declare())
     optics = optics_of(192, 60, 190.0)
     config = RenderConfig(
-        bounces=BOUNCES, face_samples=1 << 16, hole_noise_mm=0.03, hole_samples=1 << 14
+        bounces=BOUNCES,
+        face_samples=1 << 16,
+        hole_noise_mm=0.03,
+        hole_samples=1 << 14,
     )
     view = render_view(target, optics, config)
     theirs = its_phasors(lit_scene(load_mitsuba(), target.parts, optics), optics, 64, histogram)

@@ -15,7 +15,6 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import _main as calibration_program
 from scenes.sensor.camera import (
     CAMERA_FOLDER,
-    CameraConfig,
     camera_names,
     camera_of,
     guessed_precision,
@@ -23,7 +22,8 @@ from scenes.sensor.camera import (
     load_camera,
     read_camera,
 )
-from scenes.sensor.facts import unfolded_slope
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.facts import unfolded_slope
 from scenes.target.mesh import build_target
 from tests.support.declared_targets import target_from_data
 
@@ -40,7 +40,8 @@ def test_every_camera_file_is_read_and_names_its_sources(name):
     camera = load_camera(name)
     assert camera.name == name
     lens = camera.optics.lens
-    assert 0 < lens.cx < lens.width and 0 < lens.cy < lens.height
+    assert 0 < lens.cx < lens.width
+    assert 0 < lens.cy < lens.height
 
 
 @pytest.mark.parametrize(
@@ -102,16 +103,18 @@ def test_a_camera_like_another_states_only_what_differs(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(
         OWN
-        + "photons: {signal_electrons: {value: 600.0, tag: M, source: guess}}\nengine: {edge_threshold: null}\n"
+        + "photons: {signal_electrons: {value: 600.0, tag: M, source: guess}}\n"
+        + "engine: {edge_threshold: null}\n"
     )
-    own = load_camera(str(path))
+    camera = load_camera(str(path))
     azure = load_camera("azure_kinect_nfov")
-    assert (own.name, own.title) == ("own", "my own")
-    assert (
-        own.photons.signal_electrons.value == 600.0 and own.photons.band_nm == azure.photons.band_nm
-    )
-    assert own.engine.edge_threshold is None and own.engine.window_px == azure.engine.window_px
-    assert own.lens == azure.lens and not own.modes
+    assert (camera.name, camera.title) == ("own", "my own")
+    assert camera.photons.signal_electrons.value == 600.0
+    assert camera.photons.band_nm == azure.photons.band_nm
+    assert camera.engine.edge_threshold is None
+    assert camera.engine.window_px == azure.engine.window_px
+    assert camera.lens == azure.lens
+    assert not camera.modes
     second = tmp_path / "second.yaml"
     second.write_text("name: second\ntitle: of that\nlike: own.yaml\n")
     assert load_camera(str(second)).photons.signal_electrons.value == 600.0
@@ -145,13 +148,13 @@ def test_mistakes_in_a_camera_like_another_are_told_where_they_stand(tmp_path, t
 def test_an_experiment_names_a_camera_by_its_file(tmp_path, capsys):
     (tmp_path / "own.yaml").write_text(OWN)
     (tmp_path / "a.yaml").write_text(Path(SMOKE).read_text())
-    named = load_experiment(tmp_path / "a.yaml", ["source.camera.name=azure_kinect_nfov"])
+    by_name = load_experiment(tmp_path / "a.yaml", ["source.camera.name=azure_kinect_nfov"])
     text = (tmp_path / "a.yaml").read_text()
     assert "name: azure_kinect_nfov" in text
     (tmp_path / "a.yaml").write_text(text.replace("name: azure_kinect_nfov", "name: ./own.yaml", 1))
-    own = load_experiment(tmp_path / "a.yaml")
-    assert camera_of(own.points[0].config.source.camera).name == "own"
-    assert own.points[0].digest != named.points[0].digest
+    by_file = load_experiment(tmp_path / "a.yaml")
+    assert camera_of(by_file.points[0].config.source.camera).name == "own"
+    assert by_file.points[0].digest != by_name.points[0].digest
     axis = f"sweep={{source.camera.name: [azure_kinect_nfov, {tmp_path / 'own.yaml'}]}}"
     swept = load_experiment(SMOKE, [axis, "sensitivity=null"])
     assert [point.variant for point in swept.points] == ["camera=azure_kinect_nfov", "camera=own"]
@@ -174,7 +177,8 @@ def test_an_experiment_names_a_camera_by_its_file(tmp_path, capsys):
 @pytest.mark.parametrize("mode", load_camera("azure_kinect_nfov").modes)
 def test_a_mode_is_a_camera_that_knows_the_others(mode):
     assert lens_named(mode).plain == load_camera(mode).nominal_lens
-    assert lens_named(mode).mode == mode and len(lens_named(mode).others) == 4
+    assert lens_named(mode).mode == mode
+    assert len(lens_named(mode).others) == 4
     data = load_camera("azure_kinect_nfov").to_data() | {"modes": {mode: {"width_px": 1}}}
     assert AmcwCamera.from_data(data).modes == (mode,)  # as older files say it
 
@@ -182,26 +186,29 @@ def test_a_mode_is_a_camera_that_knows_the_others(mode):
 def test_a_guess_of_the_precision_states_its_range(tmp_path):
     path = tmp_path / "own.yaml"
     for range_, legal in (
-        ("range: [300.0, 1200.0]", True),
-        ("range: [700.0, 1200.0]", False),
+        ("range: [300.0, 1200.0],", True),
+        ("range: [600.0, 600.0],", True),
+        ("range: [700.0, 1200.0],", False),
+        ("range: [100.0, 500.0],", False),
         ("", False),
     ):
-        path.write_text(
-            OWN
-            + f"photons: {{signal_electrons: {{value: 600.0, tag: G, {range_}, source: guess}}}}\n".replace(
-                ", ,", ","
-            )
-        )
+        fact = f"{{value: 600.0, tag: G, {range_} source: guess}}"
+        path.write_text(OWN + f"photons: {{signal_electrons: {fact}}}\n")
         if legal:
-            assert read_camera(path).photons.signal_electrons.range == (300.0, 1200.0)
+            assert read_camera(path).photons.signal_electrons.range is not None
         else:
             with pytest.raises(UserError, match="states the `range`"):
                 read_camera(path)
 
 
 def test_a_lens_may_fold_outside_its_field(tmp_path):
-    wide = "lens:\n  width_px: {value: 1024, tag: R, source: s}\n  height_px: {value: 1024, tag: R, source: s}\n"
-    wide += "  cx_px: {value: 513.738, tag: R, source: s}\n  cy_px: {value: 513.338, tag: R, source: s}\n"
+    wide = (
+        "lens:\n"
+        "  width_px: {value: 1024, tag: R, source: s}\n"
+        "  height_px: {value: 1024, tag: R, source: s}\n"
+        "  cx_px: {value: 513.738, tag: R, source: s}\n"
+        "  cy_px: {value: 513.338, tag: R, source: s}\n"
+    )
     path = tmp_path / "own.yaml"
     path.write_text(OWN + wide)
     with pytest.raises(UserError, match="folds the image"):
@@ -210,7 +217,15 @@ def test_a_lens_may_fold_outside_its_field(tmp_path):
     camera = read_camera(path)
     outside = camera.lens.outside_field(camera.nominal_lens.whole)
     # the circle of 120 degrees just fits the sensor of 1024 x 1024 pixels
-    assert 511 < np.sqrt((~outside).sum() / np.pi) < 513 and outside[0, 0] and not outside[512, 512]
+    radius_px = np.sqrt((~outside).sum() / np.pi)
+    assert 511 < radius_px < 513
+    assert outside[0, 0]
+    assert not outside[512, 512]
+    # and so do the directions
+    just_in = np.array([[-np.tan(np.deg2rad(59.9)), 0.0, 1.0]])
+    just_out = np.array([[-np.tan(np.deg2rad(60.1)), 0.0, 1.0]])
+    assert camera.images(just_in).all()
+    assert not camera.images(just_out).any()
 
 
 def test_distortion_unfolds_up_to_where_its_slope_vanishes():
@@ -224,14 +239,15 @@ def test_distortion_unfolds_up_to_where_its_slope_vanishes():
 
 
 def test_an_experiment_replaces_numbers_of_a_camera():
-    own = camera_of(
+    camera = camera_of(
         CameraConfig(numbers={"lens.fx_px": 500.0, "emitter.position_mm": [-20.0, 0.0, 0.0]})
     )
     nominal = load_camera("azure_kinect_nfov")
-    assert own.optics.lens.fx == 500.0 and own.lens.fx_px.tag == "U"
-    assert own.optics.emitter_m.tolist() == [-0.02, 0.0, 0.0]
-    assert own.optics.lens.fy == nominal.optics.lens.fy
-    assert own.optics.content() != nominal.optics.content()
+    assert camera.optics.lens.fx == 500.0
+    assert camera.lens.fx_px.tag == "U"
+    assert camera.optics.emitter_m.tolist() == [-0.02, 0.0, 0.0]
+    assert camera.optics.lens.fy == nominal.optics.lens.fy
+    assert camera.optics.content() != nominal.optics.content()
     assert camera_of(CameraConfig()) is nominal
     with pytest.raises(UserError, match=r"no number 'lens.fx'; did you mean 'lens.f[xy]_px'"):
         camera_of(CameraConfig(numbers={"lens.fx": 500.0}))
@@ -258,8 +274,8 @@ def test_albedos_near_850_nm_hold_and_others_must_be_declared():
         "floor": 0.2,
         "back_wall": 0.1,
     }
-    other = thesis(other_wavelengths=[entry]).at_wavelength(945.0)
-    albedos = {part.name: part.albedo_850 for part in build_target(other).parts}
+    at_945 = thesis(other_wavelengths=[entry]).at_wavelength(945.0)
+    albedos = {part.name: part.albedo_850 for part in build_target(at_945).parts}
     assert albedos["board"] == pytest.approx(0.5, rel=1e-3)
     assert (albedos["tape_1"], albedos["backing"], albedos["floor"], albedos["back_wall"]) == (
         0.4,
@@ -319,9 +335,9 @@ def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
     # all of the face nearer than 0.5 m along the axis, though not along the rays
     with pytest.raises(UserError, match=r"to 0\.4\d+ m from the camera"):
         check_in_view(thesis(distance_m=0.46), load_camera("kinect_v2").optics)
-    near = type(optics)(**{**optics.__dict__, "nearest_m": 0.9})
+    from_900_mm = type(optics)(**{**optics.__dict__, "nearest_m": 0.9})
     with pytest.raises(UserError, match=r"lies 0.\d+ to 0.\d+ m from the camera"):
-        check_in_view(thesis(), near)
+        check_in_view(thesis(), from_900_mm)
 
 
 @pytest.mark.parametrize(
@@ -350,7 +366,8 @@ def test_a_recordings_own_lens_takes_the_nominal_ones_place(shared_data):
     assert lens.fx == numbers["lens.fx_px"] != nominal.fx
     # five published units agree to 0.3 px in focal length and scatter by some 10 px in their
     # centre
-    assert abs(lens.fx - nominal.fx) < 1 and abs(lens.cx - nominal.cx) < 20
+    assert abs(lens.fx - nominal.fx) < 1
+    assert abs(lens.cx - nominal.cx) < 20
     with pytest.raises(UserError, match=r"512 x 424"):
         lens_numbers(recording, ["kinect_v2"])
 

@@ -1,8 +1,9 @@
-"""Every effect of a real unit, on against off: the right amount when on, exactly nothing when off."""
+"""Every effect of a real unit, on against off: the right amount when on, nothing when off."""
 
 from __future__ import annotations
 
 import dataclasses
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from scipy import stats
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.imager import AmcwImager, with_harmonics
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, camera_of, load_camera
+from scenes.sensor.camera import camera_of, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
+from scenes.sensor.common.unit import frame_errors_m, smooth_field
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.unit import frame_errors_m, smooth_field
+from tests.support.sensor_frames import first_frame, stretch_of, true_z_m, z_of
 
 AZURE = "azure_kinect_nfov"
 V2 = "kinect_v2"
@@ -43,22 +46,21 @@ def unit_of(
     settings: CameraConfig, distance_m: float = 0.9, albedo: float = 0.6, **changes
 ) -> SimulatedUnit:
     camera = camera_of(settings)
-    view = plane_view(camera, NEAR_AXIS, distance_m, albedo, 0.05, 0.02)
+    view = plane_view(
+        camera,
+        NEAR_AXIS,
+        distance_m,
+        albedo,
+        0.05,
+        0.02,
+    )
     return SimulatedUnit(camera, settings, dataclasses.replace(view, **changes))
-
-
-def frames(unit: SimulatedUnit, count: int = 1, seed: int = 1) -> np.ndarray:
-    return np.stack([frame.z_m for frame in unit.capture(count, seed).frames()]).astype(float)
-
-
-def stretch(unit: SimulatedUnit) -> np.ndarray:
-    """(h, w): range along the ray by distance along the axis."""
-    return np.sqrt(1 + (unit.view.slopes[unit.cut] ** 2).sum(axis=-1))
 
 
 def detour(view) -> np.ndarray:
     """The view's light with a tenth more that came 0.3 m further."""
-    phase = 2 * np.pi * np.array(view.frequencies_hz)[:, None, None] * 0.3 / SPEED_OF_LIGHT_AIR
+    frequencies_hz = np.array(view.frequencies_hz)[:, None, None]
+    phase = 2 * np.pi * frequencies_hz * 0.3 / SPEED_OF_LIGHT_AIR
     return view.phasor * (1 + 0.1 * np.exp(1j * phase))
 
 
@@ -68,8 +70,8 @@ def detour(view) -> np.ndarray:
 @pytest.mark.parametrize("camera", [AZURE, V2])
 def test_without_effects_a_camera_sees_the_truth(camera):
     unit = unit_of(config(camera))
-    truth = unit.view.range_m[unit.cut] / stretch(unit)
-    z = frames(unit, 2)
+    truth = true_z_m(unit)
+    z = z_of(unit, 2)
     assert np.array_equal(z[0], z[1])
     # the window makes up to a hundredth of a millimetre of the plane's perspective
     assert np.abs(z[0] - truth).max() < 0.02e-3
@@ -91,35 +93,34 @@ def test_an_effect_that_is_off_is_exactly_absent(effect, numbers):
     """Off, its numbers change no bit of any frame; on, they do. All other effects are on."""
     all_on = dict.fromkeys(EffectsConfig.model_fields, True)
 
-    def three(numbers: dict, on: bool) -> np.ndarray:
-        return frames(unit_of(config(numbers=numbers, **(all_on | {effect: on}))), 3)
+    def three_frames(numbers: dict, switch: bool) -> np.ndarray:
+        settings = config(numbers=numbers, **(all_on | {effect: switch}))
+        return z_of(unit_of(settings), 3)
 
-    assert np.array_equal(three({}, False), three(numbers, False), equal_nan=True)
-    assert not np.array_equal(three({}, True), three(numbers, True), equal_nan=True)
+    plain_off = three_frames({}, False)
+    changed_off = three_frames(numbers, False)
+    assert np.array_equal(plain_off, changed_off, equal_nan=True)
+    plain_on = three_frames({}, True)
+    changed_on = three_frames(numbers, True)
+    assert not np.array_equal(plain_on, changed_on, equal_nan=True)
 
 
 def test_ambient_and_multipath_that_are_off_are_exactly_absent():
     all_on = dict.fromkeys(EffectsConfig.model_fields, True)
-    dark, bright = (
-        frames(
-            unit_of(
-                config(**(all_on | {"ambient": False})).model_copy(
-                    update={"ambient_uw_cm2_nm": level}
-                )
-            )
-        )
-        for level in (0.0, 50.0)
-    )
-    assert np.array_equal(dark, bright)
+    settings = config(**(all_on | {"ambient": False}))
+    dark = settings.model_copy(update={"ambient_uw_cm2_nm": 0.0})
+    bright = settings.model_copy(update={"ambient_uw_cm2_nm": 50.0})
+    assert np.array_equal(z_of(unit_of(dark)), z_of(unit_of(bright)))
     settings = config(**(all_on | {"multipath": False}))
     plain = unit_of(settings)
-    assert np.array_equal(frames(plain), frames(unit_of(settings, phasor=detour(plain.view))))
+    with_detour = unit_of(settings, phasor=detour(plain.view))
+    assert np.array_equal(z_of(plain), z_of(with_detour))
 
 
 def test_noise_keeps_its_draws_when_another_effect_is_switched():
     """So that what an effect costs is its difference and not another draw."""
-    with_offset = frames(unit_of(config(noise=True, unit_offset=True)), 4)
-    without = frames(unit_of(config(noise=True, unit_offset=False)), 4)
+    with_offset = z_of(unit_of(config(noise=True, unit_offset=True)), 4)
+    without = z_of(unit_of(config(noise=True, unit_offset=False)), 4)
     assert (with_offset - without).std() < 0.1 * without.std(axis=0).mean()
 
 
@@ -132,15 +133,25 @@ def triangle(phase: np.ndarray) -> np.ndarray:
     return np.where(t < 0.5, 1 - 4 * t, 4 * t - 3)
 
 
-@pytest.mark.parametrize(("phases", "most_mrad"), [(3, 19.5), (4, 71.1), (5, 4.06)])
+@pytest.mark.parametrize(
+    ("phases", "most_mrad"),
+    [
+        (3, 19.5),
+        (4, 71.1),
+        (5, 4.06),
+    ],
+)
 def test_harmonics_are_those_of_a_triangle_seen_at_n_phases(phases, most_mrad):
     phase = np.linspace(0, 2 * np.pi, 5001)[None, None]
     steps = 2 * np.pi * np.arange(phases) / phases
-    seen = sum(triangle(phase - step) * np.exp(1j * step) for step in steps)
-    error = np.angle(seen * np.exp(-1j * phase))
-    ours = np.angle(with_harmonics(np.exp(1j * phase), phases, np.ones(1)) * np.exp(-1j * phase))
+    sampled = np.zeros(phase.shape, complex)
+    for step in steps:
+        sampled += triangle(phase - step) * np.exp(1j * step)
+    error = np.angle(sampled * np.exp(-1j * phase))
+    harmonics = with_harmonics(np.exp(1j * phase), phases, np.ones(1))
+    by_series = np.angle(harmonics * np.exp(-1j * phase))
     # what the series leaves out at the triangle's corners
-    assert np.abs(ours - error).max() < 0.6e-3
+    assert np.abs(by_series - error).max() < 0.6e-3
     assert np.abs(error).max() * 1e3 == pytest.approx(most_mrad, abs=0.05)
 
 
@@ -150,14 +161,17 @@ def test_wiggling_is_the_weighted_sum_of_its_frequencies(camera):
     error of phase."""
     for distance_m in (0.62, 0.85, 1.31):
         unit = unit_of(config(camera, wiggling=True), distance_m)
-        imager = AmcwImager(unit.camera, unit.config, unit.region, unit.view.slopes[unit.cut])
+        slopes = unit.view.slopes[unit.cut]
+        imager = AmcwImager(unit.camera, unit.config, unit.region, slopes)
         shares = np.array(unit.camera.modulation.wiggling_residual.value)
         light = unit.view.phasor
-        turns = np.angle(with_harmonics(light, 3, shares) * light.conj()) / (2 * np.pi)
+        wiggled_light = with_harmonics(light, 3, shares)
+        turns = np.angle(wiggled_light * light.conj()) / (2 * np.pi)
         expected = np.einsum("f,fhw->hw", imager.unwrap.metres_per_turn, turns)[unit.cut]
-        wiggled = frames(unit)[0] - frames(unit_of(config(camera), distance_m))[0]
+        plain = unit_of(config(camera), distance_m)
+        wiggled = z_of(unit)[0] - z_of(plain)[0]
         # along the axis, and averaged over the filter's window
-        assert np.abs(wiggled - expected / stretch(unit)).max() < 0.06e-3
+        assert np.abs(wiggled - expected / stretch_of(unit)).max() < 0.06e-3
 
 
 def test_wiggling_of_a_kinect_v2_has_the_published_size_and_period():
@@ -165,12 +179,12 @@ def test_wiggling_of_a_kinect_v2_has_the_published_size_and_period():
     camera = load_camera(V2)
     distance_m = np.linspace(0.5, 4.5, 4001)
     phase = 4 * np.pi * camera.frequencies_hz[1] * distance_m / SPEED_OF_LIGHT_AIR
-    error = np.angle(
-        with_harmonics(np.exp(1j * phase)[None, None], 3, np.ones(1)) * np.exp(-1j * phase)
-    )[0, 0]
-    error_mm = error / (2 * np.pi) * 694.0
+    light = np.exp(1j * phase)
+    wiggled = with_harmonics(light[None, None], 3, np.ones(1))[0, 0]
+    error_mm = np.angle(wiggled * light.conj()) / (2 * np.pi) * 694.0
     assert np.abs(error_mm).max() == pytest.approx(2.15, abs=0.05)
-    crossings = distance_m[1:][(error_mm[1:] >= 0) & (error_mm[:-1] < 0)]
+    rises = (error_mm[1:] >= 0) & (error_mm[:-1] < 0)
+    crossings = distance_m[1:][rises]
     assert np.diff(crossings) == pytest.approx(1.561, abs=0.002)
 
 
@@ -180,11 +194,12 @@ def test_wiggling_of_a_kinect_v2_has_the_published_size_and_period():
 def test_unit_offset_is_drawn_once_for_a_unit():
     """24 units scatter by the file's deviation: chi-square at alpha 0.001."""
     plain = unit_of(config())
-    nominal = frames(plain)[0]
+    nominal = z_of(plain)[0]
     offsets_mm = []
     for seed in range(24):
         settings = config(unit_offset=True).model_copy(update={"unit_seed": seed})
-        shift_mm = (frames(unit_of(settings))[0] - nominal) * stretch(plain) * 1e3
+        shift_m = z_of(unit_of(settings))[0] - nominal
+        shift_mm = shift_m * stretch_of(plain) * 1e3
         assert np.ptp(shift_mm) < 0.02
         offsets_mm.append(shift_mm.mean())
     sigma = load_camera(AZURE).unit.offset_mm.value
@@ -197,14 +212,13 @@ def test_drift_decays_and_tilts(minutes):
     facts = load_camera(AZURE).unit
     settings = config(warm_up_drift=True).model_copy(update={"minutes_since_power_on": minutes})
     unit = unit_of(settings)
-    shift_mm = (frames(unit)[0] - frames(unit_of(config()))[0]) * 1e3
-    expected = (
-        2.0
-        * np.exp(-minutes / 20.0)
-        * (1 + 0.5 * unit.view.slopes[unit.cut][..., 0])
-        / stretch(unit)
-    )
-    assert (facts.drift_mm.value, facts.drift_min.value, facts.drift_ramp.value) == (2.0, 20.0, 0.5)
+    still = unit_of(config())
+    shift_mm = (z_of(unit)[0] - z_of(still)[0]) * 1e3
+    ramp = 1 + 0.5 * unit.view.slopes[unit.cut][..., 0]
+    expected = 2.0 * np.exp(-minutes / 20.0) * ramp / stretch_of(unit)
+    assert facts.drift_mm.value == 2.0
+    assert facts.drift_min.value == 20.0
+    assert facts.drift_ramp.value == 0.5
     assert np.abs(shift_mm - expected).max() < 0.02
 
 
@@ -212,13 +226,14 @@ def test_frames_jitter_and_jump_as_a_whole():
     """Jitter by chi-square at alpha 0.001; of 300 frames, jumps as many as a binomial's 99.9 %
     interval allows."""
     unit = unit_of(config(frame_jumps=True, numbers={"unit.jump_rate": 0.05}))
-    z = frames(unit, 300)
-    shift_mm = (z - frames(unit_of(config()))[0]) * stretch(unit) * 1e3
+    z = z_of(unit, 300)
+    shift_mm = (z - z_of(unit_of(config()))[0]) * stretch_of(unit) * 1e3
     assert np.ptp(shift_mm, axis=(1, 2)).max() < 0.05
     mean_mm = shift_mm.mean(axis=(1, 2))
     jumped = np.abs(mean_mm) > 10
     assert np.abs(mean_mm[jumped]) == pytest.approx(17.0, abs=1.5)
-    assert stats.binom.ppf(0.0005, 300, 0.05) <= jumped.sum() <= stats.binom.ppf(0.9995, 300, 0.05)
+    fewest, most_jumps = stats.binom.ppf([0.0005, 0.9995], 300, 0.05)
+    assert fewest <= jumped.sum() <= most_jumps
     statistic = (mean_mm[~jumped] ** 2).sum() / 0.25**2
     calm = (~jumped).sum()
     assert stats.chi2.ppf(0.0005, calm) < statistic < stats.chi2.ppf(0.9995, calm)
@@ -236,30 +251,26 @@ def test_ambient_electrons_by_hand():
         electrons = (
             unit.model.ambient_electrons(unit.view, unit.view.intensity) / unit.model.gathered
         )
-        own = unit.camera.photons.signal_electrons.value
+        at_1m = unit.camera.photons.signal_electrons.value
         # 0.998: the plane leans by 3 degrees; 5 %: seen up to 6 degrees more aslant, from an
         # emitter beside the lens
-        assert electrons == pytest.approx(0.11 * 0.5 * own * 0.998, rel=0.05)
+        assert electrons == pytest.approx(0.11 * 0.5 * at_1m * 0.998, rel=0.05)
 
 
 def test_ambient_adds_its_shot_noise():
     """At 2 m and 2.2 uW/cm2/nm the surroundings give 0.11 x 2^2 of the own light: variances in
     that ratio."""
-    quiet, bright = (
-        frames(
-            unit_of(
-                config(V2, noise=True, ambient=on).model_copy(update={"ambient_uw_cm2_nm": 2.2}),
-                2.0,
-            ),
-            120,
-        )
-        for on in (False, True)
-    )
+    light = {"ambient_uw_cm2_nm": 2.2}
+    dark_settings = config(V2, noise=True, ambient=False).model_copy(update=light)
+    quiet = z_of(unit_of(dark_settings, 2.0), 120)
+    bright_settings = config(V2, noise=True, ambient=True).model_copy(update=light)
+    bright = z_of(unit_of(bright_settings, 2.0), 120)
     photons = load_camera(V2).photons
     electrons = photons.signal_electrons.value * 0.6 / 2.0**2
     noise = electrons + 2 * photons.read_noise_electrons.value**2
     expected = np.sqrt((noise + electrons * 0.11 * 2.0**2) / noise)
-    assert bright.std(axis=0).mean() / quiet.std(axis=0).mean() == pytest.approx(expected, rel=0.02)
+    ratio = bright.std(axis=0).mean() / quiet.std(axis=0).mean()
+    assert ratio == pytest.approx(expected, rel=0.02)
 
 
 def test_sunlight_fills_the_wells():
@@ -269,23 +280,24 @@ def test_sunlight_fills_the_wells():
     sun = {"ambient_uw_cm2_nm": 150.0}
     for saturation, expected in ((True, Reason.SATURATED), (False, Reason.VALID)):
         settings = config(AZURE, ambient=True, saturation=saturation).model_copy(update=sun)
-        frame = next(iter(unit_of(settings, 0.42, albedo=0.9).capture(1, 1).frames()))
+        frame = first_frame(unit_of(settings, 0.42, albedo=0.9))
         assert (frame.reason == expected).all()
-    assert np.isfinite(
-        frames(unit_of(config(AZURE, ambient=True, saturation=True), 0.42, albedo=0.9))
-    ).all()
+    in_a_room = config(AZURE, ambient=True, saturation=True)
+    assert np.isfinite(z_of(unit_of(in_a_room, 0.42, albedo=0.9))).all()
 
 
 def test_near_bright_surfaces_saturate():
     """White ones do below the least distance of use (0.5 m) and not from it on; with the effect
     off none does."""
     numbers = {"engine.min_range_mm": 50.0}
-    near = unit_of(config(AZURE, numbers, fine=False, saturation=True), 0.14, albedo=1.0)
-    assert (next(iter(near.capture(1, 1).frames())).reason == Reason.SATURATED).all()
-    assert np.isfinite(frames(unit_of(config(AZURE, numbers, fine=False), 0.14, albedo=1.0))).all()
-    assert np.isfinite(
-        frames(unit_of(config(AZURE, fine=False, saturation=True), 0.53, albedo=0.95))
-    ).all()
+    with_effect = config(AZURE, numbers, fine=False, saturation=True)
+    close = unit_of(with_effect, 0.14, albedo=1.0)
+    frame = first_frame(close)
+    assert (frame.reason == Reason.SATURATED).all()
+    without_effect = config(AZURE, numbers, fine=False)
+    assert np.isfinite(z_of(unit_of(without_effect, 0.14, albedo=1.0))).all()
+    in_use = config(AZURE, fine=False, saturation=True)
+    assert np.isfinite(z_of(unit_of(in_use, 0.53, albedo=0.95))).all()
 
 
 def test_an_exposure_that_ends_early_has_the_noise_of_what_it_holds():
@@ -295,35 +307,33 @@ def test_an_exposure_that_ends_early_has_the_noise_of_what_it_holds():
     photons = load_camera(V2).photons
     for distance_m in (1.0, 2.5):
         unit = unit_of(config(V2, noise=True), distance_m, albedo=1.0)
-        electrons = (
-            photons.signal_electrons.value
-            * unit.view.intensity[unit.view.intensity.shape[0] // 2].mean()
-        )
+        intensity = unit.view.intensity
+        middle_row = intensity[len(intensity) // 2]
+        electrons = photons.signal_electrons.value * middle_row.mean()
         share = min(1.0, photons.exposure_ends_electrons.value / electrons)
-        expected = np.sqrt(
-            electrons / share + 2 * (photons.read_noise_electrons.value / share) ** 2
-        )
-        middle = unit.exposure.sigma.reshape(unit.exposure.shape)[unit.exposure.shape[0] // 2]
+        read_noise = photons.read_noise_electrons.value / share
+        expected = np.sqrt(electrons / share + 2 * read_noise**2)
+        sigma = unit.exposure.sigma.reshape(unit.exposure.shape)
+        middle = sigma[len(sigma) // 2].mean()
         assert (share < 1) == (distance_m == 1.0)
-        assert middle.mean() * unit.camera.photons.electrons_per_unit.value == pytest.approx(
-            expected, rel=0.01
-        )
+        per_unit = unit.camera.photons.electrons_per_unit.value
+        assert middle * per_unit == pytest.approx(expected, rel=0.01)
 
 
 def test_multipath_off_sees_the_direct_light_only():
     settings = config(multipath=True)
     plain = unit_of(settings)
     lit = {"phasor": detour(plain.view), "intensity": plain.view.intensity * 1.1}
-    lengthened = frames(unit_of(settings, **lit))[0] - frames(plain)[0]
+    lengthened = z_of(unit_of(settings, **lit))[0] - z_of(plain)[0]
     # a tenth of the light on a way that is 0.15 m longer, one way, at most; less as the filter's
     # phasor is no mean
     assert 2e-3 < lengthened.mean() < 15e-3
-    assert np.array_equal(frames(unit_of(config(), **lit)), frames(plain))
+    assert np.array_equal(z_of(unit_of(config(), **lit)), z_of(plain))
     # and its photons are the direct light's alone
     dim = unit_of(config(noise=True, multipath=False), **lit).exposure.sigma
     bright = unit_of(config(noise=True, multipath=True), **lit).exposure.sigma
-    own = unit_of(config(noise=True, multipath=True)).exposure.sigma
-    assert dim == pytest.approx(own, rel=1e-5)
+    plain_sigma = unit_of(config(noise=True, multipath=True)).exposure.sigma
+    assert dim == pytest.approx(plain_sigma, rel=1e-5)
     assert (bright**2 / dim**2).mean() == pytest.approx(1.1, abs=0.01)
 
 
@@ -332,13 +342,12 @@ def test_the_scanner_is_rid_of_all_indirect_light_too():
     direct part alone."""
     settings = config("realsense_l515", fine=False, noise=True)
     plain = unit_of(settings)
-    lit = unit_of(settings, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity)
+    twice = {"phasor": 2 * plain.view.phasor, "intensity": 2 * plain.view.intensity}
+    lit = unit_of(settings, **twice)
     assert np.allclose(lit.exposure.noise, plain.exposure.noise, rtol=1e-6)
-    on = config("realsense_l515", fine=False, noise=True, multipath=True)
-    assert (
-        unit_of(on, phasor=2 * plain.view.phasor, intensity=2 * plain.view.intensity).exposure.noise
-        > 1.1 * plain.exposure.noise
-    ).all()
+    with_multipath = config("realsense_l515", fine=False, noise=True, multipath=True)
+    noisy = unit_of(with_multipath, **twice)
+    assert (noisy.exposure.noise > 1.1 * plain.exposure.noise).all()
 
 
 def test_saturated_neighbours_do_not_count():
@@ -346,18 +355,19 @@ def test_saturated_neighbours_do_not_count():
     amplitude."""
     settings = config(saturation=True, multipath=True)
     plain = unit_of(settings)
-    bright = np.where(np.arange(plain.view.intensity.shape[1]) < 30, 1.0, 2000.0)
+    columns = np.arange(plain.view.intensity.shape[1])
+    bright = np.where(columns < 30, 1.0, 2000.0)
     unit = unit_of(
         settings, phasor=plain.view.phasor * bright, intensity=plain.view.intensity * bright
     )
-    one = next(iter(unit.capture(1, 1).frames()))
-    other = next(iter(plain.capture(1, 1).frames()))
+    frame = first_frame(unit)
+    plain_frame = first_frame(plain)
     dark = slice(0, 30 - (unit.region.col0 - unit.view.region.col0))
-    assert (one.reason[:, dark.stop :] == Reason.SATURATED).all()
-    assert (one.reason[:, dark] == Reason.VALID).all()
+    assert (frame.reason[:, dark.stop :] == Reason.SATURATED).all()
+    assert (frame.reason[:, dark] == Reason.VALID).all()
     # the plane is tilted: half a window has its middle a pixel aside, 0.1 mm in z
-    assert np.allclose(one.z_m[:, dark], other.z_m[:, dark], atol=2e-4)
-    assert np.allclose(one.amplitude[:, dark], other.amplitude[:, dark], rtol=0.01)
+    assert np.allclose(frame.z_m[:, dark], plain_frame.z_m[:, dark], atol=2e-4)
+    assert np.allclose(frame.amplitude[:, dark], plain_frame.amplitude[:, dark], rtol=0.01)
 
 
 def test_ambient_light_of_a_mixed_pixel_is_that_of_its_nearest_surface():
@@ -368,9 +378,15 @@ def test_ambient_light_of_a_mixed_pixel_is_that_of_its_nearest_surface():
     range_m = plain.view.range_m.copy()
     coverage = plain.view.coverage.copy()
     intensity = plain.view.intensity.copy()
-    range_m[20, 30], coverage[20, 30], intensity[20, 30] = 2.5, 0.5, intensity[20, 30] / 2
+    range_m[20, 30] = 2.5
+    coverage[20, 30] = 0.5
+    intensity[20, 30] /= 2
     unit = unit_of(
-        settings, distance_m=0.7, range_m=range_m, coverage=coverage, intensity=intensity
+        settings,
+        distance_m=0.7,
+        range_m=range_m,
+        coverage=coverage,
+        intensity=intensity,
     )
     light = unit.model.ambient_electrons(unit.view, intensity)
     assert light[20, 30] == pytest.approx(light[20, 31] / 2, rel=0.02)
@@ -381,10 +397,11 @@ def test_the_drift_goes_on_during_a_capture():
     settings = config(numbers={"unit.drift_mm": 100.0, "unit.drift_ramp": 0.0}, warm_up_drift=True)
     facts = camera_of(settings).unit
     errors = frame_errors_m(facts, settings.effects, 5.0, np.random.default_rng(1))
-    first, *_, last = (next(errors) for _ in range(901))
-    wanted = 0.1 * (np.exp(-5.5 / facts.drift_min.value) - np.exp(-5.0 / facts.drift_min.value))
-    assert first == 0.0
-    assert last == pytest.approx(wanted, rel=1e-6)
+    errors_m = list(islice(errors, 901))
+    minutes = facts.drift_min.value
+    wanted_m = 0.1 * (np.exp(-5.5 / minutes) - np.exp(-5.0 / minutes))
+    assert errors_m[0] == 0.0
+    assert errors_m[-1] == pytest.approx(wanted_m, rel=1e-6)
 
 
 @pytest.mark.parametrize("length_px", [0.4, 2.0, 12.0])
@@ -392,6 +409,5 @@ def test_smooth_fields_have_unit_variance_at_any_length(length_px):
     field = smooth_field(np.random.default_rng(3).standard_normal((600, 600)), length_px)
     # 360,000 pixels hold 360,000 / (4 pi (l^2 / 2)) independent ones: 400 at 12 px, whose
     # deviation is known to 3.5 %
-    assert field.std() == pytest.approx(
-        1.0, abs=3 * max(0.002, np.sqrt(2 * np.pi * length_px**2 / 720_000))
-    )
+    deviation = np.sqrt(2 * np.pi * length_px**2 / 720_000)
+    assert field.std() == pytest.approx(1.0, abs=3 * max(0.002, deviation))

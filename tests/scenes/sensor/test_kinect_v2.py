@@ -15,8 +15,10 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.facts import unwrap_table
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
+from scenes.sensor.camera import camera_of, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
+from tests.support.sensor_frames import correlation, first_frame, noise_of, true_z_m, z_of
 
 f4 = np.float32
 V2 = load_camera("kinect_v2_libfreenect2")
@@ -31,14 +33,21 @@ NOISY = QUIET.model_copy(
 )
 FINE = {"converter.knee_units": 10**6, "photons.electrons_per_unit": 0.1}
 """A converter whose rounding hides nothing."""
-WINDOW = np.exp(-(np.add.outer([1, 0, 1], [1, 0, 1])) / 18)
+DISTANCE2_PX = np.add.outer([1, 0, 1], [1, 0, 1])
+WINDOW = np.exp(-DISTANCE2_PX / 18)
 """The published kernel: a Gaussian of 3 px over 3x3."""
 
 
 def test_gain_meets_the_calibration_point():
     electrons = calibrated_signal_electrons(V2, frames=60, seed=5)
     assert V2.photons.signal_electrons.value == pytest.approx(electrons, rel=0.03)
-    sigma_m = temporal_sigma_m(V2, 1.5, 0.8, 100, seed=6)
+    sigma_m = temporal_sigma_m(
+        V2,
+        1.5,
+        0.8,
+        100,
+        seed=6,
+    )
     assert np.hypot(sigma_m, 1e-3 * V2.unit.jitter_mm.value) == pytest.approx(1.42e-3, rel=0.02)
 
 
@@ -52,8 +61,15 @@ def test_the_window_is_the_published_one():
 
 
 def test_the_window_leaves_a_third_of_the_noise():
-    """0.334 by its weights; on the phases of each frequency, deviations over 40 frames within 2 %."""
-    view = plane_view(V2, NEAR_AXIS, 1.0, 0.8, 0.05, 0.02)
+    """0.334 by its weights; on each frequency's phases, deviations over 40 frames within 2 %."""
+    view = plane_view(
+        V2,
+        NEAR_AXIS,
+        1.0,
+        0.8,
+        0.05,
+        0.02,
+    )
     imager = AmcwImager(V2, NOISY, NEAR_AXIS, view.slopes)
     exposure = imager.expose(view)
     rng = random_stream(3)
@@ -63,13 +79,16 @@ def test_the_window_leaves_a_third_of_the_noise():
     for _ in range(40):
         unit, amplitude, _ = imager.phasors(exposure, rng)
         filtered, _ = imager.filter(unit, amplitude, exposure.shape)
-        before.append(np.angle((unit[0] + 1j * unit[1]).reshape(light.shape) * light))
-        after.append(np.angle((filtered[:, 0] + 1j * filtered[:, 1]) * light))
+        phasor = (unit[0] + 1j * unit[1]).reshape(light.shape)
+        before.append(np.angle(phasor * light))
+        smooth = filtered[:, 0] + 1j * filtered[:, 1]
+        after.append(np.angle(smooth * light))
     inner = (slice(None), slice(1, -1), slice(1, -1))
-    ratio = np.sqrt(
-        np.var(after, axis=0)[inner].mean((1, 2)) / np.var(before, axis=0)[inner].mean((1, 2))
-    )
-    assert np.sqrt((WINDOW**2).sum()) / WINDOW.sum() == pytest.approx(0.334, abs=0.001)
+    variance_before = np.var(before, axis=0)[inner].mean((1, 2))
+    variance_after = np.var(after, axis=0)[inner].mean((1, 2))
+    ratio = np.sqrt(variance_after / variance_before)
+    by_weights = np.sqrt((WINDOW**2).sum()) / WINDOW.sum()
+    assert by_weights == pytest.approx(0.334, abs=0.001)
     assert ratio == pytest.approx(0.334, rel=0.02)
 
 
@@ -79,14 +98,23 @@ def test_noise_correlates_over_three_pixels():
     settings = NOISY.model_copy(update={"numbers": {"engine.output_step_mm": 1e-3}})
     camera = camera_of(settings)
     region = Region(130, 280, 150, 350)
-    unit = SimulatedUnit(camera, settings, plane_view(camera, region, 1.0, 0.8, 0.05, 0.02))
-    z = np.stack([frame.z_m for frame in unit.capture(60, 1).frames()]).astype(float)
-    d = z - z.mean(axis=0)
-    variance = (d**2).mean()
+    unit = SimulatedUnit(
+        camera,
+        settings,
+        plane_view(
+            camera,
+            region,
+            1.0,
+            0.8,
+            0.05,
+            0.02,
+        ),
+    )
+    noise = noise_of(z_of(unit, 60))
     for lag, expected in ((1, 0.68), (2, 0.32), (3, 0.0)):
-        assert (d[..., lag:] * d[..., :-lag]).mean() / variance == pytest.approx(expected, abs=0.02)
-        assert (d[:, lag:] * d[:, :-lag]).mean() / variance == pytest.approx(expected, abs=0.02)
-    assert (d[:, 1:, 1:] * d[:, :-1, :-1]).mean() / variance == pytest.approx(0.46, abs=0.02)
+        assert correlation(noise, 0, lag) == pytest.approx(expected, abs=0.02)
+        assert correlation(noise, lag, 0) == pytest.approx(expected, abs=0.02)
+    assert correlation(noise, 1, 1) == pytest.approx(0.46, abs=0.02)
 
 
 def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, float]:
@@ -99,9 +127,23 @@ def filtered_beside(phase: float, amplitude: float = 500.0) -> tuple[complex, fl
     unit = np.stack([np.cos(phases), np.sin(phases)]).astype(f4)
     filtered = np.empty((3, 3, 3), f4)
     edge = np.empty((3, 3), f4)
-    settings = kernels.FilterSettings(WINDOW.astype(f4), f4(3.6067), f4(3), True, True, True)
-    kernels.filter_image(unit, strength, settings, filtered, edge)
-    return complex(filtered[0, 1, 1], filtered[1, 1, 1]), float(edge[1, 1])
+    settings = kernels.FilterSettings(
+        WINDOW.astype(f4),
+        f4(3.6067),
+        f4(3),
+        True,
+        True,
+        True,
+    )
+    kernels.filter_image(
+        unit,
+        strength,
+        settings,
+        filtered,
+        edge,
+    )
+    re, im, _ = filtered[:, 1, 1]
+    return complex(re, im), float(edge[1, 1])
 
 
 @pytest.mark.parametrize(
@@ -126,30 +168,31 @@ def test_weights_across_a_step(step_mm, weights):
 
 def test_dim_neighbours_are_dropped():
     lit, edge = filtered_beside(2.0, amplitude=2.9)
-    assert lit.imag == 0 and edge == 0
+    assert lit.imag == 0
+    assert edge == 0
     lit, edge = filtered_beside(2.0, amplitude=3.1)
-    assert lit.imag > 0 and edge == pytest.approx(3 * (1 - np.cos(2.0)) / 2, rel=1e-5)
+    assert lit.imag > 0
+    assert edge == pytest.approx(3 * (1 - np.cos(2.0)) / 2, rel=1e-5)
 
 
 def two_planes(
     near_m: float, step_m: float, share: float, config: CameraConfig = QUIET
 ) -> SimulatedUnit:
-    """A step between two frontal planes at column 40, whose pixels see ``share`` of the near one."""
+    """A step between two frontal planes at column 40, which sees ``share`` of the near one."""
     camera = camera_of(config)
-    near = plane_view(camera, NEAR_AXIS, near_m, 0.5)
-    far = plane_view(camera, NEAR_AXIS, near_m + step_m, 0.5)
+    front = plane_view(camera, NEAR_AXIS, near_m, 0.5)
+    back = plane_view(camera, NEAR_AXIS, near_m + step_m, 0.5)
     part = np.where(np.arange(NEAR_AXIS.shape[1]) < 40, 1.0, 0.0)
     part[40] = share
-    mixed = {
-        key: part * getattr(near, key) + (1 - part) * getattr(far, key)
-        for key in ("phasor", "intensity")
-    }
-    return SimulatedUnit(camera, config, dataclasses.replace(near, **mixed))
+    phasor = part * front.phasor + (1 - part) * back.phasor
+    intensity = part * front.intensity + (1 - part) * back.intensity
+    view = dataclasses.replace(front, phasor=phasor, intensity=intensity)
+    return SimulatedUnit(camera, config, view)
 
 
 def middle(unit: SimulatedUnit) -> tuple[np.ndarray, np.ndarray]:
     """z and reason along the middle row."""
-    frame = next(iter(unit.capture(1, 1).frames()))
+    frame = first_frame(unit)
     return frame.z_m[30].astype(float), frame.reason[30]
 
 
@@ -175,9 +218,10 @@ def test_flying_pixels_die_over_a_far_step_and_live_over_a_near_one(share, step_
     unrounded = QUIET.model_copy(update={"numbers": SHARP | {"engine.output_step_mm": 1e-3}})
     z, _ = middle(two_planes(0.8, step_m, share, gate_open(unrounded)))
     assert np.isfinite(z).all()
-    near = z[1:-1] - np.minimum(z[:-2], z[2:])
-    far = np.maximum(z[:-2], z[2:]) - z[1:-1]
-    rule = 1 + np.flatnonzero((near > 0.05) & (far > 0.03) & (np.maximum(near, far) > 0.1))
+    before_m = z[1:-1] - np.minimum(z[:-2], z[2:])
+    behind_m = np.maximum(z[:-2], z[2:]) - z[1:-1]
+    between = (before_m > 0.05) & (behind_m > 0.03)
+    rule = 1 + np.flatnonzero(between & (np.maximum(before_m, behind_m) > 0.1))
     _, reason = middle(two_planes(0.8, step_m, share, unrounded))
     assert np.flatnonzero(reason == Reason.EDGE).tolist() == rule.tolist() == dead
     assert ((reason == Reason.EDGE) | (reason == Reason.VALID)).all()
@@ -189,7 +233,8 @@ def test_even_amplitudes_hide_a_flying_pixel():
         update={"numbers": SHARP | {"engine.flying_pixels.relative_deviation": 2.0}}
     )
     z, _ = middle(two_planes(0.8, 0.3, 0.3, lenient))
-    assert np.isfinite(z).all() and 0.9 < z[38] < 1.0
+    assert np.isfinite(z).all()
+    assert 0.9 < z[38] < 1.0
 
 
 def test_the_edge_flag_needs_half_a_wavelength():
@@ -238,7 +283,13 @@ def test_unwrapping_is_right_over_the_whole_range_and_equals_the_published_one()
         published = published_range_m(turn.astype(float))
         half = np.empty(range_m.size, f4)
         residual2 = np.empty(range_m.size, f4)
-        ranging.half_path(turn, range_m.size, table, half, residual2)
+        ranging.half_path(
+            turn,
+            range_m.size,
+            table,
+            half,
+            residual2,
+        )
         if sigma == 0:
             assert np.abs(half - range_m).max() < 5e-6
             assert residual2.max() < 1e-9
@@ -255,18 +306,18 @@ def test_the_residual_that_is_allowed_falls_with_amplitude():
     turns = np.linspace(0.05, 0.11, 60_001)
 
     def limit_of(amplitude: float) -> float:
-        each = dict.fromkeys(ranging.GateInputs._fields, np.full(turns.size, 1e3))
-        each |= {
-            "edge": np.zeros(turns.size),
-            "range_m": np.full(turns.size, 1e6),
-            "low_m": np.ones(turns.size),
-        }
-        each |= {
-            "high_m": np.ones(turns.size),
-            "residual2": turns**2,
-            "brightest": np.full(turns.size, amplitude),
-        }
-        codes = ranging.first_failed_each(gates, ranging.GateInputs(**each))
+        inputs = ranging.GateInputs(
+            edge=np.zeros(turns.size),
+            least=np.full(turns.size, 1e3),
+            greatest=np.full(turns.size, 1e3),
+            total=np.full(turns.size, 1e3),
+            residual2=turns**2,
+            brightest=np.full(turns.size, amplitude),
+            range_m=np.full(turns.size, 1e6),
+            low_m=np.ones(turns.size),
+            high_m=np.ones(turns.size),
+        )
+        codes = ranging.first_failed_each(gates, inputs)
         assert set(codes) == {ranging.VALID, ranging.UNWRAP}
         return float(2 * np.pi * turns[codes == ranging.VALID].max())
 
@@ -282,13 +333,22 @@ def test_the_residual_that_is_allowed_falls_with_amplitude():
 def test_noise_free_range_is_exact_from_half_a_metre_on():
     settings = CameraConfig(name="kinect_v2_libfreenect2", effects=NO_EFFECTS, numbers=FINE)
     camera = camera_of(settings)
-    for distance_m, valid in ((0.49, False), (0.52, True), (2.0, True), (4.4, True), (4.6, False)):
+    for distance_m in (0.49, 0.52, 2.0, 4.4, 4.6):
         unit = SimulatedUnit(
-            camera, settings, plane_view(camera, NEAR_AXIS, distance_m, 0.6, 0.01, 0.02)
+            camera,
+            settings,
+            plane_view(
+                camera,
+                NEAR_AXIS,
+                distance_m,
+                0.6,
+                0.01,
+                0.02,
+            ),
         )
-        frame = next(iter(unit.capture(1, 1).frames()))
-        truth = (unit.view.range_m / np.sqrt(1 + (unit.view.slopes**2).sum(-1)))[unit.cut]
-        if valid:
+        frame = first_frame(unit)
+        truth = true_z_m(unit)
+        if 0.5 < distance_m < 4.5:
             assert np.abs(frame.z_m - truth).max() < 0.5e-3 + 0.05e-3
         else:
             assert (frame.reason == Reason.OUT_OF_RANGE).all()

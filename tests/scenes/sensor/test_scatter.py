@@ -8,7 +8,8 @@ import pytest
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw.imager import scattered
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 
 REGION = Region(250, 330, 260, 380)
@@ -29,12 +30,13 @@ def test_a_point_keeps_its_light_and_gets_the_declared_width():
         )
     ).scatter
     point = np.zeros((2, 101, 121), np.complex64)
-    point[0, 50, 60], point[1, 40, 70] = 1.0, 2.0j
+    point[0, 50, 60] = 1.0
+    point[1, 40, 70] = 2.0j
     spread = scattered(point, facts)
     v, u = np.mgrid[:101, :121]
     assert spread.sum(axis=(1, 2)) == pytest.approx([1.0, 2.0j], abs=1e-5)
-    for along, at in ((u, 60), (v, 50)):
-        variance = (spread[0].real * (along - at) ** 2).sum()
+    for coordinate, centre in ((u, 60), (v, 50)):
+        variance = (spread[0].real * (coordinate - centre) ** 2).sum()
         assert variance == pytest.approx(0.8 * 1.5**2 + 0.2 * 8.0**2, rel=0.01)
 
 
@@ -43,15 +45,17 @@ def test_stray_light_draws_a_near_patch_towards_its_surroundings():
     keeps nine tenths."""
 
     def patch(camera):
-        near = layered_view(
+        def covers(slopes: np.ndarray) -> np.ndarray:
+            return np.asarray(np.abs(slopes + 0.03).max(axis=-1) < 0.012)
+
+        return layered_view(
             camera,
             REGION,
             Plane(0.6),
             Plane(0.7),
-            lambda s: np.abs(s + 0.03).max(axis=-1) < 0.012,
+            covers,
             0.6,
         )
-        return near
 
     def far(camera):
         return plane_view(camera, REGION, 0.7, 0.6)

@@ -14,8 +14,8 @@ from scipy.ndimage import uniform_filter
 
 from detectors.findings.measure import HoleModelConfig, measure_detection
 from detectors.interface import Detection, Evidence, Measurement
+from harness.trials.board import LabelledCloud
 from harness.trials.judge import matched
-from harness.trials.setup import KnownCloud
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.checks import check_target
@@ -31,14 +31,37 @@ BOARD = {"width_mm": 300.0, "height_mm": 200.0, "thickness_mm": 12.0}
 PIPE = {**BOARD, "shape": {"kind": "cylinder", "radius_mm": 200.0}}
 INSIDE = {
     **BOARD,
-    "shape": {"kind": "cylinder", "radius_mm": 300.0, "bulge": "away", "straight_along": "x"},
+    "shape": {
+        "kind": "cylinder",
+        "radius_mm": 300.0,
+        "bulge": "away",
+        "straight_along": "x",
+    },
 }
-SLOT = {"kind": "slot", "length_mm": 60.0, "width_mm": 3.0, "depth_mm": 8.0, "angle_deg": 30.0}
-V_GOUGE = {"kind": "gouge", "length_mm": 60.0, "width_mm": 6.0, "depth_mm": 2.0, "angle_deg": -20.0}
+SLOT = {
+    "kind": "slot",
+    "length_mm": 60.0,
+    "width_mm": 3.0,
+    "depth_mm": 8.0,
+    "angle_deg": 30.0,
+}
+V_GOUGE = {
+    "kind": "gouge",
+    "length_mm": 60.0,
+    "width_mm": 6.0,
+    "depth_mm": 2.0,
+    "angle_deg": -20.0,
+}
 ROUND_GOUGE = {**V_GOUGE, "section": "round", "run_out_mm": 10.0}
 DENT = {"kind": "pressed_dent", "diameter_mm": 40.0, "depth_mm": 5.0}
 CORROSION = {"kind": "corrosion", "diameter_mm": 30.0, "depth_mm": 1.5}
-CHIP = {"kind": "chip", "length_mm": 40.0, "width_mm": 10.0, "depth_mm": 6.0, "angle_deg": 0}
+CHIP = {
+    "kind": "chip",
+    "length_mm": 40.0,
+    "width_mm": 10.0,
+    "depth_mm": 6.0,
+    "angle_deg": 0,
+}
 SPATTER = {"kind": "protrusion", "diameter_mm": 8.0, "depth_mm": 3.0}
 VOLUMES_MM3 = [
     (SLOT, 60 * 3 * 8),
@@ -65,20 +88,21 @@ def target(*flaws: dict[str, Any], board: dict[str, Any] = BOARD) -> TargetConfi
 
 
 def removed_m3(built: Target) -> float:
-    whole = board_solid(built.config.hole_free(), ())
-    left = built.parts[0].mesh
-    assert left.is_watertight
-    assert left.is_winding_consistent
-    return float(whole.volume - left.volume)
+    undamaged = board_solid(built.config.hole_free(), ())
+    remaining = built.parts[0].mesh
+    assert remaining.is_watertight
+    assert remaining.is_winding_consistent
+    return float(undamaged.volume - remaining.volume)
 
 
 @pytest.mark.parametrize(
     ("flaw", "volume_mm3"),
     VOLUMES_MM3,
-    ids=lambda one: one["kind"] if isinstance(one, dict) else "",
+    ids=lambda damage: damage["kind"] if isinstance(damage, dict) else "",
 )
 def test_volumes_are_those_of_closed_forms_and_of_the_mesh(
-    flaw: dict[str, Any], volume_mm3: float
+    flaw: dict[str, Any],
+    volume_mm3: float,
 ) -> None:
     built = build_target(target(flaw))
     (truth,) = built.truth
@@ -103,10 +127,10 @@ def test_a_sheet_pressed_deeper_than_it_is_thick_stays_whole() -> None:
     for kind, sign in (("pressed_dent", -1.0), ("pressed_bump", 1.0)):
         built = build_target(target({**DENT, "kind": kind}, board=sheet))
         mesh = board_solid(built.config, built.truth)
-        whole = board_solid(built.config.hole_free(), ())
+        undamaged = board_solid(built.config.hole_free(), ())
         assert mesh.is_watertight
         assert mesh.euler_number == 2
-        assert mesh.volume == pytest.approx(whole.volume, rel=1e-6)
+        assert mesh.volume == pytest.approx(undamaged.volume, rel=1e-6)
         deep = -0.8e-3 - 5e-3 if sign < 0 else -0.8e-3
         assert mesh.vertices[:, 2].min() == pytest.approx(deep, abs=1e-9)
         assert mesh.vertices[:, 2].max() == pytest.approx(5e-3 if sign > 0 else 0.0, abs=1e-9)
@@ -115,7 +139,12 @@ def test_a_sheet_pressed_deeper_than_it_is_thick_stays_whole() -> None:
 
 def test_corrosion_has_the_stated_statistics() -> None:
     relief = CorrosionConfig(
-        id=1, centre_mm=(0, 0), kind="corrosion", diameter_mm=60.0, depth_mm=2.0, rough_mm=0.4
+        id=1,
+        centre_mm=(0, 0),
+        kind="corrosion",
+        diameter_mm=60.0,
+        depth_mm=2.0,
+        rough_mm=0.4,
     ).relief()
     inner = relief.depth_m[16:49, 16:49]
     assert inner.std() * 1e3 == pytest.approx(0.4, rel=0.2)
@@ -133,7 +162,7 @@ def test_outline_tells_inside_from_outside() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flaws", "said"),
+    ("flaws", "message"),
     [
         ([{**SLOT, "depth_mm": 12.0}], "not less than the board's thickness"),
         ([{**SLOT, "centre_mm": [140.0, 0.0]}], "leaves the board"),
@@ -142,8 +171,11 @@ def test_outline_tells_inside_from_outside() -> None:
         ([{**CHIP, "length_mm": 320.0}], "leaves the board"),
     ],
 )
-def test_what_cannot_be_built_is_refused(flaws: list[dict[str, Any]], said: str) -> None:
-    with pytest.raises(UserError, match=said):
+def test_what_cannot_be_built_is_refused(
+    flaws: list[dict[str, Any]],
+    message: str,
+) -> None:
+    with pytest.raises(UserError, match=message):
         check_target(target(*flaws))
 
 
@@ -188,16 +220,25 @@ def test_a_rough_board_has_its_deviation_and_every_board_its_own_face() -> None:
         "depth_mm": [8.0, 8.0],
     }
     board = {**BOARD, "thickness_mm": 40.0, "shape": {"kind": "rough", "deviation_mm": 0.4}}
-    family = target_from_data({"name": "drawn", "damage": damage, "board": board, "apart_mm": 60.0})
+    family = target_from_data(
+        {
+            "name": "drawn",
+            "damage": damage,
+            "board": board,
+            "apart_mm": 60.0,
+        }
+    )
     assert isinstance(family, DrawnTargetConfig)
     first = family.drawn("damaged", 0)
     second = family.drawn("damaged", 1)
     x, y = np.meshgrid(np.linspace(-0.14, 0.14, 200), np.linspace(-0.09, 0.09, 150))
-    heights = [face_of(one.board).height_m(x, y) for one in (first, second)]
-    assert [each.std() * 1e3 for each in heights] == pytest.approx([0.4, 0.4], rel=0.25)
+    heights = [face_of(damage.board).height_m(x, y) for damage in (first, second)]
+    assert [height.std() * 1e3 for height in heights] == pytest.approx([0.4, 0.4], rel=0.25)
     assert abs(np.corrcoef(heights[0].ravel(), heights[1].ravel())[0, 1]) < 0.5
     built = build_target(first)
-    assert removed_m3(built) == pytest.approx(sum(one.volume_m3 for one in built.truth), rel=5e-3)
+    assert removed_m3(built) == pytest.approx(
+        sum(damage.volume_m3 for damage in built.truth), rel=5e-3
+    )
     with pytest.raises(UserError, match="smooth face"):
         check_target(
             first.model_copy(
@@ -216,25 +257,47 @@ def _one_hole(board: dict[str, Any]) -> dict[str, Any]:
 
 RANGES = {"depth_mm": [0.5, 3.0], "per_board": 5}
 FAMILIES: tuple[dict[str, Any], ...] = (
-    {"kind": "slot", "width_mm": [0.5, 5.0], "length_mm": [30.0, 50.0], "wander_mm": 1.0, **RANGES},
-    {"kind": "gouge", "width_mm": [4.0, 6.0], "length_mm": [20.0, 40.0], **RANGES},
+    {
+        "kind": "slot",
+        "width_mm": [0.5, 5.0],
+        "length_mm": [30.0, 50.0],
+        "wander_mm": 1.0,
+        **RANGES,
+    },
+    {
+        "kind": "gouge",
+        "width_mm": [4.0, 6.0],
+        "length_mm": [20.0, 40.0],
+        **RANGES,
+    },
     {"kind": "pressed_bump", "diameter_mm": [10.0, 40.0], **RANGES},
     {"kind": "corrosion", "diameter_mm": [10.0, 30.0], **RANGES},
-    {"kind": "chip", "length_mm": [10.0, 30.0], "width_mm": [3.0, 6.0], **RANGES},
+    {
+        "kind": "chip",
+        "length_mm": [10.0, 30.0],
+        "width_mm": [3.0, 6.0],
+        **RANGES,
+    },
     {"kind": "protrusion", "diameter_mm": [3.0, 9.0], **RANGES},
 )
 
 
 @pytest.mark.parametrize("damage", FAMILIES, ids=lambda damage: damage["kind"])
 def test_every_drawn_board_can_be_built_and_is_drawn_again_alike(damage: dict[str, Any]) -> None:
-    family = target_from_data({"name": "drawn", "damage": damage, "apart_mm": 60.0, "board": PIPE})
+    family = target_from_data(
+        {
+            "name": "drawn",
+            "damage": damage,
+            "apart_mm": 60.0,
+            "board": PIPE,
+        }
+    )
     assert isinstance(family, DrawnTargetConfig)
     for number in range(4):
         config = family.drawn("damaged", number)
         check_target(config)
-        sizes, depths = (
-            [getattr(one, name) for one in config.flaws] for name in ("size_mm", "depth_mm")
-        )
+        sizes = [flaw.size_mm for flaw in config.flaws]
+        depths = [flaw.depth_mm for flaw in config.flaws]
         assert sizes == sorted(sizes)
         assert min(depths) >= 0.5
         assert max(depths) <= 3.0
@@ -243,7 +306,7 @@ def test_every_drawn_board_can_be_built_and_is_drawn_again_alike(damage: dict[st
     assert outline_board_m(config.board).shape[1] == 3
 
 
-def known_slot() -> KnownCloud:
+def known_slot() -> LabelledCloud:
     """A flat board seen straight on, a pixel each millimetre, with a slot along x about (20, 10)
     mm."""
     config = target({**SLOT, "angle_deg": 0.0})
@@ -263,44 +326,60 @@ def known_slot() -> KnownCloud:
     )
     truth = truth_of(config, np.eye(4))
     outlines = {1: np.flatnonzero(truth[0].within(x, y))}
-    return KnownCloud(
-        cloud, np.eye(4), config, truth, outlines, points[..., :2], zeros == 0, {1: 0.008}
+    return LabelledCloud(
+        cloud=cloud,
+        damaged=True,
+        T_board_cloud=np.eye(4),
+        target=config,
+        truth=truth,
+        outlines=outlines,
+        places_m=points[..., :2],
+        undamaged=zeros == 0,
+        seen_depth_m={1: 0.008},
     )
 
 
-def finding(known: KnownCloud, x_mm: tuple[float, float], y_mm: tuple[float, float]) -> Detection:
-    x, y = np.moveaxis(known.places_m, -1, 0) * 1e3
+def finding(
+    known_cloud: LabelledCloud,
+    x_mm: tuple[float, float],
+    y_mm: tuple[float, float],
+) -> Detection:
+    x, y = np.moveaxis(known_cloud.places_m, -1, 0) * 1e3
     inside = (x > x_mm[0]) & (x < x_mm[1]) & (y > y_mm[0]) & (y < y_mm[1])
-    centre = np.append(known.places_m[inside].mean(axis=0), 0.0)
+    centre = np.append(known_cloud.places_m[inside].mean(axis=0), 0.0)
     return Detection(1.0, np.flatnonzero(inside), centre)
 
 
 def test_what_counts_for_a_slot() -> None:
     """The slot lies from x = -10 to 50 mm at y = 10 mm."""
-    known = known_slot()
-    end = finding(known, (38, 50), (8, 12))
-    middle = finding(known, (0, 20), (8, 12))
-    beside = finding(known, (0, 20), (16, 24))
-    away = finding(known, (0, 20), (40, 44))
-    assert matched(known, [end], 5e-3, None) == (
+    known_cloud = known_slot()
+    end = finding(known_cloud, (38, 50), (8, 12))
+    middle = finding(known_cloud, (0, 20), (8, 12))
+    beside = finding(known_cloud, (0, 20), (16, 24))
+    away = finding(known_cloud, (0, 20), (40, 44))
+    assert matched(known_cloud, [end], 5e-3, None) == (
         {0: 0},
         0,
     )  # 24 mm from its centre, but on its line
-    assert matched(known, [beside], 5e-3, None) == ({}, 0)
-    assert matched(known, [away, middle], 15e-3, None) == ({0: 1}, 0)
+    assert matched(known_cloud, [beside], 5e-3, None) == ({}, 0)
+    assert matched(known_cloud, [away, middle], 15e-3, None) == ({0: 1}, 0)
     # the second piece of a slot is a false call by its centre alone, a part of the slot by overlap
-    assert matched(known, [end, middle], 15e-3, None)[1] == 0
-    assert matched(known, [end, middle], 15e-3, 0.5)[1] == 1
+    assert matched(known_cloud, [end, middle], 15e-3, None)[1] == 0
+    assert matched(known_cloud, [end, middle], 15e-3, 0.5)[1] == 1
     # a wide finding whose centre lies off the line still counts where half of it lies on the slot,
     # and not otherwise
-    wide = finding(known, (0, 20), (6, 20))
-    assert matched(known, [wide], 1e-3, None) == ({}, 0)
-    assert matched(known, [wide], 1e-3, 0.4) == ({0: 0}, 0)
-    assert matched(known, [wide], 1e-3, 0.9) == ({}, 0)
-    assert matched(known, [], 1e-3, 0.4) == ({}, 0)
+    wide = finding(known_cloud, (0, 20), (6, 20))
+    assert matched(known_cloud, [wide], 1e-3, None) == ({}, 0)
+    assert matched(known_cloud, [wide], 1e-3, 0.4) == ({0: 0}, 0)
+    assert matched(known_cloud, [wide], 1e-3, 0.9) == ({}, 0)
+    assert matched(known_cloud, [], 1e-3, 0.4) == ({}, 0)
 
 
-def slot_seen(angle_deg: float, length_mm: float, width_mm: float) -> Measurement:
+def slot_seen(
+    angle_deg: float,
+    length_mm: float,
+    width_mm: float,
+) -> Measurement:
     """A slot 6 mm deep in a plane at 0.7 m, seen by pixels of 1 mm through a window of 5, with
     little noise."""
     u, v = np.meshgrid(np.arange(-60, 61) * 1.0, np.arange(-50, 51) * 1.0)
@@ -316,7 +395,13 @@ def slot_seen(angle_deg: float, length_mm: float, width_mm: float) -> Measuremen
     points = np.stack([u / 700 * z, v / 700 * z, z], axis=-1)
     zeros = np.zeros(u.shape, np.uint8)
     cloud = Cloud(
-        points, zeros, zeros.astype(int), np.full(u.shape, np.nan), Region(0, 101, 0, 121), 0.0, 1
+        points,
+        zeros,
+        zeros.astype(int),
+        np.full(u.shape, np.nan),
+        Region(0, 101, 0, 121),
+        0.0,
+        1,
     )
     evidence = Evidence(depth / 5e-5, depth, np.full(u.shape, 0.7), 5e-5)
     pixels = np.flatnonzero(depth.ravel() > 1e-3)
@@ -333,19 +418,26 @@ def slot_seen(angle_deg: float, length_mm: float, width_mm: float) -> Measuremen
     [(0.0, 40.0, 6.0), (35.0, 50.0, 8.0), (-60.0, 30.0, 10.0)],
 )
 def test_a_long_finding_has_length_width_and_direction(
-    angle_deg: float, length_mm: float, width_mm: float
+    angle_deg: float,
+    length_mm: float,
+    width_mm: float,
 ) -> None:
-    found = slot_seen(angle_deg, length_mm, width_mm)
-    assert found.length_m * 1e3 == pytest.approx(length_mm, rel=0.05)
-    assert found.width_m * 1e3 == pytest.approx(width_mm, rel=0.2)
-    seen_deg = np.degrees(np.arctan2(found.along[1], found.along[0]))
+    measured = slot_seen(angle_deg, length_mm, width_mm)
+    assert measured.length_m * 1e3 == pytest.approx(length_mm, rel=0.05)
+    assert measured.width_m * 1e3 == pytest.approx(width_mm, rel=0.2)
+    seen_deg = np.degrees(np.arctan2(measured.along[1], measured.along[0]))
     assert abs((seen_deg - angle_deg + 90) % 180 - 90) < 2
 
 
 # ---- parts from mesh files
 
 
-def part_file(folder: Path, *, keep: slice = slice(None), name: str = "part.stl") -> Path:
+def part_file(
+    folder: Path,
+    *,
+    keep: slice = slice(None),
+    name: str = "part.stl",
+) -> Path:
     """An ellipsoid of 200 x 160 x 100 mm, without some of its triangles."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=100.0)
     mesh.apply_scale([1.0, 0.8, 0.5])
@@ -376,7 +468,7 @@ def test_damage_lies_on_the_front_of_a_mesh(tmp_path: Path) -> None:
         config.board.thickness_mm,
     ) == pytest.approx((200, 160, 100))
     assert removed_m3(built) == pytest.approx(
-        sum(one.volume_m3 * (-1 if one.raised else 1) for one in built.truth), rel=5e-3
+        sum(damage.volume_m3 * (-1 if damage.raised else 1) for damage in built.truth), rel=5e-3
     )
     face = face_of(config.board)
     x = np.array([0.0, 60e-3, 0.0])
@@ -391,17 +483,22 @@ def test_damage_lies_on_the_front_of_a_mesh(tmp_path: Path) -> None:
 
 
 def test_meshes_that_cannot_be_used_are_refused_with_the_place(tmp_path: Path) -> None:
-    opened = part_file(tmp_path, keep=slice(3, None), name="open.stl")
+    opened = part_file(
+        tmp_path,
+        keep=slice(3, None),
+        name="open.stl",
+    )
     (tmp_path / "no.stl").write_text("no mesh")
-    for file, said in (
+    for file, message in (
         (opened, r"open.stl: open edges: \d+, the first at \("),
         (tmp_path / "part.step", "not triangles"),
         (tmp_path / "absent.stl", "cannot be read"),
         (tmp_path / "no.stl", r"not a (readable )?mesh|are open"),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=message):
             target_from_data({"name": "mesh", "file": str(file)}).declare()
-    first, second = (trimesh.creation.box((20.0, 20.0, 20.0)) for _ in "12")
+    first = trimesh.creation.box((20.0, 20.0, 20.0))
+    second = first.copy()
     trimesh.util.concatenate([first, second.apply_translation([8.0, 7.0, 6.0])]).export(
         tmp_path / "cross.stl"
     )
@@ -440,7 +537,12 @@ def test_a_family_of_damage_on_a_mesh_keeps_to_its_front(tmp_path: Path) -> None
         {
             "name": "drawn",
             "damage": damage,
-            "board": {"width_mm": 200.0, "height_mm": 160.0, "thickness_mm": 100.0, "shape": shape},
+            "board": {
+                "width_mm": 200.0,
+                "height_mm": 160.0,
+                "thickness_mm": 100.0,
+                "shape": shape,
+            },
             "apart_mm": 30.0,
             "edge_mm": 30.0,
         }
@@ -449,5 +551,5 @@ def test_a_family_of_damage_on_a_mesh_keeps_to_its_front(tmp_path: Path) -> None
     for number in range(3):
         built = build_target(family.drawn("damaged", number))
         assert removed_m3(built) == pytest.approx(
-            sum(one.volume_m3 for one in built.truth), rel=1e-2
+            sum(damage.volume_m3 for damage in built.truth), rel=1e-2
         )

@@ -108,17 +108,36 @@ def test_kind_is_told_by_name() -> None:
             ("custom", "holes", 0, "centre_mm", 1),
         ),
         (
-            {"holes": [{"id": 1, "diameter_mm": 5, "centre_mm": [0, 0], "kind": "blind"}]},
+            {
+                "holes": [
+                    {
+                        "id": 1,
+                        "diameter_mm": 5,
+                        "centre_mm": [0, 0],
+                        "kind": "blind",
+                    }
+                ]
+            },
             ("custom", "holes", 0),
         ),
         (
-            {"holes": [{"id": 1, "diameter_mm": 5, "centre_mm": [0, 0], "depth_mm": 3}]},
+            {
+                "holes": [
+                    {
+                        "id": 1,
+                        "diameter_mm": 5,
+                        "centre_mm": [0, 0],
+                        "depth_mm": 3,
+                    }
+                ]
+            },
             ("custom", "holes", 0),
         ),
     ],
 )
 def test_illegal_fields_are_refused_with_their_place(
-    parts: dict[str, object], loc: tuple[str | int, ...]
+    parts: dict[str, object],
+    loc: tuple[str | int, ...],
 ) -> None:
     with pytest.raises(ValidationError) as caught:
         custom(**parts)
@@ -128,9 +147,27 @@ def test_illegal_fields_are_refused_with_their_place(
 def test_ids_are_unique_over_holes_and_dents() -> None:
     with pytest.raises(ValidationError, match="given more than once: 4"):
         TargetConfig(
-            board=BoardConfig(width_mm=300, height_mm=100, thickness_mm=12, shape=FlatConfig()),
-            holes=(HoleConfig(id=4, diameter_mm=5, centre_mm=(0, 0)),),
-            dents=(DentConfig(id=4, diameter_mm=5, depth_mm=1, centre_mm=(50, 0)),),
+            board=BoardConfig(
+                width_mm=300,
+                height_mm=100,
+                thickness_mm=12,
+                shape=FlatConfig(),
+            ),
+            holes=(
+                HoleConfig(
+                    id=4,
+                    diameter_mm=5,
+                    centre_mm=(0, 0),
+                ),
+            ),
+            dents=(
+                DentConfig(
+                    id=4,
+                    diameter_mm=5,
+                    depth_mm=1,
+                    centre_mm=(50, 0),
+                ),
+            ),
         )
 
 

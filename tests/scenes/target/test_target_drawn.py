@@ -36,7 +36,12 @@ DENT = {**THROUGH, "kind": "dent", "depth_mm": [0.5, 3.0]}
 SHAPES = (
     {"kind": "flat"},
     {"kind": "cylinder", "radius_mm": 260.0},
-    {"kind": "cylinder", "radius_mm": 200.0, "straight_along": "x", "bulge": "away"},
+    {
+        "kind": "cylinder",
+        "radius_mm": 200.0,
+        "straight_along": "x",
+        "bulge": "away",
+    },
     {"kind": "sphere", "radius_mm": 300.0},
     {"kind": "sphere", "radius_mm": 300.0, "bulge": "away"},
     {"kind": "polynomial", "terms": [{"power_x": 3, "power_y": 0, "coefficient_mm": 12.0}]},
@@ -93,11 +98,22 @@ def test_every_board_can_be_built(
     tapes = (
         [{"centre_mm": [20.0, 30.0], "size_mm": [60.0, 12.0], "angle_deg": 30.0}] if tape else []
     )
-    board = {"width_mm": 304.8, "height_mm": 203.2, "thickness_mm": 12.7, "shape": shape}
-    drawn = family(board=board, damage=declared, edge_mm=edge_mm, tapes=tapes, seed=seed)
+    board = {
+        "width_mm": 304.8,
+        "height_mm": 203.2,
+        "thickness_mm": 12.7,
+        "shape": shape,
+    }
+    drawn = family(
+        board=board,
+        damage=declared,
+        edge_mm=edge_mm,
+        tapes=tapes,
+        seed=seed,
+    )
     config = drawn.drawn(purpose, number)
     check_target(config)
-    assert [one.id for one in config.damages] == list(range(1, per_board + 1))
+    assert [damage.id for damage in config.damages] == list(range(1, per_board + 1))
     assert sizes(config) == sorted(sizes(config))
     assert min(sizes(config)) >= low
     assert max(sizes(config)) <= low + spread
@@ -105,26 +121,44 @@ def test_every_board_can_be_built(
     reach = np.abs(places(config)) + np.array(sizes(config))[:, None] / 2
     assert (reach <= np.array([304.8, 203.2]) / 2 - edge_mm + 1e-9).all()
     if damage["kind"] == "dent":
-        assert all(one.depth_mm <= one.diameter_mm / 2 for one in config.dents)
+        assert all(damage.depth_mm <= damage.diameter_mm / 2 for damage in config.dents)
 
 
 @pytest.mark.parametrize(
     "shape", SHAPES[1:], ids=["towards", "away", "sphere", "sphere away", "polynomial"]
 )
 @pytest.mark.parametrize("kind", ["through", "dent"])
-def test_crowded_boards_of_bent_faces_can_be_built(shape: dict[str, Any], kind: str) -> None:
+def test_crowded_boards_of_bent_faces_can_be_built(
+    shape: dict[str, Any],
+    kind: str,
+) -> None:
     """As near to one another and to the edge as may be declared: holes through boards so thick
     that their axes come together, dents so shallow that a face that bends away widens them."""
     thickness_mm = {"through": 95.0, "dent": 3.0}[kind]
-    board = {"width_mm": 304.8, "height_mm": 203.2, "thickness_mm": thickness_mm, "shape": shape}
+    board = {
+        "width_mm": 304.8,
+        "height_mm": 203.2,
+        "thickness_mm": thickness_mm,
+        "shape": shape,
+    }
     damage: dict[str, Any] = {"kind": kind, "per_board": 40, "diameter_mm": [10.0, 10.0]}
     if kind == "dent":
         damage["depth_mm"] = [0.14, 0.14]
     with pytest.raises(ValidationError, match="it must be") as refused:
-        family(board=board, damage=damage, edge_mm=0.01, apart_mm=1.0)
+        family(
+            board=board,
+            damage=damage,
+            edge_mm=0.01,
+            apart_mm=1.0,
+        )
     least = re.search(r"it must be ([\d.]+) mm or more", str(refused.value))
     assert least is not None
-    drawn = family(board=board, damage=damage, edge_mm=0.01, apart_mm=float(least[1]) + 0.01)
+    drawn = family(
+        board=board,
+        damage=damage,
+        edge_mm=0.01,
+        apart_mm=float(least[1]) + 0.01,
+    )
     for number in range(3):
         check_target(drawn.drawn("damaged", number))
 
@@ -190,9 +224,10 @@ def test_depths_of_one_kind_do_not_move_those_of_another() -> None:
     """A fixed depth is that depth; a range is covered evenly by each board, apart from the sizes'
     order."""
     assert {
-        one.depth_mm for one in family(damage={**BLIND, "depth_mm": [4.0, 4.0]}).declare().holes
+        damage.depth_mm
+        for damage in family(damage={**BLIND, "depth_mm": [4.0, 4.0]}).declare().holes
     } == {4.0}
-    depths = np.array([one.depth_mm for one in family(damage=BLIND).declare().holes])
+    depths = np.array([damage.depth_mm for damage in family(damage=BLIND).declare().holes])
     assert np.array_equal(np.sort(np.floor((depths - 1.0) / 8.0 * 8)), np.arange(8))
     assert not np.array_equal(np.sort(depths), depths)
 
@@ -223,10 +258,8 @@ def test_pose_and_depth_are_uniform() -> None:
         "roll_deg": 2.0,
     }
     drawn_values = {name: [getattr(pose, name) for pose in poses] for name in limits}
-    limits["distance_m"], drawn_values["distance_m"] = (
-        0.01,
-        [pose.distance_m - 0.7 for pose in poses],
-    )
+    limits["distance_m"] = 0.01
+    drawn_values["distance_m"] = [pose.distance_m - 0.7 for pose in poses]
     for name, limit in limits.items():
         assert (
             stats.kstest(drawn_values[name], stats.uniform(-limit, 2 * limit).cdf).pvalue > ALPHA
@@ -236,8 +269,8 @@ def test_pose_and_depth_are_uniform() -> None:
     for axis, name in enumerate(("first x", "first y")):
         drawn_values[name] = [board.holes[0].centre_mm[axis] for board in boards]
     drawn_values["grain"] = [board.material.grain_seed for board in boards]
-    for (name, values), (other, others) in combinations(drawn_values.items(), 2):
-        assert stats.spearmanr(values, others).pvalue > ALPHA / 55, (name, other)
+    for (name, values), (second_name, second_values) in combinations(drawn_values.items(), 2):
+        assert stats.spearmanr(values, second_values).pvalue > ALPHA / 55, (name, second_name)
     holes = [hole for board in boards for hole in board.holes]
     # independent of the size: the rank correlation of depth and diameter over all holes
     assert (
@@ -276,12 +309,14 @@ def test_backing_fills_every_hole_in_every_pose() -> None:
     corners = backing_corners_board_m(config, config.backing)
     half = np.abs(corners[:, :2]).max(axis=0)
     outline = outline_board_m(drawn.board)
-    seen = []
+    shadow_shares = []
     for pose in drawn.extreme_poses():
         lens = transform_points(invert(pose.T_camera_board), np.zeros(3))
         share = (corners[0, 2] - lens[2]) / (outline[:, 2] - lens[2])
-        seen.append(np.abs(lens + share[:, None] * (outline - lens))[:, :2].max(axis=0) / half)
-    assert np.max(seen, axis=0) == pytest.approx([1.0, 1.0], abs=1e-9)
+        shadow_shares.append(
+            np.abs(lens + share[:, None] * (outline - lens))[:, :2].max(axis=0) / half
+        )
+    assert np.max(shadow_shares, axis=0) == pytest.approx([1.0, 1.0], abs=1e-9)
     declared = family(backing={"distance_mm": 150.0, "size_mm": [90.0, 80.0]}).declare()
     assert declared.backing is not None
     assert declared.backing.size_mm == (90.0, 80.0)
@@ -290,7 +325,11 @@ def test_backing_fills_every_hole_in_every_pose() -> None:
 def test_what_is_in_view_in_the_extreme_poses_always_is() -> None:
     optics = load_camera("azure_kinect_nfov").optics
     for roll_deg in (2.0, 60.0):
-        drawn = family(tilt_deg=20.0, offset_mm=50.0, roll_deg=roll_deg)
+        drawn = family(
+            tilt_deg=20.0,
+            offset_mm=50.0,
+            roll_deg=roll_deg,
+        )
         reach = [_reach_px(drawn, pose, optics) for pose in drawn.extreme_poses()]
         for number in range(30):
             assert (
@@ -301,7 +340,11 @@ def test_what_is_in_view_in_the_extreme_poses_always_is() -> None:
         check_in_view(family().declare().model_copy(update={"pose": pose}), optics)
 
 
-def _reach_px(drawn: DrawnTargetConfig, pose: Any, optics: Any) -> np.ndarray:
+def _reach_px(
+    drawn: DrawnTargetConfig,
+    pose: Any,
+    optics: Any,
+) -> np.ndarray:
     """(4,) how far the board's outline reaches left, up, right and down."""
     pixels = optics.lens.project(
         transform_points(pose.T_camera_board, outline_board_m(drawn.board))
@@ -312,17 +355,17 @@ def _reach_px(drawn: DrawnTargetConfig, pose: Any, optics: Any) -> np.ndarray:
 def test_a_board_too_full_is_refused_with_numbers() -> None:
     full = family(damage={**THROUGH, "per_board": 60})
     message = (
-        r"a board of 304\.8 x 203\.2 mm is too small for 60 damages with centres 40 mm apart and 21 mm from its "
-        r"edge: only (\d+) fit on the 262\.8 x 161\.2 mm that are left"
+        r"a board of 304\.8 x 203\.2 mm is too small for 60 damages with centres 40 mm apart and "
+        r"21 mm from its edge: only (\d+) fit on the 262\.8 x 161\.2 mm that are left"
     )
     with pytest.raises(UserError, match=message) as refused:
         full.declare()
-    found = re.search(message, refused.value.message)
-    assert found is not None
+    match = re.search(message, refused.value.message)
+    assert match is not None
     # of what discs of 40 mm in the densest packing fill, random placement reaches some 60 %
-    most = 0.9069 * (262.8 + 40) * (161.2 + 40) / (np.pi * 20**2)
-    assert 0.5 * most < int(found[1]) < 0.75 * most
-    assert refused.value.legal == f"fewer than {found[1]} damages on this board"
+    densest = 0.9069 * (262.8 + 40) * (161.2 + 40) / (np.pi * 20**2)
+    assert 0.5 * densest < int(match[1]) < 0.75 * densest
+    assert refused.value.legal == f"fewer than {match[1]} damages on this board"
 
 
 @pytest.mark.parametrize(
@@ -349,7 +392,10 @@ def test_a_board_too_full_is_refused_with_numbers() -> None:
         ({"damage": {**THROUGH, "depth_mm": [1.0, 2.0]}}, r"Extra inputs"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(parts: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_drawn_is_refused(
+    parts: dict[str, Any],
+    message: str,
+) -> None:
     with pytest.raises(ValidationError, match=message):
         family(**parts)
 
@@ -365,14 +411,21 @@ def test_damage_too_wide_for_a_bent_face_is_refused() -> None:
     with pytest.raises(
         ValidationError, match=r"31 mm is too wide for a face bent to a radius of 60 mm"
     ):
-        family(board=board, damage=wide, apart_mm=60.0, edge_mm=1.0)
+        family(
+            board=board,
+            damage=wide,
+            apart_mm=60.0,
+            edge_mm=1.0,
+        )
 
 
 def test_the_target_program_shows_any_board(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = tmp_path / "boards.yaml"
-    file.write_text("name: drawn\ndamage: {kind: through, per_board: 2, diameter_mm: [3.0, 9.0]}\n")
+    damage = "damage: {kind: through, per_board: 2, diameter_mm: [3.0, 9.0]}"
+    file.write_text(f"name: drawn\n{damage}\n")
     assert main([str(file), "--board", "5"]) == 0
     shown = capsys.readouterr().out
     for size in sizes(

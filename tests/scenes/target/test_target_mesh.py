@@ -47,24 +47,58 @@ from scenes.target.truth import face_of
 WAVY = PolynomialConfig(
     kind="polynomial",
     terms=(
-        TermConfig(power_x=1, power_y=0, coefficient_mm=20),
-        TermConfig(power_x=2, power_y=0, coefficient_mm=-10),
-        TermConfig(power_x=1, power_y=1, coefficient_mm=5),
-        TermConfig(power_x=3, power_y=0, coefficient_mm=8),
-        TermConfig(power_x=0, power_y=3, coefficient_mm=-2),
+        TermConfig(
+            power_x=1,
+            power_y=0,
+            coefficient_mm=20,
+        ),
+        TermConfig(
+            power_x=2,
+            power_y=0,
+            coefficient_mm=-10,
+        ),
+        TermConfig(
+            power_x=1,
+            power_y=1,
+            coefficient_mm=5,
+        ),
+        TermConfig(
+            power_x=3,
+            power_y=0,
+            coefficient_mm=8,
+        ),
+        TermConfig(
+            power_x=0,
+            power_y=3,
+            coefficient_mm=-2,
+        ),
     ),
 )
 CURVED = [
     CylinderConfig(kind="cylinder", radius_mm=500),
-    CylinderConfig(kind="cylinder", radius_mm=300, bulge="away", straight_along="x"),
+    CylinderConfig(
+        kind="cylinder",
+        radius_mm=300,
+        bulge="away",
+        straight_along="x",
+    ),
     SphereConfig(kind="sphere", radius_mm=1000),
-    SphereConfig(kind="sphere", radius_mm=500, bulge="away"),
+    SphereConfig(
+        kind="sphere",
+        radius_mm=500,
+        bulge="away",
+    ),
     WAVY,
 ]
 
 
 def target(shape: Any = FlatConfig(), **parts: Any) -> TargetConfig:  # noqa: B008
-    board = BoardConfig(width_mm=300, height_mm=100, thickness_mm=12.7, shape=shape)
+    board = BoardConfig(
+        width_mm=300,
+        height_mm=100,
+        thickness_mm=12.7,
+        shape=shape,
+    )
     return TargetConfig(board=board, **parts)
 
 
@@ -73,18 +107,21 @@ def removed_m3(config: TargetConfig, sagitta_m: float) -> list[float]:
     face = face_of(config.board)
     size_m = (config.board.width_mm * 1e-3, config.board.height_mm * 1e-3)
     body = sheet(
-        face, size_m, top_m=0.0, bottom_m=-config.board.thickness_mm * 1e-3, sagitta_m=sagitta_m
+        face,
+        size_m,
+        top_m=0.0,
+        bottom_m=-config.board.thickness_mm * 1e-3,
+        sagitta_m=sagitta_m,
     )
     removed = []
     for damage, item in zip(build_target(config).truth, config.damages, strict=True):
-        left = subtract(body, [cutter(damage, item)])
-        assert left.is_watertight
-        removed.append(float(body.volume - left.volume))
+        remaining = subtract(body, [cutter(damage, item)])
+        assert remaining.is_watertight
+        removed.append(float(body.volume - remaining.volume))
     return removed
 
 
 # ---- volumes
-# ---------------------------------------------------------------------------------------------------------
 
 
 def test_thesis_board_is_watertight_and_each_hole_has_its_volume() -> None:
@@ -106,16 +143,26 @@ def test_thesis_blind_holes_leave_a_floor() -> None:
     board = built.parts[0].mesh
     assert board.is_watertight
     assert board.euler_number == 2
-    whole = 0.6096 * 0.1143 * 12.7e-3
-    assert whole - board.volume == pytest.approx(sum(d.volume_m3 for d in built.truth), rel=1e-9)
+    undamaged_m3 = 0.6096 * 0.1143 * 12.7e-3
+    assert undamaged_m3 - board.volume == pytest.approx(
+        sum(d.volume_m3 for d in built.truth), rel=1e-9
+    )
     assert built.truth[3].volume_m3 == pytest.approx(math.pi / 4 * 6.35e-3**2 * 9.5e-3, rel=1e-9)
     assert {damage.depth_m for damage in built.truth} == {9.5e-3}
 
 
 @pytest.mark.parametrize(("kind", "depth_mm"), [("through", None), ("blind", 6.0)])
-def test_a_chamfer_takes_a_cone_off_the_edge(kind: Any, depth_mm: float | None) -> None:
+def test_a_chamfer_takes_a_cone_off_the_edge(
+    kind: Any,
+    depth_mm: float | None,
+) -> None:
     hole = HoleConfig(
-        id=1, diameter_mm=5, centre_mm=(0, 0), kind=kind, depth_mm=depth_mm, chamfer_mm=0.8
+        id=1,
+        diameter_mm=5,
+        centre_mm=(0, 0),
+        kind=kind,
+        depth_mm=depth_mm,
+        chamfer_mm=0.8,
     )
     config = target(holes=(hole,))
     built = build_target(config)
@@ -134,9 +181,19 @@ def test_a_chamfer_takes_a_cone_off_the_edge(kind: Any, depth_mm: float | None) 
 @pytest.mark.parametrize(
     ("diameter_mm", "depth_mm"), [(20, 0.04), (20, 1), (20, 10), (1, 0.3), (40, 12)]
 )
-def test_dent_on_a_flat_board_is_a_spherical_cap(diameter_mm: float, depth_mm: float) -> None:
+def test_dent_on_a_flat_board_is_a_spherical_cap(
+    diameter_mm: float,
+    depth_mm: float,
+) -> None:
     config = target(
-        dents=(DentConfig(id=1, diameter_mm=diameter_mm, depth_mm=depth_mm, centre_mm=(30, -10)),)
+        dents=(
+            DentConfig(
+                id=1,
+                diameter_mm=diameter_mm,
+                depth_mm=depth_mm,
+                centre_mm=(30, -10),
+            ),
+        )
     )
     truth = build_target(config).truth[0]
     a = diameter_mm / 2
@@ -156,13 +213,37 @@ def test_volumes_on_curved_boards(shape: Any) -> None:
     config = target(
         shape,
         holes=(
-            HoleConfig(id=1, diameter_mm=25.4, centre_mm=(100, 20)),
-            HoleConfig(id=2, diameter_mm=25.4, centre_mm=(-100, 20), kind="blind", depth_mm=9.5),
-            HoleConfig(id=3, diameter_mm=1.6, centre_mm=(-60, -20)),
+            HoleConfig(
+                id=1,
+                diameter_mm=25.4,
+                centre_mm=(100, 20),
+            ),
+            HoleConfig(
+                id=2,
+                diameter_mm=25.4,
+                centre_mm=(-100, 20),
+                kind="blind",
+                depth_mm=9.5,
+            ),
+            HoleConfig(
+                id=3,
+                diameter_mm=1.6,
+                centre_mm=(-60, -20),
+            ),
         ),
         dents=(
-            DentConfig(id=4, diameter_mm=20, depth_mm=2, centre_mm=(0, 0)),
-            DentConfig(id=5, diameter_mm=20, depth_mm=10, centre_mm=(40, 20)),
+            DentConfig(
+                id=4,
+                diameter_mm=20,
+                depth_mm=2,
+                centre_mm=(0, 0),
+            ),
+            DentConfig(
+                id=5,
+                diameter_mm=20,
+                depth_mm=10,
+                centre_mm=(40, 20),
+            ),
         ),
     )
     built = build_target(config)
@@ -181,10 +262,22 @@ def test_dent_on_a_sphere_is_a_lens_of_two_spheres() -> None:
         width_mm=60,
         height_mm=60,
         thickness_mm=12,
-        shape=SphereConfig(kind="sphere", radius_mm=100, bulge="towards"),
+        shape=SphereConfig(
+            kind="sphere",
+            radius_mm=100,
+            bulge="towards",
+        ),
     )
     config = TargetConfig(
-        board=board, dents=(DentConfig(id=1, diameter_mm=20, depth_mm=2, centre_mm=(0, 0)),)
+        board=board,
+        dents=(
+            DentConfig(
+                id=1,
+                diameter_mm=20,
+                depth_mm=2,
+                centre_mm=(0, 0),
+            ),
+        ),
     )
     big = 100.0
     small = 26.0
@@ -224,7 +317,12 @@ def test_any_hole_in_a_flat_board(
     config = target(
         holes=(hole,),
         material=MaterialConfig(grain_contrast=0.0),
-        pose=PoseConfig(distance_m=1.0, tilt_x_deg=pose[0], tilt_y_deg=pose[1], roll_deg=pose[2]),
+        pose=PoseConfig(
+            distance_m=1.0,
+            tilt_x_deg=pose[0],
+            tilt_y_deg=pose[1],
+            roll_deg=pose[2],
+        ),
     )
     built = build_target(config)
     board = built.parts[0].mesh
@@ -236,13 +334,23 @@ def test_any_hole_in_a_flat_board(
 
 
 # ---- frames
-# ----------------------------------------------------------------------------------------------------------
 
 
 def test_frames_at_zero_tilt() -> None:
-    hole = HoleConfig(id=1, diameter_mm=5, centre_mm=(40, 30))
+    hole = HoleConfig(
+        id=1,
+        diameter_mm=5,
+        centre_mm=(40, 30),
+    )
     built = build_target(
-        target(holes=(hole,), pose=PoseConfig(distance_m=0.7, offset_x_mm=10, offset_y_mm=-20))
+        target(
+            holes=(hole,),
+            pose=PoseConfig(
+                distance_m=0.7,
+                offset_x_mm=10,
+                offset_y_mm=-20,
+            ),
+        )
     )
     damage = built.truth[0]
     assert damage.centre_camera_m == pytest.approx([0.050, -0.050, 0.7], abs=1e-12)
@@ -258,7 +366,10 @@ def test_frames_at_zero_tilt() -> None:
     ("turn", "nearer_mm"),
     [({"tilt_x_deg": 10.0}, (0, 40, 0)), ({"tilt_y_deg": 10.0}, (-100, 0, 0))],
 )
-def test_signs_of_tilts(turn: dict[str, float], nearer_mm: tuple[float, ...]) -> None:
+def test_signs_of_tilts(
+    turn: dict[str, float],
+    nearer_mm: tuple[float, ...],
+) -> None:
     T_camera_board = build_target(target(pose=PoseConfig(**turn))).T_camera_board
     z_m = transform_points(T_camera_board, np.array(nearer_mm) * 1e-3)[2]
     assert 0.7 - z_m == pytest.approx(math.sin(math.radians(10)) * np.linalg.norm(nearer_mm) * 1e-3)
@@ -287,7 +398,6 @@ def test_truth_rows_are_millimetres() -> None:
 
 
 # ---- faces
-# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [FlatConfig(), *CURVED], ids=lambda shape: shape.kind)
@@ -311,7 +421,15 @@ def test_curvatures_of_round_faces() -> None:
     y = np.array([0.0, 0.03])
     ball = face_of(target(SphereConfig(kind="sphere", radius_mm=500)).board)
     assert ball.curvatures(x, y) == pytest.approx(np.full((2, 2), 2.0), rel=1e-6)
-    trough = face_of(target(CylinderConfig(kind="cylinder", radius_mm=250, bulge="away")).board)
+    trough = face_of(
+        target(
+            CylinderConfig(
+                kind="cylinder",
+                radius_mm=250,
+                bulge="away",
+            )
+        ).board
+    )
     assert trough.curvatures(x, y) == pytest.approx(np.array([[0.0, -4.0]] * 2), abs=1e-9)
 
 
@@ -350,11 +468,15 @@ def test_back_face_is_parallel() -> None:
 
 
 # ---- what else stands there
-# ------------------------------------------------------------------------------------------
 
 
 def test_tape_lies_on_the_face_with_its_size_and_angle() -> None:
-    tape = TapeConfig(centre_mm=(50, 10), size_mm=(40, 12), angle_deg=30, thickness_mm=0.15)
+    tape = TapeConfig(
+        centre_mm=(50, 10),
+        size_mm=(40, 12),
+        angle_deg=30,
+        thickness_mm=0.15,
+    )
     built = build_target(target(tapes=(tape,)))
     strip = built.parts[1]
     assert strip.name == "tape_1"
@@ -388,7 +510,12 @@ def test_backing_of_a_bulging_board_clears_its_deepest_point() -> None:
 
 
 def test_room_faces_the_light() -> None:
-    room = RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5, width_m=4, height_m=2.5)
+    room = RoomConfig(
+        floor_below_lens_m=0.75,
+        back_wall_distance_m=2.5,
+        width_m=4,
+        height_m=2.5,
+    )
     built = build_target(target(room=room))
     parts = {part.name: part for part in built.parts}
     assert list(parts) == ["board", "floor", "back_wall"]
@@ -403,7 +530,6 @@ def test_room_faces_the_light() -> None:
 
 
 # ---- textures
-# --------------------------------------------------------------------------------------------------------
 
 
 def test_grain_has_mean_contrast_and_direction() -> None:
@@ -472,7 +598,15 @@ def test_look_up_is_bilinear_between_texel_centres() -> None:
 def test_board_uv_follow_the_plan() -> None:
     """Row 0 is the board's upper edge, column 0 its -x edge."""
     built: Target = build_target(
-        target(holes=(HoleConfig(id=1, diameter_mm=20, centre_mm=(50, 10)),))
+        target(
+            holes=(
+                HoleConfig(
+                    id=1,
+                    diameter_mm=20,
+                    centre_mm=(50, 10),
+                ),
+            )
+        )
     )
     board = built.parts[0]
     assert board.uv is not None

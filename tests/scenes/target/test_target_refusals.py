@@ -16,14 +16,27 @@ BOARD: dict[str, Any] = {"width_mm": 300, "height_mm": 100, "thickness_mm": 12}
 
 
 def hole(
-    number: int, diameter_mm: float, x_mm: float, y_mm: float, depth_mm: float | None = None
+    number: int,
+    diameter_mm: float,
+    x_mm: float,
+    y_mm: float,
+    depth_mm: float | None = None,
 ) -> dict[str, Any]:
     blind = {} if depth_mm is None else {"kind": "blind", "depth_mm": depth_mm}
-    return {"id": number, "diameter_mm": diameter_mm, "centre_mm": [x_mm, y_mm], **blind}
+    return {
+        "id": number,
+        "diameter_mm": diameter_mm,
+        "centre_mm": [x_mm, y_mm],
+        **blind,
+    }
 
 
 def dent(
-    number: int, diameter_mm: float, depth_mm: float, x_mm: float = 0, y_mm: float = 0
+    number: int,
+    diameter_mm: float,
+    depth_mm: float,
+    x_mm: float = 0,
+    y_mm: float = 0,
 ) -> dict[str, Any]:
     return {
         "id": number,
@@ -104,7 +117,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"board": round_board("sphere", 190)}, r"sphere of radius 190 mm .* reaches 158.114 mm"),
     (
         {"board": {**round_board("cylinder", 200), "thickness_mm": 101}},
-        r"radius of curvature 200 mm is too small for a thickness of 101 mm; it must be 202 mm or more",
+        r"radius of curvature 200 mm is too small for a thickness of 101 mm; "
+        r"it must be 202 mm or more",
     ),
     (
         {
@@ -152,7 +166,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("parts", "message"), REFUSED)
-def test_refused_with_name_and_numbers(parts: dict[str, Any], message: str) -> None:
+def test_refused_with_name_and_numbers(
+    parts: dict[str, Any],
+    message: str,
+) -> None:
     config = target_from_data({"name": "custom", "board": BOARD, **parts}).declare()
     with pytest.raises(UserError, match=message):
         build_target(config)
@@ -234,7 +251,12 @@ def test_a_face_that_needs_too_many_cells() -> None:
     config = target_from_data(
         {
             "name": "custom",
-            "board": {"width_mm": 5000, "height_mm": 5000, "thickness_mm": 12, "shape": shape},
+            "board": {
+                "width_mm": 5000,
+                "height_mm": 5000,
+                "thickness_mm": 12,
+                "shape": shape,
+            },
         }
     ).declare()
     with pytest.raises(UserError, match="cells for an error below 2 um"):

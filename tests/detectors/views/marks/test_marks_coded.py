@@ -31,14 +31,14 @@ def tags(places: dict[int, tuple[float, float]], codes: dict[int, int] | None = 
 
     def paint(xy: np.ndarray) -> np.ndarray:
         colours = np.broadcast_to(np.array(WOOD, float), (*xy.shape[:-1], 3)).copy()
-        for key, place in places.items():
+        for key, position in places.items():
             modules = np.pad(
                 dictionary.generateImageMarker((codes or {}).get(key, key), 8),
                 1,
                 constant_values=255,
             )
             # the board's y is up, a picture's rows go down
-            cell = np.floor((xy - place) * [1, -1] / (TAG_M / 8) + 5).astype(int)
+            cell = np.floor((xy - position) * [1, -1] / (TAG_M / 8) + 5).astype(int)
             on = np.all((cell >= 0) & (cell < 10), axis=-1)
             colours[on] = np.clip(modules[cell[on][:, 1], cell[on][:, 0]], 20, 235)[:, None]
         return colours

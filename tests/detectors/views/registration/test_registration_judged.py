@@ -9,10 +9,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from detectors.rigid_motion import displacement_jacobian
 from detectors.views.registration.register import judge, register
 from detectors.views.registration.registered import (
     Registration,
-    displacement_jacobian,
     predicted_error_m,
     sampling_of,
     still_moving,

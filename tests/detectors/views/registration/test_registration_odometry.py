@@ -36,7 +36,7 @@ def test_it_follows_a_walk_and_drifts():
 
 
 def test_the_same_walk_gives_the_same_bits():
-    made = [each.prepared for each in views(WALK[:3], noise_m=2e-4, textured=True)]
+    made = [view.prepared for view in views(WALK[:3], noise_m=2e-4, textured=True)]
     first = register_by_odometry(made)
     second = register_by_odometry(made)
     assert [a.T_reference_view.tobytes() for a in first] == [
@@ -45,7 +45,7 @@ def test_the_same_walk_gives_the_same_bits():
 
 
 def test_after_a_view_that_shows_nothing_it_is_lost_for_good():
-    made = [each.prepared for each in views(WALK[:4], noise_m=2e-4, textured=True)]
+    made = [view.prepared for view in views(WALK[:4], noise_m=2e-4, textured=True)]
     nothing = np.zeros_like(made[2].inside)
     # only a corner of three pixels is left of the target
     nothing[tuple(np.argwhere(made[2].inside)[:3].T)] = True

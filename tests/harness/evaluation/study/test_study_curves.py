@@ -13,9 +13,10 @@ from scipy import special, stats
 
 from harness.evaluation.intervals import false_call_rate
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curve
-from harness.evaluation.study.limit import SetUpLimit, limit_of, surface_of
+from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.result import FRAMES, axis_lines, difference
+from harness.evaluation.study.surface import surface_of
 from harness.records.trials import ResultTables
 from tests.support.synthetic_study import (
     PIXEL_GRID,
@@ -40,8 +41,8 @@ def loud() -> ResultTables:
 def two_boards(findings: list[tuple[str, int, float, float, str]]) -> ResultTables:
     """Boards 0 and 1 with a damage at (0, 0) and (50, 0), hole-free board 9; findings (role,
     board, x, y, hole)."""
-    place = {"hole": ["a", "b"], "true_x_mm": [0.0, 50.0], "true_y_mm": [0.0, 0.0]}
-    holes = pd.DataFrame({"board": [0, 1], "repeat": 0, **place})
+    damages = {"hole": ["a", "b"], "true_x_mm": [0.0, 50.0], "true_y_mm": [0.0, 0.0]}
+    holes = pd.DataFrame({"board": [0, 1], "repeat": 0, **damages})
     runs = pd.DataFrame(
         {"role": ["damaged", "damaged", "hole_free"], "board": [0, 1, 9], "repeat": 0}
     )
@@ -62,14 +63,15 @@ class TestChance:
                 ("hole_free", 9, 0.0, -4.9, ""),
             ]
         )
-        found = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0)
+        chance = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0)
         # a over board 1: hit; b over board 0: not; a, b over board 9: one of two
-        assert (found.laid, found.probability) == (4, 0.5)
+        assert chance.laid == 4
+        assert chance.probability == 0.5
 
     def test_findings_that_count_for_damage_are_no_chance(self):
         tables = two_boards([("damaged", 1, 0.0, 0.0, "b")])
-        found = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0)
-        assert found.probability == 0
+        chance = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0)
+        assert chance.probability == 0
 
     def test_the_radius_is_included(self):
         tables = two_boards([("hole_free", 9, 0.0, 5.0, "")])
@@ -84,23 +86,23 @@ class TestChance:
 
     def test_findings_spread_evenly_hit_as_their_rate_says(self, loud):
         rate = false_call_rate(int(LOUD * 7.5), 7.5)
-        found = chance_hits(loud.holes, loud.sites, loud.runs, loud.findings, RADIUS_MM, rate)
+        chance = chance_hits(loud.holes, loud.sites, loud.runs, loud.findings, RADIUS_MM, rate)
         expected = -np.expm1(-LOUD * np.pi * (RADIUS_MM / 1000) ** 2)
-        assert found.expected == pytest.approx(expected, rel=1e-12)
-        assert found.probability == pytest.approx(expected, rel=0.3)
-        assert found.laid == 240 * 59
-        assert (
-            found.sites == 240 and found.sites_interval.low < expected < found.sites_interval.high
-        )
-        assert found.of_sites == loud.sites["detected"].mean()
+        assert chance.expected == pytest.approx(expected, rel=1e-12)
+        assert chance.probability == pytest.approx(expected, rel=0.3)
+        assert chance.laid == 240 * 59
+        assert chance.sites == 240
+        assert chance.sites_interval.low < expected < chance.sites_interval.high
+        assert chance.of_sites == loud.sites["detected"].mean()
 
     def test_repeats_of_a_site_are_shares_of_it(self):
         tables = two_boards([])
         sites = pd.DataFrame(
             {"board": [9, 9, 8], "hole": "a", "repeat": [0, 1, 0], "detected": [True, False, False]}
         )
-        found = chance_hits(tables.holes, sites, tables.runs, tables.findings, 5.0)
-        assert (found.sites, found.of_sites) == (2, 0.25)
+        chance = chance_hits(tables.holes, sites, tables.runs, tables.findings, 5.0)
+        assert chance.sites == 2
+        assert chance.of_sites == 0.25
 
 
 class TestRoc:
@@ -111,7 +113,7 @@ class TestRoc:
         ranks = stats.mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
         assert curve.area == pytest.approx(ranks, rel=1e-12)
         assert np.trapezoid(curve.true, curve.false) == pytest.approx(ranks, rel=1e-9)
-        assert curve.at == ((negative > THRESHOLD).mean(), (positive > THRESHOLD).mean())
+        assert curve.in_use == ((negative > THRESHOLD).mean(), (positive > THRESHOLD).mean())
 
     def test_ties_and_unjudged_places_by_hand(self):
         """Signals 2, 1, none against 1, none: won 2 + 1.5 + 0.5 of 6."""
@@ -121,8 +123,11 @@ class TestRoc:
         sites = pd.DataFrame({"board": [8, 9], "signal": [1.0, np.nan]})
         curve = roc_curve(holes, sites, 0.5)
         assert curve.area == pytest.approx(4 / 6)
-        assert curve.at == (0.5, pytest.approx(2 / 3))
-        assert (curve.false[0], curve.true[0], curve.false[-1], curve.true[-1]) == (0, 0, 1, 1)
+        assert curve.in_use == (0.5, pytest.approx(2 / 3))
+        assert curve.false[0] == 0
+        assert curve.true[0] == 0
+        assert curve.false[-1] == 1
+        assert curve.true[-1] == 1
 
     def test_none_without_sites(self, loud):
         assert roc_curve(loud.holes, loud.sites.iloc[:0], THRESHOLD) is None
@@ -131,20 +136,20 @@ class TestRoc:
 class TestFreeResponse:
     def test_the_threshold_in_use_lies_on_the_curve(self, loud):
         curve = free_response(loud.operating, loud.runs, loud.holes)
-        here = np.flatnonzero(curve.threshold == THRESHOLD)[0]
-        assert curve.at == (curve.false_calls_per_m2[here], curve.found[here])
-        assert curve.at[1] == loud.holes["detected"].mean()
-        assert curve.found_low[here] < curve.at[1] < curve.found_high[here]
+        index = np.flatnonzero(curve.threshold == THRESHOLD)[0]
+        assert curve.in_use == (curve.false_calls_per_m2[index], curve.found_share[index])
+        assert curve.in_use[1] == loud.holes["detected"].mean()
+        assert curve.found_low[index] < curve.in_use[1] < curve.found_high[index]
         assert curve.area_m2 == pytest.approx(30 * 0.25)
 
     def test_the_rate_is_that_of_hole_free_boards_alone(self, loud):
         """So it is the table's, though damaged boards have false calls of their own."""
         curve = free_response(loud.operating, loud.runs, loud.holes)
         runs = loud.runs[loud.runs["role"] == "hole_free"]
-        assert curve.at[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
-        more = loud.operating.copy()
-        more.loc[more["role"] == "damaged", "findings"] = more["findings"] + 7
-        again = free_response(more, loud.runs, loud.holes)
+        assert curve.in_use[0] == runs["false_calls"].sum() / runs["inspected_m2"].sum()
+        operating = loud.operating.copy()
+        operating.loc[operating["role"] == "damaged", "findings"] = operating["findings"] + 7
+        again = free_response(operating, loud.runs, loud.holes)
         assert np.array_equal(again.false_calls_per_m2, curve.false_calls_per_m2)
 
     def test_what_folds_back_is_left_out(self):
@@ -172,19 +177,21 @@ class TestFreeResponse:
         curve = free_response(pd.concat([free, hits]), runs, holes, draws=10)
         assert curve.threshold.tolist() == [6.0, 5.0, 3.0, 2.0]
         assert curve.false_calls_per_m2.tolist() == [0.0, 4.0, 4.0, 6.0]
-        assert curve.found.tolist() == [0.0, 0.5, 0.5, 1.0] and curve.at == (4.0, 0.5)
+        assert curve.found_share.tolist() == [0.0, 0.5, 0.5, 1.0]
+        assert curve.in_use == (4.0, 0.5)
 
     def test_none_without_hole_free_boards(self, loud):
         runs = loud.runs[loud.runs["role"] == "damaged"]
         assert free_response(loud.operating, runs, loud.holes) is None
 
     def test_false_calls_fall_as_their_scores_do(self, loud):
-        """Scores are exponential, so the logarithm of the rate falls by 1 in a unit of threshold."""
+        """Scores are exponential: the logarithm of the rate falls by 1 in a unit of threshold."""
         curve = free_response(loud.operating, loud.runs, loud.holes)
         expected = LOUD * np.exp(THRESHOLD - curve.threshold)
         scatter = np.sqrt(expected / curve.area_m2)
         assert np.all(np.abs(curve.false_calls_per_m2 - expected) < 4 * scatter)
-        assert np.all(np.diff(curve.found) >= 0) and np.all(np.diff(curve.threshold) < 0)
+        assert np.all(np.diff(curve.found_share) >= 0)
+        assert np.all(np.diff(curve.threshold) < 0)
 
 
 class TestPixels:
@@ -213,7 +220,8 @@ class TestPixels:
     def test_thresholds_that_end_early_give_no_overlap_score(self, loud):
         above = [counts[PIXEL_GRID > 1.0] for counts in loud.pixels["above"]]
         curves = pixel_curves(loud.pixels.assign(above=above))
-        assert np.isnan(curves.pro) and "0.1" in curves.why
+        assert np.isnan(curves.pro)
+        assert "0.1" in curves.why
 
     def test_none_without_damage(self, loud):
         assert pixel_curves(loud.pixels[loud.pixels["hole"] == ""]) is None
@@ -226,31 +234,37 @@ class TestSurface:
 
     def test_agrees_with_statsmodels(self):
         sm = pytest.importorskip("statsmodels.api")
-        seen = (record := study_record(self.study(mm_per_depth_mm=0.4)).set_ups[0]).inspected
+        inspected = (record := study_record(self.study(mm_per_depth_mm=0.4)).set_ups[0]).inspected
         surface, _ = surface_of(record)
-        columns = [np.ones(len(seen.hit)), np.log(seen.diameter_mm), np.log(seen.depth_mm)]
+        columns = [
+            np.ones(len(inspected.hit)),
+            np.log(inspected.diameter_mm),
+            np.log(inspected.depth_mm),
+        ]
         link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[
             surface.link
         ]
         fit = sm.GLM(
-            seen.hit.astype(float), np.column_stack(columns), family=sm.families.Binomial(link)
+            inspected.hit.astype(float), np.column_stack(columns), family=sm.families.Binomial(link)
         ).fit()
-        assert surface.b[:3] == pytest.approx(fit.params, rel=1e-5) and surface.b[3] == 0
+        assert surface.b[:3] == pytest.approx(fit.params, rel=1e-5)
+        assert surface.b[3] == 0
         assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
 
     def drawn(self, predictor: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> SetUpRecord:
         """Hits of chance expit(predictor(ln a, ln d)) on the study's damage."""
         record = study_record(self.study()).set_ups[0]
-        seen = record.inspected
-        chance = special.expit(predictor(np.log(seen.diameter_mm), np.log(seen.depth_mm)))
+        inspected = record.inspected
+        chance = special.expit(predictor(np.log(inspected.diameter_mm), np.log(inspected.depth_mm)))
         hit = np.random.default_rng(5).random(len(chance)) < chance
-        return dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
+        return dataclasses.replace(record, inspected=dataclasses.replace(inspected, hit=hit))
 
     def test_an_interaction_that_the_data_show_is_fitted(self):
         sm = pytest.importorskip("statsmodels.api")
         record = self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d)
         surface, why = surface_of(record, draws=50)
-        assert why == surface.note == "" and surface.interaction_p < 0.05
+        assert why == surface.note == ""
+        assert surface.interaction_p < 0.05
         a = np.log(record.inspected.diameter_mm)
         d = np.log(record.inspected.depth_mm)
         link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[
@@ -272,10 +286,10 @@ class TestSurface:
         assert surface.pod(surface.diameter_mm, surface.d90_mm)[reached] == pytest.approx(
             0.9, abs=1e-9
         )
-        assert reached.sum() > 15 and np.all(np.diff(surface.d90_mm[reached]) < 0)
-        assert np.all(surface.d90_low_mm <= surface.d90_mm) and np.all(
-            surface.d90_mm <= surface.d90_high_mm
-        )
+        assert reached.sum() > 15
+        assert np.all(np.diff(surface.d90_mm[reached]) < 0)
+        assert np.all(surface.d90_low_mm <= surface.d90_mm)
+        assert np.all(surface.d90_mm <= surface.d90_high_mm)
 
     @pytest.mark.slow
     def test_the_depth_found_holds_the_truth(self):
@@ -284,21 +298,26 @@ class TestSurface:
         record = study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[
             0
         ]
-        held = 0
-        seen = record.inspected
-        chance = special.expit(-18.0 + 9.0 * np.log(seen.diameter_mm) + 3.0 * np.log(seen.depth_mm))
+        covered = 0
+        inspected = record.inspected
+        chance = special.expit(
+            -18.0 + 9.0 * np.log(inspected.diameter_mm) + 3.0 * np.log(inspected.depth_mm)
+        )
         for seed in range(15):
             hit = np.random.default_rng(seed).random(len(chance)) < chance
-            again = dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
+            again = dataclasses.replace(record, inspected=dataclasses.replace(inspected, hit=hit))
             surface, _ = surface_of(again, draws=100)
-            at = int(np.abs(surface.diameter_mm - 5.0).argmin())
-            true = np.exp((special.logit(0.9) + 18.0 - 9.0 * np.log(surface.diameter_mm[at])) / 3.0)
-            held += surface.d90_low_mm[at] < true < surface.d90_high_mm[at]
-        assert held >= 11
+            index = int(np.abs(surface.diameter_mm - 5.0).argmin())
+            true = np.exp(
+                (special.logit(0.9) + 18.0 - 9.0 * np.log(surface.diameter_mm[index])) / 3.0
+            )
+            covered += surface.d90_low_mm[index] < true < surface.d90_high_mm[index]
+        assert covered >= 11
 
     def test_a_chance_that_falls_with_diameter_has_none(self):
         surface, why = surface_of(self.drawn(lambda a, d: 3.0 - 2.0 * a + 0.5 * d))
-        assert surface is None and why == "the probability of detection does not grow with diameter"
+        assert surface is None
+        assert why == "the probability of detection does not grow with diameter"
 
     def test_a_chance_that_falls_with_depth_is_said(self):
         surface, _ = surface_of(self.drawn(lambda a, d: -3.0 + 4.0 * a - 2.0 * d), draws=50)
@@ -306,16 +325,18 @@ class TestSurface:
 
     def test_refused_where_depth_does_not_vary(self):
         surface, why = surface_of(study_record(Study(hole_free_boards=0)).set_ups[0])
-        assert surface is None and why == "depth does not vary: 5 to 5 mm"
+        assert surface is None
+        assert why == "depth does not vary: 5 to 5 mm"
 
     def test_refused_where_a_plane_parts_hits_from_misses(self):
         record = study_record(self.study()).set_ups[0]
-        seen = record.inspected
-        hit = np.log(seen.diameter_mm) + 0.3 * np.log(seen.depth_mm) > 2.2
+        inspected = record.inspected
+        hit = np.log(inspected.diameter_mm) + 0.3 * np.log(inspected.depth_mm) > 2.2
         surface, why = surface_of(
-            dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
+            dataclasses.replace(record, inspected=dataclasses.replace(inspected, hit=hit))
         )
-        assert surface is None and "separation" in why
+        assert surface is None
+        assert "separation" in why
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +352,7 @@ def limits() -> list[SetUpLimit]:
         boards=30,
         hole_free_boards=0,
     )
-    return [limit_of(one, draws=200) for one in study_record(study).set_ups]
+    return [limit_of(record, draws=200) for record in study_record(study).set_ups]
 
 
 class TestAxes:
@@ -342,24 +363,18 @@ class TestAxes:
             ("camera", ("b", "a")),
             (FRAMES, (1, 20)),
         ]
-        assert (
-            lines[0].held == {"camera": "b", FRAMES: 1}
-            and lines[0].numeric
-            and not lines[1].numeric
-        )
+        assert lines[0].fixed == {"camera": "b", FRAMES: 1}
+        assert lines[0].numeric
+        assert not lines[1].numeric
         assert lines[0].limits == (limits[2], limits[0])
 
     def test_what_differs_is_told_from_what_does_not(self, limits):
         distance, camera, _ = axis_lines(limits)
-        assert (
-            distance.steps[0].paired
-            and distance.steps[0].beyond_chance
-            and distance.steps[0].interval.low > 1
-        )
-        assert (
-            not camera.steps[0].beyond_chance
-            and camera.steps[0].interval.low < 1 < camera.steps[0].interval.high
-        )
+        assert distance.steps[0].paired
+        assert distance.steps[0].beyond_chance
+        assert distance.steps[0].interval.low > 1
+        assert not camera.steps[0].beyond_chance
+        assert camera.steps[0].interval.low < 1 < camera.steps[0].interval.high
         assert distance.steps[0].ratio == limits[0].a90_mm / limits[2].a90_mm
         assert len(distance.steps) == 1
 
@@ -372,14 +387,18 @@ class TestAxes:
             boards=30,
             hole_free_boards=0,
         )
-        one, other = (limit_of(record, draws=300) for record in study_record(study).set_ups)
-        paired = difference(one, other)
+        records = study_record(study).set_ups
+        first = limit_of(records[0], draws=300)
+        second = limit_of(records[1], draws=300)
+        paired = difference(first, second)
         elsewhere = dataclasses.replace(
-            other.record.inspected, x_mm=other.record.inspected.x_mm + 1
+            second.record.inspected, x_mm=second.record.inspected.x_mm + 1
         )
-        moved = dataclasses.replace(other.record, targets_digest="others", inspected=elsewhere)
-        apart = difference(one, dataclasses.replace(other, record=moved))
-        assert paired.paired and not apart.paired and apart.ratio == paired.ratio
-        assert apart.interval.high - apart.interval.low > 1.5 * (
+        moved = dataclasses.replace(second.record, targets_digest="others", inspected=elsewhere)
+        unpaired = difference(first, dataclasses.replace(second, record=moved))
+        assert paired.paired
+        assert not unpaired.paired
+        assert unpaired.ratio == paired.ratio
+        assert unpaired.interval.high - unpaired.interval.low > 1.5 * (
             paired.interval.high - paired.interval.low
         )

@@ -36,26 +36,27 @@ EMPTY: dict[str, list[Any]] = {name: [] for name in DATA["set_ups"][0]["inspecte
 
 def changed(path: tuple[str | int, ...], value: Any) -> Any:
     data = copy.deepcopy(DATA)
-    at = data
+    container = data
     for step in path[:-1]:
-        at = at[step]
+        container = container[step]
     if value is MISSING:
-        del at[path[-1]]
+        del container[path[-1]]
     else:
-        at[path[-1]] = value
+        container[path[-1]] = value
     return data
 
 
 def refusal(file: Path) -> UserError:
     with pytest.raises(UserError) as caught:
         read_record(file)
-    assert str(file) in caught.value.message and (caught.value.fix or caught.value.legal)
+    assert str(file) in caught.value.message
+    assert caught.value.fix or caught.value.legal
     return caught.value
 
 
 def test_written_and_read_it_is_the_same(tmp_path):
     by_depth = STUDY.set_ups[0].inspected.hit
-    seen = replace(
+    inspected = replace(
         STUDY.set_ups[0].inspected,
         signal=np.where(np.arange(12) == 3, np.nan, 2.5),
         by_depth=by_depth,
@@ -63,7 +64,10 @@ def test_written_and_read_it_is_the_same(tmp_path):
     )
     study = replace(
         STUDY,
-        set_ups=(replace(STUDY.set_ups[0], inspected=seen, threshold_mm=np.nan), STUDY.set_ups[1]),
+        set_ups=(
+            replace(STUDY.set_ups[0], inspected=inspected, threshold_mm=np.nan),
+            STUDY.set_ups[1],
+        ),
     )
     text = record_text(study)
     assert "NaN" not in text, "JSON has no such word"
@@ -73,10 +77,10 @@ def test_written_and_read_it_is_the_same(tmp_path):
     for field in fields(StudyRecord):
         if field.name != "set_ups":
             assert getattr(again, field.name) == getattr(study, field.name)
-    for one, other in zip(study.set_ups, again.set_ups, strict=True):
+    for first, second in zip(study.set_ups, again.set_ups, strict=True):
         for field in fields(SetUpRecord):
-            a = getattr(one, field.name)
-            b = getattr(other, field.name)
+            a = getattr(first, field.name)
+            b = getattr(second, field.name)
             if isinstance(a, Inspected | Unflawed | Calibrated):
                 for column in fields(a):
                     before = getattr(a, column.name)
@@ -135,11 +139,17 @@ def test_written_and_read_it_is_the_same(tmp_path):
         (("further",), 1, "further: "),
     ],
 )
-def test_a_damaged_one_is_told_with_its_place(tmp_path, path, value, told):
+def test_a_damaged_one_is_told_with_its_place(
+    tmp_path,
+    path,
+    value,
+    told,
+):
     file = tmp_path / "study.json"
     file.write_text(json.dumps(changed(path, value)))
     mistake = refusal(file)
-    assert f"{file}: is damaged: " in mistake.message and told in mistake.message
+    assert f"{file}: is damaged: " in mistake.message
+    assert told in mistake.message
     assert "run the study again" in (mistake.fix or "")
 
 
@@ -153,4 +163,6 @@ def test_several_mistakes_are_counted(tmp_path):
 def test_what_is_no_json_is_told_what_to_do(tmp_path, content):
     (tmp_path / "no.json").write_bytes(content)
     mistake = refusal(tmp_path / "no.json")
-    assert "is not JSON" in mistake.message and mistake.fix and mistake.legal
+    assert "is not JSON" in mistake.message
+    assert mistake.fix
+    assert mistake.legal

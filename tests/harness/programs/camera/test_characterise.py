@@ -15,7 +15,8 @@ from ruamel.yaml import YAML
 from harness.programs.camera import characterise
 from harness.vocabulary.geometry import MM, Lens
 from scenes.closed_form import Plane, image_view
-from scenes.sensor.camera import CameraConfig, EffectsConfig, load_camera, read_camera
+from scenes.sensor.camera import load_camera, read_camera
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.source import SimulatedUnit
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from harness.programs.camera.export_noise import main, noise_table
-from harness.trials.trial import pair_noise
+from harness.trials.clouds import pair_noise
 from scenes.sensor.calibration import unit_before_plane
 from scenes.sensor.camera import load_camera
-from scenes.sensor.tabled import DepthNoise, TorchDepthNoise
+from scenes.sensor.common.tabled import DepthNoise, TorchDepthNoise
 
 PAIRS = 15
 table_of = lru_cache(lambda name: noise_table(load_camera(name)))

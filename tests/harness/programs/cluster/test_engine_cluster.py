@@ -277,7 +277,7 @@ def renders_and_set_ups(experiment: Path, cache: Path) -> tuple[list[Job], list[
     ]
     batches = [batch for group in plan.groups for batch in group.batches]
     loads = [
-        Job(f"load {n} {again}", "trials", probes_of, (batch.set_ups[0],))
+        Job(f"load {n} {again}", "trials", probes_of, (batch.views[0],))
         for n, batch in enumerate(batches)
         for again in range(4)
     ]
@@ -300,8 +300,8 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tin
     assert again[renders[0].name].value[0] is True
     assert all(read_view(cache / job.name) is not None for job in renders)
     assert {how.state for how in ended.values()} == {"done"}, ended
-    assert len({how.worker for how in looks.values()}) == 2
-    assert all(how.value == [] for how in looks.values()), "a worker loaded Mitsuba"
+    assert len({look.worker for look in looks.values()}) == 2
+    assert all(look.value == [] for look in looks.values()), "a worker loaded Mitsuba"
     assert {path.name for path in cache.glob(".*")} <= {
         ".lock",
         ".rendering",

@@ -29,7 +29,7 @@ from harness.runs.engines import engine_of
 from harness.runs.job_batches import render_missing
 from harness.runs.options import EngineOptions
 from harness.runs.plan import batch_of, plan_of
-from harness.trials.trial import TrialTask, run_trial
+from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.errors import UserError
 
 THRESHOLD = 5.0
@@ -210,12 +210,17 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
         with engine_of(EngineOptions(serial=True)) as serial:
             assert not render_missing(batch.renders, serial)
         for repeat in range(4):
-            one = TrialTask(batch.set_ups, group.seed, "damaged", repeat, (task,), None, number)
-            for row in run_trial(one)["holes"]:
-                found = bool(row["detected"] or row["no_return"])
-                hits.setdefault(at[int(row["hole"])], []).append(
-                    (row["true_depth_mm"], found, number)
-                )
+            trial = Trial(
+                views=batch.views,
+                seed=group.seed,
+                role="damaged",
+                repeat=repeat,
+                points=(task,),
+                board=number,
+            )
+            for row in run_trial(trial).holes:
+                is_hit = bool(row.detected or row.no_return)
+                hits.setdefault(at[int(row.hole)], []).append((row.true_depth_mm, is_hit, number))
     limits = {}
     for place, rows in hits.items():
         depth_mm, hit, inspected = zip(*rows, strict=True)

@@ -37,7 +37,8 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view
 from scenes.optics import NoiseFreeView
 from scenes.perspectives import ArcViews, guessed_T_reference_view, poses_of
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.thesis import ThesisTargetConfig
 
@@ -394,8 +395,8 @@ def test_the_quaternion_turns_as_the_matrix_does() -> None:
 
 def test_views_follow_each_other_in_time(view: NoiseFreeView) -> None:
     views = in_turn([simulated(view, i) for i in range(3)], [np.eye(4)] * 3, FRAMES, 30.0)
-    stamps = [each.stamp_ns(frame) for each in views for frame in range(FRAMES)]
-    assert stamps == sorted(set(stamps)) and [each.name for each in views] == [
+    stamps = [view.stamp_ns(frame) for view in views for frame in range(FRAMES)]
+    assert stamps == sorted(set(stamps)) and [view.name for view in views] == [
         "view_00",
         "view_01",
         "view_02",

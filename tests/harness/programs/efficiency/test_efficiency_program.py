@@ -105,6 +105,6 @@ def test_a_board_without_noise_is_a_mistake_and_a_bug_keeps_its_traceback(
     monkeypatch.setattr(ideal, "FEWEST_PIXELS", 10**9)
     assert main([str(results), "--serial"]) == 2
     assert "its noise is not known" in capsys.readouterr().err
-    monkeypatch.setattr(ideal, "load_set_up", lambda _: 1 / 0)
+    monkeypatch.setattr(ideal, "load_board", lambda _: 1 / 0)
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         main([str(results), "--serial"])

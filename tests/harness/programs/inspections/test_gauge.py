@@ -28,7 +28,8 @@ from harness.programs.inspections.gauge_page import (
 from harness.vocabulary.geometry import MM, Lens, invert, rotation_xyz_deg, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
@@ -210,9 +211,9 @@ def seen_by(
     (board,) = truth.boards
     holes = tuple(
         custom.HoleConfig(
-            id=each.id, diameter_mm=each.diameter_mm, centre_mm=(each.x_mm, each.y_mm)
+            id=hole.id, diameter_mm=hole.diameter_mm, centre_mm=(hole.x_mm, hole.y_mm)
         )
-        for each in board.holes
+        for hole in board.holes
     )
     target = custom.TargetConfig(
         board=custom.BoardConfig(
@@ -280,7 +281,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
     changes.append(f"source.target.edge_mm={2 * gauge.EDGE_MM}")
     changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
     changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
-    given = [text for each in changes for text in ("--set", each)]
+    given = [text for change in changes for text in ("--set", change)]
     assert sweep.main([str(experiment), *given, "--out", str(tmp_path / "study")]) == 0
     study = tmp_path / "study" / "detection_limit" / "latest"
     simulated, real = (limit_of(one) for one in read_record(study).set_ups)

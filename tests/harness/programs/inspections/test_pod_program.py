@@ -405,7 +405,7 @@ def test_any_separator_mark_and_line_end(
 ) -> None:
     path = tmp_path_factory.mktemp("csv") / "a.csv"
     # with a semicolon or a tab between columns, a comma is the decimal mark
-    texts = [repr(one) if separator == "," else repr(one).replace(".", ",") for one in sizes]
+    texts = [repr(size) if separator == "," else repr(size).replace(".", ",") for size in sizes]
     rows = [
         separator.join(("a", "h", "t")),
         *(separator.join((text, "1", "x y")) for text in texts),

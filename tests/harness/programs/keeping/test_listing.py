@@ -25,7 +25,8 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import plane_view
 from scenes.render.cache import in_use, write_view
-from scenes.sensor.camera import EffectsConfig, load_camera
+from scenes.sensor.camera import load_camera
+from scenes.sensor.common.config import EffectsConfig
 
 ROOT = Path(__file__).resolve().parents[4]
 DAY_S = 86_400.0

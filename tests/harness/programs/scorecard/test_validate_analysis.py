@@ -23,7 +23,8 @@ from harness.stills.statistics import (
 )
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 
 AZURE = "azure_kinect_nfov"
 QUICK = Effort(noise_frames=20, few_frames=4, whole_frames=80, units=4)

@@ -18,7 +18,8 @@ from harness.programs.scorecard.validate import main
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import GENERATOR, RESULTS_VERSION
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import CameraConfig, load_camera
+from scenes.sensor.camera import load_camera
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 
 AZURE = load_camera("azure_kinect_nfov")

@@ -14,8 +14,10 @@ from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import WIDEST_PX, AmcwCamera
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera, read_camera
+from scenes.sensor.camera import load_camera, read_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
+from tests.support.sensor_frames import first_frame, true_z_m, z_of
 
 MIDDLE = Region(90, 150, 120, 200)
 
@@ -97,9 +99,20 @@ TWO = {
 @pytest.mark.parametrize("distance_m", [0.6, 3.1, 6.7])
 def test_noise_free_range_is_exact(changes, distance_m, tmp_path):
     camera = read(fourth_camera(**changes), tmp_path)
-    unit = SimulatedUnit(camera, quiet(), plane_view(camera, MIDDLE, distance_m, 0.6, 0.05, 0.02))
-    frame = next(iter(unit.capture(1, 1).frames()))
-    truth = (unit.view.range_m / np.sqrt(1 + (unit.view.slopes**2).sum(-1)))[unit.cut]
+    unit = SimulatedUnit(
+        camera,
+        quiet(),
+        plane_view(
+            camera,
+            MIDDLE,
+            distance_m,
+            0.6,
+            0.05,
+            0.02,
+        ),
+    )
+    frame = first_frame(unit)
+    truth = true_z_m(unit)
     assert (frame.reason == Reason.VALID).all()
     # the output's half millimetre, the converter's rounding (1 in 3,000 at 6.7 m, 1.2 m a radian)
     # and the window
@@ -114,7 +127,7 @@ def test_no_wrap_counts_is_no_range_though_the_camera_has_no_gate_on_the_lattice
     )
     reach_m = 299_702_547 / (2 * 20e6)
     unit = SimulatedUnit(camera, quiet(noise=True), plane_view(camera, MIDDLE, reach_m - 0.02, 0.6))
-    frame = next(iter(unit.capture(1, 1).frames()))
+    frame = first_frame(unit)
     assert (frame.reason == Reason.UNWRAP).mean() > 0.1
     # noise that carries both phases beyond the reach makes a short range, as in a real camera;
     # nothing lies between
@@ -128,12 +141,24 @@ def test_noise_follows_the_closed_form_for_any_number_of_phases(tmp_path):
     for phases in (3, 4, 7):
         camera = read(fourth_camera(modulation__phases=phases, engine__concentration=0.0), tmp_path)
         unit = SimulatedUnit(
-            camera, quiet(noise=True), plane_view(camera, MIDDLE, 1.0, 0.6, 0.05, 0.02)
+            camera,
+            quiet(noise=True),
+            plane_view(
+                camera,
+                MIDDLE,
+                1.0,
+                0.6,
+                0.05,
+                0.02,
+            ),
         )
-        z = np.stack([frame.z_m for frame in unit.capture(60, 1).frames()]).astype(float)
+        z = z_of(unit, 60)
         electrons = 50_000.0 * 0.6
-        phase = np.sqrt(2 / phases) * np.sqrt(electrons + 2 * 3.2**2) / (0.5 * electrons)
-        expected = np.hypot(299_702_547 / (4 * np.pi * 20e6) * phase / 3, 1e-3 / np.sqrt(12))
+        noise = np.sqrt(electrons + 2 * 3.2**2)
+        phase = np.sqrt(2 / phases) * noise / (0.5 * electrons)
+        metres_per_radian = 299_702_547 / (4 * np.pi * 20e6)
+        rounding_m = 1e-3 / np.sqrt(12)
+        expected = np.hypot(metres_per_radian * phase / 3, rounding_m)
         # the lens gathers up to 3 % less beside the axis
         assert z.std(axis=0, ddof=1).mean() == pytest.approx(expected, rel=0.03)
 

@@ -19,20 +19,22 @@ from scipy import ndimage, stats
 from detectors.averages.average import AverageConfig, prefix_averages
 from detectors.crop import NoCrop
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
-from harness.trials import trial as averages
-from harness.trials.trial import averages_of
+from harness.trials import averages
+from harness.trials.averages import averages_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import at_once as sums_of_frames
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.at_once import BEND, SCALE
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
-from scenes.sensor.amcw.linear import light_of_samples
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.amcw.light import light_of_samples
+from scenes.sensor.amcw.linear_frames import BEND, SCALE
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
+from tests.support.sensor_frames import z_of as stacked_z
 
 REGIONS = {
     "azure_kinect_nfov": Region(306, 338, 296, 352),
@@ -47,6 +49,7 @@ FEWEST_FRAMES = 6
 """For these tests; as many as `averages.FEWEST_FRAMES` would only take longer."""
 CAPTURES = 60
 FRAMES = 8
+FEWEST_PIXELS = 12  # of a group, for statistics of their z
 SURE = 5.0
 SURE_OF_FLOOR = 6.0
 """Far behind a hole the light is dim, and means drawn at once scatter some 7 % less than those of
@@ -83,10 +86,12 @@ def numbers_of(name: str) -> dict[str, float]:
 def unit_before_hole(name: str, behind_mm: float, jump_rate: float | None = None) -> SimulatedUnit:
     """A unit before a plate with a round hole of 24 mm, one of 8 mm and a straight edge, and a
     plane behind it."""
-    numbers = numbers_of(name) | ({} if jump_rate is None else {"unit.jump_rate": jump_rate})
-    config = CameraConfig(
-        name=name, effects=STILL if jump_rate is None else EffectsConfig(), numbers=numbers
-    )
+    numbers = numbers_of(name)
+    effects = STILL
+    if jump_rate is not None:
+        numbers["unit.jump_rate"] = jump_rate
+        effects = EffectsConfig()
+    config = CameraConfig(name=name, effects=effects, numbers=numbers)
     camera = camera_of(config)
     outer = REGIONS[name].grown(
         camera.optics.margin_px, camera.nominal_lens.height, camera.nominal_lens.width
@@ -95,14 +100,26 @@ def unit_before_hole(name: str, behind_mm: float, jump_rate: float | None = None
     middle = slopes.reshape(-1, 2).mean(axis=0)
     reach = np.ptp(slopes[..., 0]) / 2
 
-    def covers(at: np.ndarray) -> np.ndarray:
-        x = at[..., 0] - middle[0]
-        y = at[..., 1] - middle[1]
-        holes = (np.hypot(x + 0.3 * reach, y) < 0.017) | (np.hypot(x - 0.3 * reach, y) < 0.0057)
-        return np.isfinite(at[..., 0]) & ~holes & (x < 0.8 * reach)
+    def covers(slopes: np.ndarray) -> np.ndarray:
+        x = slopes[..., 0] - middle[0]
+        y = slopes[..., 1] - middle[1]
+        large_hole = np.hypot(x + 0.3 * reach, y) < 0.017
+        small_hole = np.hypot(x - 0.3 * reach, y) < 0.0057
+        return np.isfinite(x) & ~large_hole & ~small_hole & (x < 0.8 * reach)
 
     back = Plane(FRONT.distance_m + behind_mm * MM, FRONT.slope_x, FRONT.slope_y)
-    return SimulatedUnit(camera, config, layered_view(camera, outer, FRONT, back, covers, 0.6))
+    return SimulatedUnit(
+        camera,
+        config,
+        layered_view(
+            camera,
+            outer,
+            FRONT,
+            back,
+            covers,
+            0.6,
+        ),
+    )
 
 
 @lru_cache
@@ -113,11 +130,13 @@ def clouds_of(name: str, behind_mm: float) -> tuple[list[Cloud], list[Cloud]]:
 
 def clouds_before(unit: SimulatedUnit) -> tuple[list[Cloud], list[Cloud]]:
     """The same of any unit."""
-    captures = [unit.capture(FRAMES, 1, number) for number in range(CAPTURES)]
-    exact = [averages_of(capture, [FRAMES], PLAIN, exact=True)[FRAMES] for capture in captures]
-    return exact, [
-        averages_of(capture, [FRAMES], PLAIN, exact=False)[FRAMES] for capture in captures
-    ]
+    exact = []
+    at_once = []
+    for number in range(CAPTURES):
+        capture = unit.capture(FRAMES, 1, number)
+        exact.append(averages_of(capture, [FRAMES], PLAIN, exact=True)[FRAMES])
+        at_once.append(averages_of(capture, [FRAMES], PLAIN, exact=False)[FRAMES])
+    return exact, at_once
 
 
 def groups_of(unit: SimulatedUnit) -> dict[str, np.ndarray]:
@@ -133,45 +152,52 @@ def groups_of(unit: SimulatedUnit) -> dict[str, np.ndarray]:
 
 
 def statistics_of(
-    z_m: np.ndarray, count: np.ndarray, group: np.ndarray, both: np.ndarray
+    z_m: np.ndarray, count: np.ndarray, group: np.ndarray, all_z_m: np.ndarray
 ) -> dict[str, np.ndarray]:
     """(captures,) each: statistics over a group's pixels (h, w); ``z_m`` and ``count`` (captures,
-    h, w). ``both`` (captures', h, w): z of all captures, which gives the common mean and
+    h, w). ``all_z_m`` (captures', h, w): z of all captures, which gives the common mean and
     deviation."""
-    known = group & (np.isfinite(both).mean(axis=0) > 0.5)
-    if known.sum() < 12:
-        return {"count": count[:, group].mean(axis=1)}
-    found = {"count": count[:, group].mean(axis=1), "empty": (count[:, group] == 0).mean(axis=1)}
+    statistics = {"count": count[:, group].mean(axis=1)}
+    measured = group & (np.isfinite(all_z_m).mean(axis=0) > 0.5)
+    if measured.sum() < FEWEST_PIXELS:
+        return statistics
+    statistics["empty"] = (count[:, group] == 0).mean(axis=1)
+    standard = standardised(z_m, all_z_m)
+    standard = np.where(measured & np.isfinite(standard), standard, 0.0)
+    statistics["mean"] = standard[:, measured].mean(axis=1)
+    statistics["variance"] = (standard[:, measured] ** 2).mean(axis=1)
+    for limit in (2, 3):
+        beyond = np.abs(standard[:, measured]) > limit
+        statistics[f"beyond {limit}"] = beyond.mean(axis=1)
+    for lag in (1, 2, 3, 4):
+        pairs = measured[:, lag:] & measured[:, :-lag]
+        if pairs.sum() >= FEWEST_PIXELS:
+            products = standard[:, :, lag:] * standard[:, :, :-lag]
+            statistics[f"lag {lag} x"] = products[:, pairs].mean(axis=1)
+        pairs = measured[lag:] & measured[:-lag]
+        if pairs.sum() >= FEWEST_PIXELS:
+            products = standard[:, lag:] * standard[:, :-lag]
+            statistics[f"lag {lag} y"] = products[:, pairs].mean(axis=1)
+    return statistics
+
+
+def standardised(z_m: np.ndarray, all_z_m: np.ndarray) -> np.ndarray:
+    """z (captures, h, w) minus the mean of each pixel, over its deviation."""
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels without any range
-        standard = (z_m - np.nanmean(both, axis=0)) / np.maximum(np.nanstd(both, axis=0), 1e-7)
-    standard = np.where(known & np.isfinite(standard), standard, 0.0)
-    found |= {
-        "mean": standard[:, known].mean(axis=1),
-        "variance": (standard[:, known] ** 2).mean(axis=1),
-    }
-    for limit in (2, 3):
-        found[f"beyond {limit}"] = (np.abs(standard[:, known]) > limit).mean(axis=1)
-    for lag in (1, 2, 3, 4):
-        for axis, pairs in (
-            ("x", known[:, lag:] & known[:, :-lag]),
-            ("y", known[lag:] & known[:-lag]),
-        ):
-            one, other = (
-                (standard[:, :, lag:], standard[:, :, :-lag])
-                if axis == "x"
-                else (standard[:, lag:], standard[:, :-lag])
-            )
-            if pairs.sum() >= 12:
-                found[f"lag {lag} {axis}"] = (one * other)[:, pairs].mean(axis=1)
-    return found
+        deviation_m = np.maximum(np.nanstd(all_z_m, axis=0), 1e-7)
+        return (z_m - np.nanmean(all_z_m, axis=0)) / deviation_m
 
 
-def compared(one: np.ndarray, other: np.ndarray) -> float:
+def compared(first: np.ndarray, second: np.ndarray) -> float:
     """Difference of two samples' means in standard errors; 0 where both are the same constant."""
-    error = np.sqrt(one.var(ddof=1) / len(one) + other.var(ddof=1) / len(other))
-    difference = one.mean() - other.mean()
-    return float(difference / error) if error > 0 else (0.0 if difference == 0 else np.inf)
+    first_error2 = first.var(ddof=1) / len(first)
+    second_error2 = second.var(ddof=1) / len(second)
+    error = np.sqrt(first_error2 + second_error2)
+    difference = first.mean() - second.mean()
+    if error == 0:
+        return 0.0 if difference == 0 else np.inf
+    return float(difference / error)
 
 
 @pytest.mark.parametrize(
@@ -205,43 +231,70 @@ def test_so_have_those_of_a_dim_and_distant_face(name: str):
         camera.optics.margin_px, camera.nominal_lens.height, camera.nominal_lens.width
     )
     albedo = 0.25 if name == "azure_kinect_nfov" else 0.2
-    unit = SimulatedUnit(camera, config, plane_view(camera, outer, 1.6, albedo, 0.05, 0.02))
+    unit = SimulatedUnit(
+        camera,
+        config,
+        plane_view(
+            camera,
+            outer,
+            1.6,
+            albedo,
+            0.05,
+            0.02,
+        ),
+    )
     assert unit.at_once is not None
     knee = float(camera.converter.knee_units.value)
     light = light_of_samples(unit.exposure, knee, np.ones(len(camera.frequencies_hz)))
-    assert 0.055 < np.median(light.turn.max(axis=0)) < 0.13
+    assert 0.055 < np.median(light.phase_noise.max(axis=0)) < 0.13
     assert_alike(unit, *clouds_before(unit))
+
+
+def z_of(clouds: list[Cloud]) -> np.ndarray:
+    return np.stack([cloud.points_m[..., 2] for cloud in clouds])
+
+
+def count_of(clouds: list[Cloud]) -> np.ndarray:
+    return np.stack([cloud.count for cloud in clouds])
 
 
 def assert_alike(unit: SimulatedUnit, exact: list[Cloud], at_once: list[Cloud]) -> None:
     """By every statistic of every group of pixels."""
-    z_m = [np.stack([cloud.points_m[..., 2] for cloud in clouds]) for clouds in (exact, at_once)]
-    count = [np.stack([cloud.count for cloud in clouds]) for clouds in (exact, at_once)]
-    variance = [np.stack([cloud.variance_m2 for cloud in clouds]) for clouds in (exact, at_once)]
-    amplitude = [np.stack([cloud.amplitude for cloud in clouds]) for clouds in (exact, at_once)]
-    assert not np.array_equal(*z_m, equal_nan=True)
+    both_kinds = (exact, at_once)
+    all_z_m = z_of(exact + at_once)
+    all_variances = np.stack([cloud.variance_m2 for cloud in exact + at_once])
+    assert not np.array_equal(z_of(exact), z_of(at_once), equal_nan=True)
     for group, pixels in groups_of(unit).items():
-        ours = [
-            statistics_of(z, n, pixels, np.concatenate(z_m))
-            for z, n in zip(z_m, count, strict=True)
-        ]
-        known = pixels & np.isfinite(np.concatenate(variance)).all(axis=0)
-        if known.any():
-            for one, planes in (("variance_m2", variance), ("amplitude", amplitude)):
-                for each, plane in zip(ours, planes, strict=True):
-                    each[one] = plane[:, known].mean(axis=1)
-        off = {key: compared(ours[0][key], ours[1][key]) for key in ours[0]}
-        assert max(map(abs, off.values())) < (SURE_OF_FLOOR if group == "floor" else SURE), (
-            group,
-            off,
-        )
-    never = (np.concatenate(count) == 0).all(axis=0)
-    reasons = [
-        np.stack([cloud.reason for cloud in clouds])[:, never] for clouds in (exact, at_once)
-    ]
+        repeated = pixels & np.isfinite(all_variances).all(axis=0)
+        statistics = []
+        for clouds in both_kinds:
+            values = statistics_of(z_of(clouds), count_of(clouds), pixels, all_z_m)
+            if repeated.any():
+                variances = np.stack([cloud.variance_m2 for cloud in clouds])
+                values["variance_m2"] = variances[:, repeated].mean(axis=1)
+                amplitudes = np.stack([cloud.amplitude for cloud in clouds])
+                values["amplitude"] = amplitudes[:, repeated].mean(axis=1)
+            statistics.append(values)
+        off = {}
+        for key, value in statistics[0].items():
+            off[key] = compared(value, statistics[1][key])
+        limit = SURE_OF_FLOOR if group == "floor" else SURE
+        assert max(map(abs, off.values())) < limit, (group, off)
+    never = (count_of(exact + at_once) == 0).all(axis=0)
+    commonest = []
+    for clouds in both_kinds:
+        reasons = np.stack([cloud.reason for cloud in clouds])[:, never]
+        commonest.append(stats.mode(reasons).mode)
     # which of two gates stops a pixel first may be decided frame by frame, where the commonest of
     # ten may be either
-    assert (stats.mode(reasons[0]).mode != stats.mode(reasons[1]).mode).sum() <= 0.02 * never.sum()
+    assert (commonest[0] != commonest[1]).sum() <= 0.02 * never.sum()
+
+
+def differences(exact: np.ndarray, at_once: np.ndarray, least_error: float) -> np.ndarray:
+    """(n,): difference of the means over captures (captures, n), in standard errors."""
+    variance = exact.var(axis=0, ddof=1) + at_once.var(axis=0, ddof=1)
+    error = np.maximum(np.sqrt(variance / CAPTURES), least_error)
+    return (exact.mean(axis=0) - at_once.mean(axis=0)) / error
 
 
 @pytest.mark.parametrize("name", REGIONS)
@@ -249,20 +302,13 @@ def test_single_pixels_agree_in_mean_and_in_how_often_they_have_a_range(name: st
     """At a hole before 200 mm: mean z and count of every pixel that is not certain; the largest of
     thousands."""
     exact, at_once = clouds_of(name, 200.0)
-    count = [
-        np.stack([cloud.count for cloud in clouds]).astype(float) for clouds in (exact, at_once)
-    ]
-    mixed = np.minimum(*(each.var(axis=0) for each in count)) > 0.1
+    exact_count = count_of(exact).astype(float)
+    count = count_of(at_once).astype(float)
+    mixed = np.minimum(exact_count.var(axis=0), count.var(axis=0)) > 0.1
     assert mixed.sum() > 30
-    error = np.sqrt(sum(each[:, mixed].var(axis=0, ddof=1) for each in count) / CAPTURES)
-    off = (count[0][:, mixed].mean(axis=0) - count[1][:, mixed].mean(axis=0)) / error
-    assert np.abs(off).max() < SURE
-    z_m = [np.stack([cloud.points_m[..., 2] for cloud in clouds]) for clouds in (exact, at_once)]
-    known = np.isfinite(np.concatenate(z_m)).all(axis=0)
-    error_m = np.sqrt(sum(each[:, known].var(axis=0, ddof=1) for each in z_m) / CAPTURES)
-    off = (z_m[0][:, known].mean(axis=0) - z_m[1][:, known].mean(axis=0)) / np.maximum(
-        error_m, 1e-7
-    )
+    assert np.abs(differences(exact_count[:, mixed], count[:, mixed], 0.0)).max() < SURE
+    always = np.isfinite(z_of(exact + at_once)).all(axis=0)
+    off = differences(z_of(exact)[:, always], z_of(at_once)[:, always], 1e-7)
     assert np.abs(off).max() < SURE
 
 
@@ -270,13 +316,13 @@ def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
     """Every pixel that some frame loses and another does not is on the list; few others, and no
     even face."""
     unit = unit_before_hole("azure_kinect_nfov", 200.0)
-    z_m = np.stack([frame.z_m for frame in unit.capture(100, 7).frames()])
+    z_m = stacked_z(unit, 100, 7)
     valid = np.isfinite(z_m).mean(axis=0)
     summer = unit.at_once
     assert summer is not None
-    on_list = np.isin(np.arange(summer.linear.z.size), summer.listed).reshape(summer.shape)[
-        unit.cut
-    ]
+    listed = np.zeros(summer.shape, bool)
+    listed.ravel()[summer.listed] = True
+    on_list = listed[unit.cut]
     assert on_list[(valid > 0) & (valid < 1)].all()
     assert not on_list[groups_of(unit)["face"]].any()
     assert on_list.mean() < 0.25
@@ -284,24 +330,27 @@ def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
 
 def test_prefixes_nest_and_do_not_hang_on_what_else_is_asked_for():
     unit = unit_before_hole("azure_kinect_nfov", 200.0)
-    products = []
-    squares = []
+    face = groups_of(unit)["face"]
+    z_by_count: dict[int, list[np.ndarray]] = {20: [], 40: [], 80: []}
     for number in range(30):
         capture = unit.capture(80, 3, number)
         together = averages_of(capture, [1, 20, 40, 80], PLAIN, exact=False)
-        for n, alone in ((n, averages_of(capture, [n], PLAIN, exact=False)[n]) for n in (1, 80)):
+        for n in (1, 80):
+            alone = averages_of(capture, [n], PLAIN, exact=False)[n]
             assert np.array_equal(together[n].points_m, alone.points_m, equal_nan=True)
             assert np.array_equal(together[n].variance_m2, alone.variance_m2, equal_nan=True)
-        z = [together[n].points_m[..., 2][groups_of(unit)["face"]] for n in (20, 40, 80)]
-        products.append([z[0], z[1], z[2]])
-    first, ten, forty = np.moveaxis(np.array(products), 1, 0)
-    centred = [each - each.mean(axis=0) for each in (first, ten, forty)]
+        for n, values in z_by_count.items():
+            values.append(together[n].points_m[..., 2][face])
+    noise = {}
+    for n, values in z_by_count.items():
+        z_m = np.array(values)
+        noise[n] = z_m - z_m.mean(axis=0)
     # a mean of 40 contains half of the first twenty's noise: cov(20, 40) = var(40), and so on
-    for inner, outer in ((centred[0], centred[1]), (centred[1], centred[2])):
-        products = (inner * outer).mean(axis=1)
-        squares = (outer**2).mean(axis=1)
+    for fewer, more_frames in ((20, 40), (40, 80)):
+        products = (noise[fewer] * noise[more_frames]).mean(axis=1)
+        squares = (noise[more_frames] ** 2).mean(axis=1)
         assert abs(compared(products, squares)) < SURE
-        assert (outer**2).mean() < 0.6 * (inner**2).mean()
+        assert (noise[more_frames] ** 2).mean() < 0.6 * (noise[fewer] ** 2).mean()
 
 
 def test_frames_that_jump_are_left_out_as_frames_are():
@@ -318,26 +367,28 @@ def test_frames_that_jump_are_left_out_as_frames_are():
             at_once[30].points_m, exact[30].points_m, equal_nan=True
         )
         for n in (20, 30):
-            assert [one.name for one in at_once[n].left_out] == [
-                one.name for one in exact[n].left_out
-            ]
             assert at_once[n].n_frames == exact[n].n_frames
-            for one, other in zip(at_once[n].left_out, exact[n].left_out, strict=True):
-                assert one.why.split(" mm")[1:] == other.why.split(" mm")[1:]
+            for frame, exact_frame in zip(at_once[n].left_out, exact[n].left_out, strict=True):
+                assert frame.name == exact_frame.name
+                # but for the displacement itself
+                assert frame.why.split(" mm")[1:] == exact_frame.why.split(" mm")[1:]
             left_out += len(exact[n].left_out)
-        assert np.nanmedian(
-            at_once[30].points_m[..., 2] - exact[30].points_m[..., 2]
-        ) == pytest.approx(0, abs=0.2 * MM)
-    assert left_out > 40 and drawn_at_once > 15
+        off_m = at_once[30].points_m[..., 2] - exact[30].points_m[..., 2]
+        assert np.nanmedian(off_m) == pytest.approx(0, abs=0.2 * MM)
+    assert left_out > 40
+    assert drawn_at_once > 15
 
 
 def trial(
-    unit: SimulatedUnit, number: int, hole: np.ndarray, exact: bool, detector: ThesisDetector
+    unit: SimulatedUnit,
+    number: int,
+    hole: np.ndarray,
+    exact: bool,
+    detector: ThesisDetector,
 ):
     """The highest scores in the hole and anywhere else."""
-    cloud = averages_of(unit.capture(FRAMES, 11, number, int(exact)), [FRAMES], PLAIN, exact=exact)[
-        FRAMES
-    ]
+    capture = unit.capture(FRAMES, 11, number, int(exact))
+    cloud = averages_of(capture, [FRAMES], PLAIN, exact=exact)[FRAMES]
     score = detector.analyse(cloud).score
     return np.nanmax(score[hole]), np.nanmax(np.where(hole, np.nan, score))
 
@@ -354,18 +405,53 @@ def test_a_detector_finds_as_often_and_calls_as_often_falsely():
     )
     middle = camera.nominal_lens.region_slopes(REGIONS[name]).reshape(-1, 2).mean(axis=0)
 
-    def covers(at: np.ndarray) -> np.ndarray:
-        return np.hypot(*(at - middle).transpose(-1, *range(at.ndim - 1))) > 0.0046
+    def covers(slopes: np.ndarray) -> np.ndarray:
+        x = slopes[..., 0] - middle[0]
+        y = slopes[..., 1] - middle[1]
+        return np.hypot(x, y) > 0.0046
 
     back = Plane(FRONT.distance_m + 1.3 * MM, FRONT.slope_x, FRONT.slope_y)
     unit = SimulatedUnit(
-        camera, CameraConfig(name=name), layered_view(camera, outer, FRONT, back, covers, 0.6)
+        camera,
+        CameraConfig(name=name),
+        layered_view(
+            camera,
+            outer,
+            FRONT,
+            back,
+            covers,
+            0.6,
+        ),
     )
-    hole = ndimage.binary_dilation((unit.view.surface == 1)[unit.cut], np.ones((7, 7)))
+    floor = (unit.view.surface == 1)[unit.cut]
+    hole = ndimage.binary_dilation(floor, np.ones((7, 7)))
     detector = ThesisDetector(ThesisConfig(crop=NoCrop()))
-    exact, at_once = (
-        np.array([trial(unit, number, hole, exact, detector) for number in range(200)], float)
-        for exact in (True, False)
+    trials = range(200)
+    exact = np.array(
+        [
+            trial(
+                unit,
+                number,
+                hole,
+                True,
+                detector,
+            )
+            for number in trials
+        ],
+        float,
+    )
+    at_once = np.array(
+        [
+            trial(
+                unit,
+                number,
+                hole,
+                False,
+                detector,
+            )
+            for number in trials
+        ],
+        float,
     )
     assert stats.ks_2samp(exact[:, 1], at_once[:, 1]).pvalue > 1e-4
     for column, share in ((0, 0.5), (1, 0.8)):
@@ -378,33 +464,60 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     unit = unit_before_hole("kinect_v2_libfreenect2", 200.0)
     summer = unit.at_once
     imager = unit.model
-    assert summer is not None and isinstance(imager, AmcwImager)
+    assert summer is not None
+    assert isinstance(imager, AmcwImager)
     light = summer.light
-    places = summer.list
-    words = random_stream(1).integers(2**32, size=(len(places.halo), 3, LANES), dtype=np.uint32)
-    planes = np.empty((len(places.halo) // kernels.BESIDE + 2, 3, 3, kernels.STRIDE), np.float32)
-    noise = np.empty((len(places.halo), LANES), np.float32)
-    kernels.noisy_phasors(*light[:2], *light[3:], summer.shares, words, planes, noise)
-    filtered = np.empty((3, 3, len(places.range), LANES), np.float32)
-    edge = np.empty((3, len(places.range), LANES), np.float32)
-    kernels.filter_listed(planes, places.window, imager.filter_settings, filtered, edge)
-    by_plane = (
-        planes.reshape(-1, 3, 3, kernels.BESIDE, LANES)
-        .transpose(0, 3, 1, 2, 4)
-        .reshape(-1, 3, 3, LANES)
+    halo = summer.list.halo
+    ranges = summer.list.range
+    shape = (len(halo), 3, LANES)
+    words = random_stream(1).integers(2**32, size=shape, dtype=np.uint32)
+    n_rows = len(halo) // kernels.BESIDE + 2
+    planes = np.empty((n_rows, 3, 3, kernels.STRIDE), np.float32)
+    noise = np.empty((len(halo), LANES), np.float32)
+    kernels.noisy_phasors(
+        light.phasor,
+        light.amplitude,
+        light.phase_noise,
+        light.relative_noise,
+        summer.shares,
+        words,
+        planes,
+        noise,
     )
-    by_plane = by_plane[: len(places.halo)]
+    filtered = np.empty((3, 3, len(ranges), LANES), np.float32)
+    edge = np.empty((3, len(ranges), LANES), np.float32)
+    kernels.filter_listed(
+        planes,
+        summer.list.window,
+        imager.filter_settings,
+        filtered,
+        edge,
+    )
+    rows = planes.reshape(
+        -1,
+        3,
+        3,
+        kernels.BESIDE,
+        LANES,
+    ).transpose(
+        0,
+        3,
+        1,
+        2,
+        4,
+    )
+    drawn = rows.reshape(-1, 3, 3, LANES)[: len(halo)]
     for lane in (0, LANES - 1):
         shape = unit.exposure.shape
         phasors = np.zeros((2, 3, np.prod(shape)), np.float32)
         amplitude = np.full((3, np.prod(shape)), -1, np.float32)
-        phasors[:, :, places.halo] = by_plane[:, :, :2, lane].transpose(2, 1, 0)
-        amplitude[:, places.halo] = by_plane[:, :, 2, lane].T
-        whole, whole_edge = imager.filter(phasors, amplitude, shape)
-        wanted = whole.reshape(3, 3, -1)[:, :, places.range]
-        wanted_edge = whole_edge.reshape(3, -1)[:, places.range]
-        near = np.maximum(1e-4 * np.abs(wanted), 1e-2)
-        assert (np.abs(filtered[..., lane] - wanted) <= near).all()
+        phasors[:, :, halo] = drawn[:, :, :2, lane].transpose(2, 1, 0)
+        amplitude[:, halo] = drawn[:, :, 2, lane].T
+        of_picture, edge_of_picture = imager.filter(phasors, amplitude, shape)
+        wanted = of_picture.reshape(3, 3, -1)[:, :, ranges]
+        wanted_edge = edge_of_picture.reshape(3, -1)[:, ranges]
+        tolerance = np.maximum(1e-4 * np.abs(wanted), 1e-2)
+        assert (np.abs(filtered[..., lane] - wanted) <= tolerance).all()
         np.testing.assert_allclose(edge[..., lane], wanted_edge, rtol=0, atol=1e-4)
 
 
@@ -415,10 +528,10 @@ def test_other_means_and_exact_captures_are_drawn_frame_by_frame(method: str):
         ours = averages_of(capture, [8], config, exact=exact)[8]
         frames = prefix_averages(capture, [8], config)[8]
         assert np.array_equal(ours.points_m, frames.points_m, equal_nan=True)
-    few = FEWEST_FRAMES - 1
-    ours = averages_of(capture, [few], PLAIN, exact=False)[few]
-    frames = prefix_averages(capture, [few], PLAIN)[few]
-    assert np.array_equal(ours.points_m, frames.points_m, equal_nan=True)
+    too_few = FEWEST_FRAMES - 1
+    cloud = averages_of(capture, [too_few], PLAIN, exact=False)[too_few]
+    frames = prefix_averages(capture, [too_few], PLAIN)[too_few]
+    assert np.array_equal(cloud.points_m, frames.points_m, equal_nan=True)
 
 
 def test_what_no_model_can_draw_at_once_is_drawn_frame_by_frame():
@@ -428,16 +541,13 @@ def test_what_no_model_can_draw_at_once_is_drawn_frame_by_frame():
     azure = camera_of(CameraConfig())
     quiet = CameraConfig(effects=EffectsConfig(noise=False))
     narrow = CameraConfig(numbers={"converter.full_scale_units": 820})
+    region = Region(300, 330, 300, 330)
+    lidar_view = plane_view(lidar, region, 0.7, 0.6)
+    azure_view = plane_view(azure, region, 0.7, 0.6)
     units = (
-        SimulatedUnit(
-            lidar,
-            CameraConfig(name="realsense_l515"),
-            plane_view(lidar, Region(300, 330, 300, 330), 0.7, 0.6),
-        ),
-        SimulatedUnit(azure, quiet, plane_view(azure, Region(300, 330, 300, 330), 0.7, 0.6)),
-        SimulatedUnit(
-            camera_of(narrow), narrow, plane_view(azure, Region(300, 330, 300, 330), 0.7, 0.6)
-        ),
+        SimulatedUnit(lidar, CameraConfig(name="realsense_l515"), lidar_view),
+        SimulatedUnit(azure, quiet, azure_view),
+        SimulatedUnit(camera_of(narrow), narrow, azure_view),
     )
     for unit in units:
         assert unit.at_once is None

@@ -15,11 +15,12 @@ from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.optics import NoiseFreeView
 from scenes.sensor.calibration import ONLY_NOISE
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.lidar.scanner import LidarScanner, overlap_taps, smear_weights
 from scenes.sensor.source import SimulatedUnit
 from tests.support.lidar_footprint import hole_depth_seen_m, share_in_disc
-from tests.support.lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, changed, mixed, z_of
+from tests.support.lidar_units import CAMERA, FINE, PATCH, QUIET, RAW, changed, mixed
+from tests.support.sensor_frames import first_frame, z_of
 
 # ---------------------------------------------------------------- several returns in one beam
 
@@ -28,11 +29,10 @@ def two_returns(share: float, effects: EffectsConfig) -> tuple[SimulatedUnit, np
     """A unit without smoothing whose beams see 1 m and, with ``share`` of equal light, 2 m; and
     its z."""
     camera = changed(RAW)
-    near = plane_view(camera, PATCH, 1.0, 0.6)
-    far = plane_view(camera, PATCH, 2.0, 2.4)
-    unit = SimulatedUnit(
-        camera, QUIET.model_copy(update={"effects": effects}), mixed(near, far, share)
-    )
+    front = plane_view(camera, PATCH, 1.0, 0.6)
+    back = plane_view(camera, PATCH, 2.0, 2.4)
+    config = QUIET.model_copy(update={"effects": effects})
+    unit = SimulatedUnit(camera, config, mixed(front, back, share))
     return unit, z_of(unit, 20)
 
 
@@ -46,8 +46,10 @@ def test_the_stronger_of_two_returns_wins_and_equal_ones_flip():
         unit, z = two_returns(share, ONLY_NOISE.effects)
         returns = unit.exposure
         order = np.where(returns.half_m[0] > 1.5, 1.0, -1.0)
-        lead = order * (returns.height[0] - returns.height[1]) / (np.sqrt(2) * returns.noise)
-        assert (z > 1.5).mean() == pytest.approx(float(stats.norm.cdf(lead).mean()), abs=0.015)
+        ahead = order * (returns.height[0] - returns.height[1])
+        deviations = ahead / (np.sqrt(2) * returns.noise)
+        far_share = float(stats.norm.cdf(deviations).mean())
+        assert (z > 1.5).mean() == pytest.approx(far_share, abs=0.015)
 
 
 def test_shot_noise_is_that_of_all_light_in_the_beam():
@@ -66,10 +68,10 @@ def test_shot_noise_is_that_of_all_light_in_the_beam():
 def test_a_footprint_across_a_small_step_reads_between_by_light():
     """Returns 30 mm apart merge: a tenth of the pulse's 0.3 m, so the peak is their mean by light,
     within 2 %."""
-    near = plane_view(CAMERA, PATCH, 1.0, 0.6)
-    far = plane_view(CAMERA, PATCH, 1.03, 0.6 * 1.03**2)
+    front = plane_view(CAMERA, PATCH, 1.0, 0.6)
+    back = plane_view(CAMERA, PATCH, 1.03, 0.6 * 1.03**2)
     for share in (0.25, 0.5, 0.75):
-        z = z_of(SimulatedUnit(CAMERA, QUIET, mixed(near, far, share)))
+        z = z_of(SimulatedUnit(CAMERA, QUIET, mixed(front, back, share)))
         assert (z - 1.0).mean() == pytest.approx(30e-3 * share, abs=0.6e-3)
 
 
@@ -82,13 +84,12 @@ def test_multipath_lengthens_range_and_its_switch_takes_it_away():
         intensity=direct.intensity + 0.1 * late.intensity,
     )
     without = NO_EFFECTS.model_copy(update={"saturation": True})
-    on, off = (
-        z_of(SimulatedUnit(CAMERA, QUIET.model_copy(update={"effects": e}), view)).mean()
-        for e in (QUIET.effects, without)
-    )
-    assert off == pytest.approx(1.0, abs=1e-5)
+    direct_only = QUIET.model_copy(update={"effects": without})
+    all_light_m = z_of(SimulatedUnit(CAMERA, QUIET, view)).mean()
+    direct_m = z_of(SimulatedUnit(CAMERA, direct_only, view)).mean()
+    assert direct_m == pytest.approx(1.0, abs=1e-5)
     # 8 % of the light 100 mm later, pulled in full while within the pulse: nearly 7.6 mm
-    assert 4e-3 < on - off < 8e-3
+    assert 4e-3 < all_light_m - direct_m < 8e-3
 
 
 # ---------------------------------------------------------------- processing on the device
@@ -96,9 +97,10 @@ def test_multipath_lengthens_range_and_its_switch_takes_it_away():
 
 def stepped(step_m: float) -> NoiseFreeView:
     """The left half at 1 m, the right half farther, no beam across the edge."""
-    near = plane_view(CAMERA, PATCH, 1.0, 0.6)
-    far = plane_view(CAMERA, PATCH, 1.0 + step_m, 0.6)
-    return mixed(near, far, (np.arange(PATCH.shape[1]) >= 30).astype(float))
+    front = plane_view(CAMERA, PATCH, 1.0, 0.6)
+    back = plane_view(CAMERA, PATCH, 1.0 + step_m, 0.6)
+    right_half = np.arange(PATCH.shape[1]) >= 30
+    return mixed(front, back, right_half.astype(float))
 
 
 def test_smoothing_keeps_a_step_of_30_mm_and_blurs_one_of_4_mm():
@@ -118,17 +120,25 @@ def test_integration_smears_along_the_sweep_only():
     beside nothing."""
     view = plane_view(CAMERA, PATCH, 1.0, 0.6)
     row = (np.arange(PATCH.shape[0]) == 25).astype(float)[:, None]
-    lit = mixed(replace(view, phasor=0 * view.phasor, intensity=0 * view.intensity), view, row)
+    dark = replace(view, phasor=0 * view.phasor, intensity=0 * view.intensity)
+    lit = mixed(dark, view, row)
     heights = SimulatedUnit(CAMERA, QUIET, lit).exposure.height[0]
     weights = smear_weights(CAMERA.integration_points)
     bright = SimulatedUnit(CAMERA, QUIET, view).exposure.height[0]
-    assert heights[24:27] / bright[24:27] == pytest.approx(weights[:, None] * np.ones(60), rel=1e-4)
-    assert heights[23].max() <= 0 and heights[27].max() <= 0
+    shares = heights[24:27] / bright[24:27]
+    expected = np.repeat(weights[:, None], 60, axis=1)
+    assert shares == pytest.approx(expected, rel=1e-4)
+    assert heights[23].max() <= 0
+    assert heights[27].max() <= 0
 
 
 @pytest.mark.parametrize(
     ("points", "weights"),
-    [(1.0, [1 / 8, 6 / 8, 1 / 8]), (2.0, [1 / 4, 1 / 2, 1 / 4]), (1e-6, [0, 1, 0])],
+    [
+        (1.0, [1 / 8, 6 / 8, 1 / 8]),
+        (2.0, [1 / 4, 1 / 2, 1 / 4]),
+        (1e-6, [0, 1, 0]),
+    ],
 )
 def test_smear_weights_by_hand(points, weights):
     assert smear_weights(points) == pytest.approx(weights, abs=1e-5)
@@ -139,16 +149,16 @@ def test_smear_weights_by_hand(points, weights):
 def test_overlapping_integrations_share_light_and_noise_as_their_overlap(points):
     assert smear_weights(points).sum() == pytest.approx(1)
     taps = overlap_taps(points)
+    padded = np.append(taps, np.zeros(4))
     for lag in range(4):
-        found = float((taps[lag:] * taps[: len(taps) - lag]).sum()) if lag < len(taps) else 0.0
-        assert found == pytest.approx(
-            max(0.0, 1 - lag / points) if points > 1 else float(lag == 0), abs=0.006
-        )
+        correlation = float((taps * padded[lag : lag + len(taps)]).sum())
+        overlap = max(0.0, 1 - lag / points) if points > 1 else float(lag == 0)
+        assert correlation == pytest.approx(overlap, abs=0.006)
 
 
 def reasons_at(distance_m: float, albedo: float, config: CameraConfig = QUIET) -> set[Reason]:
     unit = SimulatedUnit(CAMERA, config, plane_view(CAMERA, PATCH, distance_m, albedo))
-    frame = next(iter(unit.capture(1, 1).frames()))
+    frame = first_frame(unit)
     assert np.array_equal(np.isnan(frame.z_m), frame.reason != Reason.VALID)
     return {Reason(code) for code in np.unique(frame.reason)}
 
@@ -166,15 +176,16 @@ def test_each_gate_names_its_reason():
 def test_five_pixels_in_a_row_are_invalid_and_three_by_three_are_not():
     """They hold 0.08 and 0.15 of the weights; a tenth is asked for."""
     view = plane_view(CAMERA, PATCH, 1.0, 0.6)
-    other = plane_view(CAMERA, PATCH, 1.8, 1.9)
+    behind = plane_view(CAMERA, PATCH, 1.8, 1.9)
     share = np.zeros(PATCH.shape)
     share[20, 20:25] = share[30:33, 20:23] = 1.0
     camera = changed({"code.integration_ns": 1e-3})
-    unit = SimulatedUnit(camera, QUIET, mixed(view, other, share))
-    frame = next(iter(unit.capture(1, 1).frames()))
+    unit = SimulatedUnit(camera, QUIET, mixed(view, behind, share))
+    frame = first_frame(unit)
     m = camera.optics.margin_px
     assert (frame.reason[20 - m, 20 - m : 25 - m] == Reason.EDGE).all()
-    assert frame.z_m[30 - m : 33 - m, 20 - m : 23 - m] == pytest.approx(1.8, abs=0.13e-3)
+    square = frame.z_m[30 - m : 33 - m, 20 - m : 23 - m]
+    assert square == pytest.approx(1.8, abs=0.13e-3)
     assert (frame.reason != Reason.VALID).sum() == 5
 
 
@@ -185,22 +196,33 @@ def test_dark_beams_do_not_pass_for_returns():
     assert not np.isfinite(z_of(unit, 20)).any()
     open_gates = {"engine.least_agreeing": 0.0, "engine.confidence_electrons": 0.0}
     z = z_of(SimulatedUnit(changed(open_gates), ONLY_NOISE, unit.view))
-    assert np.isfinite(z).mean() > 0.9 and np.nanstd(z) > 1.0
+    assert np.isfinite(z).mean() > 0.9
+    assert np.nanstd(z) > 1.0
 
 
 # ---------------------------------------------------------------- units, effects, streams
 
 
 def test_effects_that_are_off_are_absent():
-    view = plane_view(CAMERA, PATCH, 0.8, 0.6, 0.05, 0.02)
-    z = z_of(SimulatedUnit(CAMERA, CameraConfig(name=CAMERA.name, effects=NO_EFFECTS), view), 3)
-    assert np.array_equal(z[0], z[1]) and np.array_equal(z[0], z[2])
+    view = plane_view(
+        CAMERA,
+        PATCH,
+        0.8,
+        0.6,
+        0.05,
+        0.02,
+    )
+    quiet = CameraConfig(name=CAMERA.name, effects=NO_EFFECTS)
+    z = z_of(SimulatedUnit(CAMERA, quiet, view), 3)
+    assert np.array_equal(z[0], z[1])
+    assert np.array_equal(z[0], z[2])
     for name in EffectsConfig.model_fields:
         effects = NO_EFFECTS.model_copy(update={name: True})
-        one = z_of(SimulatedUnit(CAMERA, CameraConfig(name=CAMERA.name, effects=effects), view))
+        config = CameraConfig(name=CAMERA.name, effects=effects)
+        with_effect = z_of(SimulatedUnit(CAMERA, config, view))
         # nothing to saturate, no other path, no noise to add to, no harmonics
         silent = name in ("multipath", "wiggling", "ambient", "saturation")
-        assert np.array_equal(one[0], z[0]) == silent, name
+        assert np.array_equal(with_effect[0], z[0]) == silent, name
 
 
 def test_ripples_have_the_size_and_length_of_their_facts():
@@ -215,10 +237,9 @@ def test_ripples_have_the_size_and_length_of_their_facts():
     # some 2,700 independent patches: 1.4 % at one sigma
     assert ripples.std() == pytest.approx(size, rel=0.05)
     for lag in (6, 12, 24):
+        products = ripples[lag:] * ripples[:-lag]
         expected = np.exp(-(lag**2) / (2 * length**2))
-        assert (ripples[lag:] * ripples[:-lag]).mean() / ripples.var() == pytest.approx(
-            expected, abs=0.05
-        )
+        assert products.mean() / ripples.var() == pytest.approx(expected, abs=0.05)
     part = LidarScanner(CAMERA, config, PATCH, lens.region_slopes(PATCH)).static_error_m
     assert np.array_equal(part, ripples[PATCH.within(lens.whole)])
 
@@ -235,10 +256,17 @@ def test_shorter_captures_are_prefixes_and_streams_are_repeatable():
 
 
 def test_single_precision_views_change_nothing_that_counts():
-    view = plane_view(CAMERA, PATCH, 0.8, 0.6, 0.05, 0.02)
-    single = replace(
-        view, phasor=view.phasor.astype(np.complex64), intensity=view.intensity.astype(np.float32)
+    view = plane_view(
+        CAMERA,
+        PATCH,
+        0.8,
+        0.6,
+        0.05,
+        0.02,
     )
+    phasor = view.phasor.astype(np.complex64)
+    intensity = view.intensity.astype(np.float32)
+    single = replace(view, phasor=phasor, intensity=intensity)
     a = SimulatedUnit(CAMERA, QUIET, view).exposure.half_m[0]
     b = SimulatedUnit(CAMERA, QUIET, single).exposure.half_m[0]
     assert np.abs(a - b).max() < 2e-6
@@ -276,12 +304,20 @@ def test_the_closed_form_hole_is_the_one_of_a_sampled_view():
     centre = lens.slopes(np.array(528), np.array(403))
 
     def covers(slopes: np.ndarray) -> np.ndarray:
-        return np.asarray(((slopes - centre) ** 2).sum(axis=-1) > (1.6e-3 / 0.75) ** 2)
+        distance2 = ((slopes - centre) ** 2).sum(axis=-1)
+        return np.asarray(distance2 > (1.6e-3 / 0.75) ** 2)
 
-    view = layered_view(camera, region, Plane(0.75), Plane(0.755), covers, 0.6)
+    view = layered_view(
+        camera,
+        region,
+        Plane(0.75),
+        Plane(0.755),
+        covers,
+        0.6,
+    )
     half_m = SimulatedUnit(camera, QUIET, view).exposure.half_m[0]
-    seen = half_m[403 - 396, 528 - 520] - half_m[0, 528 - 520]
-    assert seen == pytest.approx(hole_depth_seen_m(camera, 3.2e-3, 5e-3, 0.75), rel=0.05)
+    depth_m = half_m[403 - 396, 528 - 520] - half_m[0, 528 - 520]
+    assert depth_m == pytest.approx(hole_depth_seen_m(camera, 3.2e-3, 5e-3, 0.75), rel=0.05)
 
 
 # ---------------------------------------------------------------- the file
@@ -313,9 +349,11 @@ def test_the_comb_spans_the_pulse_and_the_range():
     optics = CAMERA.optics
     spacing = np.diff([0.0, *optics.frequencies_hz])
     assert spacing == pytest.approx(1 / 64e-9)
-    assert optics.nearest_m == 0.25 and optics.farthest_m > 6.5
-    assert (
-        CAMERA.weights[-1] > 0.03 > CAMERA.weights[-1] * (CAMERA.weights[-1] / CAMERA.weights[-2])
-    )
+    assert optics.nearest_m == 0.25
+    assert optics.farthest_m > 6.5
+    # the next line would be below the floor
+    before_last, last = CAMERA.weights[-2:]
+    assert last > 0.03
+    assert last * (last / before_last) < 0.03
     twice = changed({"code.correlation_fwhm_ns": 1.0})
     assert len(twice.weights) == pytest.approx(2 * len(CAMERA.weights), abs=1)

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from detectors.rigid_motion import displacement_jacobian, kabsch
 from detectors.views.marks.mark import Mark, MarkSet, problem_of
-from detectors.views.marks.pairing import kabsch, pair_marks, place
 from detectors.views.registration.by_marks import held_out_error_m, register_by_marks
-from detectors.views.registration.registered import displacement_jacobian, predicted_error_m
+from detectors.views.registration.pairing import pair_marks, place
+from detectors.views.registration.registered import predicted_error_m
 from detectors.views.view import PreparedView
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import random_stream

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -18,43 +18,57 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.seeds import canonical_json, random_stream
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig
-from scenes.sensor.facts import UnitFacts
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
+from scenes.sensor.common.facts import CameraFacts, UnitFacts
 
-Camera = TypeVar("Camera", bound=AnyCamera)
+Camera = TypeVar("Camera", bound=CameraFacts)
 N_REASONS = max(Reason) + 1
-SUMMED = ("count", "total", "squares", "amplitude")
 
 
 class DecodedFrame(NamedTuple):
-    """A frame. ``z_m`` (h, w) float32: NaN where ``reason`` (h, w) uint8 is not VALID.
-    ``amplitude``: (h, w)."""
+    """A frame of h x w pixels."""
 
     z_m: np.ndarray
+    """(h, w) float32: NaN where ``reason`` is not VALID."""
     reason: np.ndarray
+    """(h, w) uint8: the pixel's `Reason`."""
     amplitude: np.ndarray
+    """(h, w): in the camera's units."""
 
 
 @dataclass(frozen=True)
 class FrameTotals:
-    """Sums over ``frames`` frames on pixels (h, w), with z in whole steps of ``step_m``, so that
-    sums are exact. ``count``: of valid samples. ``total``, ``squares``: of their z minus ``base``.
-    ``amplitude``: in the camera's units. ``reasons`` (r, h, w): how often each `Reason` occurred.
-    """
+    """Sums over frames on pixels (h, w), with z in whole steps, so that sums are exact."""
 
     frames: int
+    """Number of frames."""
     step_m: float
+    """The step of z in metres."""
     base: np.ndarray
+    """(h, w): whole steps that are taken off z."""
     count: np.ndarray
+    """(h, w): number of valid samples."""
     total: np.ndarray
+    """(h, w): sum of their z minus ``base``, in steps."""
     squares: np.ndarray
+    """(h, w): sum of its square."""
     amplitude: np.ndarray
+    """(h, w): sum of their amplitudes, in the camera's units."""
     reasons: np.ndarray
+    """(r, h, w): how often each `Reason` occurred."""
 
-    def cut(self, at: tuple[slice, slice]) -> FrameTotals:
+    def cut(self, part: tuple[slice, slice]) -> FrameTotals:
         """Return the same on a part of the pixels."""
-        images = {name: getattr(self, name)[at] for name in ("base", *SUMMED)}
-        return replace(self, reasons=self.reasons[:, *at], **images)
+        return FrameTotals(
+            frames=self.frames,
+            step_m=self.step_m,
+            base=self.base[part],
+            count=self.count[part],
+            total=self.total[part],
+            squares=self.squares[part],
+            amplitude=self.amplitude[part],
+            reasons=self.reasons[:, *part],
+        )
 
 
 def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,24 +82,25 @@ def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.nd
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
     """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2),
     periodic."""
-    responses = []
-    for size in white.shape:
-        response = ndimage.gaussian_filter1d(
-            np.eye(1, size)[0], length_px / np.sqrt(2), mode="wrap"
-        )
-        responses.append(scipy.fft.fft(response / np.linalg.norm(response)).astype(np.complex64))
-    down, across = responses
+    h, w = white.shape
     spectrum = scipy.fft.rfft2(white)
-    return np.asarray(
-        scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape), float
-    )
+    down = _smoothing_spectrum(h, length_px)
+    across = _smoothing_spectrum(w, length_px)[: spectrum.shape[1]]
+    return np.asarray(scipy.fft.irfft2(spectrum * down[:, None] * across, white.shape), float)
 
 
-SPECTRUM = 256
-LEAST_POWER = 1e-3
-FAINT = 0.05
-"""Frequencies of a filter's spectrum, and its least power and tap relative to the largest:
-correlations to 0.015."""
+def _smoothing_spectrum(size: int, length_px: float) -> np.ndarray:
+    """Return the spectrum (size,) complex64 of a periodic Gaussian whose squares sum to 1."""
+    impulse = np.eye(1, size)[0]
+    response = ndimage.gaussian_filter1d(impulse, length_px / np.sqrt(2), mode="wrap")
+    spectrum = scipy.fft.fft(response / np.linalg.norm(response))
+    return np.asarray(spectrum.astype(np.complex64))
+
+
+# these reproduce correlations to 0.015
+SPECTRUM = 256  # frequencies of a filter's spectrum
+LEAST_POWER = 1e-3  # its least power relative to the largest
+FAINT = 0.05  # least tap relative to the largest
 
 
 def taps_of(correlation: np.ndarray) -> np.ndarray:
@@ -93,17 +108,19 @@ def taps_of(correlation: np.ndarray) -> np.ndarray:
     (n,) at lags 0 to n - 1: the minimum-phase factor of its spectrum, by the cepstrum (Oppenheim
     and Schafer), as it is short."""
     lags = len(correlation)
+    half = SPECTRUM // 2
     circle = np.zeros(SPECTRUM)
     circle[:lags] = correlation
     circle[SPECTRUM - lags + 1 :] = correlation[:0:-1]
-    spectrum = np.fft.fft(circle).real
-    cepstrum = np.fft.ifft(0.5 * np.log(np.maximum(spectrum, LEAST_POWER * spectrum.max()))).real
-    cepstrum[1 : SPECTRUM // 2] *= 2.0
-    cepstrum[SPECTRUM // 2 + 1 :] = 0.0
+    power = np.fft.fft(circle).real
+    power = np.maximum(power, LEAST_POWER * power.max())
+    # the cepstrum of the amplitude, folded onto positive times, is that of the minimum phase
+    cepstrum = np.fft.ifft(0.5 * np.log(power)).real
+    cepstrum[1:half] *= 2.0
+    cepstrum[half + 1 :] = 0.0
     taps = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
-    taps = taps[
-        : 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())
-    ]
+    loud = np.abs(taps[:half]) > FAINT * np.abs(taps).max()
+    taps = taps[: 1 + int(np.flatnonzero(loud).max())]
     return np.asarray(taps / np.sqrt((taps**2).sum()), np.float32)
 
 
@@ -113,7 +130,8 @@ def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, n
     cancel at every frequency."""
     if effects.multipath:
         return view.phasor, view.intensity
-    return view.phasor_direct, np.minimum(np.abs(view.phasor_direct).max(axis=0), view.intensity)
+    direct = np.abs(view.phasor_direct).max(axis=0)
+    return view.phasor_direct, np.minimum(direct, view.intensity)
 
 
 KEPT_PATTERNS = 4  # whole sensors' patterns that a process keeps for other views of the same unit
@@ -140,26 +158,31 @@ class UnitModel(ABC, Generic[Camera]):
         """All range errors (h, w) that the frames of this unit share, if they are switched on."""
         camera = self.camera
         config = self.config
-        lens = self.camera.nominal_lens
-        error = _drift_m(
-            camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0]
-        )
-        if config.effects.unit_offset:
-            deviation = float(
-                random_stream(config.unit_seed, "unit offset", camera.name).standard_normal()
-            )
-            error = error + deviation * camera.unit.offset_mm.value * MM
-        if not config.effects.fixed_pattern:
-            return error
-        numbers = canonical_json([config.numbers, camera.fixed_pattern.to_data()])
+        effects = config.effects
+        error_m = _drift_m(camera.unit, effects, config.minutes_since_power_on, self.slopes[..., 0])
+        if effects.unit_offset:
+            stream = random_stream(config.unit_seed, "unit offset", camera.name)
+            deviation = float(stream.standard_normal())
+            error_m = error_m + deviation * camera.unit.offset_mm.value * MM
+        if effects.fixed_pattern:
+            cut = self.region.within(camera.nominal_lens.whole)
+            pattern_m = self._sensor_pattern_mm()[cut] * MM
+            error_m = error_m + pattern_m * config.fixed_pattern_scale
+        return np.asarray(error_m)
+
+    def _sensor_pattern_mm(self) -> np.ndarray:
+        """Return the fixed pattern of the whole sensor, drawn or kept."""
+        camera = self.camera
+        config = self.config
+        lens = camera.nominal_lens
+        numbers = canonical_json([config.numbers, camera.to_data()["fixed_pattern"]])
         key = camera.name, numbers, config.unit_seed, lens  # several files may have the same name
         if key not in _patterns_mm:
             while len(_patterns_mm) >= KEPT_PATTERNS:
                 del _patterns_mm[next(iter(_patterns_mm))]
             stream = random_stream(config.unit_seed, "fixed pattern", camera.name)
             _patterns_mm[key] = self.pattern_mm(stream, (lens.height, lens.width))
-        drawn_mm = _patterns_mm[key][self.region.within(lens.whole)]
-        return np.asarray(error + drawn_mm * MM * config.fixed_pattern_scale)
+        return _patterns_mm[key]
 
 
 def _drift_m(
@@ -180,12 +203,15 @@ def frame_errors_m(
     effect that is off adds 0."""
     axis = np.zeros(1)
     per_minute = facts.frames_per_second.value * 60
-    first = _drift_m(facts, effects, minutes, axis)[0]
+    first_m = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():
-        drifted = float(_drift_m(facts, effects, minutes + frame / per_minute, axis)[0] - first)
-        # each half of the chances of a jump stands for one direction
-        jitter = rng.standard_normal()
+        now_m = _drift_m(facts, effects, minutes + frame / per_minute, axis)[0]
+        drifted_m = float(now_m - first_m)
+        jitter_mm = rng.standard_normal() * facts.jitter_mm.value
+        # a number from 0 to 1 is a jump; each half of them stands for one direction
         chance = rng.random() / max(facts.jump_rate.value, 1e-12)
-        jump = math.copysign(facts.jump_mm.value, chance - 0.5) if chance < 1 else 0.0
-        moved = (jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
-        yield moved + drifted
+        jump_mm = 0.0
+        if chance < 1:
+            jump_mm = math.copysign(facts.jump_mm.value, chance - 0.5)
+        moved_m = (jitter_mm + jump_mm) * MM if effects.frame_jumps else 0.0
+        yield moved_m + drifted_m

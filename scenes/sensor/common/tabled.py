@@ -20,10 +20,12 @@ class DepthNoise:
         self.table = table = _loaded(table)
         slopes = table["slopes"] if slopes is None else slopes
         self.stretch = np.sqrt(1.0 + (np.asarray(slopes, np.float32) ** 2).sum(axis=-1))
-        self.cosine, self.shape = 1.0 / self.stretch, self.stretch.shape
+        self.cosine = 1.0 / self.stretch
+        self.shape = self.stretch.shape
         self.falloff = table["falloff"] if slopes is table["slopes"] else np.float32(1.0)
-        self.sigma_m, self.seen = (np.append(first, table[key]).astype(np.float32)
-                                   for first, key in ((0.0, "sigma_m"), (0.0, "seen")))  # fmt: skip
+        # entry 0 means no return
+        self.sigma_m = np.append(0.0, table["sigma_m"]).astype(np.float32)
+        self.seen_share = np.append(0.0, table["seen"]).astype(np.float32)
         white = np.random.default_rng(seed).standard_normal(self.shape, dtype=np.float32)
         self.pattern_m = table["pattern_m"] * filtered(
             white, table["pattern_rows"], table["pattern_columns"]
@@ -39,25 +41,25 @@ class DepthNoise:
             level = np.log2(self.falloff * np.asarray(intensity, np.float32) / (range_m * range_m))
         level *= table["per_octave"]
         level += np.float32(1.5) - table["first"] * table["per_octave"]
-        # entry 0 means no return; pixels without light (NaN or minus infinity) get it
-        place = np.fmin(
-            np.fmax(level, 0.0, out=level), np.float32(len(self.seen) - 1), out=level
-        ).astype(np.int32)
-        noise = filtered(
-            rng.standard_normal(self.shape, dtype=np.float32), table["rows"], table["columns"]
-        )
-        seen = rng.random(self.shape, dtype=np.float32) < self.seen.take(place)
-        seen &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
-        noise *= self.sigma_m.take(place)
-        noise += range_m
-        noise += self.pattern_m
-        noise *= self.cosine
-        if (step := table["step_m"]) > 0:
-            noise *= 1.0 / step
-            np.round(noise, out=noise)
-            noise *= step
-        noise[~seen] = np.nan
-        return noise
+        # pixels without light (NaN or minus infinity) get entry 0
+        np.fmax(level, 0.0, out=level)
+        np.fmin(level, np.float32(len(self.seen_share) - 1), out=level)
+        entry = level.astype(np.int32)
+        white = rng.standard_normal(self.shape, dtype=np.float32)
+        z = filtered(white, table["rows"], table["columns"])
+        valid = rng.random(self.shape, dtype=np.float32) < self.seen_share.take(entry)
+        valid &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
+        z *= self.sigma_m.take(entry)
+        z += range_m
+        z += self.pattern_m
+        z *= self.cosine
+        step_m = table["step_m"]
+        if step_m > 0:
+            z *= 1.0 / step_m
+            np.round(z, out=z)
+            z *= step_m
+        z[~valid] = np.nan
+        return z
 
 
 def filtered(image, rows, columns):  # type: ignore[no-untyped-def]
@@ -66,12 +68,10 @@ def filtered(image, rows, columns):  # type: ignore[no-untyped-def]
         reach = len(taps) - 1
         side = image.shape[axis]
         longer = np.concatenate([image.take(range(side - reach, side), axis), image], axis)
-        parts = (
-            longer[k : k + side] if axis == 0 else longer[:, k : k + side] for k in range(reach + 1)
-        )
         image = np.zeros_like(image)
-        for tap, part in zip(taps[::-1], parts, strict=True):
-            image += tap * part
+        for k, tap in enumerate(taps[::-1]):
+            shifted = longer[k : k + side] if axis == 0 else longer[:, k : k + side]
+            image += tap * shifted
     return image
 
 
@@ -88,14 +88,10 @@ class TorchDepthNoise:
     def __init__(self, table, device="cpu", seed=1):  # type: ignore[no-untyped-def]
         import torch
 
-        numbers = {
-            name: values
-            for name, values in _loaded(table).items()
-            if np.asarray(values).dtype.kind == "f"
-        }
-        self.table = {
-            name: torch.as_tensor(np.float32(each), device=device) for name, each in numbers.items()
-        }
+        self.table = {}
+        for name, values in _loaded(table).items():
+            if np.asarray(values).dtype.kind == "f":
+                self.table[name] = torch.as_tensor(np.float32(values), device=device)
         self.torch = torch
         self.stretch = (1.0 + (self.table["slopes"] ** 2).sum(-1)).sqrt()
         generator = torch.Generator(device=device).manual_seed(seed)
@@ -111,21 +107,21 @@ class TorchDepthNoise:
         torch = self.torch
         table = self.table
         range_m = z_m * self.stretch
-        level = (torch.log2(table["falloff"] * intensity / range_m**2) - table["first"]) * table[
-            "per_octave"
-        ]
+        octaves = torch.log2(table["falloff"] * intensity / range_m**2)
+        level = (octaves - table["first"]) * table["per_octave"]
         level = torch.nan_to_num(level, nan=-1.0, posinf=1e6, neginf=-1.0)
-        place = (level + 0.5).clamp(0, len(table["sigma_m"]) - 1).long()
+        entry = (level + 0.5).clamp(0, len(table["sigma_m"]) - 1).long()
         white = torch.randn(z_m.shape, generator=generator, device=z_m.device)
         noise = self.filtered(white, "rows", "columns")
-        moved = range_m + table["sigma_m"][place] * noise + self.pattern_m
-        chance = torch.where(level < 0.0, torch.zeros_like(level), table["seen"][place])
-        seen = torch.rand(z_m.shape, generator=generator, device=z_m.device) < chance
-        seen &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
-        z = moved / self.stretch
-        step = table["step_m"]
-        z = torch.round(z / step) * step if step > 0 else z
-        return torch.where(seen, z, torch.full_like(z, float("nan")))
+        noisy_m = range_m + table["sigma_m"][entry] * noise + self.pattern_m
+        seen_share = torch.where(level < 0.0, torch.zeros_like(level), table["seen"][entry])
+        valid = torch.rand(z_m.shape, generator=generator, device=z_m.device) < seen_share
+        valid &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
+        z = noisy_m / self.stretch
+        step_m = table["step_m"]
+        if step_m > 0:
+            z = torch.round(z / step_m) * step_m
+        return torch.where(valid, z, torch.full_like(z, float("nan")))
 
     def filtered(self, image, rows, columns):  # type: ignore[no-untyped-def]
         """Return images (.., h, w) after two causal filters of the table; edges wrap around."""

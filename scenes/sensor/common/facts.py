@@ -3,6 +3,7 @@ properties of a unit."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
@@ -23,25 +24,29 @@ STEEPEST = 6.0  # slope from the axis up to which distortion is checked: 80 degr
 
 
 class Fact(Config, Generic[T]):
-    """One number of a camera with its origin. ``tag``: R read in the named public source, D
-    derived from such, S a single secondary source, W measured on public captures, O measured on
-    the owner's by `tofpod characterise`, C calibrated, M a guess, G a guess of the precision with
-    its ``range``, U set by the user of an experiment."""
+    """One number of a camera with its origin."""
 
     value: T
+    """The number, in the unit that the key's name ends with."""
     tag: Literal["R", "D", "S", "W", "O", "C", "M", "G", "U"]
+    """R: read in the named public source; D: derived from such; S: a single secondary source; W:
+    measured on public captures; O: measured on the owner's by `tofpod characterise`; C: calibrated;
+    M: a guess; G: a guess of the precision; U: set by the user of an experiment."""
     source: str
+    """The document or measurement that says so."""
     range: tuple[float, float] | None = None
+    """Least and greatest value of a guess of the precision."""
 
     @model_validator(mode="after")
     def _guess_has_a_range(self) -> Fact[T]:
-        low, high = self.range or (np.nan, np.nan)
-        if (self.tag == "G") != (self.range is not None) or (
-            self.range and not low <= self.value <= high
-        ):  # type: ignore[operator]
-            raise ValueError(
-                "a number with the tag G, and no other, states the `range` that it may lie in"
-            )
+        message = "a number with the tag G, and no other, states the `range` that it may lie in"
+        if (self.tag == "G") != (self.range is not None):
+            raise ValueError(message)
+        if self.range is not None:
+            low, high = self.range
+            value: Any = self.value
+            if not low <= value <= high:
+                raise ValueError(message)
         return self
 
 
@@ -50,7 +55,8 @@ def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
     states."""
 
     def check(fact: Fact[Any]) -> Fact[Any]:
-        for value in fact.value if isinstance(fact.value, tuple) else (fact.value,):
+        values = fact.value if isinstance(fact.value, tuple) else (fact.value,)
+        for value in values:
             if not holds(value):
                 raise ValueError(f"the value is {value}; it must be {legal}")
         return fact
@@ -78,22 +84,30 @@ Wavelength = Annotated[
 
 
 class LensFacts(Config):
-    """The nominal lens. ``distortion``: k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty.
-    Pixels beyond ``field_half_angle_deg`` see nothing, and distortion may fold there; None: the
-    image covers the sensor."""
+    """The nominal lens."""
 
     width_px: PositiveInt
+    """Columns of the sensor."""
     height_px: PositiveInt
+    """Rows of the sensor."""
     fx_px: Positive
+    """Focal length across."""
     fy_px: Positive
+    """Focal length down."""
     cx_px: Fact[float]
+    """Column of the optical axis."""
     cy_px: Fact[float]
+    """Row of the optical axis."""
     distortion: Fact[tuple[float, ...]]
+    """k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty."""
     field_half_angle_deg: HalfAngle | None = None
+    """Pixels beyond it see nothing, and distortion may fold there; None: the image covers the
+    sensor."""
 
     @model_validator(mode="after")
     def _sees_each_direction_once(self) -> LensFacts:
-        if (count := len(self.distortion.value)) not in TERMS:
+        count = len(self.distortion.value)
+        if count not in TERMS:
             raise ValueError(
                 f"distortion has {count} terms; OpenCV's models have {', '.join(map(str, TERMS))}"
             )
@@ -101,26 +115,31 @@ class LensFacts(Config):
         across = max(lens.cx, lens.width - 1 - lens.cx)
         down = max(lens.cy, lens.height - 1 - lens.cy)
         corner = float(np.hypot(across / lens.fx, down / lens.fy))
+        image_ends = min(corner, self.image_radius)
         limit = unfolded_slope(lens.distortion)
-        if (ends := min(corner, self.image_radius)) > limit:
+        if image_ends > limit:
             end = "corner of the sensor lies" if corner < self.image_radius else "field ends"
-            folds = f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis"
-            raise ValueError(f"{folds}, and the {end} at {ends:.3g}")
-        u, v = (
-            a.ravel()
-            for a in np.meshgrid(
-                np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)
+            raise ValueError(
+                f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the "
+                f"axis, and the {end} at {image_ends:.3g}"
             )
-        )
-        seen = np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) < self.image_radius
-        u = u[seen]
-        v = v[seen]
-        again = lens.project(np.concatenate([lens.slopes(u, v), np.ones((u.size, 1))], axis=-1))
-        if not (np.abs(again - np.stack([u, v], axis=-1)) < WORST_PX).all():
+        if not self._pixels_come_back(lens):
             raise ValueError(
                 "distortion folds the image: somewhere on the sensor no direction leads to a pixel"
             )
         return self
+
+    def _pixels_come_back(self, lens: Lens) -> bool:
+        """Return whether pixels all over the image are met again by the rays that they see."""
+        columns = np.linspace(0, lens.width - 1, 9)
+        rows = np.linspace(0, lens.height - 1, 9)
+        u, v = np.meshgrid(columns, rows)
+        radius = np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy)
+        in_image = radius < self.image_radius
+        pixels = np.stack([u[in_image], v[in_image]], axis=-1)
+        slopes = lens.slopes(pixels[:, 0], pixels[:, 1])
+        rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=-1)
+        return bool((np.abs(lens.project(rays) - pixels) < WORST_PX).all())
 
     @cached_property
     def image_radius(self) -> float:
@@ -140,50 +159,63 @@ class LensFacts(Config):
 
     def lens(self) -> Lens:
         """The lens as a `Lens` of the program."""
-        width = self.width_px.value
-        height = self.height_px.value
         terms = self.distortion.value
-        centre = self.cx_px.value, self.cy_px.value
+        missing = 8 - len(terms)
         return Lens(
-            width, height, self.fx_px.value, self.fy_px.value, *centre, (*terms, *(0.0,) * 8)[:8]
+            width=self.width_px.value,
+            height=self.height_px.value,
+            fx=self.fx_px.value,
+            fy=self.fy_px.value,
+            cx=self.cx_px.value,
+            cy=self.cy_px.value,
+            distortion=terms + (0.0,) * missing,
         )
 
 
 class UnitFacts(Config):
-    """Differences of a unit from the nominal camera, and of its frames from each other.
-    ``offset_mm``: deviation between units of a constant range error. ``drift_mm`` exp(-t /
-    ``drift_min``): range error after power-on, greater by ``drift_ramp`` of itself per unit of
-    x/z. ``jump_rate``: share of frames that are displaced as a whole by ``jump_mm``, either way.
-    ``jitter_mm``: deviation of a small displacement of every frame."""
+    """Differences of a unit from the nominal camera, and of its frames from each other."""
 
     frames_per_second: Positive
+    """Rate of frames."""
     offset_mm: NonNegative
+    """Deviation between units of a constant range error."""
     drift_mm: Fact[float]
+    """Range error at power-on on the axis."""
     drift_min: Positive
+    """Minutes after which it has decayed to 1/e."""
     drift_ramp: Fact[float]
+    """Share of itself by which it is greater per unit of x/z."""
     jump_rate: Share
+    """Share of frames that jump."""
     jump_mm: NonNegative
+    """Displacement of a frame that jumps, either way."""
     jitter_mm: NonNegative
+    """Deviation of a small displacement of every frame."""
 
 
 class SmoothPatternFacts(Config):
     """A fixed pattern, which is the same in every frame of a unit: a smooth range error."""
 
     smooth_mm: NonNegative
+    """Its deviation."""
     smooth_length_px: LengthPx
+    """l of its correlation exp(-k^2 / 2 l^2) at a distance of k pixels."""
 
 
 class OutputFacts(Config):
     """The smallest range that a camera gives, and the step of the stored z."""
 
     min_range_mm: NonNegative
+    """Smallest range."""
     output_step_mm: Positive
+    """Step of the stored z."""
 
 
 class LimitFacts(OutputFacts):
     """Limits of range."""
 
     max_range_mm: Positive
+    """Greatest range."""
 
     @model_validator(mode="after")
     def _range_is_left(self) -> Self:
@@ -197,8 +229,11 @@ class ConeFacts(Config):
     angles."""
 
     position_mm: Fact[tuple[float, float, float]]
+    """x, y, z in the camera's frame."""
     full_half_angle_deg: HalfAngle
+    """Angle up to which it is whole."""
     cutoff_half_angle_deg: HalfAngle
+    """Angle from which it is 0."""
 
     @model_validator(mode="after")
     def _rolls_off_outwards(self) -> Self:
@@ -208,22 +243,28 @@ class ConeFacts(Config):
 
     def optics(self) -> dict[str, Any]:
         """Return the arguments that a camera's optics take from this cone."""
-        angles = {
-            key: getattr(self, key).value
-            for key in ("full_half_angle_deg", "cutoff_half_angle_deg")
+        return {
+            "emitter_m": np.array(self.position_mm.value) * MM,
+            "full_half_angle_deg": self.full_half_angle_deg.value,
+            "cutoff_half_angle_deg": self.cutoff_half_angle_deg.value,
         }
-        return {"emitter_m": np.array(self.position_mm.value) * MM, **angles}
 
 
 class CameraFacts(Config):
     """Contents of every camera's file, whatever its kind."""
 
     name: str
+    """Name of the file."""
     title: str
+    """Name for readers."""
     wavelength_nm: Wavelength
+    """Wavelength of the emitter."""
     lens: LensFacts
+    """The nominal lens."""
     unit: UnitFacts
+    """Differences between units, and between frames."""
     engine: OutputFacts
+    """Processing of the measurements."""
     modes: Annotated[tuple[str, ...], BeforeValidator(tuple)] = Field((), exclude=True)
     """Cameras that are other modes of this one, or a mapping of them by name; no simulation uses
     them."""
@@ -239,24 +280,30 @@ class CameraFacts(Config):
         """The rounding step of the output's z."""
         return self.engine.output_step_mm.value * MM
 
-    def optics_with(self, **own: Any) -> Optics:
-        """Return the camera's optics for the render. ``own``: arguments that only its kind knows."""
-        facts = {
-            "title": self.title,
-            "lens": self.nominal_lens,
-            "wavelength_nm": self.wavelength_nm.value,
-        }
-        return Optics(**facts, nearest_m=self.engine.min_range_mm.value * MM, **own)  # type: ignore[arg-type]
+    @property
+    @abstractmethod
+    def optics(self) -> Optics:
+        """The facts that the render needs."""
+
+    def optics_with(self, **of_kind: Any) -> Optics:
+        """Return the camera's optics for the render. ``of_kind``: arguments that only its kind
+        knows."""
+        return Optics(
+            title=self.title,
+            lens=self.nominal_lens,
+            wavelength_nm=self.wavelength_nm.value,
+            nearest_m=self.engine.min_range_mm.value * MM,
+            **of_kind,
+        )
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
         """Return (...) bool: whether points (..., 3) have an image on the sensor and within the
         lens's field."""
         half_angle = self.lens.field_half_angle_deg
-        aside = np.linalg.norm(points_camera_m[..., :2], axis=-1)
         widest = np.deg2rad(half_angle.value) if half_angle else np.pi / 2
-        return self.nominal_lens.images(points_camera_m) & (
-            np.arctan2(aside, points_camera_m[..., 2]) <= widest
-        )
+        aside_m = np.linalg.norm(points_camera_m[..., :2], axis=-1)
+        in_field = np.arctan2(aside_m, points_camera_m[..., 2]) <= widest
+        return self.nominal_lens.images(points_camera_m) & in_field
 
 
 def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
@@ -264,10 +311,10 @@ def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndar
     slopes (n,)."""
     k1, k2, _, _, k3, k4, k5, k6 = distortion
     s = slope**2
+    numerator = 1 + s * (k1 + s * (k2 + s * k3))
+    denominator = 1 + s * (k4 + s * (k5 + s * k6))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(
-            slope * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
-        )
+        return np.asarray(slope * numerator / denominator)
 
 
 def unfolded_slope(distortion: tuple[float, ...]) -> float:

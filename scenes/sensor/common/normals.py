@@ -13,14 +13,48 @@ FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil"
 """Compiler options of all camera kernels: operations are neither reordered nor fused, so that
 every processor gives the same bits. Values may be infinite: an unlit pixel may divide by zero and
 is gated out later."""
-EXACT_SUMS: Any = {
-    **FAST,
-    "fastmath": {"nsz", "reassoc"},
-}  # of whole numbers that float32 holds: exact in any order
+# of whole numbers that float32 holds: exact in any order
+EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 """The same for float64 sums that are rounded to float32 afterwards; their order changes a range by
 1e-13 m."""
-TWO_PI = np.float32(2.0 * math.pi)
+f4 = np.float32
+TWO_PI = f4(2.0 * math.pi)
+LOG_2 = f4(0.69314718)
+ROOT_2 = f4(1.41421356)
+PER_WORD_OF_16 = f4(2.0**-16)
+PER_WORD_OF_24 = f4(2.0**-24)
+MINUS_TWO = f4(-2)
+QUARTER = f4(0.25)
+HALF = f4(0.5)
+ONE = f4(1)
+TWO = f4(2)
+FOUR = f4(4)
+# coefficients of the series of 2 atanh, sine and cosine, by their powers
+ATANH_3 = f4(2 / 3)
+ATANH_5 = f4(2 / 5)
+ATANH_7 = f4(2 / 7)
+ATANH_9 = f4(2 / 9)
+SINE_3 = f4(-1 / 6)
+SINE_5 = f4(1 / 120)
+SINE_7 = f4(-1 / 5040)
+COSINE_2 = f4(-0.5)
+COSINE_4 = f4(1 / 24)
+COSINE_6 = f4(-1 / 720)
+COSINE_8 = f4(1 / 40320)
+# of the bits of a float32
+EXPONENT_SHIFT = np.uint32(23)
+EXPONENT_OF_ONE = np.int32(127)
+MANTISSA_BITS = np.uint32(0x007FFFFF)
+BITS_OF_ONE = np.uint32(0x3F800000)
+# of a word of 32 bits
+LOWER_SHIFT = np.uint32(8)
+HALF_SHIFT = np.uint32(16)
+LOWER_HALF = np.uint32(0xFFFF)
+# whole numbers
+INT_0 = np.int32(0)
+INT_1 = np.int32(1)
+INT_2 = np.int32(2)
 
 
 @numba.njit(**FAST)
@@ -30,9 +64,9 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
     n = np.uint64(out.size // 2)
     for i in range(n):
         # the upper 24 bits of a word fill a float32 exactly
-        u = (np.float32(bits[i] >> np.uint32(8)) + np.float32(0.5)) * np.float32(2.0**-24)
-        v = np.float32(bits[n + i] >> np.uint32(8)) * np.float32(2.0**-24)
-        radius = np.sqrt(np.float32(-2) * _log(u))
+        u = (f4(bits[i] >> LOWER_SHIFT) + HALF) * PER_WORD_OF_24
+        v = f4(bits[n + i] >> LOWER_SHIFT) * PER_WORD_OF_24
+        radius = np.sqrt(MINUS_TWO * _log(u))
         sine, cosine = _sincos_turns(v)
         out[i] = radius * cosine
         out[n + i] = radius * sine
@@ -42,9 +76,10 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
 def normal_pair(word):  # type: ignore[no-untyped-def]
     """Return two standard normals from a uniform word of 32 bits: from 65,536 radii, up to 4.9,
     and as many angles."""
-    u = (np.float32(word & np.uint32(0xFFFF)) + np.float32(0.5)) * np.float32(2.0**-16)
-    radius = np.sqrt(np.float32(-2) * _log(u))
-    sine, cosine = _sincos_turns(np.float32(word >> np.uint32(16)) * np.float32(2.0**-16))
+    u = (f4(word & LOWER_HALF) + HALF) * PER_WORD_OF_16
+    v = f4(word >> HALF_SHIFT) * PER_WORD_OF_16
+    radius = np.sqrt(MINUS_TWO * _log(u))
+    sine, cosine = _sincos_turns(v)
     return radius * cosine, radius * sine
 
 
@@ -53,48 +88,51 @@ def _log(u):  # type: ignore[no-untyped-def]
     """Return the natural logarithm of a positive float32: exponent from its bits, mantissa by an
     atanh series."""
     word: Any = float_bits(u)
-    exponent = np.int32(word >> np.uint32(23)) - np.int32(127)
-    mantissa = bits_float((word & np.uint32(0x007FFFFF)) | np.uint32(0x3F800000))
-    big = mantissa > np.float32(1.41421356)
-    mantissa = mantissa * np.float32(0.5) if big else mantissa
-    exponent = exponent + np.int32(1) if big else exponent
-    q = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
+    exponent = np.int32(word >> EXPONENT_SHIFT) - EXPONENT_OF_ONE
+    mantissa = bits_float((word & MANTISSA_BITS) | BITS_OF_ONE)
+    big = mantissa > ROOT_2
+    mantissa = mantissa * HALF if big else mantissa
+    exponent = exponent + INT_1 if big else exponent
+    q = (mantissa - ONE) / (mantissa + ONE)
     s = q * q
-    series = np.float32(2 / 3) + s * (
-        np.float32(2 / 5) + s * (np.float32(2 / 7) + s * np.float32(2 / 9))
-    )
-    return np.float32(exponent) * np.float32(0.69314718) + q * (np.float32(2) + s * series)
+    series = ATANH_7 + s * ATANH_9
+    series = ATANH_5 + s * series
+    series = ATANH_3 + s * series
+    return f4(exponent) * LOG_2 + q * (TWO + s * series)
 
 
 @numba.njit(inline="always", **FAST)
 def _sincos_turns(v):  # type: ignore[no-untyped-def]
     """Return sine and cosine of v turns, 0 <= v < 1."""
-    quarter = np.floor(v * np.float32(4) + np.float32(0.5))
-    x = (v - quarter * np.float32(0.25)) * TWO_PI
+    quarter = np.floor(v * FOUR + HALF)
+    x = (v - quarter * QUARTER) * TWO_PI
     x2 = x * x
-    sine = x * (
-        np.float32(1)
-        + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040)))
-    )
-    series = np.float32(1 / 24) + x2 * (np.float32(-1 / 720) + x2 * np.float32(1 / 40320))
-    cosine = np.float32(1) + x2 * (np.float32(-0.5) + x2 * series)
+    series = SINE_5 + x2 * SINE_7
+    series = SINE_3 + x2 * series
+    sine = x * (ONE + x2 * series)
+    series = COSINE_6 + x2 * COSINE_8
+    series = COSINE_4 + x2 * series
+    series = COSINE_2 + x2 * series
+    cosine = ONE + x2 * series
+    # a quarter of a turn swaps both, half a turn changes their signs
     k = np.int32(quarter)
-    odd = (k & np.int32(1)) == np.int32(1)
+    odd = (k & INT_1) == INT_1
     a = cosine if odd else sine
     b = sine if odd else cosine
-    a = -a if (k & np.int32(2)) != np.int32(0) else a
-    b = -b if ((k + np.int32(1)) & np.int32(2)) != np.int32(0) else b
+    a = -a if (k & INT_2) != INT_0 else a
+    b = -b if ((k + INT_1) & INT_2) != INT_0 else b
     return a, b
 
 
-def _bits(of: Any, into: Any) -> Any:
+def _bits(source: Any, target: Any) -> Any:
     """Return a compiled function that reinterprets the bits of a number of one type as another
     type."""
 
+    def generate(context, builder, _, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], context.get_value_type(target))
+
     def cast(context, value):  # type: ignore[no-untyped-def]
-        return into(of), lambda inner, builder, _, args: builder.bitcast(
-            args[0], inner.get_value_type(into)
-        )
+        return target(source), generate
 
     return intrinsic(cast)
 
@@ -103,8 +141,13 @@ float_bits = _bits(types.float32, types.uint32)
 bits_float = _bits(types.uint32, types.float32)
 
 
+def _generate_fused(context: Any, builder: Any, _: Any, args: Any) -> Any:
+    a, b, c = args
+    return builder.fma(a, b, c)
+
+
 def _fused(context: Any, a: Any, b: Any, c: Any) -> Any:
-    return types.float32(*3 * (types.float32,)), lambda _, builder, __, args: builder.fma(*args)
+    return types.float32(types.float32, types.float32, types.float32), _generate_fused
 
 
 fma: Any = intrinsic(_fused)

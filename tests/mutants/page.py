@@ -1,0 +1,105 @@
+"""The page on mutants: the share killed, by room, and the survivors by module."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from scipy.stats import binomtest
+
+from tests.mutants.kinds import RULES, Mutant
+
+HEAD = """# Mutants: small faults that the tests must notice
+
+Written by `make mutants`, not edited by hand. {number} small faults of the numeric modules are
+drawn with the seed {seed}, at most one of an expression. Each is put into a copy of the tree, where
+the tests of its room run without the slow ones. A fault is killed if a test fails or takes much too
+long.
+"""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A mutant with its outcome."""
+
+    mutant: Mutant
+    state: str
+    """``killed``, ``timed out`` (which counts as killed) or ``survived``."""
+    test: str
+    """The first test that failed."""
+    reason: str | None
+    """Why a survivor is no fault; None for a fault."""
+
+    @property
+    def is_killed(self) -> bool:
+        return self.state != "survived"
+
+    @property
+    def is_equivalent(self) -> bool:
+        return not self.is_killed and self.reason is not None
+
+    @property
+    def lives(self) -> bool:
+        """Whether it is a fault that no test has noticed."""
+        return not self.is_killed and self.reason is None
+
+
+def share_text(trials: Sequence[Trial]) -> str:
+    """Return the killed share of the faults with Wilson's 95 % interval."""
+    faults = [trial for trial in trials if not trial.is_equivalent]
+    if not faults:
+        return "–"
+    killed = sum(trial.is_killed for trial in faults)
+    interval = binomtest(killed, len(faults)).proportion_ci(method="wilson")
+    share = killed / len(faults)
+    return f"{100 * share:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
+
+
+def _row(name: str, trials: Sequence[Trial]) -> str:
+    killed = sum(trial.is_killed for trial in trials)
+    equivalent = sum(trial.is_equivalent for trial in trials)
+    lives = sum(trial.lives for trial in trials)
+    return f"| {name} | {len(trials)} | {killed} | {equivalent} | {lives} | {share_text(trials)} |"
+
+
+def _table(first: str, groups: dict[str, list[Trial]], trials: Sequence[Trial]) -> list[str]:
+    lines = [
+        f"| {first} | mutants | killed | equivalent | living | killed of the faults |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [_row(name, group) for name, group in groups.items() if group]
+    return [*lines, _row("all", trials), ""]
+
+
+def _listed(trials: Sequence[Trial]) -> list[str]:
+    lines: list[str] = []
+    file = ""
+    for trial in trials:
+        mutant = trial.mutant
+        if mutant.file != file:
+            file = mutant.file
+            lines += [f"### {file}", ""]
+        lines += [f"{mutant.function}, {mutant.kind}:", ""]
+        lines += [f"    - {mutant.original}", f"    + {mutant.mutant}", ""]
+        if trial.reason is not None:
+            lines += [trial.reason, ""]
+    return lines or ["None.", ""]
+
+
+def page(trials: Sequence[Trial], seed: int) -> str:
+    """Return the page in Markdown. ``trials``: in the order of their files."""
+    rooms = {Path(trial.mutant.file).parent.as_posix(): [] for trial in trials}
+    kinds: dict[str, list[Trial]] = {kind: [] for kind in RULES}
+    for trial in trials:
+        rooms[Path(trial.mutant.file).parent.as_posix()].append(trial)
+        kinds[trial.mutant.kind].append(trial)
+    share = f"{share_text(trials)} of the faults are killed (Wilson's 95 % interval)."
+    lines = [HEAD.format(number=len(trials), seed=seed), share, ""]
+    lines += _table("room", rooms, trials)
+    lines += _table("kind", kinds, trials)
+    lines += ["## Faults that live", "", *_listed([trial for trial in trials if trial.lives])]
+    lines += [
+        "## Equivalent mutants",
+        "",
+        *_listed([trial for trial in trials if trial.is_equivalent]),
+    ]
+    return "\n".join(lines).rstrip() + "\n"
