@@ -402,16 +402,16 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
     evidence names the place."""
     verdicts: list[Verdict] = []
     for claim, rule in VIEW_CLAIMS.items():
-        by_place: dict[str, list[Verdict]] = {}
+        by_conditions: dict[str, list[Verdict]] = {}
         for case in cases:
             answer, evidence = rule(case)
             if len(cases) > 1:
                 evidence = f"{case.conditions}: {evidence}"
-            # units of a camera are different cases at the same place
-            place = case.without_unit if claim in OVER_UNITS else case.conditions
-            by_place.setdefault(place, []).append(verdict_of(claim, answer, evidence))
-        for at_place in by_place.values():
-            verdicts += [_over_units(at_place)] if claim in OVER_UNITS else at_place
+            # units of a camera are different cases under the same conditions
+            conditions = case.without_unit if claim in OVER_UNITS else case.conditions
+            by_conditions.setdefault(conditions, []).append(verdict_of(claim, answer, evidence))
+        for alike_verdicts in by_conditions.values():
+            verdicts += [_over_units(alike_verdicts)] if claim in OVER_UNITS else alike_verdicts
     return verdicts
 
 
