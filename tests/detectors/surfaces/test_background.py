@@ -1,4 +1,4 @@
-"""The surface's shape, chosen by evidence, against surfaces that are known to the last micrometre."""
+"""The surface's shape, chosen by evidence, against surfaces known to the last micrometre."""
 
 from __future__ import annotations
 
@@ -99,7 +99,9 @@ def test_the_simplest_shape_that_explains_the_cloud_is_taken(
     z: np.ndarray, name: str, correlated_px: float
 ) -> None:
     answer = found(measured(z, correlated_px=correlated_px))
-    assert answer.notes["shape"] == name and answer.scale_m is None and answer.warning == ""
+    assert answer.notes["shape"] == name
+    assert answer.scale_m is None
+    assert answer.warning == ""
     error = answer.surface_z_m - z
     assert np.nanquantile(np.abs(error), 0.9) < 0.5 * NOISE_M
     assert abs(error[71:73, 79:81]).max() < 0.5 * NOISE_M
@@ -109,11 +111,10 @@ def test_a_free_form_says_its_scale_and_does_not_swallow_damage() -> None:
     deep = ((0.0, 0.0, 0.06, 0.002), (0.15, 0.1, 0.04, -0.002), (-0.2, -0.12, 0.04, 0.002))
     z = face(lambda x, y: 0.7 + 0.01 * np.tanh(x / 0.2) + 0.004 * np.sin(y / 0.1))
     answer = found(measured(z, damage=deep))
-    assert answer.notes["shape"] == "free form" and not answer.warning
-    assert (
-        answer.scale_m is not None
-        and f"wider than {1e3 * answer.scale_m:.0f} mm" in answer.description
-    )
+    assert answer.notes["shape"] == "free form"
+    assert not answer.warning
+    assert answer.scale_m is not None
+    assert f"wider than {1e3 * answer.scale_m:.0f} mm" in answer.description
     for x, y, _, depth in deep:
         pixel = np.unravel_index(np.argmin(np.hypot(X * z - x, Y * z - y)), SHAPE)
         # a sixth of the depth: what is left of a dent 12 pixels wide that the weights leave out
@@ -126,7 +127,8 @@ def test_a_free_form_says_its_scale_and_does_not_swallow_damage() -> None:
 def test_a_stated_degree_that_does_not_fit_is_warned_of(z: np.ndarray, degree: int) -> None:
     answer = found(measured(z), shape="polynomial", degree=degree)
     assert answer.warning.startswith("the surface does not fit here: degree")
-    assert answer.notes["misfit_share"] > 0.1 and answer.notes["misfit_rms_m"] > 0.5 * NOISE_M
+    assert answer.notes["misfit_share"] > 0.1
+    assert answer.notes["misfit_rms_m"] > 0.5 * NOISE_M
     warning = misfit(cloud_of(measured(z)), answer.residual_m, "it")
     assert warning.startswith("the surface does not fit here: it leaves")
 
@@ -135,10 +137,8 @@ def test_a_board_on_a_floor_taken_for_one_surface_is_warned_of() -> None:
     """Damage that covers less than a tenth of the target is no reason for doubt."""
     board = (np.abs(X * 0.7 + 0.02) < 0.22) & (np.abs(Y * 0.7) < 0.2)
     warning = found(measured(np.where(board, 0.986, 1.0) * plane())).warning
-    assert (
-        warning.startswith("the surface does not fit here: ")
-        and "a step between two surfaces" in warning
-    )
+    assert warning.startswith("the surface does not fit here: ")
+    assert "a step between two surfaces" in warning
     assert found(measured(plane(), damage=((0.05, 0.0, 0.2, 0.03),))).warning == ""
 
 
@@ -150,7 +150,8 @@ def test_flat_boards_stay_planes_and_without_warning(correlated_px: float) -> No
     assert sum(answer.notes["shape"] == "plane" for answer in answers) >= 4
     noise_m = np.array([np.nanmedian(answer.noise_m) for answer in answers])
     # noise that neighbours share is in part taken for level within a cell of 4 x 4 pixels
-    assert (noise_m > 0.75 * NOISE_M).all() and (noise_m < 1.05 * NOISE_M).all()
+    assert (noise_m > 0.75 * NOISE_M).all()
+    assert (noise_m < 1.05 * NOISE_M).all()
 
 
 def test_missing_pixels_change_little() -> None:
@@ -158,7 +159,8 @@ def test_missing_pixels_change_little() -> None:
     complete = found(z)
     z[np.random.default_rng(1).random(SHAPE) < 0.35] = np.nan
     answer = found(z)
-    assert answer.notes["shape"] == "quadric" and np.isnan(answer.residual_m[np.isnan(z)]).all()
+    assert answer.notes["shape"] == "quadric"
+    assert np.isnan(answer.residual_m[np.isnan(z)]).all()
     assert np.nanquantile(np.abs(answer.surface_z_m - complete.surface_z_m), 0.9) < 0.2 * NOISE_M
 
 
@@ -171,12 +173,11 @@ def test_what_is_seen_too_obliquely_is_left_out_and_said() -> None:
     sine = np.abs(X) / np.hypot(X, 1) * 0.9 / 0.2
     incidence = np.degrees(np.arcsin(np.minimum(sine, 1)))
     # to the next pixel the sine grows by 0.03: from 75 to 82 degrees
-    assert judged[incidence < 73].all() and not judged[(incidence > 82)].any()
+    assert judged[incidence < 73].all()
+    assert not judged[(incidence > 82)].any()
     share = 1 - judged.sum() / np.isfinite(z).sum()
-    assert (
-        answer.notes["steep_share"] == pytest.approx(share)
-        and "is not judged" in answer.description
-    )
+    assert answer.notes["steep_share"] == pytest.approx(share)
+    assert "is not judged" in answer.description
 
 
 def test_a_cloud_without_a_grid_and_a_map_are_no_different() -> None:
@@ -194,7 +195,8 @@ def test_a_cloud_without_a_grid_and_a_map_are_no_different() -> None:
     )
     mapped = replace(cloud_of(z, np.stack([x, y, heights], axis=-1)), projection="parallel")
     answer = background(mapped, mapped.valid, SurfaceConfig(shape="auto"))
-    assert answer.notes["shape"] == "quadric" and np.nanstd(answer.residual_m) < 1.05 * NOISE_M
+    assert answer.notes["shape"] == "quadric"
+    assert np.nanstd(answer.residual_m) < 1.05 * NOISE_M
 
 
 def test_few_points_are_a_plane_and_said_to_be_few() -> None:

@@ -60,9 +60,15 @@ def seen(path: Path, T_camera_part: np.ndarray, noise_mm: float, dent_mm: float 
 def blank() -> Cloud:
     shape = (288, 320)
     return Cloud(
-        points_m=np.full((*shape, 3), np.nan), reason=np.zeros(shape, np.uint8), count=np.full(shape, 10),
-        variance_m2=np.full(shape, np.nan), n_frames=10, region=Region(0, 288, 0, 320), lens=LENS, z_step_m=0.0,
-    )  # fmt: skip
+        points_m=np.full((*shape, 3), np.nan),
+        reason=np.zeros(shape, np.uint8),
+        count=np.full(shape, 10),
+        variance_m2=np.full(shape, np.nan),
+        n_frames=10,
+        region=Region(0, 288, 0, 320),
+        lens=LENS,
+        z_step_m=0.0,
+    )
 
 
 def stood(turn_deg: tuple[float, float, float], quarter: int = 0) -> np.ndarray:
@@ -146,4 +152,6 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
     )
     assert settings["surface"]["reference"] == {"file": str(path), "unit": "cm", "front": "+z"}
     with pytest.raises(UserError, match="has no surface setting"):
-        detector_of(main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", [])
+        detector_of(
+            main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", []
+        )
