@@ -41,7 +41,7 @@ from harness.experiment.load import load_experiment
 from harness.inspection.arguments import DEFAULT_DETECTOR
 from harness.inspection.judging import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
-from harness.report.study_page import draw_overlay
+from harness.report.study_figures import draw_overlay
 from harness.runs.options import EngineOptions
 from harness.target import declared
 from harness.vocabulary.declaration.diagnose import settings_of

@@ -386,7 +386,9 @@ def trials(runs: int) -> None:
         for name, detector in detectors.items():
             for way, exact in WAYS.items():
                 spent = seconds(
-                    partial(run_all, trials_of(Path(folder), 1, *detector, f"capture.exact={exact}")),
+                    partial(
+                        run_all, trials_of(Path(folder), 1, *detector, f"capture.exact={exact}")
+                    ),
                     runs,
                 )
                 print(

@@ -185,7 +185,10 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     (finding,) = told["findings"]
     row = rows_of(out / "findings.csv")[0]
     assert row["kind"] == finding["kind"] == "hole"
-    for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {"kind", "findings_version"}:
+    for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {
+        "kind",
+        "findings_version",
+    }:
         assert float(row[column]) == pytest.approx(finding[column], abs=1e-4)
     assert finding["size_from"] == "model" and finding["model"]["diameter_se_mm"] > 0
     assert (

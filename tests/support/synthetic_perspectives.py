@@ -1,4 +1,4 @@
-"""Result tables of an experiment with maps whose answers are known, and a map of them to look at."""
+"""Result tables of an experiment with maps whose answers are known, and a map to look at."""
 
 from __future__ import annotations
 

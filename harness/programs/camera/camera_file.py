@@ -61,7 +61,9 @@ def camera_of_size(lens: Lens) -> str:
     raise UserError."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [
-        name for name, size in sizes.items() if (size.width, size.height) == (lens.width, lens.height)
+        name
+        for name, size in sizes.items()
+        if (size.width, size.height) == (lens.width, lens.height)
     ]
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:

@@ -191,7 +191,9 @@ def beside(
         for each in every
     ]
     values = [
-        {(row[0], position.get(row[1], row[1])): row[3] for row in own_figures(each)} if each else {}
+        {(row[0], position.get(row[1], row[1])): row[3] for row in own_figures(each)}
+        if each
+        else {}
         for each, position in zip(every, places, strict=True)
     ]
     ends = {("temporal noise", face.where): face.temporal.interval for face in found.surfaces}

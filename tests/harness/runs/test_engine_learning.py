@@ -245,4 +245,6 @@ def test_one_blob_of_one_unit_decides_its_calibration_and_units_spread_it(study_
     assert set_by(of_one)[0].same_pixels == 4, "of 5 boards"
     assert set_by(of_units)[0].same_pixels == 1
     assert "highest score on the same pixels" in threshold_warnings(of_one)[0]
-    assert not any("same pixels" in threshold_warning for threshold_warning in threshold_warnings(of_units))
+    assert not any(
+        "same pixels" in threshold_warning for threshold_warning in threshold_warnings(of_units)
+    )

@@ -305,7 +305,9 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
         [id(leader) for leader, parts in zip(leaders, each, strict=True) if parts]
         for each in judged
     ]
-    both = [group for group in leaders if all(id(group) in shard for shard in shards) and group.first]
+    both = [
+        group for group in leaders if all(id(group) in shard for shard in shards) and group.first
+    ]
     calibrates = any(
         point.config.threshold.calibrate is not None for group in both for point in group.points
     )

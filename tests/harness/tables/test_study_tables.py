@@ -51,7 +51,11 @@ def two() -> list[SetUpLimit]:
     return limits_of(SetUp(frames=1, a50_mm=6.0), SetUp(frames=50, a50_mm=4.0))
 
 
-def with_runs(limit: SetUpLimit, threshold: float, **columns: object) -> SetUpLimit:
+def with_runs(
+    limit: SetUpLimit,
+    threshold: float,
+    **columns: object,
+) -> SetUpLimit:
     """A limit whose threshold four runs set."""
     runs = Calibrated(
         board=np.array([3, 5, 7, 9]),
@@ -69,10 +73,15 @@ def with_runs(limit: SetUpLimit, threshold: float, **columns: object) -> SetUpLi
 
 def test_the_run_that_set_a_threshold_has_the_nearest_score(two: list[SetUpLimit]) -> None:
     (row,) = set_by([with_runs(two[0], 11.9)])
-    assert (row.board, row.x_mm, row.y_mm, row.runs) == (5, -120.4, 33.2, 4)
-    assert (row.place, row.same_pixels) == ("−120, 33", None)
+    assert row.board == 5
+    assert row.x_mm == -120.4
+    assert row.y_mm == 33.2
+    assert row.runs == 4
+    assert row.place == ("−120, 33")
+    assert row.same_pixels is None
     (off,) = set_by([with_runs(two[0], 7.5)])
-    assert (off.board, off.place) == (7, "off the board")
+    assert off.board == 7
+    assert off.place == "off the board"
     assert set_by([replace(two[0], record=replace(two[0].record, calibrated=None))]) == []
 
 
@@ -85,7 +94,10 @@ def test_the_run_that_set_a_threshold_has_the_nearest_score(two: list[SetUpLimit
     ],
 )
 def test_runs_within_five_pixels_are_on_the_same_pixels(
-    two: list[SetUpLimit], u_px: list[float], v_px: list[float], same: int
+    two: list[SetUpLimit],
+    u_px: list[float],
+    v_px: list[float],
+    same: int,
 ) -> None:
     limit = with_runs(two[0], 12.0, u_px=np.array(u_px), v_px=np.array(v_px))
     (row,) = set_by([limit])
@@ -209,7 +221,10 @@ def test_depths_are_estimates_up_to_the_deepest_inspected(two: list[SetUpLimit])
     assert [row.limit for row in rows] == [two[1], two[1]]
     assert [row.diameter_mm for row in rows] == [2.0, 4.0]
     depth = rows[1].depth
-    assert (depth.value, depth.low, depth.high, depth.most) == (3.0, 2.0, 4.0, 9.0)
+    assert depth.value == 3.0
+    assert depth.low == 2.0
+    assert depth.high == 4.0
+    assert depth.most == 9.0
 
 
 def test_areas_that_could_not_be_computed_are_named(two: list[SetUpLimit]) -> None:
@@ -252,8 +267,11 @@ def test_the_limit_of_a_new_unit_is_quoted(units: SetUpLimit, two: list[SetUpLim
     assert sentence.endswith("(0.01 to 100).")
     assert study_answer([units]) == sentence
     row = LIMITS.frame([units]).iloc[0]
-    assert (row["one_unit_mm"], row["one_unit_low_mm"], row["one_unit_high_mm"]) == (8.4, 8.0, 9.1)
-    assert (row["new_unit_mm"], row["new_unit_verdict"]) == (9.5, "demonstrated")
+    assert row["one_unit_mm"] == 8.4
+    assert row["one_unit_low_mm"] == 8.0
+    assert row["one_unit_high_mm"] == 9.1
+    assert row["new_unit_mm"] == 9.5
+    assert row["new_unit_verdict"] == "demonstrated"
     single = LIMITS.frame(two).iloc[0]
     assert single["one_unit_mm"] == two[0].a90_95.value
     assert "all units (mm)" in limits_grid([units, two[1]]).heads
@@ -277,12 +295,10 @@ def test_of_many_limits_depths_are_not_compared_with_diameters(two: list[SetUpLi
 def test_estimates_and_bounds(two: list[SetUpLimit]) -> None:
     limit = two[0]
     estimate = size_estimate(limit, "a90")
-    assert (estimate.value, estimate.low, estimate.high, estimate.most) == (
-        limit.a90_mm,
-        limit.a90_interval_mm.low,
-        limit.a90_interval_mm.high,
-        limit.largest_mm,
-    )
+    assert estimate.value == limit.a90_mm
+    assert estimate.low == limit.a90_interval_mm.low
+    assert estimate.high == limit.a90_interval_mm.high
+    assert estimate.most == limit.largest_mm
     assert np.isnan(size_estimate(replace(limit, a50_mm=0.0), "a50").value)
     nothing = replace(limit.a90_95, value=np.inf)
     assert bound_text(bound_estimate(limit, nothing)) == "not demonstrated"
@@ -300,7 +316,8 @@ def test_hits_by_missing_returns_alone_are_noted(two: list[SetUpLimit]) -> None:
     limit = replace(two[0], record=replace(two[0].record, inspected=split))
     assert f"3 of {limit.hits} hits by missing returns alone" in "; ".join(notes_of(limit))
     row = LIMITS.frame([limit]).iloc[0]
-    assert (row["hits_by_depth"], row["hits_by_no_return"]) == (limit.hits - 3, 5)
+    assert row["hits_by_depth"] == limit.hits - 3
+    assert row["hits_by_no_return"] == 5
     cells = LIMITS.grid([limit])
     text = cells.rows[0][cells.heads.index("found")].text
     assert text == (

@@ -62,12 +62,14 @@ def forbidden_calls(text: str) -> set[str]:
             continue
         name = ast.unparse(node.func)
         safe = any(
-            keyword.arg == "allow_pickle" and ast.unparse(keyword.value) == "False" for keyword in node.keywords
+            keyword.arg == "allow_pickle" and ast.unparse(keyword.value) == "False"
+            for keyword in node.keywords
         )
         if name in FORBIDDEN and not (name in LOADS and safe):
             found.add(name)
         if any(
-            keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False" for keyword in node.keywords
+            keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"
+            for keyword in node.keywords
         ):
             found.add(f"{name}(allow_pickle)")
         if name.endswith("YAML") and any(

@@ -155,7 +155,7 @@ def test_a_rim_that_is_seen_more_steeply_is_told(radius_m: float | None, said: s
         for one in [damages_placed(scan, family, CAMERA, "damaged", n)]
         if one.damages
     ]
-    known = scan.known(scan.whole, site)
+    known = scan.known(scan.whole, site, damaged=True)
     for damage in known.truth:
         wide_m2 = scan.pitch_m**2 * len(known.outlines[damage.id])
         assert wide_m2 == pytest.approx(damage.length_m * damage.width_m, rel=0.4)
