@@ -16,7 +16,14 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled, parts_with
+from detectors.pixels.masks import (
+    grown,
+    holes_filled,
+    inset,
+    nearest_pixel,
+    notches_filled,
+    parts_with,
+)
 from detectors.surfaces.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
@@ -369,7 +376,8 @@ def _doubts_about_others(candidates: tuple[Candidate, ...], contact_m: float) ->
     large = sum(2 * candidate.share >= first.share for candidate in candidates[1:])
     if large >= CROWD:
         doubts.append(
-            f"{large} other surfaces are half as large as target 1 or larger: the scene may hold no"
+            f"{large} other surfaces are half as large as target 1 or larger: the scene may "
+            "hold no"
             " target"
         )
     in_plane = [

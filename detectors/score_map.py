@@ -11,10 +11,10 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 from pydantic import Field
 
-from detectors.findings.clusters import nested_clusters
 from detectors.findings.measure import HoleModelConfig, centres_of, measure_detection
 from detectors.interface import Detection, Detector, Evidence, Measurement
-from detectors.masks import on_grid as on_grid
+from detectors.pixels.clusters import nested_clusters
+from detectors.pixels.masks import on_grid as on_grid
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud
 

@@ -198,7 +198,7 @@ def _run(name: str, program_arguments: list[str]) -> int:
             end="",
         )
         return 0
-    from harness.vocabulary.declaration.diagnose import nearest
+    from harness.vocabulary.words import nearest
 
     names = [program.name for program in PROGRAMS]
     nearest_name = nearest(name, names)

@@ -41,7 +41,7 @@ from harness.experiment.load import load_experiment
 from harness.inspection.arguments import DEFAULT_DETECTOR
 from harness.inspection.judging import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
-from harness.report.study_page import draw_overlay
+from harness.report.study_figures import draw_overlay
 from harness.runs.options import EngineOptions
 from harness.target import declared
 from harness.vocabulary.declaration.diagnose import settings_of
@@ -49,7 +49,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, FrameSource
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from harness.vocabulary.geometry import Region
 from scenes.optics import NoiseFreeView, Optics, footprint_of, wave_numbers
-from scenes.sensor.camera import AnyCamera
+from scenes.sensor.common.facts import CameraFacts
 
 WHITE = 0.8  # albedo of closed-form surfaces in red, green and blue; no sensor uses it
 # slopes (..., 2), without NaN, to whether the front is there
@@ -44,7 +44,7 @@ class Plane:
 
 
 def plane_view(
-    camera: AnyCamera,
+    camera: CameraFacts,
     region: Region,
     distance_m: float,
     albedo: float,
@@ -61,7 +61,7 @@ def plane_view(
 
 
 def image_view(
-    camera: AnyCamera,
+    camera: CameraFacts,
     region: Region,
     z_m: np.ndarray,
     light: np.ndarray,
@@ -104,7 +104,7 @@ class _Hits(NamedTuple):
 
 
 def layered_view(
-    camera: AnyCamera,
+    camera: CameraFacts,
     region: Region,
     front: Plane,
     back: Plane,

@@ -19,7 +19,8 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_paths, numbers_of_lens
+from scenes.sensor.camera import camera_of, number_paths, numbers_of_lens
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 

@@ -133,9 +133,9 @@ def test_the_rules_see_a_forbidden_import_and_a_circle(tmp_path):
     for name, text in texts.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    made = structure.module_graph(structure.modules_in(tmp_path))
-    assert structure.circles(made) == [["harness.core", "harness.programs.one.first"]]
-    assert structure.arrows_to_programs(made) == (
+    created = structure.module_graph(structure.modules_in(tmp_path))
+    assert structure.circles(created) == [["harness.core", "harness.programs.one.first"]]
+    assert structure.arrows_to_programs(created) == (
         {("one", "two")},
         {("harness.core", "harness.programs.one.first")},
     )
@@ -225,16 +225,15 @@ def test_class_names_have_one_meaning():
 
 
 def test_docstrings_begin_as_sentences_do():
-    """A verb or a noun comes first; a preposition or a relative word makes a fragment."""
+    """A verb or a noun comes first; a preposition or a relative word makes a fragment. The notes
+    of fields may be fragments: "Whether x is the logarithm of the size."."""
     fragments = []
     for path in sources():
         for node in nodes(path):
-            body = getattr(node, "body", None)
-            for each in body if isinstance(body, list) else ():
-                if (
-                    isinstance(each, ast.Expr)
-                    and isinstance(each.value, ast.Constant)
-                    and isinstance(each.value.value, str)
-                ) and each.value.value.split(maxsplit=1)[0] in FRAGMENTS:
-                    fragments.append(f"{path.relative_to(ROOT).as_posix()}:{each.lineno}")
+            if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                continue
+            text = ast.get_docstring(node) or ""
+            if text and text.split(maxsplit=1)[0] in FRAGMENTS:
+                line = getattr(node, "lineno", 1)
+                fragments.append(f"{path.relative_to(ROOT).as_posix()}:{line}: {text[:50]}")
     assert not fragments

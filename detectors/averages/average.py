@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from pydantic import Field
 
-from detectors.findings.clusters import PLAIN
+from detectors.pixels.clusters import PLAIN
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, LeftOut, Reason

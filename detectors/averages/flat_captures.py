@@ -19,8 +19,8 @@ from scipy import sparse
 from scipy.sparse.linalg import lsqr
 
 from detectors.averages.flat_field import NEAR_ENOUGH, FlatField
-from detectors.averages.noise import LEAST_FRAMES, average_variance_m2, sigma_of
-from detectors.masks import on_grid
+from detectors.pixels.masks import on_grid
+from detectors.pixels.noise import LEAST_FRAMES, average_variance_m2, sigma_of
 from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens, transform_points

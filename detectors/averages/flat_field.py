@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from detectors.averages.noise import LEAST_FRAMES, average_variance_m2
+from detectors.pixels.noise import LEAST_FRAMES, average_variance_m2
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_path, refuse_pixels

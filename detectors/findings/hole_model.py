@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numba
 import numpy as np
 
-from detectors.findings.clusters import PLAIN
 from detectors.findings.whitening import correlated_products, covariance_factor
+from detectors.pixels.clusters import PLAIN
 
 # --- the picture ---
 

@@ -13,8 +13,6 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.averages.noise import median_of, quantile_of, sigma_of
-from detectors.findings.clusters import PLAIN
 from detectors.findings.hole_model import (
     MOST_MISFIT,
     HoleFit,
@@ -27,7 +25,9 @@ from detectors.findings.hole_model import (
     whitened,
 )
 from detectors.interface import Detection, Evidence, Measurement
-from detectors.masks import grown, parts_with
+from detectors.pixels.clusters import PLAIN
+from detectors.pixels.masks import grown, parts_with
+from detectors.pixels.noise import median_of, quantile_of, sigma_of
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 

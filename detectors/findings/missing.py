@@ -19,7 +19,7 @@ from scipy.special import ndtri, ndtri_exp, owens_t
 
 from detectors.findings.measure import local_plane
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
-from detectors.masks import grown, holes_filled, nearest_pixel, parts_with
+from detectors.pixels.masks import grown, holes_filled, nearest_pixel, parts_with
 from harness.vocabulary.geometry import Cloud, Reason
 from harness.vocabulary.seeds import random_stream
 

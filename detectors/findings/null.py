@@ -23,7 +23,7 @@ from scipy import ndimage, optimize, special
 
 from detectors.findings.measure import extents
 from detectors.interface import Detection, Detector, Evidence
-from detectors.masks import grown, holes_filled, parts_with
+from detectors.pixels.masks import grown, holes_filled, parts_with
 from harness.vocabulary.geometry import Cloud
 
 # --- the tail ---

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.fft
 import scipy.linalg
 
-from detectors.findings.clusters import PLAIN
+from detectors.pixels.clusters import PLAIN
 
 LONGEST_LAG_PX = 28  # lag at which Parzen's window fades the covariance to 0
 GRID = 96  # side of the grid that holds the widest template and the reach of its whitened edge

@@ -18,11 +18,11 @@ import numba
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.averages.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.crop import AutoCrop, CropConfig, crop
-from detectors.findings.clusters import PLAIN, root_of
 from detectors.findings.measure import HoleModelConfig, measure_detection
 from detectors.interface import Detection, Evidence, Measurement
+from detectors.pixels.clusters import PLAIN, root_of
+from detectors.pixels.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.score_map import Findings, above, on_grid
 from detectors.surfaces.background import Background, background
 from detectors.surfaces.smooth_surfaces import raster

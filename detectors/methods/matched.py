@@ -35,15 +35,15 @@ import cv2
 import numba
 import numpy as np
 
-from detectors.averages.noise import median_of
 from detectors.findings import templates, whitening
-from detectors.findings.clusters import PLAIN
 from detectors.findings.missing import missing_evidence
 from detectors.interface import Evidence
-from detectors.masks import grown
 from detectors.methods import local
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.methods.scatter import FAINT, WIDE_PX, evened, tail_of, zones_of
+from detectors.pixels.clusters import PLAIN
+from detectors.pixels.masks import grown
+from detectors.pixels.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
 # --- residuals in deviations ---

@@ -20,10 +20,10 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from detectors.averages.average import AverageConfig, average
-from detectors.averages.noise import median_of, rounding_floor, sigma_of
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detector, Evidence
 from detectors.open3d_library import open3d_on_one_thread
+from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.recordings import open_capture
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surfaces.background import background

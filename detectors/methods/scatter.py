@@ -12,10 +12,10 @@ import numba
 import numpy as np
 from scipy import special
 
-from detectors.findings.clusters import PLAIN
 from detectors.findings.templates import Template
-from detectors.masks import grown
 from detectors.methods import local
+from detectors.pixels.clusters import PLAIN
+from detectors.pixels.masks import grown
 
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
 """Distances from the outline up to which scores have their own scatter; farther inside, all scores

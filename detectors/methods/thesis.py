@@ -8,9 +8,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from detectors.averages.noise import median_of, rounding_floor, sigma_of
 from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
+from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surfaces.background import background
 from detectors.surfaces.surface import SurfaceConfig, fit_surface

@@ -18,8 +18,8 @@ import cv2
 import numba
 import numpy as np
 
-from detectors.averages.noise import median_of, sigma_of
-from detectors.masks import grown, on_grid
+from detectors.pixels.masks import grown, on_grid
+from detectors.pixels.noise import median_of, sigma_of
 from detectors.surfaces.free_form import free_form, picture_places
 from detectors.surfaces.reference import laid_on
 from detectors.surfaces.surface import (

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import solveh_banded
 
-from detectors.findings.clusters import PLAIN
+from detectors.pixels.clusters import PLAIN
 from detectors.surfaces.surface import RIDGE, Fit
 
 KNOTS_PER_WAVELENGTH = 4.0

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from detectors.open3d_library import load_open3d
+from detectors.rigid_motion import displacement_jacobian, kabsch, moved_by
 from detectors.surfaces.surface import BISQUARE_TUNING, Fit, ReferenceConfig, bisquare_weights
-from detectors.views.marks.pairing import kabsch
-from detectors.views.registration.registered import displacement_jacobian, moved_by
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
 from harness.vocabulary.meshes import front_first, read_mesh

@@ -9,9 +9,16 @@ import cv2
 import numba
 import numpy as np
 
-from detectors.averages.noise import quantile_of
-from detectors.findings.clusters import PLAIN
-from detectors.masks import components, grown, holes_filled, nearest_pixel, parts_with, shrunk
+from detectors.pixels.clusters import PLAIN
+from detectors.pixels.masks import (
+    components,
+    grown,
+    holes_filled,
+    nearest_pixel,
+    parts_with,
+    shrunk,
+)
+from detectors.pixels.noise import quantile_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 
 MAX_SURFACE_TILT = 6.0  # tan(80.5 degrees): a steeper step is an edge

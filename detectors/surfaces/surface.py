@@ -17,8 +17,8 @@ from pydantic import Field, model_validator
 from scipy.linalg import eigh
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from detectors.averages.noise import median_of
-from detectors.findings.clusters import PLAIN
+from detectors.pixels.clusters import PLAIN
+from detectors.pixels.noise import median_of
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis

@@ -28,13 +28,8 @@ from harness.vocabulary.declaration.yaml_source import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import (
-    CameraConfig,
-    camera_names,
-    is_camera_path,
-    load_camera,
-    numbers_of_lens,
-)
+from scenes.sensor.camera import camera_names, is_camera_path, load_camera, numbers_of_lens
+from scenes.sensor.common.config import CameraConfig
 
 # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 EXPERIMENT_VERSION = 1
@@ -58,7 +53,10 @@ def load_experiment(
     # a file in a result folder states its version; a file that is written by hand states none
     stamp = stamp_of(written.text, STAMP_KIND)
     if stamp is not None:
-        again = "use the original experiment, or remove the first line and correct the problems that are then reported"
+        again = (
+            "use the original experiment, or remove the first line and correct the problems "
+            "that are then reported"
+        )
         check_version(stamp, EXPERIMENT_VERSION, path, "an experiment", again=again)
     overrides = [*_quick(written.data), *overrides] if quick else overrides
     source, problems = overridden(written, overrides, declared_of)
@@ -200,7 +198,10 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         )
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
-            fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
+            fix = (
+                "name a recording of the same camera in the same mode, or choose another "
+                "source.camera.name"
+            )
             message = f"{recording}: its calibration is for {lens.width} x {lens.height} pixels"
             raise UserError(message, legal=legal, fix=fix)
     return numbers_of_lens(lens)

@@ -12,7 +12,7 @@ from typing import Any
 from harness.experiment import checks
 from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of, point_of
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.diagnose import dotted, nearest, shown, unknown_key
+from harness.vocabulary.declaration.diagnose import dotted, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import (
     DeclarationError,
     KeyPath,
@@ -24,6 +24,7 @@ from harness.vocabulary.declaration.yaml_source import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json, random_stream
+from harness.vocabulary.words import nearest
 
 OPTION = "--set"
 NOT_VARIED = ("sweep", "sensitivity")  # Keys that hold dotted paths themselves

@@ -12,7 +12,7 @@ from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
 from detectors.findings.null import OwnThreshold, each_object_once, own_threshold
 from detectors.interface import Detection, Detector, Evidence, Measurement
-from detectors.masks import grown, holes_filled
+from detectors.pixels.masks import grown, holes_filled
 from detectors.surfaces.background import misfit
 from harness.inspection import arguments as cli
 from harness.report.findings import Finding, Judged

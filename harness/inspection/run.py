@@ -15,9 +15,9 @@ import numpy as np
 
 from detectors.averages.average import RECORDED, average, unsteadiness
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
-from detectors.averages.noise import REACH_FRAMES, noise_reach_px
 from detectors.crop import Choice
 from detectors.interface import Detector
+from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output

@@ -77,7 +77,7 @@ class StudyExample:
     pod: float
     """Probability of detection by the curve at that size; NaN without a curve."""
     hit: bool
-    """Whether the damage was found."""
+    """True if the damage was found."""
     score: float
     """Highest score on the damage, in the threshold's unit; NaN if no pixel there was judged."""
     threshold: float
@@ -108,7 +108,7 @@ class Circle3d:
     label: str
     """Text beside the ring."""
     kind: CircleKind
-    """What the ring marks; decides its colour."""
+    """The marked thing; decides the ring's colour."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Scene3d:
     facts: tuple[tuple[str, str], ...] = ()
     """(name, value) of what stands beside the picture."""
     shown: str = "camera's colours"
-    """What ``rgb`` represents."""
+    """Meaning of ``rgb``."""
     key: tuple[tuple[str, str], ...] = ()
     """(words, colour) that explain ``rgb``."""
 
@@ -156,4 +156,4 @@ class MappedExample:
     scene: Scene3d
     """The cloud with its rings."""
     is_variation: bool = False
-    """Whether the variant is a variation of a set-up."""
+    """True if the variant is a variation of a set-up."""

@@ -34,7 +34,8 @@ from harness.vocabulary.seeds import canonical_json, digest, random_stream
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews, poses_of
 from scenes.render.cache import render_key
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 

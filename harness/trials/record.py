@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from detectors.averages.noise import median_of
 from detectors.interface import Measurement
+from detectors.pixels.noise import median_of
 from harness.records.rows import (
     DamageRow,
     FindingRow,

@@ -18,7 +18,8 @@ from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
-from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, load_camera
+from scenes.sensor.camera import AnyCamera, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit

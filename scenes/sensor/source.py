@@ -15,10 +15,11 @@ from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw.at_once import AtOnce, at_once
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.camera import AnyCamera, CameraConfig
+from scenes.sensor.camera import AnyCamera
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.unit import FrameTotals, frame_errors_m
 from scenes.sensor.empirical.imager import EmpiricalImager
 from scenes.sensor.lidar.scanner import LidarScanner
-from scenes.sensor.unit import FrameTotals, frame_errors_m
 
 
 @dataclass(frozen=True)

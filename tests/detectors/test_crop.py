@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from detectors import load_detector
 from detectors.crop import AutoCrop, BoxCrop, CropConfig, NoCrop, PolygonCrop, choice_of, crop
-from detectors.masks import holes_filled
+from detectors.pixels.masks import holes_filled
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region
 from tests.support.target_scenes import SCENES, Scene

@@ -13,7 +13,8 @@ from scenes import implants
 from scenes.closed_form import plane_view
 from scenes.implants import Implant, implant_of, local_board, side_mm, unit_config
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 

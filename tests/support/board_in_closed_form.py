@@ -13,7 +13,8 @@ from harness.trials.judge import Criteria
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.seeds import canonical_json
 from scenes.closed_form import Plane, layered_view
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.custom import TargetConfig
 from scenes.target.truth import truth_of

@@ -9,7 +9,8 @@ import numpy as np
 
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Region
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
+from scenes.sensor.camera import camera_of, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA = load_camera("realsense_l515")

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from detectors.averages.noise import sigma_of
-from detectors.masks import grown, parts_with, shrunk
+from detectors.pixels.masks import grown, parts_with, shrunk
+from detectors.pixels.noise import sigma_of
 from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 

@@ -26,11 +26,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaincc
 
-from detectors.averages.noise import sigma_of
+from detectors.pixels.noise import sigma_of
+from detectors.rigid_motion import displacement_jacobian, moved_by
 from detectors.surfaces.surface import BISQUARE_TUNING, SurfaceConfig, fit_surface
 from detectors.views.marks.mark import Mark, off_line_problem
-from detectors.views.marks.pairing import SHARED_M, Placement, pair_marks, place
 from detectors.views.registration import registered
+from detectors.views.registration.pairing import SHARED_M, Placement, pair_marks, place
 from detectors.views.view import PreparedView
 from harness.vocabulary.geometry import MM, invert, transform_points
 
@@ -64,14 +65,23 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         not problem
         and gammaincc(freedom / 2, _placed(fixed, moved, SHARED_M).chi2 / 2) < REFUSE_BELOW
     ):
-        problem = f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, more than noise and"
-        problem += f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or a mark moved"
+        problem = (
+            f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, more "
+            "than noise and"
+        )
+        problem += (
+            f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or "
+            "a mark moved"
+        )
     covariance = placement.covariance
     if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
         ratio = float(np.sqrt(placement.chi2 / freedom))
         covariance = covariance * ratio**2
         notes += (
-            f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",
+            (
+                f"the marks disagree by {ratio:.1f} times their noise; the covariance is "
+                "widened to match"
+            ),
         )
     where = placement.T_to_from, covariance, placement.centre_m
     found = registered.Registration(
@@ -183,9 +193,7 @@ class JointState:
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
         """Return the state after a motion of all unknowns; poses move about the frame's origin."""
         poses, surface, marks, own = self.split(motion)
-        turned = (
-            registered.moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True)
-        )
+        turned = (moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))
         T = np.stack([self.T[0], *turned])
         return JointState(
             T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m
@@ -211,9 +219,7 @@ class JointState:
         by_x = (self.basis(x + dx, y) - self.basis(x - dx, y)) @ self.surface / (2 * dx)
         by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
         normals = np.stack([-by_x, -by_y, np.ones(len(x))], axis=1)
-        by_pose = np.einsum(
-            "ni,nij->nj", normals, registered.displacement_jacobian(points, np.zeros(3))
-        )
+        by_pose = np.einsum("ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3)))
         scale = max(data.noise_m, sigma_of(residual))
         tukey = np.clip(1 - (residual / scale / BISQUARE_TUNING) ** 2, 0.0, None) ** 2
         return residual, basis, by_pose, tukey / data.sigma_m**2
@@ -241,7 +247,7 @@ class JointState:
             turn = self.T[v][:2, :3]
             for mark, label in view.marks:
                 place = transform_points(self.T[v], mark.centre_m)
-                within = registered.displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
+                within = displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
                 rows = np.concatenate([-np.eye(2), within], axis=1)
                 weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
                 add(
@@ -313,7 +319,10 @@ def _adjust(
     covariance = np.linalg.inv(state.equations(data)[0])
     T_reference_surface = invert(T_surface_reference)
     both = np.kron(np.eye(2), T_reference_surface[:3, :3])
-    note = f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the covariance includes it"
+    note = (
+        f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the "
+        "covariance includes it"
+    )
     lost = "" if converged else f"did not converge in {steps} steps of the joint adjustment"
     adjusted = []
     for v, found in enumerate(marked, start=1):

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from detectors.open3d_library import open3d_on_one_thread
-from detectors.views.marks.pairing import kabsch
+from detectors.rigid_motion import displacement_jacobian, kabsch
 from detectors.views.registration import registered
 from detectors.views.registration.settings import CpdRegistration, IcpRegistration
 from detectors.views.view import PreparedView
@@ -64,7 +64,10 @@ def register_by_icp(
             moved = transform_points(T, moving)
             apart, paired = _pairs(tree, moved, limit_m)
             if paired.sum() < 3:
-                failure = f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the reference's"
+                failure = (
+                    f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the "
+                    "reference's"
+                )
                 return registered.failed(view, "icp", start, failure, *notes)
             change = kabsch(moved[paired], (moved - apart)[paired], np.ones(paired.sum()))
             T = change @ T
@@ -116,7 +119,7 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
     within cubes of 5 pixels whose errors are common. It ignores that the iteration may stop at one
     of many near minima. NaN if a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
-    jacobian = registered.displacement_jacobian(arm, np.zeros(3))
+    jacobian = displacement_jacobian(arm, np.zeros(3))
     scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
 
     def half_cost(motion: np.ndarray) -> float:
@@ -280,7 +283,7 @@ def drift_covariance(
     scores = np.einsum("nij,nj->ni", linear, moments[:, :, 3]) / variance
     within = (linear @ moments @ np.swapaxes(linear, 1, 2)).sum(axis=0) / variance**2
     # the complete information is the weighted sum of J'J, with J linear in (y, 1) too
-    parts = registered.displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
+    parts = displacement_jacobian(np.vstack([np.eye(3), np.zeros(3)]), np.zeros(3))
     parts[:3] -= parts[3]
     complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
     information = complete - (within - scores.T @ scores)
@@ -359,7 +362,10 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
                     int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before)
                 )
                 if pairs < registered.MIN_OVERLAP * pixels:
-                    lost = f"odometry failed at {view.view.name}: only {pairs} pixels match the view before it"
+                    lost = (
+                        f"odometry failed at {view.view.name}: only {pairs} pixels match the "
+                        "view before it"
+                    )
             if lost:
                 found.append(registered.failed(view, "odometry", None, lost))
                 continue

@@ -6,17 +6,20 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from detectors.averages.average import CORRELATED_PIXELS
-from detectors.averages.noise import sigma_of
+from detectors.pixels.noise import sigma_of
+from detectors.rigid_motion import displacement_jacobian
 from detectors.views.view import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
 # side of the cubes within which errors count as common: the window of the widest depth filter
 CLUSTER_PITCHES = 5.0
 UNKNOWN_COVARIANCE = np.full((6, 6), np.nan)
-SLIDES = "not determined: the points can slide or rotate without matching worse, as on a flat or smooth surface"
+SLIDES = (
+    "not determined: the points can slide or rotate without matching worse, as on a flat or "
+    "smooth surface"
+)
 
 
 @dataclass(frozen=True)
@@ -70,28 +73,6 @@ def guess_of(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
     )
 
 
-def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n, 3, 6) of points (n, 3), reference frame, by the error (w, t) of
-    `Registration`."""
-    arm = np.asarray(points_m) - centre_m
-    jacobian = np.zeros((len(arm), 3, 6))
-    # w x r = -[r]x w
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = arm[:, 2], -arm[:, 1]
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -arm[:, 2], arm[:, 0]
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = arm[:, 1], -arm[:, 0]
-    jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
-    return jacobian
-
-
-def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-    """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a rotation by the vector
-    w, then a shift."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
-    T[:3, 3] = centre_m - T[:3, :3] @ centre_m + motion[3:]
-    return T
-
-
 def predicted_error_m(
     registration: Registration, points_m: np.ndarray, normal: np.ndarray
 ) -> tuple[float, float]:
@@ -134,16 +115,14 @@ def clustered_sandwich(
 NOISE_LAG = 6
 """Pixels between the points of a second difference: beyond the widest depth filter, errors are
 independent."""
-MIN_OVERLAP = (
-    0.1  # least share of the view beside the reference's target: with less, nothing can be judged
-)
+# least share of the view beside the reference's target: with less, nothing can be judged
+MIN_OVERLAP = 0.1
 MOVING_PITCHES = 0.5  # an iteration whose last step moves the target by more has not converged
 MAX_POINTS = 10_000
 """Most points of a cloud to register: the time of coherent point drift grows with the product of
 both numbers."""
-THINNED_POINTS = (
-    2000  # points on which overlap and agreement are judged: a share is then known to 1 %
-)
+# points on which overlap and agreement are judged: a share is then known to 1 %
+THINNED_POINTS = 2000
 
 
 @dataclass(frozen=True)
@@ -209,7 +188,10 @@ def clouds_of(
     )
     few = ""
     if min(len(fixed), len(moving)) < 3:
-        few = f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: {len(fixed)} in the"
+        few = (
+            f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: "
+            f"{len(fixed)} in the"
+        )
         few += f" reference and {len(moving)} in the view, 3 needed in each"
     return fixed, moving, guess, notes, few
 

@@ -24,11 +24,12 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from harness.vocabulary.declaration.diagnose import nearest, shown
+from harness.vocabulary.declaration.diagnose import shown
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
+from harness.vocabulary.words import nearest
 
 # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
 RECORD_VERSION = 2
@@ -127,7 +128,7 @@ class Inspected:
     y_mm: Numbers
     """True centre (n,) on the board, upwards."""
     hit: Truths
-    """Whether the damage was found (n,)."""
+    """True if the damage was found (n,)."""
     signal: NumbersOrNull
     """Highest score (n,) within the hit radius; NaN if no pixel there was judged."""
     by_depth: Truths | None = None
@@ -135,7 +136,7 @@ class Inspected:
     by_no_return: Truths | None = None
     """Hits (n,) by a finding of missing returns; None likewise."""
     size_of: Name = "diameter"
-    """What ``diameter_mm`` holds: diameter, width or length."""
+    """Name of what ``diameter_mm`` holds: diameter, width or length."""
 
     @property
     def limit_of(self) -> str:

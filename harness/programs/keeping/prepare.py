@@ -30,7 +30,8 @@ def draw_frames() -> None:
     from detectors.averages.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
-    from scenes.sensor.camera import CameraConfig, camera_names, load_camera
+    from scenes.sensor.camera import camera_names, load_camera
+    from scenes.sensor.common.config import CameraConfig
     from scenes.sensor.empirical.imager import decode
     from scenes.sensor.source import SimulatedUnit
 
@@ -58,7 +59,8 @@ def analyse() -> None:
     from harness.trials.averages import FEWEST_FRAMES, averages_of
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
-    from scenes.sensor.camera import CameraConfig, load_camera
+    from scenes.sensor.camera import load_camera
+    from scenes.sensor.common.config import CameraConfig
     from scenes.sensor.source import SimulatedUnit
 
     camera = load_camera("azure_kinect_nfov")
@@ -70,9 +72,9 @@ def analyse() -> None:
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     wanted = [
         {"crop": {"kind": "auto"}},
-        *({"crop": {"kind": "none"}, "surface": each} for each in surfaces),
+        *({"crop": {"kind": "none"}, "surface": surface} for surface in surfaces),
     ]
-    for name, settings in (("matched", wanted[1]), *(("thesis", each) for each in wanted)):
+    for name, settings in (("matched", wanted[1]), *(("thesis", surface) for surface in wanted)):
         detector = load_detector(name, settings)
         with suppress(
             UserError

@@ -9,7 +9,8 @@ import numpy as np
 
 from harness.vocabulary.geometry import Region
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import NO_EFFECTS, AnyCamera, CameraConfig, EffectsConfig, load_camera
+from scenes.sensor.camera import AnyCamera, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 
 SEED = 1

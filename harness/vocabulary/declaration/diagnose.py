@@ -1,7 +1,6 @@
 """Translates pydantic's errors into problems with a place, the legal values and the nearest legal
 word."""
 
-import difflib
 import json
 import re
 from collections import defaultdict
@@ -22,16 +21,10 @@ from harness.vocabulary.declaration.yaml_source import (
     Source,
 )
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.words import nearest
 
-YES_AND_NO = {
-    "yes": "true",
-    "on": "true",
-    "no": "false",
-    "off": "false",
-}  # Booleans of YAML 1.1, text in YAML 1.2
-LEAST_HELD = (
-    3  # Least letters of a word that is searched for within others; shorter words match too often
-)
+YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
+"""Booleans of YAML 1.1, which are text in YAML 1.2."""
 WORDS = {
     "Input should be": "it should be",
     "an object": "a mapping",
@@ -230,21 +223,6 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     return Problem(
         f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", position, legal, fix=fix
     )
-
-
-def nearest(word: object, words: Iterable[object]) -> str | None:
-    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most
-    similar spelling, else the shortest that contains the word (three letters or more), as
-    realsense_l515 contains l515; None if neither."""
-    folded = {str(word).lower().replace("-", "_"): str(word) for word in words}
-    sought = str(word).lower().replace("-", "_")
-    matches = difflib.get_close_matches(sought, folded, n=1)
-    if not matches and len(sought) >= LEAST_HELD:
-        matches = sorted(
-            (candidate for candidate in folded if sought in candidate),
-            key=lambda candidate: (len(candidate), candidate),
-        )
-    return folded[matches[0]] if matches else None
 
 
 def dotted(path: Sequence[str | int]) -> str:

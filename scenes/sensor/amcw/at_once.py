@@ -42,7 +42,7 @@ from scenes.sensor.amcw.linear_frames import (
 )
 from scenes.sensor.amcw.listed import Listed, ListedSums, add_listed_frames, empty_sums, listed_of
 from scenes.sensor.amcw.windows import pixels_within, windows_of
-from scenes.sensor.unit import N_REASONS, FrameTotals
+from scenes.sensor.common.unit import N_REASONS, FrameTotals
 
 f4 = np.float32
 RADIANS_PER_TURN = f4(2 * np.pi)

@@ -10,7 +10,7 @@ import numpy as np
 from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.amcw.light import Light
 from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, linearised, unknown_filtered
-from scenes.sensor.normals import FAST
+from scenes.sensor.common.normals import FAST
 
 f4 = np.float32
 # a window with a smaller edge sum is even: a neighbour 0.13 rad off changes its weight by 3 %

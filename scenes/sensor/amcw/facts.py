@@ -14,7 +14,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR
 from scenes.optics import Optics
-from scenes.sensor.facts import (
+from scenes.sensor.common.facts import (
     CameraFacts,
     ConeFacts,
     Fact,

@@ -29,10 +29,10 @@ from scenes.sensor.amcw.facts import (
     unwrap_table,
 )
 from scenes.sensor.amcw.windows import windows_of
-from scenes.sensor.camera import CameraConfig
-from scenes.sensor.facts import Fact
-from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.facts import Fact
+from scenes.sensor.common.normals import standard_normals
+from scenes.sensor.common.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
 HIGHEST_HARMONIC = 31  # higher harmonics change the phase by less than 0.1 mrad in total

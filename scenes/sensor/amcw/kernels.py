@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from scenes.sensor.normals import FAST, bits_float, float_bits, fma, normal_pair
+from scenes.sensor.common.normals import FAST, bits_float, float_bits, fma, normal_pair
 
 f4 = np.float32
 ZERO = f4(0)

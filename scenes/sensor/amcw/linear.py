@@ -30,7 +30,7 @@ import numpy as np
 
 from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.amcw.light import NEVER_ZERO, SMALLEST, Light
-from scenes.sensor.normals import FAST
+from scenes.sensor.common.normals import FAST
 
 # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
 DEVIATIONS = 4.5

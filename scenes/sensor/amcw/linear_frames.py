@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from scenes.sensor.amcw.kernels import LANES
-from scenes.sensor.normals import EXACT_SUMS, FAST
+from scenes.sensor.common.normals import EXACT_SUMS, FAST
 
 f4 = np.float32
 # kinds of pixels

@@ -8,8 +8,8 @@ import numpy as np
 
 from scenes.sensor.amcw import ranging
 from scenes.sensor.amcw.windows import pixels_within, windows_of
-from scenes.sensor.normals import FAST
-from scenes.sensor.unit import N_REASONS
+from scenes.sensor.common.normals import FAST
+from scenes.sensor.common.unit import N_REASONS
 
 f4 = np.float32
 

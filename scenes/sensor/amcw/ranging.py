@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.vocabulary.geometry import Reason
 from scenes.sensor.amcw.facts import UnwrapTable
-from scenes.sensor.normals import FAST
+from scenes.sensor.common.normals import FAST
 
 f4 = np.float32
 ZERO = f4(0)

@@ -11,7 +11,7 @@ from pydantic import model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM
 from scenes.optics import Optics
-from scenes.sensor.facts import (
+from scenes.sensor.common.facts import (
     CameraFacts,
     Fact,
     LimitFacts,

@@ -16,11 +16,11 @@ from scipy import ndimage
 
 from harness.vocabulary.geometry import MM, Reason, Region
 from scenes.optics import NoiseFreeView, wave_numbers
-from scenes.sensor.camera import CameraConfig
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.normals import FAST, standard_normals
+from scenes.sensor.common.tabled import filtered
+from scenes.sensor.common.unit import DecodedFrame, UnitModel
 from scenes.sensor.empirical.facts import EmpiricalCamera, Taps
-from scenes.sensor.normals import FAST, standard_normals
-from scenes.sensor.tabled import filtered
-from scenes.sensor.unit import DecodedFrame, UnitModel
 
 f4 = np.float32
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2
 from scenes.optics import FWHM_PER_DEVIATION, Optics
-from scenes.sensor.facts import (
+from scenes.sensor.common.facts import (
     CameraFacts,
     ConeFacts,
     Fact,

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from harness.vocabulary.geometry import Reason
-from scenes.sensor.normals import FAST, IN_DOUBLE
+from scenes.sensor.common.normals import FAST, IN_DOUBLE
 
 # samples of the correlation per spectral line in a period; two just represent it, four miss no peak
 SAMPLES_PER_LINE = 4

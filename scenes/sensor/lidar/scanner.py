@@ -19,12 +19,12 @@ from scipy import interpolate, linalg, ndimage
 
 from harness.vocabulary.geometry import MM, Region
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import CameraConfig
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.normals import standard_normals
+from scenes.sensor.common.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 from scenes.sensor.lidar import kernels
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.lidar.kernels import strongest_peaks
-from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
 BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels need 8 MB

@@ -30,7 +30,6 @@ from detectors.findings.whitening import (
     grid_of,
 )
 from detectors.interface import Detection
-from detectors.masks import grown
 from detectors.methods.local import LocalDetector
 from detectors.methods.matched import (
     CLIP_SIGMAS,
@@ -44,6 +43,7 @@ from detectors.methods.matched import (
     _tamed,
     _without_rim,
 )
+from detectors.pixels.masks import grown
 from harness.testing.synthetic_clouds import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
 
@@ -316,6 +316,9 @@ def test_what_the_rim_shares_is_taken_out_at_each_distance() -> None:
     shared[:, 2] = -1.0
     result = _without_rim(noise + shared, depth_px)
     remainder = result.mean(axis=0)
+    # what those next to the rim share too stays
+    level = _without_rim(noise + shared + np.float32(0.8), depth_px).mean(axis=0)
+    np.testing.assert_allclose(level[:RIM_PX], 0.8, atol=0.5)
     # 100 pixels, of which some 65 count at each
     assert np.abs(remainder[:RIM_PX]).max() < 0.35
     np.testing.assert_array_equal(result[:, RIM_PX:], noise[:, RIM_PX:])

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors import detector_names, detector_type, load_detector
-from detectors.averages.noise import rounding_floor
 from detectors.interface import Detector, Evidence
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
+from detectors.pixels.noise import rounding_floor
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region
 

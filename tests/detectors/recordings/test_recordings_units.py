@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from detectors.averages.noise import noise_reach_px
+from detectors.pixels.noise import noise_reach_px
 from detectors.recordings import Recording, open_capture
 from detectors.recordings.distances import decided_unit, no_return_codes
 from harness.vocabulary.errors import UserError

@@ -140,8 +140,8 @@ def study_record(number: int) -> dict[str, list[dict[str, object]]]:
                 common | {"hole": str(k), "pixels": 30_000, "threshold": grid, "above": counts}
                 for k, counts in enumerate(above)
             ]
-        for name, made in rows.items():
-            record.setdefault(name, []).extend(made)
+        for name, row in rows.items():
+            record.setdefault(name, []).extend(row)
     return record
 
 

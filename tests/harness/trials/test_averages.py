@@ -12,7 +12,7 @@ from detectors.averages.average import AverageConfig
 from harness.trials import averages
 from harness.trials.averages import FEWEST_FRAMES, averages_of
 from harness.vocabulary.geometry import MM, Region
-from scenes.sensor.unit import FrameTotals
+from scenes.sensor.common.unit import FrameTotals
 
 REGION = Region(0, 1, 0, 4)
 STEP_M = 1e-3

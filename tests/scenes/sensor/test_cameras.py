@@ -15,7 +15,6 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import _main as calibration_program
 from scenes.sensor.camera import (
     CAMERA_FOLDER,
-    CameraConfig,
     camera_names,
     camera_of,
     guessed_precision,
@@ -23,7 +22,8 @@ from scenes.sensor.camera import (
     load_camera,
     read_camera,
 )
-from scenes.sensor.facts import unfolded_slope
+from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.facts import unfolded_slope
 from scenes.target.mesh import build_target
 from tests.support.declared_targets import target_from_data
 

@@ -12,9 +12,10 @@ from scipy import stats
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw.imager import AmcwImager, with_harmonics
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, camera_of, load_camera
+from scenes.sensor.camera import camera_of, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
+from scenes.sensor.common.unit import frame_errors_m, smooth_field
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.unit import frame_errors_m, smooth_field
 from tests.support.sensor_frames import first_frame, stretch_of, true_z_m, z_of
 
 AZURE = "azure_kinect_nfov"

@@ -8,7 +8,8 @@ import pytest
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw.imager import scattered
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 
 REGION = Region(250, 330, 260, 380)

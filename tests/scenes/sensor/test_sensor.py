@@ -15,8 +15,9 @@ from scenes.sensor.amcw.facts import unwrap_table
 from scenes.sensor.amcw.filter_reference import filtered_pixel
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_number
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
-from scenes.sensor.normals import normals_from_bits
+from scenes.sensor.camera import camera_of, load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
+from scenes.sensor.common.normals import normals_from_bits
 from scenes.sensor.source import SimulatedUnit
 from tests.support.sensor_frames import correlation, first_frame, noise_of, true_z_m, z_of
 

@@ -10,10 +10,11 @@ from scipy import stats
 
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import plane_view
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, load_camera
-from scenes.sensor.facts import UnitFacts
+from scenes.sensor.camera import load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
+from scenes.sensor.common.facts import UnitFacts
+from scenes.sensor.common.unit import FrameTotals, frame_errors_m, light_of, rays_of, taps_of
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.unit import FrameTotals, frame_errors_m, light_of, rays_of, taps_of
 
 ONLY_JUMPS = NO_EFFECTS.model_copy(update={"frame_jumps": True})
 AZURE = load_camera("azure_kinect_nfov")

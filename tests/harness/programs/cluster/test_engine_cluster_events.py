@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs 
 FIRST = "tcp://first:1"
 SECOND = "tcp://second:1"
 CODE = code_of(["thesis"])
-DIGESTS = {stage: source_digest(*which) for stage, which in CODE.items()}
+DIGESTS = {stage: source_digest(*indices) for stage, indices in CODE.items()}
 SEEN = "the driver's mark"
 
 
@@ -100,7 +100,7 @@ def engine_with(
     engine = ClusterEngine(scheduler, Limits(seconds=900.0), 1, CODE, Path())
     engine._nonce = SEEN
     engine._client = client
-    client.nodes |= {f"tcp://{name}:1": said for name, said in nodes.items()}
+    client.nodes |= {f"tcp://{name}:1": node for name, node in nodes.items()}
     stepped(engine, lambda: len(engine._nodes) + len(engine._refused) == len(nodes))
     return engine
 

@@ -14,7 +14,8 @@ from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import WIDEST_PX, AmcwCamera
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera, read_camera
+from scenes.sensor.camera import load_camera, read_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from tests.support.sensor_frames import first_frame, true_z_m, z_of
 

@@ -31,7 +31,8 @@ from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
 from scenes.sensor.amcw.light import light_of_samples
 from scenes.sensor.amcw.linear_frames import BEND, SCALE
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 from tests.support.sensor_frames import z_of as stacked_z
 

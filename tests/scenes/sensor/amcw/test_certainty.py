@@ -15,7 +15,8 @@ from scenes.sensor.amcw.certainty import _edge_fails, _may_fly
 from scenes.sensor.amcw.even import even_pixels, fill_even
 from scenes.sensor.amcw.light import Light
 from scenes.sensor.amcw.linear import linearised, unknown_filtered
-from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 
 f4 = np.float32

@@ -11,7 +11,8 @@ from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.amcw.imager import AmcwImager, pixel_spans
 from scenes.sensor.amcw.light import LENGTHS, RICE, light_of_samples
 from scenes.sensor.amcw.windows import pixels_within, windows_of
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of
+from scenes.sensor.camera import camera_of
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 
 f4 = np.float32
 STEPS = 2 * np.pi * np.arange(3) / 3

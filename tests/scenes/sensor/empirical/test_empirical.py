@@ -10,11 +10,12 @@ import pytest
 
 from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, load_camera
+from scenes.sensor.camera import load_camera
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
+from scenes.sensor.common.tabled import DepthNoise, filtered
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.empirical.imager import EmpiricalImager, IdealRange
 from scenes.sensor.source import SimulatedUnit
-from scenes.sensor.tabled import DepthNoise, filtered
 from tests.support.sensor_frames import correlation
 
 REGION = Region(60, 120, 80, 160)

@@ -15,7 +15,7 @@ from scenes.sensor.calibration import (
     temporal_sigma_m,
     unit_before_plane,
 )
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.lidar.kernels import CHUNK, NOWHERE_M, smooth, strongest_peaks
 from scenes.sensor.source import SimulatedUnit

@@ -15,7 +15,7 @@ from harness.vocabulary.geometry import Reason, Region
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.optics import NoiseFreeView
 from scenes.sensor.calibration import ONLY_NOISE
-from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig
+from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.lidar.scanner import LidarScanner, overlap_taps, smear_weights
 from scenes.sensor.source import SimulatedUnit
 from tests.support.lidar_footprint import hole_depth_seen_m, share_in_disc

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from detectors.masks import components
+from detectors.pixels.masks import components
 from detectors.surfaces.smooth_surfaces import links, turns, unit_normals
 
 

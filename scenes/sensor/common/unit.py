@@ -18,10 +18,10 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, Reason, Region
 from harness.vocabulary.seeds import canonical_json, random_stream
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig
-from scenes.sensor.facts import UnitFacts
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
+from scenes.sensor.common.facts import CameraFacts, UnitFacts
 
-Camera = TypeVar("Camera", bound=AnyCamera)
+Camera = TypeVar("Camera", bound=CameraFacts)
 N_REASONS = max(Reason) + 1
 
 
@@ -175,7 +175,7 @@ class UnitModel(ABC, Generic[Camera]):
         camera = self.camera
         config = self.config
         lens = camera.nominal_lens
-        numbers = canonical_json([config.numbers, camera.fixed_pattern.to_data()])
+        numbers = canonical_json([config.numbers, camera.to_data()["fixed_pattern"]])
         key = camera.name, numbers, config.unit_seed, lens  # several files may have the same name
         if key not in _patterns_mm:
             while len(_patterns_mm) >= KEPT_PATTERNS:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from detectors.averages.noise import (
+from detectors.pixels.noise import (
     LEAST_FRAMES,
     average_variance_m2,
     median_of,

@@ -16,8 +16,8 @@ from itertools import combinations
 
 import numpy as np
 
+from detectors.rigid_motion import displacement_jacobian, kabsch, moved_by
 from detectors.views.marks.mark import LEAST_MARKS, Mark
-from detectors.views.registration.registered import displacement_jacobian, moved_by
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 MAX_STEPS = 20
@@ -39,26 +39,6 @@ class Placement:
     chi2: float
     iterations: int
     converged: bool
-
-
-def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the proper least-squares rigid transforms (..., 4, 4) of points (..., n, 3) onto
-    (..., n, 3), with ``weights`` (..., n) of 0 or more. The rotation of points on a line about it
-    is undetermined and arbitrary."""
-    share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
-    from_centre = (share * from_m).sum(axis=-2)
-    to_centre = (share * to_m).sum(axis=-2)
-    spread = np.swapaxes(share * (from_m - from_centre[..., None, :]), -1, -2) @ (
-        to_m - to_centre[..., None, :]
-    )
-    u, _, vt = np.linalg.svd(spread)
-    signs = np.ones(spread.shape[:-1])
-    signs[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    T = np.zeros((*spread.shape[:-2], 4, 4))
-    T[..., :3, :3] = np.swapaxes(vt, -1, -2) @ (signs[..., None] * np.swapaxes(u, -1, -2))
-    T[..., :3, 3] = to_centre - np.einsum("...ij,...j->...i", T[..., :3, :3], from_centre)
-    T[..., 3, 3] = 1.0
-    return T
 
 
 def place(
@@ -160,7 +140,7 @@ def pair_marks(
     odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
     first, *rest = np.argsort(-odds, kind="stable").tolist()
     pairs = np.array(
-        [(mark, other) for mark, other in enumerate(solutions[first][0]) if other >= 0],
+        [(mark, solution) for mark, solution in enumerate(solutions[first][0]) if solution >= 0],
         dtype=np.int64,
     )
     pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
@@ -170,7 +150,10 @@ def pair_marks(
     problem = f"the marks lie symmetrically: two placements bring {both} of them together, and "
     if T_reference_view_guess is None:
         return Pairing(pairs, problem + "there is no guess to choose by")
-    between = f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} mm from the other"
+    between = (
+        f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} "
+        "mm from the other"
+    )
     return Pairing(pairs, problem + between)
 
 
@@ -183,7 +166,10 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     ).reshape(-1, 2)
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
-    few = f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
+    few = (
+        f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
+        f"the view {shown[1]}"
+    )
     return Pairing(pairs, few if len(common) < LEAST_MARKS else "", notes)
 
 

@@ -3,6 +3,7 @@ properties of a unit."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
@@ -278,6 +279,11 @@ class CameraFacts(Config):
     def z_step_m(self) -> float:
         """The rounding step of the output's z."""
         return self.engine.output_step_mm.value * MM
+
+    @property
+    @abstractmethod
+    def optics(self) -> Optics:
+        """The facts that the render needs."""
 
     def optics_with(self, **of_kind: Any) -> Optics:
         """Return the camera's optics for the render. ``of_kind``: arguments that only its kind

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from detectors.findings.clusters import euclidean_clusters, nested_clusters
+from detectors.pixels.clusters import euclidean_clusters, nested_clusters
 from harness.vocabulary.errors import UserError
 
 

@@ -1,0 +1,1 @@
+"""Images of pixels: masks, clusters, and the noise of a cloud."""
