@@ -456,8 +456,9 @@ def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
     )
     assert "no topic points; its topics: /picture" in refusal(bag, topic="points")
     assert "/picture message 0: holds 'mono8' pictures, not depth" in refusal(bag, topic="picture")
-    np.save(tmp_path / "d.npy", plane.depth_mm())
-    assert "is not a ROS bag" in refusal(tmp_path / "d.npy", topic="points2", lens=plane.LENS)
+    path = tmp_path / "d.npy"
+    np.save(path, plane.depth_mm())
+    assert "is not a ROS bag" in refusal(path, topic="points2", lens=plane.LENS)
 
 
 @pytest.mark.parametrize("mcap", (False, True))

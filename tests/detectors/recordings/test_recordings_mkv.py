@@ -171,10 +171,11 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
         tmp_path / "r.mkv", [{"DEPTH": DEPTH}] * 3, attached=plane.calibration()
     )
     content = intact.read_bytes()
+    path = tmp_path / "cut.mkv"
     for part in (0.0, 0.001, 0.3, 0.7, 0.99):
-        (tmp_path / "cut.mkv").write_bytes(content[: int(part * len(content))])
-        assert "cut.mkv" in refusal(tmp_path / "cut.mkv")
-        assert "truncated" in refusal(tmp_path / "cut.mkv")
+        path.write_bytes(content[: int(part * len(content))])
+        assert "cut.mkv" in refusal(path)
+        assert "truncated" in refusal(path)
     assert "no DEPTH track (its tracks: IR)" in refusal(
         plane.write_mkv(tmp_path / "ir.mkv", [{"IR": DEPTH}])
     )
