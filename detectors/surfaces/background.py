@@ -206,7 +206,10 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def _of_few_points(
-    points: np.ndarray, mask: np.ndarray, config: SurfaceConfig, central: bool
+    points: np.ndarray,
+    mask: np.ndarray,
+    config: SurfaceConfig,
+    central: bool,
 ) -> Background:
     """Return the stated surface, or a plane, behind points (n, 3) that are too few to judge it."""
     if config.shape not in STATED:
@@ -343,7 +346,9 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
 
 @numba.njit(cache=True, nogil=True)
 def _group_medians(
-    values: np.ndarray, group: np.ndarray, groups: int
+    values: np.ndarray,
+    group: np.ndarray,
+    groups: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the median of each group's finite values, and their median distance from it over
     0.6745; else NaN."""
@@ -462,7 +467,11 @@ def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
 
 
 def _fitted(
-    cells: _Cells, name: str, fit_to: Any, wavelength: float | None, widened: bool = False
+    cells: _Cells,
+    name: str,
+    fit_to: Any,
+    wavelength: float | None,
+    widened: bool = False,
 ) -> _Shape | None:
     """Fit with bisquare weights, ``widened`` by the flanks of dents; None if the fit misses a
     fiftieth of the cells."""

@@ -115,7 +115,11 @@ def _normal_bands(
 
 @numba.njit(error_model="numpy", **PLAIN)
 def _spline_sums(
-    points: np.ndarray, central: bool, low: np.ndarray, spacing: float, coefficients: np.ndarray
+    points: np.ndarray,
+    central: bool,
+    low: np.ndarray,
+    spacing: float,
+    coefficients: np.ndarray,
 ) -> np.ndarray:
     """Return the splines' sum (n,) by coefficients (rows, columns) at points (n, 3)."""
     out = np.empty(len(points))

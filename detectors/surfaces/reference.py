@@ -112,7 +112,11 @@ def _scene(corners: np.ndarray) -> Any:
 
 
 def _fitted(
-    scene: Any, corners: np.ndarray, normals: np.ndarray, points: np.ndarray, turn: int
+    scene: Any,
+    corners: np.ndarray,
+    normals: np.ndarray,
+    points: np.ndarray,
+    turn: int,
 ) -> tuple[np.ndarray, float, float]:
     """Return T_part_camera, found from one rotation by a multiple of 90 degrees; the median
     distance of the points (n, 3) from the part's planes; and the standard error of its position

@@ -172,7 +172,10 @@ def _before_lens(points: np.ndarray) -> bool:
 
 @numba.njit(**PLAIN)
 def links(
-    points_m: np.ndarray, tilt: float, noise_m: float, central: bool
+    points_m: np.ndarray,
+    tilt: float,
+    noise_m: float,
+    central: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and
     its lower neighbour (h, w). ``central``: distances across are measured between the two rays at
@@ -282,7 +285,11 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
 
 
 def _joined(
-    masks: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
+    masks: np.ndarray,
+    cores: np.ndarray,
+    smooth: _Smooth,
+    apart_m: float,
+    turn: float,
 ) -> np.ndarray:
     """Return ``masks`` with surfaces merged, also in ``cores``, if their rims share pixels and
     their planes agree."""

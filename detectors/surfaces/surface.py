@@ -183,7 +183,10 @@ class Surface:
 
 
 def fit_surface(
-    x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: SurfaceConfig
+    x_m: np.ndarray,
+    y_m: np.ndarray,
+    z_m: np.ndarray,
+    config: SurfaceConfig,
 ) -> Surface:
     """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute
     residuals, bisquare within 0.05 standard errors of the fixed point of all points.
@@ -232,7 +235,9 @@ def fit_surface(
 
 
 def _solved(
-    basis: np.ndarray, z: np.ndarray, weight: np.ndarray | None = None
+    basis: np.ndarray,
+    z: np.ndarray,
+    weight: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p,
     p), or None."""
@@ -266,7 +271,10 @@ def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray,
 
 
 def _lar(
-    basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray = KNEES
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    knees: np.ndarray = KNEES,
 ) -> Solution:
     """Find the L1 solution by smoothing (Madsen and Nielsen 1993)."""
     c = start
@@ -306,7 +314,10 @@ def _lar(
 
 @numba.njit(**PLAIN)
 def _huber(
-    rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float
+    rows: np.ndarray,
+    z: np.ndarray,
+    c: np.ndarray,
+    knee: float,
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the sum of Huber's function over its knee, its negative gradient (p,), the inner
     normal matrix's lower half."""
@@ -404,7 +415,11 @@ def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: 
 
 
 def _reweighted(
-    basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, steps: int, note: str
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray | None,
+    steps: int,
+    note: str,
 ) -> Solution:
     """Reweight least squares until it moves little, at most ``steps`` times."""
     plain = _solved(basis, z)

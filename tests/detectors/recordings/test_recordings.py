@@ -176,7 +176,8 @@ FORMATS = (
 
 @pytest.mark.parametrize("opened", FORMATS, ids=lambda f: f.__name__)
 def test_every_format_gives_the_points_that_were_written(
-    opened: Callable[[Path], Recording], tmp_path: Path
+    opened: Callable[[Path], Recording],
+    tmp_path: Path,
 ) -> None:
     recording = opened(tmp_path)
     frame = next(recording.frames())
@@ -195,14 +196,17 @@ def test_every_format_gives_the_points_that_were_written(
     "opened", (open3d, tum, sdk_names, npz_metres, mat_grid), ids=lambda f: f.__name__
 )
 def test_colour_lies_on_the_depth_pixels(
-    opened: Callable[[Path], Recording], tmp_path: Path
+    opened: Callable[[Path], Recording],
+    tmp_path: Path,
 ) -> None:
     np.testing.assert_array_equal(next(opened(tmp_path).frames()).rgb, plane.rgb())
 
 
 @pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
 def test_a_cloud_keeps_colour_and_may_lack_a_grid(
-    write: Callable[..., Path], suffix: str, tmp_path: Path
+    write: Callable[..., Path],
+    suffix: str,
+    tmp_path: Path,
 ) -> None:
     recording = open_capture([write(tmp_path / f"c.{suffix}", TRUE_M, False)])
     frame = next(recording.frames())
@@ -398,7 +402,9 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
     ),
 )
 def test_lenses_as_other_programs_write_them(
-    tmp_path: Path, text: str, distortion: tuple[float, ...]
+    tmp_path: Path,
+    text: str,
+    distortion: tuple[float, ...],
 ) -> None:
     path = tmp_path / "lens.txt"
     path.write_text(text)
@@ -535,7 +541,10 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
     ),
 )
 def test_lists_of_points_in_every_dialect(
-    tmp_path: Path, head: str, separator: str, ending: str
+    tmp_path: Path,
+    head: str,
+    separator: str,
+    ending: str,
 ) -> None:
     path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, separator, ending)
     recording = open_capture([path])
@@ -608,7 +617,8 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unpictured")
 def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     v, u = np.mgrid[:150, :200]
     noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=u.shape), (0, 0), 1.0)

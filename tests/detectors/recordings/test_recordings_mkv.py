@@ -51,7 +51,10 @@ def test_the_nfov_lens_by_hand() -> None:
     ),
 )
 def test_modes_look_along_the_same_rays(
-    mode: str, second_mode: str, scale: int, shift: tuple[int, int]
+    mode: str,
+    second_mode: str,
+    scale: int,
+    shift: tuple[int, int],
 ) -> None:
     """A pixel of a crop, or the middle of four binned pixels, sees what it sees on the whole
     sensor."""
@@ -104,7 +107,9 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
     ),
 )
 def test_a_calibration_that_is_not_understood_is_refused(
-    path: tuple[str, ...], value: object, message: str
+    path: tuple[str, ...],
+    value: object,
+    message: str,
 ) -> None:
     data = json.loads(plane.calibration().rstrip(b"\0"))
     camera = data["CalibrationInformation"]["Cameras"][0]

@@ -108,7 +108,9 @@ def test_a_damaged_picture_is_named(tmp_path: Path) -> None:
     ((np.zeros((72, 96), np.uint8), "8 bits"), (np.ones((72, 96, 3), np.uint16), "RGB")),
 )
 def test_a_picture_that_is_no_depth_image_is_named(
-    tmp_path: Path, stored: np.ndarray, picture_kind: str
+    tmp_path: Path,
+    stored: np.ndarray,
+    picture_kind: str,
 ) -> None:
     png(tmp_path / "1.png")
     path = tmp_path / "2.png"
@@ -160,7 +162,10 @@ def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:
     ),
 )
 def test_a_wrong_unit_is_noticed_and_the_right_one_offered(
-    tmp_path: Path, stored: np.ndarray, unit: str, advice: str
+    tmp_path: Path,
+    stored: np.ndarray,
+    unit: str,
+    advice: str,
 ) -> None:
     path = tmp_path / "d.npy"
     np.save(path, stored)
@@ -201,7 +206,9 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
     ),
 )
 def test_an_array_that_is_no_capture_is_refused(
-    tmp_path: Path, array: np.ndarray, message: str
+    tmp_path: Path,
+    array: np.ndarray,
+    message: str,
 ) -> None:
     path = tmp_path / "a.npy"
     np.save(path, array)
@@ -211,7 +218,9 @@ def test_an_array_that_is_no_capture_is_refused(
 @pytest.mark.parametrize("planes", ("x y z", "red green blue depth", "depth confidence"))
 @pytest.mark.parametrize("axis", (0, -1))
 def test_planes_that_are_no_frames_of_one_scene_are_refused(
-    tmp_path: Path, planes: str, axis: int
+    tmp_path: Path,
+    planes: str,
+    axis: int,
 ) -> None:
     x, y, z = np.moveaxis(np.nan_to_num(plane.points_m(STORED)), -1, 0)
     red, green, blue = np.random.default_rng(3).random((3, *z.shape))
@@ -347,7 +356,8 @@ def test_a_height_map_that_is_none_is_explained(tmp_path: Path) -> None:
 
 
 def test_a_faulty_capture_of_a_phone_is_explained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = plane.write_stray(tmp_path / "stray", 1)
     matrix = folder / "camera_matrix.csv"

@@ -32,7 +32,10 @@ def noisy(distance_m: float, unit_m: float, seed: int = 0) -> np.ndarray:
 
 
 def opened(
-    folder: Path, stored: np.ndarray, unit: str | None = None, lens: Lens | None = plane.LENS
+    folder: Path,
+    stored: np.ndarray,
+    unit: str | None = None,
+    lens: Lens | None = plane.LENS,
 ) -> Recording:
     folder.mkdir(exist_ok=True)
     cv2.imwrite(str(folder / "1.png"), stored.astype(np.uint16))
@@ -57,7 +60,8 @@ def opened(
     ),
 )
 def test_a_code_for_no_return_is_told_by_its_place_among_the_distances(
-    codes: tuple[float, ...], dtype: type
+    codes: tuple[float, ...],
+    dtype: type,
 ) -> None:
     stored = noisy(0.7, 1e-3).astype(dtype).ravel()
     assert no_return_codes(stored) == ()
@@ -118,7 +122,9 @@ def test_a_cloud_that_looks_backwards_is_turned_and_said(tmp_path: Path) -> None
     ),
 )
 def test_the_unit_is_told_by_the_data_and_printed(
-    tmp_path: Path, stored: np.ndarray, unit_mm: float
+    tmp_path: Path,
+    stored: np.ndarray,
+    unit_mm: float,
 ) -> None:
     path = tmp_path / "d.npy"
     np.save(path, stored)
@@ -162,7 +168,10 @@ def test_a_camera_with_millimetres_is_believed_within_its_reach_only(tmp_path: P
     ),
 )
 def test_a_file_beside_the_pictures_states_the_unit(
-    tmp_path: Path, key: str, value: object, unit_mm: float
+    tmp_path: Path,
+    key: str,
+    value: object,
+    unit_mm: float,
 ) -> None:
     path = tmp_path / "c"
     path.mkdir()
@@ -213,7 +222,11 @@ def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
     ),
 )
 def test_a_named_camera_knows_its_modes_and_its_unit(
-    tmp_path: Path, name: str, size: tuple[int, int], mode: str, unit_mm: float
+    tmp_path: Path,
+    name: str,
+    size: tuple[int, int],
+    mode: str,
+    unit_mm: float,
 ) -> None:
     recording = opened(
         tmp_path / "c", np.full(size[::-1], round(900 / unit_mm)), lens=lens_named(name)
@@ -286,7 +299,10 @@ def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: 
     ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10)),
 )
 def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
-    side: int, finer: int, least: int, largest: int
+    side: int,
+    finer: int,
+    least: int,
+    largest: int,
 ) -> None:
     rng = np.random.default_rng(3)
     frames = []

@@ -45,7 +45,10 @@ def npy_header(shape: str, dtype: str = "<u2") -> bytes:
 
 
 def npz(
-    path: Path, content: bytes, stated: int | None = None, method: int = zipfile.ZIP_DEFLATED
+    path: Path,
+    content: bytes,
+    stated: int | None = None,
+    method: int = zipfile.ZIP_DEFLATED,
 ) -> Path:
     """An archive with one entry; ``stated`` replaces its size in the list of contents."""
     with zipfile.ZipFile(path, "w", method) as archive:
@@ -309,7 +312,11 @@ def test_hostile_ply(tmp_path, content, message):
 
 
 def pcd(
-    width: object, height: object, data: str = "binary", size: str = "4 4 4", count: str = "1 1 1"
+    width: object,
+    height: object,
+    data: str = "binary",
+    size: str = "4 4 4",
+    count: str = "1 1 1",
 ) -> bytes:
     lines = (
         "VERSION 0.7",
