@@ -109,7 +109,9 @@ class _Cells:
 
     def image(self, values: np.ndarray, empty: float = np.nan) -> np.ndarray:
         """Return cells' values (c,) on their grid."""
-        image = np.full((self.row.max() + 1, self.column.max() + 1), empty)
+        rows = self.row.max() + 1
+        columns = self.column.max() + 1
+        image = np.full((rows, columns), empty)
         image[self.row, self.column] = values
         return image
 
@@ -387,7 +389,9 @@ def _median(values: np.ndarray) -> float:
                 j -= gap
             values[j] = value
         gap //= 2
-    return 0.5 * (values[(len(values) - 1) // 2] + values[len(values) // 2])
+    lower = values[(len(values) - 1) // 2]
+    upper = values[len(values) // 2]
+    return 0.5 * (lower + upper)
 
 
 def _cell_noise(image: np.ndarray) -> tuple[float, float]:
@@ -459,7 +463,9 @@ def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
     of a tile or to the least scale."""
     if config.scale_mm is not None:
         return [2 * config.scale_mm * MM / cells.side_m]
-    wavelengths: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
+    rows = int(np.ptp(cells.row)) + 1
+    columns = int(np.ptp(cells.column)) + 1
+    wavelengths: list[float] = [max(rows, columns)]
     shortest = max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m)
     while wavelengths[-1] / 1.6 >= shortest:
         wavelengths.append(wavelengths[-1] / 1.6)
@@ -520,8 +526,10 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
         if fit is not None and inside.any():
             error[inside] = cells.points[inside, 2] - fit(cells.points[inside])
     error[~np.isfinite(error)] = 1e3
-    _, tile = np.unique(down * (across.max() + 1) + across, return_inverse=True)
-    return _group_medians(np.abs(error), tile, int(tile.max()) + 1)[0]
+    keys = down * (across.max() + 1) + across
+    _, tile = np.unique(keys, return_inverse=True)
+    medians, _ = _group_medians(np.abs(error), tile, int(tile.max()) + 1)
+    return medians
 
 
 def _simplest(errors: list[np.ndarray], worth: float) -> int:
@@ -540,7 +548,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     """Return a warning if structure remains that could be mistaken for damage, else "", and its
     size."""
     error = cells.points[:, 2] - fit(cells.points)
-    image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
+    is_used = np.isfinite(error) & (cells.weights > 0)
+    image = cells.image(np.where(is_used, error, np.nan))
     noise, correlation = _cell_noise(image)
     pixel = cells.pixel_noise
     # compact findings differ from their neighbourhood's median; structure is the neighbourhood
@@ -557,7 +566,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     share = float(beyond.sum() / max(enough.sum(), 1))
     # connected cells that lie far off: damage is seldom so large
     parts = cv2.connectedComponentsWithStats((valid & ~used).astype(np.uint8))[2]
-    off = float(parts[1:, cv2.CC_STAT_AREA].max(initial=0) / max(valid.sum(), 1))
+    areas = parts[1:, cv2.CC_STAT_AREA]
+    off = float(areas.max(initial=0) / max(valid.sum(), 1))
     warning = ""
     if off >= MISFIT_FROM:
         warning = (
