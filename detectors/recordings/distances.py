@@ -389,7 +389,10 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
     if fitting:
         fix = "pass " + " or ".join(fitting)
     raise UserError(
-        f"{frame.name}: the median distance would be {median_m:.4g} m, which suggests a wrong unit",
+        (
+            f"{frame.name}: the median distance would be {median_m:.4g} m, which suggests a "
+            "wrong unit"
+        ),
         legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m",
         fix=fix,
     )

@@ -104,8 +104,14 @@ def _ring(axes: Axes, hole: HoleInView, is_marked: bool) -> None:
     v = hole.v_px + radius * np.sin(turn)
     axes.plot(u, v, color=INK, lw=1.2, ls="-" if is_marked else (0, (2.5, 1.8)))
     above = (hole.u_px, hole.v_px - radius)
-    style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 9}
-    axes.annotate(hole.hole, above, (0, 2.5), **style)
+    axes.annotate(
+        hole.hole,
+        above,
+        (0, 2.5),
+        textcoords="offset points",
+        ha="center",
+        fontsize=9,
+    )
 
 
 # ---------------------------------------------------------------- single damages

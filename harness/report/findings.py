@@ -259,7 +259,8 @@ HIGHEST_IN = 30.0
 DPI = 150
 TAKEN = "#ff00ff"
 OTHERS = ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
-"""Colours that differ from grey and from one another, also for viewers with red-green blindness."""
+"""Colours that differ from grey and from one another, also for viewers with red-green blindness.
+"""
 Box = tuple[float, float, float, float]
 """Left, right, bottom and top ends of axes; down is positive."""
 
@@ -315,10 +316,14 @@ def save_blind_map(
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        style: dict[str, Any] = {"cmap": "Greys", "vmin": 0, "vmax": 100}
         unseen_percent = 100 * missing.unseen
         picture = axes.imshow(
-            unseen_percent, extent=_edges(cloud), interpolation="nearest", **style
+            unseen_percent,
+            extent=_edges(cloud),
+            interpolation="nearest",
+            cmap="Greys",
+            vmin=0,
+            vmax=100,
         )
         bar = figure.colorbar(picture, ax=axes, shrink=0.6)
         bar.set_label("frames without a return, %", fontsize=8)
@@ -326,8 +331,14 @@ def save_blind_map(
             height, width = missing.outline.shape
             columns = np.arange(width) + cloud.region.col0
             rows = np.arange(height) + cloud.region.row0
-            line: dict[str, Any] = {"levels": [0.5], "colors": "#0070c0", "linewidths": 0.8}
-            axes.contour(columns, rows, missing.outline, **line)
+            axes.contour(
+                columns,
+                rows,
+                missing.outline,
+                levels=[0.5],
+                colors="#0070c0",
+                linewidths=0.8,
+            )
         _frame(axes, cloud, box)
         for number, detection in enumerate(detections, start=1):
             if detection.kind == "no return":
@@ -382,19 +393,27 @@ def _draw_outline(
     padded = np.pad(outline, 1)
     columns = np.arange(-1, width + 1)
     rows = np.arange(-1, height + 1)
-    line: dict[str, Any] = {"colors": colour, "linewidths": line_width}
-    axes.contour(columns, rows, padded.astype(float), [0.5], **line)
+    axes.contour(
+        columns,
+        rows,
+        padded.astype(float),
+        [0.5],
+        colors=colour,
+        linewidths=line_width,
+    )
     distance_px = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     v, u = np.unravel_index(int(distance_px.argmax()), distance_px.shape)
-    style: dict[str, Any] = {
-        "fontsize": 22,
-        "weight": "bold",
-        "ha": "center",
-        "va": "center",
-        "color": colour,
-        "path_effects": [withStroke(linewidth=4, foreground="black")],
-    }
-    axes.text(float(u), float(v), number, **style)
+    axes.text(
+        float(u),
+        float(v),
+        number,
+        fontsize=22,
+        weight="bold",
+        ha="center",
+        va="center",
+        color=colour,
+        path_effects=[withStroke(linewidth=4, foreground="black")],
+    )
 
 
 def _figure(title: str, height_in: float, draw: Callable[[Figure], None]) -> Figure:
@@ -478,19 +497,21 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
     v_centre = 0.5 * float(v.min() + v.max())
     radius = 0.5 * float(max(np.ptp(u), np.ptp(v))) + margin
     axes.add_patch(Circle((u_centre, v_centre), radius, fill=False, color=TAKEN, linewidth=0.9))
-    style: dict[str, Any] = {
-        "textcoords": "offset points",
-        "bbox": {
+    corner = (u_centre + 0.71 * radius, v_centre - 0.71 * radius)
+    axes.annotate(
+        str(number),
+        corner,
+        (1, 1),
+        textcoords="offset points",
+        bbox={
             "facecolor": "white",
             "edgecolor": "none",
             "alpha": 0.6,
             "pad": 0.4,
         },
-        "fontsize": 7,
-        "annotation_clip": True,
-    }
-    corner = (u_centre + 0.71 * radius, v_centre - 0.71 * radius)
-    axes.annotate(str(number), corner, (1, 1), **style)
+        fontsize=7,
+        annotation_clip=True,
+    )
 
 
 def _bytes(rgb: Any) -> np.ndarray:

@@ -163,14 +163,15 @@ def rates_figure(main: pd.DataFrame) -> str:
             low = by_size["rate_low"]
             high = by_size["rate_high"]
             label = many(int(str(frames)), "frame")
-            style: dict[str, Any] = {
-                "marker": marker,
-                "ms": 4,
-                "color": colour,
-                "label": label,
-            }
             axes.fill_between(diameter_mm, low, high, color=colour, alpha=0.1, lw=0)
-            axes.plot(diameter_mm, by_size["rate"], **style)
+            axes.plot(
+                diameter_mm,
+                by_size["rate"],
+                marker=marker,
+                ms=4,
+                color=colour,
+                label=label,
+            )
         axes.axhline(0.5, color=blocks.GREY, lw=0.8, ls=":")
         axes.set_xlabel("true diameter (mm)")
         axes.set_ylabel("share of repeats that detected it")
@@ -208,8 +209,14 @@ def noise_figure(noise: pd.DataFrame) -> str:
 
 def _draw_errors(axes: Axes, noise: pd.DataFrame) -> None:
     frames = noise["frames"].to_numpy(float)
-    guide: dict[str, Any] = {"lw": 7, "solid_capstyle": "round", "label": "1/√N guide"}
-    axes.plot(frames, noise["guide_mm"], color=GUIDE, **guide)
+    axes.plot(
+        frames,
+        noise["guide_mm"],
+        color=GUIDE,
+        lw=7,
+        solid_capstyle="round",
+        label="1/√N guide",
+    )
     for column, colour, marker, label in (
         ("temporal_rms_mm", blocks.BLUE, "o", "temporal noise, rms"),
         ("systematic_mm", blocks.ORANGE, "s", "systematic error (offset and pattern)"),
@@ -228,5 +235,10 @@ def _draw_errors(axes: Axes, noise: pd.DataFrame) -> None:
         )
     floor_mm = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
     if floor_mm > 0:
-        style: dict[str, Any] = {"lw": 0.8, "ls": (0, (6, 3))}
-        axes.axhline(floor_mm, color=blocks.INK, label=f"floor {floor_mm:.2f} mm", **style)
+        axes.axhline(
+            floor_mm,
+            color=blocks.INK,
+            label=f"floor {floor_mm:.2f} mm",
+            lw=0.8,
+            ls=(0, (6, 3)),
+        )

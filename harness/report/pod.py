@@ -303,14 +303,17 @@ def _draw_size(
         axes.plot([size, size], [0, pod], color=colour, lw=1.1)
         x.append(size)
         y.append(pod)
-    style: dict[str, Any] = {
-        "color": colour,
-        "ms": 6,
-        "mec": "white",
-        "mew": 0.8,
-        "zorder": 5,
-    }
-    axes.plot(x, y, "o", label=plain(label), **style)
+    axes.plot(
+        x,
+        y,
+        "o",
+        label=plain(label),
+        color=colour,
+        ms=6,
+        mec="white",
+        mew=0.8,
+        zorder=5,
+    )
 
 
 def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray) -> None:
@@ -373,25 +376,27 @@ def _draw_responses(axes: Axes, statement: PodStatement, model: AhatFit) -> None
     if model.right is not None:
         is_read &= signal < model.right
         ends.append(f"≥ {model.right:.4g}")
-    dots: dict[str, Any] = {
-        "s": 14,
-        "color": INK,
-        "alpha": 0.7,
-        "lw": 0,
-        "label": "signals",
-        "rasterized": len(signal) > MOST_MARKS,
-    }
-    axes.scatter(size[is_read], signal[is_read], **dots)
+    axes.scatter(
+        size[is_read],
+        signal[is_read],
+        s=14,
+        color=INK,
+        alpha=0.7,
+        lw=0,
+        label="signals",
+        rasterized=len(signal) > MOST_MARKS,
+    )
     if ends:
-        crosses: dict[str, Any] = {
-            "s": 18,
-            "lw": 1,
-            "marker": "x",
-            "color": PURPLE,
-            "label": f"censored, {' or '.join(ends)}",
-            "rasterized": len(signal) > MOST_MARKS,
-        }
-        axes.scatter(size[~is_read], signal[~is_read], **crosses)
+        axes.scatter(
+            size[~is_read],
+            signal[~is_read],
+            s=18,
+            lw=1,
+            marker="x",
+            color=PURPLE,
+            label=f"censored, {' or '.join(ends)}",
+            rasterized=len(signal) > MOST_MARKS,
+        )
 
 
 def _log_sizes(axes: Axes, sizes: np.ndarray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -351,14 +351,17 @@ def _draw_losses(
     losses_mm = np.array([np.nan_to_num(row["loss_mm"], posinf=0.0, neginf=0.0) for _, row in bars])
     ends_mm = np.array([[row["loss_low_mm"], row["loss_high_mm"]] for _, row in bars])
     ends_mm = np.where(np.isfinite(ends_mm), ends_mm, losses_mm[:, None])
-    style: dict[str, Any] = {
-        "color": colour,
-        "label": label,
-        "ecolor": blocks.INK,
-        "capsize": 2,
-    }
     errors_mm = np.abs(ends_mm - losses_mm[:, None]).T
-    axes.barh(positions, losses_mm, 0.36, xerr=errors_mm, **style)
+    axes.barh(
+        positions,
+        losses_mm,
+        0.36,
+        xerr=errors_mm,
+        color=colour,
+        label=label,
+        ecolor=blocks.INK,
+        capsize=2,
+    )
     for position, row in bars:
         if not np.isfinite(row["loss_mm"]):
             axes.text(0, position, " out of range", va="center", fontsize=8, color=blocks.GREY)

@@ -237,14 +237,16 @@ def _draw_free_response(axes: Axes, curve: FreeResponse, colour: str, name: str)
     axes.fill_between(calls, curve.found_low, curve.found_high, color=colour, alpha=0.13, lw=0)
     axes.plot(calls, curve.found_share, color=colour, lw=1.6, label=name)
     calls_in_use, found_in_use = curve.in_use
-    style: dict[str, Any] = {
-        "color": colour,
-        "ms": 6.5,
-        "mec": "white",
-        "mew": 0.9,
-        "zorder": 5,
-    }
-    axes.plot(max(calls_in_use, least), found_in_use, "o", **style)
+    axes.plot(
+        max(calls_in_use, least),
+        found_in_use,
+        "o",
+        color=colour,
+        ms=6.5,
+        mec="white",
+        mew=0.9,
+        zorder=5,
+    )
 
 
 def _draw_overlap(axes: Axes, pixels: PixelCurves, colour: str) -> None:
@@ -399,12 +401,24 @@ def _draw_line(
         **style,
     )
     is_bound_inside = bound_mm <= top_mm
-    dash: dict[str, Any] = {"color": style["color"], "ms": 13, "mew": 2.4}
-    axes.plot(x[is_bound_inside], bound_mm[is_bound_inside], "_", **dash)
+    axes.plot(
+        x[is_bound_inside],
+        bound_mm[is_bound_inside],
+        "_",
+        color=style["color"],
+        ms=13,
+        mew=2.4,
+    )
     largest_mm = np.fmax(np.fmax(high_mm, a90_mm), bound_mm)
     is_beyond = (np.isfinite(a90_mm) & (largest_mm > top_mm)) | np.isinf(a90_mm)
-    arrow: dict[str, Any] = {"color": style["color"], "ms": 6.5, "clip_on": False}
-    axes.plot(x[is_beyond], np.full(is_beyond.sum(), top_mm), "^", **arrow)
+    axes.plot(
+        x[is_beyond],
+        np.full(is_beyond.sum(), top_mm),
+        "^",
+        color=style["color"],
+        ms=6.5,
+        clip_on=False,
+    )
     return bool(is_beyond.any())
 
 
@@ -419,13 +433,16 @@ def _name_missing(
             missing += sum(x == value and not is_within_sizes(limit) for x, limit in pairs)
         if missing:
             words = "no limit" if len(shown) == 1 else f"no limit\n({missing})"
-            style: dict[str, Any] = {
-                "ha": "center",
-                "va": "bottom",
-                "fontsize": 8,
-                "color": GREY,
-            }
-            axes.text(position, 1.02, words, transform=axes.get_xaxis_transform(), **style)
+            axes.text(
+                position,
+                1.02,
+                words,
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                fontsize=8,
+                color=GREY,
+            )
 
 
 def _label_values(axes: Axes, axis: study.AxisGroup, scale: AxisScale) -> None:

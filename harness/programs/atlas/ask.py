@@ -199,11 +199,11 @@ def _answer(
     kind = KINDS.get(options.damage, options.damage)
     chosen = _chosen(options, surfaces, kind)
     values = _values(options, chosen, kind, distance_m)
-    places = _places(values)
+    positions = _positions(values)
     rows: list[Row] = []
     cameras_by_reason: dict[str, set[str]] = {}
-    for place in places:
-        answered, refused = rows_at(chosen, titles, place, size_mm)
+    for position in positions:
+        answered, refused = rows_at(chosen, titles, position, size_mm)
         rows += answered
         for reason, title in refused:
             cameras_by_reason.setdefault(reason, set()).add(title)
@@ -215,13 +215,13 @@ def _answer(
     if not rows:
         raise UserError(
             f"the atlas does not cover this: {'; '.join(reasons)}",
-            fix=f"compute it: {_exactly(chosen[0], places[0], about)}",
+            fix=f"compute it: {_exactly(chosen[0], positions[0], about)}",
         )
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
     asked = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
     answer = f"{asked} are found nine times out of ten in {_counts(rows)}."
-    exact = _exactly(rows[0].surface, rows[0].place, about)
+    exact = _exactly(rows[0].surface, rows[0].position, about)
     heads = {} if len(values["albedo"]) > 1 else {"albedo": ""}
     show(
         [
@@ -272,7 +272,7 @@ def _values(
     return values
 
 
-def _places(values: Mapping[str, Sequence[float]]) -> list[dict[str, float]]:
+def _positions(values: Mapping[str, Sequence[float]]) -> list[dict[str, float]]:
     """Return every combination of the values, without the axes that have none."""
     axes = [axis for axis in values if values[axis]]
     combinations = product(*(values[axis] for axis in axes))
@@ -353,23 +353,23 @@ def _meant(name: str, candidates: Sequence[str]) -> str:
     return f"; did you mean {word!r}?" if word and word != name else ""
 
 
-def _exactly(surface: LimitSurface, place: Mapping[str, float], about: Mapping[str, Any]) -> str:
+def _exactly(surface: LimitSurface, position: Mapping[str, float], about: Mapping[str, Any]) -> str:
     """Return the command of a study that computes the set-up itself."""
     from harness.programs.atlas.limits import AXES, CAMERA, DAMAGE
 
     axes: dict[str, Any] = {
         CAMERA: [surface.camera],
-        "capture.frames": [int(place["frames"])],
-        AXES["distance_m"]: [place["distance_m"]],
+        "capture.frames": [int(position["frames"])],
+        AXES["distance_m"]: [position["distance_m"]],
     }
-    depth_mm = place.get("depth_mm")
+    depth_mm = position.get("depth_mm")
     if depth_mm is not None or surface.kind != "through":
         damage = json.loads(surface.damage)
         if depth_mm is not None:
             damage["depth_mm"] = [depth_mm, depth_mm]
         axes[DAMAGE] = [damage]
-    if "albedo" in place:
-        axes[AXES["albedo"]] = [place["albedo"]]
+    if "albedo" in position:
+        axes[AXES["albedo"]] = [position["albedo"]]
     swept = shlex.quote(f"sweep={json.dumps(axes)}")
     experiment = about.get("experiment", "atlas")
     return f"tofpod sweep {experiment} --set study.boards=36 --set {swept}"

@@ -110,13 +110,15 @@ class LimitSurface:
         """Root mean square error of ln a90, leaving each set-up out; NaN without a surface."""
         return float("nan") if self.fit is None else self.fit.error
 
-    def at(self, **place: float) -> Answer:
+    def at(self, **position: float) -> Answer:
         """Return the limit at a place: a value for each axis of ``grid``. Raises Outside beyond
         the computed range."""
-        self._check_inside(place)
-        position = np.array([place.get(axis, values[0]) for axis, values in self.grid.items()])
+        self._check_inside(position)
+        coordinates = np.array(
+            [position.get(axis, values[0]) for axis, values in self.grid.items()]
+        )
         is_around = np.all(
-            [self._is_beside(axis, value) for axis, value in enumerate(position)], axis=0
+            [self._is_beside(axis, value) for axis, value in enumerate(coordinates)], axis=0
         )
         unknown = float("nan")
         if not is_around.any():
@@ -125,7 +127,7 @@ class LimitSurface:
         if self.fit is None or not self.has_limit[is_around].all():
             all_miss = self.is_beyond[is_around].all()
             return Answer(unknown, unknown, unknown, largest_mm if all_miss else unknown)
-        scaled = _scaled(position[None], list(self.grid.values()))
+        scaled = _scaled(coordinates[None], list(self.grid.values()))
         row = _design(scaled, self.fit.terms)[0]
         middle = float(row @ self.fit.coefficients)
         std = np.hypot(np.sqrt(row @ self.fit.covariance @ row), self.fit.error)
@@ -137,15 +139,15 @@ class LimitSurface:
             largest_mm=largest_mm,
         )
 
-    def _check_inside(self, place: Mapping[str, float]) -> None:
+    def _check_inside(self, position: Mapping[str, float]) -> None:
         for axis, values in self.grid.items():
             lowest = values[0]
             highest = values[-1]
-            if axis not in place or lowest - TOLERANCE <= place[axis] <= highest + TOLERANCE:
+            if axis not in position or lowest - TOLERANCE <= position[axis] <= highest + TOLERANCE:
                 continue
             computed = f"{lowest:g} to {highest:g}" if len(values) > 1 else f"{lowest:g} only"
             name, _, unit = axis.partition("_")
-            wanted = f"{name} {place[axis]:g} {unit}".rstrip()
+            wanted = f"{name} {position[axis]:g} {unit}".rstrip()
             raise Outside(wanted + f": the atlas has {computed} {unit}".rstrip())
 
     def _is_beside(self, axis: int, value: float) -> np.ndarray:

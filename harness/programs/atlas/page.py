@@ -50,7 +50,7 @@ def atlas_html(
 
 
 def _curves(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the limits against distance of each camera, damage, detector and place, with four
+    """Return the limits against distance of each camera, damage, detector and position, with four
     digits."""
     curves: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
@@ -59,7 +59,7 @@ def _curves(rows: Sequence[Row]) -> list[dict[str, Any]]:
             "damage": row.damage,
             "detector": row.surface.detector,
         }
-        settings.update(row.place)
+        settings.update(row.position)
         distance_m = settings.pop("distance_m")
         curve = curves.setdefault(tuple(settings.values()), settings)
         numbers = {
@@ -79,11 +79,11 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
     """Draw a90 against distance for each camera with the fewest and the most frames. Each damage
     that has a limit in at least half of the places gets a panel. If there are several albedos, the
     brightest target is drawn."""
-    albedos = sorted({row.place["albedo"] for row in rows if "albedo" in row.place})
-    rows = [row for row in rows if row.place.get("albedo") in (None, *albedos[-1:])]
+    albedos = sorted({row.position["albedo"] for row in rows if "albedo" in row.position})
+    rows = [row for row in rows if row.position.get("albedo") in (None, *albedos[-1:])]
     damages = _damages_with_limits(rows)
     titles = list(dict.fromkeys(row.title for row in rows))
-    frames = sorted({int(row.place["frames"]) for row in rows})
+    frames = sorted({int(row.position["frames"]) for row in rows})
     fewest_frames = frames[0]
     most_frames = frames[-1]
     styles = {fewest_frames: "--", most_frames: "-"}
@@ -104,7 +104,7 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
                         for row in rows
                         if (row.damage, row.title, row.surface.detector)
                         == (damage, title, detector)
-                        and row.place["frames"] == count
+                        and row.position["frames"] == count
                     ]
                     _draw_curve(panel, curve, style, colour, title if count == most_frames else "")
             panel.set(title=damage, yscale="log")
@@ -139,7 +139,7 @@ def _draw_curve(
     name: str,
 ) -> None:
     """Draw a camera's limits against distance; a curve with a name has its band."""
-    distance_m = [row.place["distance_m"] for row in curve]
+    distance_m = [row.position["distance_m"] for row in curve]
     a90_mm = [row.answer.a90_mm for row in curve]
     panel.plot(distance_m, a90_mm, style, color=colour, label=name or None)
     if name:

@@ -24,7 +24,7 @@ class Row:
     """The surface."""
     title: str
     """Title of its camera."""
-    place: Mapping[str, float]
+    position: Mapping[str, float]
     """A value for each axis of the surface."""
     answer: Answer
     """The limit there."""
@@ -35,7 +35,7 @@ class Row:
     def damage(self) -> str:
         """The kind of damage with its depth, such as ``blind hole 6 mm deep``."""
         words = damage_words(self.surface.kind)
-        depth_mm = self.place.get("depth_mm")
+        depth_mm = self.position.get("depth_mm")
         return words if depth_mm is None else f"{words} {depth_mm:g} mm deep"
 
     @property
@@ -71,33 +71,35 @@ ATLAS = Table(
         Column(
             "distance_m",
             "distance (m)",
-            lambda row: row.place["distance_m"],
+            lambda row: row.position["distance_m"],
             "distance of the target",
         ),
         Column(
             "frames",
             "frames",
-            lambda row: int(row.place["frames"]),
+            lambda row: int(row.position["frames"]),
             "number of averaged frames",
         ),
         Column(
             "albedo",
             "albedo",
-            lambda row: row.place.get("albedo"),
+            lambda row: row.position.get("albedo"),
             "the target's albedo, if it varies",
         ),
         Column(
             "depth_mm",
             "",
-            lambda row: row.place.get("depth_mm"),
+            lambda row: row.position.get("depth_mm"),
             "depth of the damage, if it has one",
         ),
         Column(
             "a90_mm",
             "a90 (mm)",
             _a90,
-            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest"
-            " inspected size if all neighbouring set-ups miss such damage; empty if one of them has"
+            "size found 90 % of the time, with the 95 % interval of the surface; beyond the "
+            "largest"
+            " inspected size if all neighbouring set-ups miss such damage; empty if one of "
+            "them has"
             " no limit",
             interval=True,
         ),
@@ -117,7 +119,10 @@ ATLAS = Table(
             "found",
             "found?",
             "verdict",
-            "whether damage of the given size is found nine times out of ten: yes, no or undecided",
+            (
+                "whether damage of the given size is found nine times out of ten: yes, no or "
+                "undecided"
+            ),
         ),
     ),
     title="the atlas: size found 90 % of the time",
@@ -128,16 +133,16 @@ ATLAS = Table(
 def rows_at(
     surfaces: Iterable[LimitSurface],
     titles: Mapping[str, str],
-    place: Mapping[str, float],
+    position: Mapping[str, float],
     size_mm: float = np.nan,
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a place, smallest limit first, and (reason, camera title) for surfaces
+    """Return the rows at a position, smallest limit first, and (reason, camera title) for surfaces
     without an answer."""
     rows = []
     refused = []
     for surface in surfaces:
         title = titles[surface.camera]
-        on_axes = {axis: place[axis] for axis in surface.grid if axis in place}
+        on_axes = {axis: position[axis] for axis in surface.grid if axis in position}
         try:
             rows.append(Row(surface, title, on_axes, surface.at(**on_axes), size_mm))
         except Outside as reason:
@@ -161,7 +166,7 @@ def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[
         axes = [axis for axis in surface.grid if axis != "distance_m"]
         for values in product(*(surface.grid[axis] for axis in axes)):
             for distance_m in spread_m:
-                place = dict(zip(axes, values, strict=True))
-                place["distance_m"] = float(distance_m)
-                rows.append(Row(surface, title, place, surface.at(**place)))
+                position = dict(zip(axes, values, strict=True))
+                position["distance_m"] = float(distance_m)
+                rows.append(Row(surface, title, position, surface.at(**position)))
     return rows

@@ -17,7 +17,7 @@ CAMERA = "source.camera.name"
 BEST = "azure_kinect_nfov"
 OTHERS = ("kinect_v2", "realsense_l515")
 
-CountsByPlace = dict[str, dict[str, HoleCount]]
+CountsByConditions = dict[str, dict[str, HoleCount]]
 """The count of each camera (by name) at each place (as text)."""
 
 
@@ -35,7 +35,7 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]
     if rows.empty:
         return verdict_of("C11", "undecided", f"Not judged: no trial has {MANY} frames.")
-    counts = _counts_by_place(rows, axes)
+    counts = _counts_by_conditions(rows, axes)
     evidence = []
     units = rows.groupby(CAMERA)[CAMERA_UNIT].nunique().min() if CAMERA_UNIT in axes else 1
     if units < FEWEST_UNITS:
@@ -45,10 +45,12 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     evidence.append(_counts_text(counts))
     answers: list[bool | None] = []
     for camera in OTHERS:
-        standings = _places_by_standing(counts, camera)
-        answers.append(_is_better(standings))
+        conditions_of = _conditions_by_standing(counts, camera)
+        answers.append(_is_better(conditions_of))
         texts = [
-            f"{standing} at {', '.join(places)}" for standing, places in standings.items() if places
+            f"{standing} at {', '.join(conditions)}"
+            for standing, conditions in conditions_of.items()
+            if conditions
         ]
         if texts:
             evidence.append(f"Against {camera}: {'; '.join(texts)}.")
@@ -56,11 +58,11 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     return verdict_of("C11", answer, " ".join(evidence))
 
 
-def _counts_by_place(rows: pd.DataFrame, axes: Sequence[str]) -> CountsByPlace:
+def _counts_by_conditions(rows: pd.DataFrame, axes: Sequence[str]) -> CountsByConditions:
     varied = [path for path in axes if path not in (CAMERA, CAMERA_UNIT)]
     if not varied:
         return {"its one place": _counts_by_camera(rows)}
-    counts: CountsByPlace = {}
+    counts: CountsByConditions = {}
     for values, part in rows.groupby(varied, sort=False, dropna=False):
         counts[" and ".join(map(value_text, varied, values))] = _counts_by_camera(part)
     return counts
@@ -77,33 +79,33 @@ def _count(rows: pd.DataFrame) -> HoleCount:
     return HoleCount(fewest=int(certain.min()), most=int(possible.max()))
 
 
-def _counts_text(counts: CountsByPlace) -> str:
+def _counts_text(counts: CountsByConditions) -> str:
     """Return the sentence with every count, in the order of the cameras' names."""
     texts = []
-    for place, by_camera in counts.items():
+    for conditions, by_camera in counts.items():
         numbers = [
             by_camera[camera].text if camera in by_camera else "–" for camera in (BEST, *OTHERS)
         ]
-        texts.append(f"{place} {' / '.join(numbers)}")
+        texts.append(f"{conditions} {' / '.join(numbers)}")
     cameras = f"{BEST} / {' / '.join(OTHERS)}"
     return f"Holes found with {MANY} frames by {cameras}: {'; '.join(texts)}."
 
 
-def _places_by_standing(counts: CountsByPlace, camera: str) -> dict[Standing, list[str]]:
+def _conditions_by_standing(counts: CountsByConditions, camera: str) -> dict[Standing, list[str]]:
     """Return the places at which the Azure Kinect has each standing against another camera."""
-    places: dict[Standing, list[str]] = {standing: [] for standing in STANDINGS}
-    for place, by_camera in counts.items():
+    conditions_of: dict[Standing, list[str]] = {standing: [] for standing in STANDINGS}
+    for conditions, by_camera in counts.items():
         if BEST in by_camera and camera in by_camera:
             standing = by_camera[BEST].against(by_camera[camera])
-            places[standing].append(place)
-    return places
+            conditions_of[standing].append(conditions)
+    return conditions_of
 
 
-def _is_better(places: dict[Standing, list[str]]) -> bool | None:
+def _is_better(conditions_of: dict[Standing, list[str]]) -> bool | None:
     """Return whether the Azure Kinect is ahead somewhere and behind nowhere; None if that is open
     or no place has both cameras."""
-    if places["behind"]:
+    if conditions_of["behind"]:
         return False
-    if places["open"] or not any(places.values()):
+    if conditions_of["open"] or not any(conditions_of.values()):
         return None
-    return bool(places["ahead"])
+    return bool(conditions_of["ahead"])

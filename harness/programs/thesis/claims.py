@@ -250,8 +250,8 @@ def _c4(case: Case) -> tuple[Answer, str]:
     smallest = rows.iloc[diameter_mm.argmin()]
     largest = rows.iloc[diameter_mm.argmax()]
     evidence = (
-        f"Rank correlation {rho:+.2f} over {len(rows)} holes (one-sided p {_p_text(p_falls)} that"
-        f" it falls with the diameter, {_p_text(p_rises)} that it grows)."
+        f"Rank correlation {rho:+.2f} over {len(rows)} holes (one-sided p {p_text(p_falls)} that"
+        f" it falls with the diameter, {p_text(p_rises)} that it grows)."
         f" Error {_size_error(smallest)}, {_size_error(largest)}."
     )
     if p_falls < SIGNIFICANT:
@@ -259,7 +259,8 @@ def _c4(case: Case) -> tuple[Answer, str]:
     return "not borne out" if p_rises < SIGNIFICANT else "undecided", evidence
 
 
-def _p_text(p: float) -> str:
+def p_text(p: float) -> str:
+    """Return ``= 0.042``, or ``< 0.001``."""
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 

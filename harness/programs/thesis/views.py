@@ -98,7 +98,8 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     change = maps.against_one(case, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if change is None:
         return "undecided", (
-            "Not judged: the experiment has not finished both one view and two views, registered by"
+            "Not judged: the experiment has not finished both one view and two views, "
+            "registered by"
             " CPD and merged on the grid."
         )
     # if no smaller hole can be compared, one that only the single view finds speaks for the claim
@@ -327,8 +328,8 @@ def _of_equal_frames(
 def _of_equal_exposures(
     case: maps.MapCase, fused: Sequence[maps.MapSetUp]
 ) -> tuple[maps.Map, maps.Map] | None:
-    """Return the first map with the most frames that has a rival of as many exposures in total, and
-    the rival."""
+    """Return the first map with the most frames that has a rival of as many exposures in total,
+    and the rival."""
     preferred = case.single()
     singles = [set_up for set_up in case.maps if set_up.views == 1]
     singles.sort(
@@ -401,16 +402,16 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
     evidence names the place."""
     verdicts: list[Verdict] = []
     for claim, rule in VIEW_CLAIMS.items():
-        by_place: dict[str, list[Verdict]] = {}
+        by_conditions: dict[str, list[Verdict]] = {}
         for case in cases:
             answer, evidence = rule(case)
             if len(cases) > 1:
                 evidence = f"{case.conditions}: {evidence}"
-            # units of a camera are different cases at the same place
-            place = case.without_unit if claim in OVER_UNITS else case.conditions
-            by_place.setdefault(place, []).append(verdict_of(claim, answer, evidence))
-        for at_place in by_place.values():
-            verdicts += [_over_units(at_place)] if claim in OVER_UNITS else at_place
+            # units of a camera are different cases under the same conditions
+            conditions = case.without_unit if claim in OVER_UNITS else case.conditions
+            by_conditions.setdefault(conditions, []).append(verdict_of(claim, answer, evidence))
+        for alike_verdicts in by_conditions.values():
+            verdicts += [_over_units(alike_verdicts)] if claim in OVER_UNITS else alike_verdicts
     return verdicts
 
 

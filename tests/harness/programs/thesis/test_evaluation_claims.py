@@ -17,6 +17,7 @@ from harness.programs.thesis.claims import (
     RULES,
     decide,
     falling_rank,
+    p_text,
     scatter_ratio,
     score_claims,
 )
@@ -169,6 +170,16 @@ def test_positions_agree_within_the_larger_of_scatter_and_graduation(
     assert verdict("C5", world).evidence.startswith(f"{agreeing} mean positions agree")
 
 
+def test_four_holes_are_enough_to_rank() -> None:
+    """The only order of four that falls throughout has a chance of 1 in 24."""
+    four = World(rate=lambda hole, frames: float(hole >= 8))
+    answer = verdict("C4", four)
+    assert answer.verdict == "borne out"
+    assert "over 4 holes (one-sided p = 0.042 that it falls" in answer.evidence
+    three = World(rate=lambda hole, frames: float(hole >= 9))
+    assert verdict("C4", three).evidence == "Only 3 holes are found with 50 frames."
+
+
 def test_sizes_are_held_against_the_scatter_between_units_too() -> None:
     biases = {"main": 0.4, "unit 2": 1.4, "unit 3": 1.2}
     parts = [
@@ -207,6 +218,8 @@ def test_rank_test_is_the_exact_permutation_test() -> None:
         pytest.approx(1 / 24),
     )
     assert falling_rank(np.arange(4.0), np.ones(4)) == (0.0, 1.0)
+    # seven falling pairs have a chance of 1 in 5,040, of which texts tell that it is small
+    assert (p_text(1 / 5040), p_text(0.0014)) == ("< 0.001", "= 0.001")
 
 
 def test_scatter_ratio_by_hand() -> None:
