@@ -23,10 +23,12 @@ GROUPS = 10
 
 @dataclass(frozen=True)
 class Reading:
-    """A value and its two-sided 95 % interval (unknown without repeats); NaN without data."""
+    """A measured value."""
 
     value: float
+    """The value; NaN without data."""
     interval: Interval = UNKNOWN
+    """Two-sided 95 % interval; unknown without repeats."""
 
 
 NOTHING = Reading(float("nan"))
@@ -37,40 +39,45 @@ def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float]) -> 
     interval from the delete-a-group jackknife over frames; unknown below 4 frames. Source: Efron
     and Tibshirani 1993, chapter 11."""
     value = float(statistic(frames))
-    g = min(GROUPS, len(frames) // 2)
-    if g < 2 or not np.isfinite(value):
+    groups = min(GROUPS, len(frames) // 2)
+    if groups < 2 or not np.isfinite(value):
         return Reading(value)
-    number = np.arange(len(frames)) % g
-    without = np.array([statistic(frames[number != group]) for group in range(g)])
-    half = float(special.stdtrit(g - 1, UPPER) * np.sqrt((g - 1) * without.var()))
-    return Reading(value, Interval(value - half, value + half) if np.isfinite(half) else UNKNOWN)
+    number = np.arange(len(frames)) % groups
+    without = np.array([statistic(frames[number != group]) for group in range(groups)])
+    error = np.sqrt((groups - 1) * without.var())
+    half = float(special.stdtrit(groups - 1, UPPER) * error)
+    if not np.isfinite(half):
+        return Reading(value)
+    return Reading(value, Interval(value - half, value + half))
 
 
 def mean_of(values: ArrayLike) -> Reading:
     """Return the mean of independent values with Student's interval; NaN values are left out."""
     valid = np.asarray(values, float)
     valid = valid[np.isfinite(valid)]
-    if valid.size < 2:
-        return Reading(float(valid[0])) if valid.size else NOTHING
-    low, high = mean_t(valid.mean(), valid.std(ddof=1), valid.size)
-    return Reading(float(valid.mean()), Interval(float(low), float(high)))
+    if valid.size == 0:
+        return NOTHING
+    mean = valid.mean()
+    if valid.size == 1:
+        return Reading(float(mean))
+    low, high = mean_t(mean, valid.std(ddof=1), valid.size)
+    return Reading(float(mean), Interval(float(low), float(high)))
 
 
 def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
     """Return the share of true ``hits`` with Wilson's interval; ``pixels_each`` neighbours count
     as a single pixel."""
     trials = hits.size / pixels_each
-    low, high = wilson(hits.mean() * trials, trials)
-    return Reading(float(hits.mean()), Interval(float(low), float(high)))
+    share = hits.mean()
+    low, high = wilson(share * trials, trials)
+    return Reading(float(share), Interval(float(low), float(high)))
 
 
 BISQUARE = 4.685  # Tukey's constant, which gives an efficiency of 95 % for normal errors
-CANDIDATES = 400
-TRIPLE_PX = 40
-SCREENED = 4000
-"""Number of planes tried in each round, distance between the three points of each, and pixels that
-judge it."""
-GROWN = 2.0
+CANDIDATES = 400  # planes that are tried in each round
+TRIPLE_PX = 40  # largest distance between the three points of a tried plane
+SCREENED = 4000  # pixels that judge a tried plane
+GROWN = 2.0  # tolerances within which connected points belong to a plane
 MOST_PLANES = 6
 
 
@@ -81,24 +88,27 @@ def robust_inverse_fit(basis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np
     for _ in range(15):
         # an error of z is z^2 times an error of 1/z
         row = weight * z**4
-        coefficients = np.linalg.lstsq(
-            basis.T @ (basis * row[:, None]), basis.T @ (row / z), rcond=None
-        )[0]
+        normal_matrix = basis.T @ (basis * row[:, None])
+        coefficients = np.linalg.lstsq(normal_matrix, basis.T @ (row / z), rcond=None)[0]
         residual = z - 1 / (basis @ coefficients)
         # the median is 0 for exact data; a micrometre counts as exact
-        u = residual / (BISQUARE * max(1.4826 * float(np.median(np.abs(residual))), 1e-6))
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        u = residual / (BISQUARE * scale)
         weight = np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
     return coefficients, weight > 0
 
 
 def _with_ones(slopes: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.ones((*slopes.shape[:-1], 1)), slopes], axis=-1)
+    """Return the basis (..., 3) of 1/z of a plane: 1 and the slopes."""
+    ones = np.ones((*slopes.shape[:-1], 1))
+    return np.concatenate([ones, slopes], axis=-1)
 
 
 def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
     """Return the plane through points of z (n,) on rays with ``slopes`` (n, 2), robust against a
     minority."""
-    (a, b, c), _ = robust_inverse_fit(_with_ones(slopes), z_m)
+    coefficients, _ = robust_inverse_fit(_with_ones(slopes), z_m)
+    a, b, c = coefficients
     return Plane(float(1 / a), float(-b / a), float(-c / a))
 
 
@@ -118,10 +128,13 @@ def find_planes(
             mask = free & (_distance_m(inverse, basis, z_m) < tolerance_m)
             if mask.sum() < 3:
                 break
-            inverse = robust_inverse_fit(basis[mask], z_m[mask])[0]
-        labels, _ = ndimage.label(free & (_distance_m(inverse, basis, z_m) < GROWN * tolerance_m))
+            inverse, _ = robust_inverse_fit(basis[mask], z_m[mask])
+        is_close = _distance_m(inverse, basis, z_m) < GROWN * tolerance_m
+        labels, _ = ndimage.label(free & is_close)
         sizes = np.bincount(labels[mask & (labels > 0)], minlength=1)
-        mask = labels == sizes.argmax() if sizes.any() else np.zeros_like(free)
+        if not sizes.any():
+            break
+        mask = labels == sizes.argmax()
         if mask.sum() < least_px:
             break
         planes.append((fit_plane(z_m[mask], slopes[mask]), mask))
@@ -138,32 +151,28 @@ def _best_candidate(
     points = np.argwhere(free)
     shift = rng.integers(-TRIPLE_PX, TRIPLE_PX + 1, (CANDIDATES, 3, 2))
     shift[:, 0] = 0
-    sample = np.clip(
-        points[rng.integers(0, len(points), CANDIDATES)][:, None] + shift,
-        0,
-        np.array(free.shape) - 1,
-    )
-    rays = basis[sample[..., 0], sample[..., 1]]
-    z = z_m[sample[..., 0], sample[..., 1]]
-    usable = free[sample[..., 0], sample[..., 1]].all(axis=1)
+    first = points[rng.integers(0, len(points), CANDIDATES)]
+    triples = np.clip(first[:, None] + shift, 0, np.array(free.shape) - 1)
+    row, column = np.moveaxis(triples, -1, 0)
+    rays = basis[row, column]
+    z = z_m[row, column]
+    usable = free[row, column].all(axis=1)
     usable[usable] = np.abs(np.linalg.det(rays[usable])) > 1e-8
     if not usable.any():
         return np.array([1 / np.nanmedian(z_m[free]), 0.0, 0.0])
     candidates = np.linalg.solve(rays[usable], 1 / z[usable][..., None])[..., 0]
     row, column = points[rng.integers(0, len(points), SCREENED)].T
-    is_close = (
-        _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column]) < tolerance_m
-    )
-    return np.asarray(candidates[int(is_close.sum(axis=1).argmax())])
+    distance_m = _distance_m(candidates[:, None, :], basis[row, column], z_m[row, column])
+    votes = (distance_m < tolerance_m).sum(axis=1)
+    return np.asarray(candidates[int(votes.argmax())])
 
 
 def _distance_m(inverse: np.ndarray, basis: np.ndarray, z_m: np.ndarray) -> np.ndarray:
     """Return the distance of points from the plane with coefficients ``inverse`` (..., 3) of 1/z;
     infinite for NaN."""
+    length = np.linalg.norm(inverse, axis=-1)
     with np.errstate(invalid="ignore"):
-        distance = np.abs(z_m * (inverse * basis).sum(axis=-1) - 1) / np.linalg.norm(
-            inverse, axis=-1
-        )
+        distance = np.abs(z_m * (inverse * basis).sum(axis=-1) - 1) / length
     return np.nan_to_num(distance, nan=np.inf)
 
 
@@ -173,16 +182,18 @@ SURFACE_DEGREE = 5
 
 def often_valid(z_m: np.ndarray, where: np.ndarray | bool) -> np.ndarray:
     """Return the pixels of ``where`` that count, (h, w) bool."""
-    return where & (np.isfinite(z_m).sum(axis=0) >= max(2, len(z_m) / 2))
+    ranges = np.isfinite(z_m).sum(axis=0)
+    return where & (ranges >= max(2, len(z_m) / 2))
 
 
 def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray | bool = True) -> float:
     """Return the standard deviation over frames (n - 1), as an rms over the pixels that count; NaN
     if none does."""
     use = often_valid(z_m, where)
-    return (
-        float(np.sqrt(np.nanvar(z_m[:, use], axis=0, ddof=1).mean())) if use.any() else float("nan")
-    )
+    if not use.any():
+        return float("nan")
+    variance_m2 = np.nanvar(z_m[:, use], axis=0, ddof=1)
+    return float(np.sqrt(variance_m2.mean()))
 
 
 def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> np.ndarray:
@@ -190,9 +201,11 @@ def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> 
     other pixels."""
     use = often_valid(z_m, where)
     d = np.zeros_like(z_m)
-    d[:, use] = z_m[:, use] - np.nanmean(z_m[:, use], axis=0)
+    used_m = z_m[:, use]
+    d[:, use] = used_m - np.nanmean(used_m, axis=0)
     if not keep_jitter and use.any():
-        d[:, use] -= np.nanmean(d[:, use], axis=1)[:, None]
+        frame_means = np.nanmean(d[:, use], axis=1)
+        d[:, use] -= frame_means[:, None]
     return d
 
 
@@ -208,7 +221,9 @@ def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tupl
     pair = np.isfinite(a) & np.isfinite(b)
     if not pair.any():
         return float("nan"), float("nan")
-    return float((a * b)[pair].mean()), float(((a**2)[pair].mean() + (b**2)[pair].mean()) / 2)
+    product = (a * b)[pair].mean()
+    square = ((a**2)[pair].mean() + (b**2)[pair].mean()) / 2
+    return float(product), float(square)
 
 
 def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> float:
@@ -221,18 +236,17 @@ def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> flo
 def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y: int) -> float:
     """Return the correlation of temporal noise of pixels (lag_x, lag_y) apart, including
     whole-frame displacement."""
-    return correlation(
-        deviations(z_m, where, keep_jitter=True), often_valid(z_m, where), lag_x, lag_y
-    )
+    d = deviations(z_m, where, keep_jitter=True)
+    return correlation(d, often_valid(z_m, where), lag_x, lag_y)
 
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """The error of a wall's average beyond a smooth surface and noise: ``std_m``,
-    ``covariance_m2`` at lags 0..20."""
+    """The error of a wall's average beyond a smooth surface and noise."""
 
     std_m: float
     covariance_m2: np.ndarray
+    """Covariance (lags + 1,) of pixels, mean of both axes."""
 
 
 def fixed_pattern(
@@ -242,10 +256,11 @@ def fixed_pattern(
     without the remaining temporal noise. ``z_m`` (n, h, w) must be valid in every frame at every
     pixel of ``where``; ``slopes`` (h, w, 2)."""
     average = z_m.mean(axis=0)[where]
+    wall_slopes = slopes[where]
     # Legendre products up to total degree 5 over the slopes, scaled to -1..1
-    middle = slopes[where].mean(axis=0)
-    half = np.ptp(slopes[where], axis=0) / 2
-    x, y = ((slopes[where] - middle) / half).T
+    middle = wall_slopes.mean(axis=0)
+    half = np.ptp(wall_slopes, axis=0) / 2
+    x, y = ((wall_slopes - middle) / half).T
     basis = np.polynomial.legendre.legvander2d(x, y, (SURFACE_DEGREE, SURFACE_DEGREE))
     i, j = np.divmod(np.arange(basis.shape[1]), SURFACE_DEGREE + 1)
     basis = np.asarray(basis[:, i + j <= SURFACE_DEGREE])
@@ -260,20 +275,20 @@ def fixed_pattern(
     def left_at(lag_x: int, lag_y: int) -> float:
         # deviations from a mean of n frames have (n - 1)/n of the variance and the mean has 1/n: a
         # ratio of 1/(n - 1)
-        of_noise = covariance(noise, good, lag_x, lag_y)[0] / (len(z_m) - 1)
-        return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
+        of_noise, _ = covariance(noise, good, lag_x, lag_y)
+        of_average, _ = covariance(residual[None], good, lag_x, lag_y)
+        return of_average - of_noise / (len(z_m) - 1)
 
-    correlation_left = np.array([[left_at(k, 0), left_at(0, k)] for k in range(lags + 1)]).mean(
-        axis=1
-    )
-    return FixedPattern(float(np.sqrt(max(correlation_left[0], 0))), correlation_left)
+    along_axes = [(left_at(lag, 0), left_at(0, lag)) for lag in range(lags + 1)]
+    covariance_m2 = np.array(along_axes).mean(axis=1)
+    return FixedPattern(float(np.sqrt(max(covariance_m2[0], 0))), covariance_m2)
 
 
+# a point of a surface lies within four standard deviations of noise, or a tenth of the step
 TOLERANCE_SIGMAS = 4.0
-# a point of a surface lies within four standard deviations of noise plus a tenth of the step
 TOLERANCE_STEP = 0.1
 LEAST_TOLERANCE_M = 0.5 * MM
-MOST_OF_STEP = 0.45
+MOST_OF_STEP = 0.45  # share of the step above which a tolerance would join the surfaces
 FLAT_PX = 8.0  # distance from an edge beyond which the camera's filter sees a single surface
 
 
@@ -282,7 +297,9 @@ def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
     since a tolerance of more than `MOST_OF_STEP` of the step would join the surfaces."""
     noise = TOLERANCE_SIGMAS * sigma_m if np.isfinite(sigma_m) else 0.0
     tolerance_m = max(noise, TOLERANCE_STEP * step_m, LEAST_TOLERANCE_M)
-    return tolerance_m if tolerance_m <= MOST_OF_STEP * step_m else float("nan")
+    if tolerance_m > MOST_OF_STEP * step_m:
+        return float("nan")
+    return tolerance_m
 
 
 def edge_widths(
@@ -301,20 +318,20 @@ def edge_widths(
     are z along each ray; ``from_edge_px`` (h, w) is negative in front, NaN for excluded pixels."""
     within_reach = np.abs(from_edge_px) <= reach_px
     z = z_m[:, within_reach]
-    on_surface = np.any(
-        [np.abs(z - surface[within_reach]) <= tolerance_m for surface in (front_z_m, back_z_m)],
-        axis=0,
-    )
+    has_range = np.isfinite(z)
     lines = np.asarray(within_reach.any(axis=across - 1))
+    count = lines.sum()
+    gap = (~has_range).sum(axis=1) / count
+    if np.isnan(tolerance_m):
+        unknown = np.full(len(z_m), np.nan)
+        return {"gap": gap, "flying": unknown, "with_flying": unknown}
+    on_front = np.abs(z - front_z_m[within_reach]) <= tolerance_m
+    on_back = np.abs(z - back_z_m[within_reach]) <= tolerance_m
     flying = np.zeros(z_m.shape, bool)
-    flying[:, within_reach] = np.isfinite(z) & ~on_surface
-    readings = {
-        "gap": (~np.isfinite(z)).sum(axis=1) / lines.sum(),
-        "flying": flying.sum(axis=(1, 2)) / lines.sum(),
-    }
-    readings["with_flying"] = np.asarray(flying.any(axis=across))[:, lines].mean(axis=1)
-    unknown = np.full(len(z_m), np.nan)
+    flying[:, within_reach] = has_range & ~(on_front | on_back)
+    lines_with_flying = np.asarray(flying.any(axis=across))[:, lines]
     return {
-        name: unknown if np.isnan(tolerance_m) and name != "gap" else reading
-        for name, reading in readings.items()
+        "gap": gap,
+        "flying": flying.sum(axis=(1, 2)) / count,
+        "with_flying": lines_with_flying.mean(axis=1),
     }

@@ -109,21 +109,29 @@ def main(options: argparse.Namespace, command: str) -> int:
     _refuse_what_does_not_belong(options)
     guess = _guess(options)
     _check(options, guess)
-    (curve, origin, sizes, board_m2), wanted = guess, options.false_calls_per_m2
+    curve, origin, sizes, board_m2 = guess
+    wanted = options.false_calls_per_m2
     board_m2 = board_m2 if options.board_m2 is None else options.board_m2
     # refused before the simulation, which takes a minute; `_check` has required the area
     free = plan.hole_free(wanted, board_m2 or 0.0) if wanted is not None else None
     plans = plan.design(curve, sorted(set(options.targets)), sizes, studies=options.studies, seed=1)
-    outcome = (plans, *plan.recommend(plans, options.goal), options.goal, free)
+    recommended, reaches = plan.recommend(plans, options.goal)
     design = StudyDesign(
-        curve, origin, "mm" if options.unit is None else options.unit, sizes, *outcome
+        guess=curve,
+        origin=origin,
+        unit="mm" if options.unit is None else options.unit,
+        range_of_sizes=sizes,
+        plans=plans,
+        recommended=recommended,
+        reaches=reaches,
+        goal=options.goal,
+        hole_free=free,
     )
     show(design_parts(design))
     if options.out is not None:
-        data, picture, page = (options.out / name for name in FILES)
-        write_json(
-            data, {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
-        )
+        data, picture, page = [options.out / name for name in FILES]
+        facts = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
+        write_json(data, facts)
         save_design_png(picture, design)
         write_text(page, design_html(design, command))
         print(f"wrote {data}, {picture.name}, {page.name}")

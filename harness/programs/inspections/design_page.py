@@ -34,19 +34,23 @@ SIZE_IN = (11.5, 4.9)
 
 @dataclass(frozen=True, eq=False)
 class StudyDesign:
-    """Plans for a study. Sizes are in ``unit``; ``origin`` is that of the guessed curve. ``goal``
-    is the wanted bound, if any, and ``reaches`` whether nine of ten studies by the ``recommended``
-    plan demonstrate it."""
+    """Plans for a study."""
 
     guess: PodCurve
     origin: str
+    """Origin of the guessed curve."""
     unit: str
+    """Unit of all sizes; may be empty."""
     range_of_sizes: tuple[float, float]
+    """Smallest and largest size to choose from."""
     plans: tuple[planned.StudyPlan, ...]
     recommended: planned.StudyPlan
     reaches: bool | None
+    """Whether nine of ten studies by the recommended plan demonstrate the goal; None without."""
     goal: float | None
+    """The wanted a90/95, if any."""
     hole_free: planned.HoleFree | None
+    """Hole-free area for the wanted rate of false calls, if any."""
 
     @property
     def in_unit(self) -> str:
@@ -55,11 +59,9 @@ class StudyDesign:
 
     def text(self, size: float) -> str:
         """Return a size with its unit."""
-        return (
-            f"{size:.3g}" + (f" {self.unit}" if self.unit else "")
-            if np.isfinite(size)
-            else "no size at all"
-        )
+        if not np.isfinite(size):
+            return "no size at all"
+        return f"{size:.3g} {self.unit}" if self.unit else f"{size:.3g}"
 
 
 def design_html(design: StudyDesign, command: str) -> str:
@@ -193,7 +195,9 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
 
 def notes(design: StudyDesign) -> list[str]:
     """Return the handbook's minima, the Monte Carlo error, and the assumptions of the plan."""
-    plan, (low, high), texts = design.recommended, design.range_of_sizes, []
+    texts = []
+    plan = design.recommended
+    low, high = design.range_of_sizes
     if not low <= plan.true_size <= high:
         texts.append("the guess's own a90 lies outside the range: it is extrapolated")
     if design.reaches is False and design.goal is not None and np.isfinite(plan.high):
@@ -229,17 +233,14 @@ def notes(design: StudyDesign) -> list[str]:
 def design_data(design: StudyDesign) -> dict[str, Any]:
     """Return the plan as JSON types; an infinite size becomes None."""
     guess = design.guess
-    curve = {
-        "link": guess.link,
-        "log_size": guess.log_size,
-        "mu": float(guess.mu),
-        "sigma": float(guess.sigma),
-    }
     data: dict[str, Any] = {
         "recommendation": answer(design),
         "unit": design.unit,
         "guess": {
-            **curve,
+            "link": guess.link,
+            "log_size": guess.log_size,
+            "mu": float(guess.mu),
+            "sigma": float(guess.sigma),
             "a50": guess.size_at(0.5),
             "a90": guess.size_at(0.9),
             "origin": design.origin,
@@ -265,30 +266,24 @@ def save_design_png(path: Path, design: StudyDesign) -> None:
 def _draw(canvas: Figure, design: StudyDesign) -> None:
     """Draw the expected limit against the number of targets (median, 10-90 %), and the sizes on
     the guessed curve."""
-    (limits_axes, right), (low, high), plan = (
-        canvas.subplots(1, 2),
-        design.range_of_sizes,
-        design.recommended,
-    )
+    limits_axes, curve_axes = canvas.subplots(1, 2)
+    low, high = design.range_of_sizes
+    plan = design.recommended
     plan_rows = np.arange(len(design.plans))
     true_size = plan.true_size
     # a bound that is not demonstrated is infinite
     lows, bounds, ends = np.array([(plan.low, plan.bound, plan.high) for plan in design.plans]).T
     top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])
-    limits_axes.vlines(
-        plan_rows, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2
-    )
-    limits_axes.plot(
-        plan_rows,
-        np.minimum(bounds, 9 * top),
-        "o",
-        color=blocks.BLUE,
-        ms=7,
-        mec="white",
-        label="median, 10–90 %",
-    )
+    shown_lows = np.minimum(lows, top)
+    shown_ends = np.minimum(ends, top)
+    limits_axes.vlines(plan_rows, shown_lows, shown_ends, color=blocks.BLUE, lw=2.2)
+    style: dict[str, Any] = {"color": blocks.BLUE, "ms": 7, "mec": "white"}
+    label = "median, 10–90 %"
+    limits_axes.plot(plan_rows, np.minimum(bounds, 9 * top), "o", label=label, **style)
     for position, bound, end in zip(plan_rows, bounds, ends, strict=True):
-        label = "none" if not np.isfinite(bound) else "↑" if end > top else ""
+        label = "↑" if end > top else ""
+        if not np.isfinite(bound):
+            label = "none"
         limits_axes.text(position, top, label, ha="center", va="top", color=blocks.BLUE)
     label = plain(f"the guess's a90: {design.text(true_size)}")
     limits_axes.axhline(true_size, color=blocks.RED, lw=1.2, label=label)
@@ -303,21 +298,19 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
     limits_axes.set(xlabel="targets", ylabel=axis_text("expected a90/95", design.unit))
     limits_axes.set_title(f"{plan.studies} simulated studies each")
     sizes = np.linspace(low, high, 241)[1:]
-    right.plot(
-        sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}"
-    )
-    style: dict[str, Any] = {"ms": 9, "mew": 1.0, "color": blocks.BLUE, "clip_on": False}
-    right.plot(
-        plan.sizes, np.full(plan.targets, -0.08), "|", label=f"{plan.targets} targets", **style
-    )
+    label = f"guessed POD, {design.guess.link}"
+    curve_axes.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=label)
+    style = {"ms": 9, "mew": 1.0, "color": blocks.BLUE, "clip_on": False}
+    label = f"{plan.targets} targets"
+    curve_axes.plot(plan.sizes, np.full(plan.targets, -0.08), "|", label=label, **style)
     for pod in (0.5, POD):
         size = design.guess.size_at(pod)
-        right.plot([size, size], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
-    right.set(ylim=(-0.16, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))
-    right.set(
+        curve_axes.plot([size, size], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
+    curve_axes.set(ylim=(-0.16, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))
+    curve_axes.set(
         xlabel=axis_text("size", design.unit),
         ylabel="probability of detection",
         title="Sizes to make",
     )
-    for axes in (limits_axes, right):
+    for axes in (limits_axes, curve_axes):
         axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=1, borderaxespad=0)

@@ -17,19 +17,23 @@ from harness.vocabulary.seeds import random_stream
 
 @dataclass(frozen=True, eq=False)
 class StudyPlan:
-    """Expected outcome of studies, if the guess is right. ``true_size``: of the guess. ``bound``:
-    median a90/95 of the simulated studies, infinite if half of them demonstrate none. ``low``,
-    ``high``: 10 % and 90 % quantiles. ``demonstrated``: share of studies with a finite bound.
-    ``sizes`` (targets,): to make."""
+    """Expected outcome of studies, if the guess is right."""
 
     targets: int
     studies: int
+    """Number of simulated studies."""
     true_size: float
+    """The guess's a90."""
     bound: float
+    """Median a90/95 of the studies; infinite if half of them demonstrate none."""
     low: float
+    """10 % quantile of a90/95."""
     high: float
+    """90 % quantile of a90/95."""
     demonstrated: float
+    """Share of studies with a finite bound."""
     sizes: np.ndarray
+    """Sizes (targets,) to make."""
 
 
 def curve_through(
@@ -76,17 +80,22 @@ def design(
         for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
             try:
                 fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
-            except (
-                UserError
-            ):  # no limit: all or no targets are found, or POD does not grow with size
-                continue
+            except UserError:
+                continue  # no limit: all or no targets are found, or POD does not grow with size
             bounds[study] = bound(fit, POD, CONFIDENCE).value
         # order statistics, because a number and infinity have no mean
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-        facts = (number, studies, guess.size_at(POD))
-        plans.append(
-            StudyPlan(*facts, median, low, high, float(np.mean(np.isfinite(bounds))), sizes)
+        plan = StudyPlan(
+            targets=number,
+            studies=studies,
+            true_size=guess.size_at(POD),
+            bound=median,
+            low=low,
+            high=high,
+            demonstrated=float(np.mean(np.isfinite(bounds))),
+            sizes=sizes,
         )
+        plans.append(plan)
     return tuple(plans)
 
 
@@ -98,29 +107,36 @@ def recommend(
     and False. No goal: (fewest, None)."""
     most_targets = max(plan.targets for plan in plans)
     # below the handbook's minimum, the largest number of targets is nearest to it
-    allowed = sorted(
-        (plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most_targets)),
-        key=lambda p: p.targets,
-    )
-    reaching = [plan for plan in allowed if goal is None or plan.high <= goal]
-    return (reaching or allowed[-1:])[0], None if goal is None else bool(reaching)
+    least = min(LEAST_TARGETS, most_targets)
+    allowed = [plan for plan in plans if plan.targets >= least]
+    allowed.sort(key=lambda plan: plan.targets)
+    if goal is None:
+        return allowed[0], None
+    for plan in allowed:
+        if plan.high <= goal:
+            return plan, True
+    return allowed[-1], False
 
 
 @dataclass(frozen=True)
 class HoleFree:
-    """Hole-free boards needed for a rate of false calls. ``calibration_boards``: the fewest that
-    give a threshold, with ``expected_per_m2`` on average and at most ``upper_per_m2`` with
-    ``confidence``. ``silent_m2``: the area without a false call, on ``silent_boards`` other
-    boards, whose upper bound is the wanted rate."""
+    """Hole-free boards needed for a rate of false calls."""
 
     rate_per_m2: float
+    """The wanted rate."""
     board_m2: float
+    """Face of a board."""
     confidence: float
     calibration_boards: int
+    """Fewest boards that give a threshold."""
     expected_per_m2: float
+    """Mean rate at that threshold."""
     upper_per_m2: float
+    """Upper bound of the rate at that threshold, with ``confidence``."""
     silent_m2: float
+    """Area of other boards that must be free of false calls to show the wanted rate."""
     silent_boards: int
+    """Number of these boards."""
 
 
 def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> HoleFree:
@@ -135,13 +151,13 @@ def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> 
     # any distinct scores give the same rates
     threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
     area_m2 = float(stats.chi2.ppf(confidence, 2) / 2 / rate_per_m2)
-    silent = area_m2, int(np.ceil(area_m2 / board_m2 * (1 - 1e-12)))
     return HoleFree(
-        rate_per_m2,
-        board_m2,
-        confidence,
-        fewest,
-        threshold.rate_per_m2,
-        threshold.upper_per_m2,
-        *silent,
+        rate_per_m2=rate_per_m2,
+        board_m2=board_m2,
+        confidence=confidence,
+        calibration_boards=fewest,
+        expected_per_m2=threshold.rate_per_m2,
+        upper_per_m2=threshold.upper_per_m2,
+        silent_m2=area_m2,
+        silent_boards=int(np.ceil(area_m2 / board_m2 * (1 - 1e-12))),
     )

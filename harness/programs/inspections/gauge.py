@@ -109,23 +109,20 @@ def main(options: argparse.Namespace, command: str) -> int:
             f"--diameters {low:g}:{high:g}", legal=f"FROM < TO, and FROM at least {DRILLS_MM:g}"
         )
     if options.depths and not 0 < options.depths[0] <= options.depths[1] < LARGEST_MM:
-        raise UserError(
-            "--depths {:g}:{:g}".format(*options.depths), legal="FROM <= TO, both above 0, in mm"
-        )
+        shallow, deep = options.depths
+        raise UserError(f"--depths {shallow:g}:{deep:g}", legal="FROM <= TO, both above 0, in mm")
     if not 10 <= options.targets <= 600:
         raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
     curve = _curve(options)
     # sizes are spread evenly: sizes only where the study's curve rises show nothing if the real
     # curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
-    if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
-        were = (
-            f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is "
-            f"{wrong_mm:.3g} mm"
-        )
+    true_mm = PRIOR_SIZE * curve.size_at(0.9)
+    if not low < true_mm < high:
         print(
-            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other "
-            "--diameters"
+            f"warning: if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true "
+            f"a90 is {true_mm:.3g} mm, which no hole of {low:g} to {high:g} mm would show; choose "
+            "other --diameters"
         )
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
@@ -199,17 +196,22 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
     rim = options.diameters[1] / 2 + EDGE_MM
-    room = [size - 2 * rim for size in (width, height)]
-    xs, ys = (
-        np.linspace(-size / 2, size / 2, max(int(size // spacing) + 1, 2)).round(2).tolist()
-        for size in room
-    )
+    room = np.array([width, height]) - 2 * rim
+
+    def positions(length_mm: float) -> list[float]:
+        """Return evenly spread positions about the middle, at least two."""
+        number = max(int(length_mm // spacing) + 1, 2)
+        return np.linspace(-length_mm / 2, length_mm / 2, number).round(2).tolist()
+
     clear = side / 2 + options.diameters[1] / 2 + CLEAR_MM
-    free_mm = [
-        (x, y) for y in ys for x in xs if (np.abs(corners - (x, y)).max(axis=1) >= clear).all()
-    ]
+    free_mm = []
+    for y in positions(room[1]):
+        for x in positions(room[0]):
+            from_marks = np.abs(corners - (x, y)).max(axis=1)
+            if (from_marks >= clear).all():
+                free_mm.append((x, y))
     count = -(-len(sizes) // max(len(free_mm), 1))
-    if not free_mm or min(*inset, *room) <= side or 4 * count > CODES:
+    if not free_mm or min(inset.min(), room.min()) <= side or 4 * count > CODES:
         fix = "a larger --board, a smaller --apart, or fewer --targets"
         raise UserError(
             f"{len(sizes)} holes need {count} boards of {width:g} x {height:g} mm", fix=fix
@@ -223,25 +225,26 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         deep: list[float | None] = [None] * len(sheet_holes)
         if options.depths:
             parts = (stream.permutation(len(sheet_holes)) + 0.5) / len(sheet_holes)
-            deep = np.round(
-                options.depths[0] + parts * (options.depths[1] - options.depths[0]), 1
-            ).tolist()
-        holes = tuple(
-            GaugeHole(
-                id=k + 1,
-                diameter_mm=float(sheet_holes[k]),
-                depth_mm=deep[k],
-                x_mm=free_mm[position][0],
-                y_mm=free_mm[position][1],
+            shallow_mm, deepest_mm = options.depths
+            deep = np.round(shallow_mm + parts * (deepest_mm - shallow_mm), 1).tolist()
+        holes = []
+        for k, position in enumerate(chosen.tolist()):
+            x, y = free_mm[position]
+            hole = GaugeHole(
+                id=k + 1, diameter_mm=float(sheet_holes[k]), depth_mm=deep[k], x_mm=x, y_mm=y
             )
-            for k, position in enumerate(chosen.tolist())
+            holes.append(hole)
+        marks = []
+        for code, (x, y) in enumerate(corners.tolist(), start=4 * number):
+            marks.append(GaugeMark(code=code, x_mm=x, y_mm=y, side_mm=side))
+        board = GaugeBoard(
+            name=f"board-{number + 1}",
+            width_mm=width,
+            height_mm=height,
+            marks=tuple(marks),
+            holes=tuple(holes),
         )
-        corner = enumerate(corners.tolist(), start=4 * number)
-        marks = tuple(GaugeMark(code=code, x_mm=x, y_mm=y, side_mm=side) for code, (x, y) in corner)
-        name = f"board-{number + 1}"
-        boards.append(
-            GaugeBoard(name=name, width_mm=width, height_mm=height, marks=marks, holes=holes)
-        )
+        boards.append(board)
     return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * spacing, boards=tuple(boards))
 
 

@@ -1,9 +1,10 @@
 """A gauge board: its declaration, its pose in a capture by its coded marks, and the hits and
 misses of its holes."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -26,7 +27,7 @@ GAUGE_VERSION = 1
 FEWEST_MARKS = 3
 # directions around a hole in which judged points must lie; otherwise a miss is not evidence
 SIDES = 8
-# Root mean square distance of marks from their places above which the fit is doubtful
+# rms distance of marks from their places above which the fit is doubtful
 WORST_FIT_MM = 2.0
 Length = Annotated[float, Field(gt=0, le=5e3)]
 CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
@@ -88,16 +89,18 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``found`` is hit, miss, or NA if it was not judged on all sides; a hit
-    has ``offset_mm`` and ``score``. ``counted`` holds the detector with its version, its threshold
-    in units of score, and the hit radius."""
+    """A hole in a capture."""
 
     board: str
     hole: GaugeHole
     counted: tuple[str, float, float]
+    """The detector with its version, its threshold in units of score, and the hit radius in mm."""
     found: Literal["hit", "miss", "NA"]
-    offset_mm: float | None
-    score: float | None
+    """NA if the hole was not judged on all sides."""
+    offset_mm: float | None = None
+    """Distance of a hit's centre from the hole; None without a hit."""
+    score: float | None = None
+    """Score of a hit; None without a hit."""
 
 
 def _number(value: float | None) -> str:
@@ -153,20 +156,19 @@ HITS_AND_MISSES = Table(
 
 @dataclass(frozen=True)
 class GaugeSeen:
-    """The boards in a capture. ``false_calls`` counts findings on them that hit no hole and lie on
-    no mark."""
+    """The boards in a capture."""
 
     rows: tuple[GaugeRow, ...]
+    """The holes of all boards."""
     false_calls: int
+    """Findings on the boards that hit no hole and lie on no mark."""
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
     def answer(self) -> str:
         """The counts as a sentence."""
-        count = {
-            state: sum(row.found == state for row in self.rows) for state in ("hit", "miss", "NA")
-        }
+        count = Counter(row.found for row in self.rows)
         hits = f"{count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged"
         return f"gauge: {hits}, {self.false_calls} false calls"
 
@@ -178,14 +180,10 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # infrared images show printed codes too
         amplitudes = cloud.amplitude[np.isfinite(cloud.amplitude)]
-        scaled = (
-            255
-            * np.nan_to_num(cloud.amplitude)
-            / max(float(np.quantile(amplitudes, 0.99)) if amplitudes.size else 0, 1e-9)
-        )
-        cloud = replace(
-            cloud, rgb=np.repeat(np.clip(scaled, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-        )
+        white = float(np.quantile(amplitudes, 0.99)) if amplitudes.size else 0
+        scaled = 255 * np.nan_to_num(cloud.amplitude) / max(white, 1e-9)
+        grey = np.clip(scaled, 0, 255).astype(np.uint8)
+        cloud = replace(cloud, rgb=np.repeat(grey[..., None], 3, axis=2))
     marks_read = find_marks(cloud, cloud.valid, CodedMarks(dictionary=gauge.dictionary))
     by_code = {mark.code: mark for mark in marks_read.trusted}
     rows: list[GaugeRow] = []
@@ -242,35 +240,34 @@ def _matched(
         the face."""
         points = transform_points(T_board_camera, points_m.reshape(-1, 3))
         lens = T_board_camera[:3, 3]
-        return np.asarray(
-            (lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2]
-        )
+        share = lens[2] / (lens[2] - points[:, 2])
+        return np.asarray((lens + (points - lens) * share[:, None])[:, :2])
 
-    centres_mm = on_face(np.array([detection.centre_m for detection in judged.detections]))
+    findings_m = on_face(np.array([detection.centre_m for detection in judged.detections]))
     centres = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes]) * MM
-    pairs = match(centres, centres_mm, radius_m)
-    score = judged.evidence.score
+    pairs = match(centres, findings_m, radius_m)
+    scores = judged.evidence.score
     points = judged.cloud.points_m
-    judged_mm = on_face(points[np.isfinite(score) & np.isfinite(points[..., 2])])
+    judged_m = on_face(points[np.isfinite(scores) & np.isfinite(points[..., 2])])
     rows = []
     for number, (hole, centre) in enumerate(zip(board.holes, centres, strict=True)):
-        away = judged_mm - centre
+        away = judged_m - centre
         away = away[np.linalg.norm(away, axis=-1) < radius_m + hole.diameter_mm / 2 * MM]
-        sides = (
-            np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi / SIDES)).astype(int) % SIDES
-        )
-        outcome: tuple[Any, ...] = ("miss", None, None)
+        angle = np.arctan2(away[:, 1], away[:, 0])
+        sides = np.floor(angle / (2 * np.pi / SIDES)).astype(int) % SIDES
+        row = GaugeRow(board.name, hole, counted, found="miss")
         if len(np.unique(sides)) < SIDES:
-            outcome = ("NA", None, None)
+            row = replace(row, found="NA")
         elif number in pairs:
-            offset_mm = float(np.linalg.norm(centres_mm[pairs[number]] - centre)) / MM
-            outcome = ("hit", offset_mm, judged.detections[pairs[number]].score)
-        rows.append(GaugeRow(board.name, hole, counted, *outcome))
-    inside = (np.abs(centres_mm) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(
-        axis=-1
-    )
+            finding = pairs[number]
+            offset_mm = float(np.linalg.norm(findings_m[finding] - centre)) / MM
+            score = judged.detections[finding].score
+            row = replace(row, found="hit", offset_mm=offset_mm, score=score)
+        rows.append(row)
+    half_m = np.array([board.width_mm, board.height_mm]) / 2 * MM
+    is_on_board = (np.abs(findings_m) < half_m).all(axis=-1)
     for mark in board.marks:
-        inside &= (
-            np.abs(centres_mm - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM
-        ).any(axis=-1)
-    return rows, int(inside.sum()) - sum(bool(inside[finding]) for finding in pairs.values())
+        from_mark_m = np.abs(findings_m - np.array([mark.x_mm, mark.y_mm]) * MM)
+        is_on_board &= (from_mark_m > mark.side_mm * MM).any(axis=-1)
+    hits = sum(bool(is_on_board[finding]) for finding in pairs.values())
+    return rows, int(is_on_board.sum()) - hits

@@ -16,12 +16,10 @@ if TYPE_CHECKING:
 
 MM_PER_INCH = 25.4
 PAPER_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN_MM = 10.0
-FOOT_MM = 12.0
-OVERLAP_MM = 10.0
-"""Unprinted margin of a sheet, height of the line with the scale bar, and overlap of neighbouring
-tiles."""
-SCALE_MM = 100.0
+MARGIN_MM = 10.0  # unprinted margin of a sheet
+FOOT_MM = 12.0  # height of the line with the scale bar
+OVERLAP_MM = 10.0  # overlap of neighbouring tiles
+SCALE_MM = 100.0  # length of the scale bar
 
 
 def tiles_of(
@@ -36,9 +34,8 @@ def tiles_of(
         axes_of_tiles = []
         for size, has in zip((width_mm, height_mm), room, strict=True):
             count = max(1, int(np.ceil((size - OVERLAP_MM) / (has - OVERLAP_MM))))
-            beside = (
-                count * (has - OVERLAP_MM) + OVERLAP_MM - size
-            ) / 2  # the board lies in the middle of all sheets
+            # the board lies in the middle of all sheets
+            beside = (count * (has - OVERLAP_MM) + OVERLAP_MM - size) / 2
             axes_of_tiles.append([k * (has - OVERLAP_MM) - beside for k in range(count)])
         xs, ys = axes_of_tiles
         corners = [(x, y) for y in reversed(ys) for x in xs]
@@ -69,21 +66,16 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
             # without edges, hairlines would show between neighbouring modules
             axes.add_patch(Rectangle(corner, step, step, fc="black", ec="black", lw=0.1))
     for hole in board.holes:
-        centre = (hole.x_mm, hole.y_mm)
+        x = hole.x_mm
+        y = hole.y_mm
         reach = hole.diameter_mm / 2 + 2
-        axes.add_patch(Circle(centre, hole.diameter_mm / 2, fill=False, ec=INK, lw=0.4))
-        axes.plot([centre[0] - reach, centre[0] + reach], [centre[1]] * 2, color=INK, lw=0.3)
-        axes.plot([centre[0]] * 2, [centre[1] - reach, centre[1] + reach], color=INK, lw=0.3)
+        axes.add_patch(Circle((x, y), hole.diameter_mm / 2, fill=False, ec=INK, lw=0.4))
+        axes.plot([x - reach, x + reach], [y, y], color=INK, lw=0.3)
+        axes.plot([x, x], [y - reach, y + reach], color=INK, lw=0.3)
         deep = "" if hole.depth_mm is None else f", {hole.depth_mm:g} deep"
         text = f"{hole.id}: Ø {hole.diameter_mm:g}{deep}"
-        axes.annotate(
-            text,
-            (centre[0], centre[1] - reach - 0.5),
-            ha="center",
-            va="top",
-            fontsize=5.5,
-            color=INK,
-        )
+        style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": INK}
+        axes.annotate(text, (x, y - reach - 0.5), **style)
 
 
 def template_svg(board: Any, dictionary: str) -> bytes:
@@ -105,20 +97,19 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
     buffer = io.BytesIO()
     with PdfPages(buffer, metadata={"CreationDate": None}) as pages:
         for board in boards:
-            sheet, tile_corners = tiles_of(board.width_mm, board.height_mm, paper)
+            (sheet_wide, sheet_high), tile_corners = tiles_of(
+                board.width_mm, board.height_mm, paper
+            )
+            wide = sheet_wide - 2 * MARGIN_MM
+            high = sheet_high - 2 * MARGIN_MM - FOOT_MM
             for number, (x, y) in enumerate(tile_corners, start=1):
                 left_mm = x - board.width_mm / 2
                 low = y - board.height_mm / 2
-                figure, axes = _sheet(
-                    (left_mm - MARGIN_MM, low - MARGIN_MM - FOOT_MM, *sheet), board.name
-                )
+                sheet_mm = (left_mm - MARGIN_MM, low - MARGIN_MM - FOOT_MM, sheet_wide, sheet_high)
+                figure, axes = _sheet(sheet_mm, board.name)
                 draw_board(axes, board, dictionary)
                 title = f"{board.name}, tile {number} of {len(tile_corners)}: print at 100 %"
-                _frame(
-                    axes,
-                    (left_mm, low, sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM),
-                    title,
-                )
+                _frame(axes, (left_mm, low, wide, high), title)
                 pages.savefig(figure)
     return buffer.getvalue()
 
@@ -140,13 +131,8 @@ def _frame(axes: Axes, box_mm: tuple[float, float, float, float], title: str) ->
     axes.plot([left_mm, left_mm + SCALE_MM], [bar, bar], color=INK, lw=0.8)
     for tick in np.arange(0, SCALE_MM + 1, 10):
         axes.plot([left_mm + tick] * 2, [bar, bar + 2], color=INK, lw=0.5)
-    axes.annotate(
-        f"{SCALE_MM:g} mm   {title}",
-        (left_mm + SCALE_MM + 3, bar),
-        fontsize=7,
-        color=INK,
-        va="center",
-    )
+    text = f"{SCALE_MM:g} mm   {title}"
+    axes.annotate(text, (left_mm + SCALE_MM + 3, bar), fontsize=7, color=INK, va="center")
 
 
 def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:

@@ -34,10 +34,8 @@ from harness.vocabulary.files import jsonable
 from harness.vocabulary.seeds import random_stream
 
 FREEDOM = 3.0
-PRIOR_SIZE = 1.5
-PRIOR_WIDTH = 2.0
-"""Scales of the prior: factors by which a simulation may well be wrong in size and in the width of
-the rise."""
+PRIOR_SIZE = 1.5  # factor by which a simulation may well be wrong in size
+PRIOR_WIDTH = 2.0  # factor by which it may well be wrong in the width of the rise
 # half the grid's side in scales, and its nodes along ln k and ln w
 REACH = 8.0
 NODES = (241, 61)
@@ -46,22 +44,25 @@ DRAWS = 999
 # stop rule: ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this
 # factor
 ENOUGH = 1.2
+# 0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has
+# its bound
 LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
-"""0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has
-its bound."""
 
 
 @dataclass(frozen=True)
 class BoardStep:
-    """The state after some boards. ``a50``, ``a90``: posterior medians. ``a90_95``: of a90,
-    quantile `LIMIT_AT`."""
+    """The estimates after some boards; sizes are in the curve's unit."""
 
     board: str
+    """The last board; none before the first."""
     targets: int
     hits: int
     a50: float
+    """Posterior median."""
     a90: float
+    """Posterior median."""
     a90_95: float
+    """Posterior quantile `LIMIT_AT` of a90."""
 
     @property
     def enough(self) -> bool:
@@ -71,13 +72,15 @@ class BoardStep:
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """A simulated ``curve`` and real inspections in its unit (n,): ``size``, ``hit`` bool,
-    ``board`` names."""
+    """A simulated curve, and real inspections that correct it."""
 
     curve: PodCurve
     size: np.ndarray
+    """Sizes (n,) of the real targets in the curve's unit."""
     hit: np.ndarray
+    """Which targets were found, (n,) bool."""
     board: np.ndarray
+    """Names (n,) of the targets' boards."""
 
     @cached_property
     def own_covariance(self) -> np.ndarray:
@@ -99,9 +102,11 @@ class Transfer:
     @cached_property
     def grid(self) -> np.ndarray:
         """The nodes (g, 2) of ln k and ln w."""
-        reach = REACH * np.sqrt(np.diag(self.scale))
-        k, w = (np.linspace(-end, end, nodes) for end, nodes in zip(reach, NODES, strict=True))
-        return np.stack([values.ravel() for values in np.meshgrid(k, w, indexing="ij")], axis=1)
+        log_k_end, log_w_end = REACH * np.sqrt(np.diag(self.scale))
+        log_k = np.linspace(-log_k_end, log_k_end, NODES[0])
+        log_w = np.linspace(-log_w_end, log_w_end, NODES[1])
+        all_log_k, all_log_w = np.meshgrid(log_k, log_w, indexing="ij")
+        return np.stack([all_log_k.ravel(), all_log_w.ravel()], axis=1)
 
     @cached_property
     def logs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -118,9 +123,8 @@ class Transfer:
 
     def sizes_at(self, pod: float) -> np.ndarray:
         """Return the size (g,) with this POD at each node."""
-        shift = float(
-            link_ppf(self.curve.link, np.array(pod)) - link_ppf(self.curve.link, np.array(0.5))
-        )
+        link = self.curve.link
+        shift = float(link_ppf(link, np.array(pod)) - link_ppf(link, np.array(0.5)))
         k, w = np.exp(self.grid.T)
         middle = self.curve.size_at(0.5)
         if self.curve.log_size:
@@ -139,9 +143,8 @@ class Transfer:
         """The logarithms (g,) of the nodes' weights before any real inspection, minus a
         constant."""
         steeper = stats.norm.logcdf(self.grid[:, 1] / np.sqrt(self.own_spread[1, 1]))
-        return np.asarray(
-            stats.multivariate_t(np.zeros(2), self.scale, df=FREEDOM).logpdf(self.grid) + steeper
-        )
+        student = stats.multivariate_t(np.zeros(2), self.scale, df=FREEDOM)
+        return np.asarray(student.logpdf(self.grid) + steeper)
 
     def posterior(self, rows: np.ndarray) -> np.ndarray:
         """Return the weights (g,) of the nodes after the inspections ``rows`` (n,) bool; their sum
@@ -158,11 +161,16 @@ class Transfer:
         for board in ("none", *dict.fromkeys(self.board.tolist())):
             is_used = is_used | (self.board == board)
             weight = self.posterior(is_used)
-            ends = [
-                quantile(self.sizes_at(pod), weight, level)
-                for pod, level in ((0.5, 0.5), (POD, 0.5), (POD, LIMIT_AT))
-            ]
-            steps.append(BoardStep(board, int(is_used.sum()), int(self.hit[is_used].sum()), *ends))
+            a90 = self.sizes_at(POD)
+            step = BoardStep(
+                board=board,
+                targets=int(is_used.sum()),
+                hits=int(self.hit[is_used].sum()),
+                a50=quantile(self.sizes_at(0.5), weight, 0.5),
+                a90=quantile(a90, weight, 0.5),
+                a90_95=quantile(a90, weight, LIMIT_AT),
+            )
+            steps.append(step)
         return tuple(steps)
 
     def band(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -171,12 +179,11 @@ class Transfer:
         weight = self.posterior(np.ones(len(self.size), bool))
         kept = weight > weight.max() * 1e-6
         columns = np.exp(self._logs(self.grid[kept], sizes)[0]).T
-        ends = (0.5, 1 - LIMIT_AT, LIMIT_AT)
-        middle, low, high = (
-            np.array([quantile(column, weight[kept], share) for column in columns])
-            for share in ends
-        )
-        return middle, low, high
+
+        def quantiles(share: float) -> np.ndarray:
+            return np.array([quantile(column, weight[kept], share) for column in columns])
+
+        return quantiles(0.5), quantiles(1 - LIMIT_AT), quantiles(LIMIT_AT)
 
     def agreement(self, seed: int = 1) -> float:
         """Return the probability, if the simulated curve is right, of real hits and misses at
@@ -188,15 +195,17 @@ class Transfer:
         weight /= weight.sum()
         stream = random_stream(seed, "agreement", len(self.size))
         nodes = stream.choice(len(weight), DRAWS, p=weight)
-        campaigns = np.vstack(
-            [self.hit, stream.random((DRAWS, len(self.size))) < np.exp(log_hit[nodes])]
-        )
+        simulated_hits = stream.random((DRAWS, len(self.size))) < np.exp(log_hit[nodes])
+        campaigns = np.vstack([self.hit, simulated_hits])
         statistic = []
-        for block in np.array_split(campaigns, -(-len(campaigns) * len(weight) // (CELLS * 64))):
+        blocks = -(-len(campaigns) * len(weight) // (CELLS * 64))  # bounds the memory
+        for block in np.array_split(campaigns, blocks):
             value = block @ log_hit.T + ~block @ missed.T
-            statistic.append(-np.log(np.exp(value - value.max(axis=1, keepdims=True)) @ weight))
-        observed, *simulated_values = np.concatenate(statistic).tolist()
-        return float((1 + (np.array(simulated_values) >= observed - 1e-9).sum()) / (1 + DRAWS))
+            relative = np.exp(value - value.max(axis=1, keepdims=True))
+            statistic.append(-np.log(relative @ weight))
+        values = np.concatenate(statistic)
+        is_as_far = values[1:] >= values[0] - 1e-9
+        return float((1 + is_as_far.sum()) / (1 + DRAWS))
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
@@ -213,22 +222,27 @@ DISAGREES = 0.05  # probability of agreement below which the real hits contradic
 
 @dataclass(frozen=True, eq=False)
 class Mapod:
-    """A study's curve, real hits and misses, and the combination of both. ``set_up``: name in the
-    study. ``measured``: the real ones alone; None if no curve fits them (``why``). ``transfers``:
-    of all simulated models that fit about equally well. ``steps``: estimates before any board and
-    after each; limits are the largest over ``transfers``. ``agrees``: as in `Transfer.agreement`.
-    ``unlike``: how the counting of the real hits differs from the study's, or that this is
-    unknown; "" if they agree."""
+    """A study's curve, real hits and misses, and the combination of both."""
 
     set_up: str
+    """Name of the set-up in the study."""
     simulated: PodStatement
+    """The study's curve."""
     read: Inspections
+    """The real hits and misses."""
     measured: PodStatement | None
+    """The curve of the real hits and misses alone; None if no curve fits them."""
     why: str
+    """Why no curve fits the real hits and misses; empty if one does."""
     transfers: tuple[Transfer, ...]
+    """Corrections of all simulated models that fit about equally well."""
     steps: tuple[BoardStep, ...]
+    """Estimates before any board and after each; limits are the largest over ``transfers``."""
     agrees: float
+    """Probability as in `Transfer.agreement`."""
     unlike: str
+    """How the counting of the real hits differs from the study's, or that this is unknown; empty
+    if they agree."""
 
     @classmethod
     def of(
@@ -243,35 +257,33 @@ class Mapod:
         """Correct a study's curve. Raises UserError if the study has no curve, with the reason
         ``why``."""
         if simulated is None:
-            raise UserError(
-                f"set-up {set_up} has no curve to correct: {why}",
-                fix="name another set-up with --set-up",
-            )
+            problem = f"set-up {set_up} has no curve to correct: {why}"
+            raise UserError(problem, fix="name another set-up with --set-up")
         measured = None
-        none = ""
+        no_measured_curve = ""
         try:
             measured = state_hits(read, unit="mm", tested=False)
         except UserError as error:
-            none = error.message
+            no_measured_curve = error.message
         names = np.full(len(read.size), "all") if boards is None else boards
         curves = [fit.curve for fit in simulated.fits if fit.curve.size_at(0.5) > 0]
         if not curves:
             raise UserError("the simulated curve's a50 is not above 0: its sizes cannot be scaled")
         transfers = tuple(Transfer(curve, read.size, read.response == 1, names) for curve in curves)
-        boards_of = zip(*(transfer.steps() for transfer in transfers), strict=True)
-        steps = tuple(
-            replace(same[0], a90_95=max(step.a90_95 for step in same)) for same in boards_of
-        )
+        steps = []
+        for same_board in zip(*(transfer.steps() for transfer in transfers), strict=True):
+            largest = max(step.a90_95 for step in same_board)
+            steps.append(replace(same_board[0], a90_95=largest))
         return cls(
-            set_up,
-            simulated,
-            read,
-            measured,
-            none,
-            transfers,
-            steps,
-            transfers[0].agreement(),
-            unlike,
+            set_up=set_up,
+            simulated=simulated,
+            read=read,
+            measured=measured,
+            why=no_measured_curve,
+            transfers=transfers,
+            steps=tuple(steps),
+            agrees=transfers[0].agreement(),
+            unlike=unlike,
         )
 
     @property
@@ -286,39 +298,40 @@ class Mapod:
         combined = self.steps[-1].a90_95
         if not self.contradicted:
             return combined
-        return float("inf") if self.measured is None else max(combined, self.measured.bound.value)
+        if self.measured is None:
+            return float("inf")
+        return max(combined, self.measured.bound.value)
 
     @cached_property
     def sizes(self) -> np.ndarray:
         """Sizes at which the curves are drawn."""
-        return drawn_sizes(
-            np.append(self.read.size, self.simulated.sizes[[0, -1]]),
-            self.simulated.curve.log_size,
-            (),
-        )
+        sizes = np.append(self.read.size, self.simulated.sizes[[0, -1]])
+        return drawn_sizes(sizes, self.simulated.curve.log_size, ())
 
     @cached_property
     def band(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The combined curve at ``sizes``, and the widest band over the simulated models."""
         bands = [transfer.band(self.sizes) for transfer in self.transfers]
-        return (
-            bands[0][0],
-            np.min([low for _, low, _ in bands], axis=0),
-            np.max([high for *_, high in bands], axis=0),
-        )
+        middle, _, _ = bands[0]
+        low = np.min([low for _, low, _ in bands], axis=0)
+        high = np.max([high for _, _, high in bands], axis=0)
+        return middle, low, high
 
     def to_data(self) -> dict[str, Any]:
         """Return the statement as JSON's types; an infinite size becomes None."""
         middle, low, high = self.band
         combined = {"size": self.sizes, "pod": middle, "low": low, "high": high}
         data = {
-            **{"set_up": self.set_up, "file": str(self.read.path)},
+            "set_up": self.set_up,
+            "file": str(self.read.path),
             "prior": {"size": PRIOR_SIZE, "width": PRIOR_WIDTH, "freedom": FREEDOM},
             "simulated": self.simulated.to_data(),
             "measured": None if self.measured is None else self.measured.to_data(),
             "no_measured_curve": self.why,
             "after_each_board": [{**asdict(step), "enough": step.enough} for step in self.steps],
             "p_simulation_right": self.agrees,
-            **{"counted_otherwise": self.unlike, "a90_95": self.a90_95, "combined": combined},
+            "counted_otherwise": self.unlike,
+            "a90_95": self.a90_95,
+            "combined": combined,
         }
         return dict(jsonable(data))

@@ -64,14 +64,10 @@ def sizes_grid(mapod: Mapod) -> Grid:
             rows.append((name, sized(sizes.a50, ""), sized(sizes.a90, ""), bound, sizes.counts))
         else:
             rows.append((name, "-", "-", "not demonstrated", mapod.why))
-    combined_label = f"{mapod.set_up}, corrected by {last.targets} real targets"
-    rows.append(
-        (
-            "combined",
-            *(sized(size, "") for size in (last.a50, last.a90, last.a90_95)),
-            combined_label,
-        )
-    )
+    a50 = sized(last.a50, "")
+    a90 = sized(last.a90, "")
+    corrected = f"{mapod.set_up}, corrected by {last.targets} real targets"
+    rows.append(("combined", a50, a90, sized(last.a90_95, ""), corrected))
     return Grid.of(("", "a50 (mm)", "a90 (mm)", "a90/95 (mm)", "from"), rows, left=1)
 
 
@@ -98,12 +94,12 @@ def notes(mapod: Mapod) -> list[str]:
 
 def doubts(mapod: Mapod) -> list[str]:
     """Return the reasons to doubt the combined limit."""
-    texts = (
-        [f"{mapod.unlike}: a difference counts as an error of the simulation"]
-        if mapod.unlike
-        else []
-    )
-    return texts + ["the real hits and misses contradict the simulation"] * mapod.contradicted
+    texts = []
+    if mapod.unlike:
+        texts.append(f"{mapod.unlike}: a difference counts as an error of the simulation")
+    if mapod.contradicted:
+        texts.append("the real hits and misses contradict the simulation")
+    return texts
 
 
 def mapod_parts(mapod: Mapod) -> list[str | Grid]:
@@ -144,28 +140,16 @@ def _draw(figure: Figure, mapod: Mapod) -> None:
     middle, low, high = mapod.band
     curves.fill_between(mapod.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
     curves.plot(mapod.sizes, middle, color=BLUE, lw=2.2, label="combined")
-    curves.plot(
-        mapod.sizes,
-        mapod.simulated.curve.pod(mapod.sizes),
-        color=PURPLE,
-        ls="--",
-        label="simulated",
-    )
+    pod = mapod.simulated.curve.pod(mapod.sizes)
+    curves.plot(mapod.sizes, pod, color=PURPLE, ls="--", label="simulated")
     if mapod.measured is not None:
-        curves.plot(
-            mapod.sizes,
-            mapod.measured.curve.pod(mapod.sizes),
-            color=ORANGE,
-            ls=":",
-            lw=2,
-            label="measured",
-        )
+        pod = mapod.measured.curve.pod(mapod.sizes)
+        curves.plot(mapod.sizes, pod, color=ORANGE, ls=":", lw=2, label="measured")
     draw_hits(curves, mapod.read.size, mapod.read.response == 1)
     curves.axhline(POD, color=GREY, lw=0.8, ls=":")
     if mapod.sizes[0] < mapod.a90_95 < mapod.sizes[-1]:
-        curves.plot(
-            [mapod.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(mapod.a90_95, 'mm')}"
-        )
+        label = f"a90/95: {sized(mapod.a90_95, 'mm')}"
+        curves.plot([mapod.a90_95], [POD], "o", color=RED, label=label)
     hits_in_view(curves)
     curves.set(
         xlim=(mapod.sizes[0], mapod.sizes[-1]),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
@@ -107,20 +107,23 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.provenance import RESULTS_VERSION
     from harness.vocabulary.text import show
 
-    statement: Any = _stated(options) if options.prior is None else _corrected(options)
-    alone = (pod_parts, save_pod_png, pod_html)
-    combined = (mapod_parts, save_mapod_png, mapod_html)
-    parts, save_png, html = alone if options.prior is None else combined
-    show(parts(statement))
     stem = "pod" if options.prior is None else "mapod"
-    data = options.out / f"{stem}.{'json'}"
-    picture = options.out / f"{stem}.{'png'}"
-    page = options.out / f"{stem}.{'html'}"
-    write_json(
-        data, {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
-    )
-    save_png(picture, statement)
-    write_text(page, html(statement, command))
+    data = options.out / f"{stem}.json"
+    picture = options.out / f"{stem}.png"
+    page = options.out / f"{stem}.html"
+    if options.prior is None:
+        statement = _stated(options)
+        show(pod_parts(statement))
+        facts = statement.to_data()
+        save_pod_png(picture, statement)
+        write_text(page, pod_html(statement, command))
+    else:
+        mapod = _corrected(options)
+        show(mapod_parts(mapod))
+        facts = mapod.to_data()
+        save_mapod_png(picture, mapod)
+        write_text(page, mapod_html(mapod, command))
+    write_json(data, {"results_version": RESULTS_VERSION, **facts, "command": command})
     print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
@@ -158,33 +161,35 @@ def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
     does not show how."""
     from harness.evaluation.pod.inspections import texts_of
 
-    counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"
-    study_rule = counted.format(
-        f"{study.detector} {study.detector_version}", study.threshold, radius_mm
-    )
+    def rule(detector: str, threshold: float, hit_radius_mm: float) -> str:
+        return f"by {detector} at a threshold of {threshold:.3g}, within {hit_radius_mm:.3g} mm"
+
+    study_rule = rule(f"{study.detector} {study.detector_version}", study.threshold, radius_mm)
     real = {f"in a way that {read.path.name} does not state"}
     with suppress(UserError, ValueError):
-        columns = [texts_of(read, name) for name in ("detector", "threshold", "hit_radius_mm")]
+        detectors = texts_of(read, "detector")
+        thresholds = texts_of(read, "threshold")
+        radii_mm = texts_of(read, "hit_radius_mm")
         real = {
-            counted.format(detector, float(k), float(mm))
-            for detector, k, mm in zip(*columns, strict=True)
+            rule(detector, float(threshold), float(hit_radius_mm))
+            for detector, threshold, hit_radius_mm in zip(
+                detectors, thresholds, radii_mm, strict=True
+            )
         }
-    return (
-        ""
-        if real == {study_rule}
-        else f"real hits were counted {'; '.join(sorted(real))}; those of the study {study_rule}"
-    )
+    if real == {study_rule}:
+        return ""
+    return f"real hits were counted {'; '.join(sorted(real))}; those of the study {study_rule}"
 
 
 def _stated(options: argparse.Namespace) -> PodStatement:
+    """Return the statement on the inspections alone."""
     from harness.evaluation.pod import inspections as table
     from harness.evaluation.pod import statement as pod
 
     for name in ("set_up", "board"):
         if getattr(options, name) is not None:
-            raise UserError(
-                f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out"
-            )
+            option = name.replace("_", "-")
+            raise UserError(f"--{option} belongs to --prior", fix="add --prior, or leave it out")
     of_hits = options.hit is not None
     legal = "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
@@ -194,8 +199,12 @@ def _stated(options: argparse.Namespace) -> PodStatement:
             legal=legal,
             fix="name one column; the program does not guess",
         )
-    owner = "--ahat" if of_hits else "--hit"
-    for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):
+    owner = "--hit"
+    foreign: tuple[str, ...] = ("link",)
+    if of_hits:
+        owner = "--ahat"
+        foreign = ("decision", "left", "right", "log_signal")
+    for name in foreign:
         if getattr(options, name) is not None:
             raise UserError(f"--{name.replace('_', '-')} belongs to {owner}", fix="leave it out")
     if not of_hits and options.decision is None:
@@ -220,9 +229,14 @@ def _stated(options: argparse.Namespace) -> PodStatement:
         return pod.state_hits(read, link=options.link, log_size=options.log, unit=options.unit)
     if options.log_signal and options.left is None:
         table.require_positive(read, response=True, why="--log-signal")
-    names = ("decision", "left", "right", "log_signal", "unit")
     return pod.state_signals(
-        read, log_size=options.log, **{name: getattr(options, name) for name in names}
+        read,
+        log_size=options.log,
+        decision=options.decision,
+        left=options.left,
+        right=options.right,
+        log_signal=options.log_signal,
+        unit=options.unit,
     )
 
 

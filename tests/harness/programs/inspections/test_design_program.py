@@ -55,7 +55,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @settings(max_examples=30, deadline=None)
 @given(
     a50=st.floats(0.1, 50),
-    more=st.floats(1.05, 4),
+    ratio=st.floats(1.05, 4),
     link=st.sampled_from(LINKS),
     log_size=st.booleans(),
 )
