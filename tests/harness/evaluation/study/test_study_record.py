@@ -49,7 +49,8 @@ def changed(path: tuple[str | int, ...], value: Any) -> Any:
 def refusal(file: Path) -> UserError:
     with pytest.raises(UserError) as caught:
         read_record(file)
-    assert str(file) in caught.value.message and (caught.value.fix or caught.value.legal)
+    assert str(file) in caught.value.message
+    assert caught.value.fix or caught.value.legal
     return caught.value
 
 
@@ -138,11 +139,17 @@ def test_written_and_read_it_is_the_same(tmp_path):
         (("further",), 1, "further: "),
     ],
 )
-def test_a_damaged_one_is_told_with_its_place(tmp_path, path, value, told):
+def test_a_damaged_one_is_told_with_its_place(
+    tmp_path,
+    path,
+    value,
+    told,
+):
     file = tmp_path / "study.json"
     file.write_text(json.dumps(changed(path, value)))
     mistake = refusal(file)
-    assert f"{file}: is damaged: " in mistake.message and told in mistake.message
+    assert f"{file}: is damaged: " in mistake.message
+    assert told in mistake.message
     assert "run the study again" in (mistake.fix or "")
 
 
@@ -156,4 +163,6 @@ def test_several_mistakes_are_counted(tmp_path):
 def test_what_is_no_json_is_told_what_to_do(tmp_path, content):
     (tmp_path / "no.json").write_bytes(content)
     mistake = refusal(tmp_path / "no.json")
-    assert "is not JSON" in mistake.message and mistake.fix and mistake.legal
+    assert "is not JSON" in mistake.message
+    assert mistake.fix
+    assert mistake.legal
