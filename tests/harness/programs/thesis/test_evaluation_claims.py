@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from scipy.stats import spearmanr
 
-from harness.evaluation.profile import hole_shape, hole_shapes
+from harness.evaluation.profile import HoleShape, hole_shape, hole_shapes
 from harness.programs.thesis.claims import (
     RULES,
     decide,
@@ -116,6 +116,39 @@ def test_c6_is_undecided_without_a_cloud_or_with_mixed_holes() -> None:
     mixed[:, 250:] = flat.residual_mm[:, 250:]
     scored = score_claims(tables(), examples=[dataclasses.replace(round_, residual_mm=mixed)])
     assert next(v for v in scored if v.claim == "C6").verdict == "undecided"
+
+
+@pytest.mark.parametrize(
+    ("bowls", "cylinders", "unclear", "answer"),
+    [
+        (5, 0, 3, "borne out"),
+        (4, 0, 4, "undecided"),
+        (7, 1, 0, "undecided"),
+        (0, 5, 3, "not borne out"),
+        (0, 4, 4, "undecided"),
+        (1, 7, 0, "undecided"),
+    ],
+)
+def test_c6_needs_most_holes_and_no_other(
+    bowls: int, cylinders: int, unclear: int, answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    misfits = [(0.1, 1.0)] * bowls + [(1.0, 0.1)] * cylinders + [(1.0, 1.0)] * unclear
+    shapes = [
+        HoleShape(
+            hole=str(number),
+            pixels=20,
+            bowl_rms_mm=bowl_mm,
+            cylinder_rms_mm=cylinder_mm,
+            true_bowl_rms_mm=cylinder_mm,
+            true_cylinder_rms_mm=bowl_mm,
+        )
+        for number, (bowl_mm, cylinder_mm) in enumerate(misfits, start=1)
+    ]
+    monkeypatch.setattr("harness.programs.thesis.claims.hole_shapes", lambda cloud: shapes)
+    scored = score_claims(tables(frames=(50,)), examples=[example(50)])
+    c6 = next(v for v in scored if v.claim == "C6")
+    assert c6.verdict == answer
+    assert c6.evidence.endswith(f"closer to a bowl in {cylinders} of 8 holes.")
 
 
 @pytest.mark.parametrize("claim", ["C1", "C3", "C4", "C5"])
