@@ -8,7 +8,15 @@ damage:
     ...     {
     ...         "name": "custom",
     ...         "board": {"width_mm": 160, "height_mm": 100, "thickness_mm": 20},
-    ...         "holes": [{"id": 1, "diameter_mm": 20, "centre_mm": [30, 0], "kind": "blind", "depth_mm": 12}],
+    ...         "holes": [
+    ...             {
+    ...                 "id": 1,
+    ...                 "diameter_mm": 20,
+    ...                 "centre_mm": [30, 0],
+    ...                 "kind": "blind",
+    ...                 "depth_mm": 12,
+    ...             }
+    ...         ],
     ...     }
     ... )
     >>> unit = tofpod.render(board, "azure_kinect_nfov", bounces=0)
@@ -59,9 +67,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Cloud", "Finding", "UserError", "average", "detect", "findings_table", "frames", "limits", "load", "plot",
-    "plot_pod", "render", "sweep", "table", "target",
-]  # fmt: skip
+    "Cloud",
+    "Finding",
+    "UserError",
+    "average",
+    "detect",
+    "findings_table",
+    "frames",
+    "limits",
+    "load",
+    "plot",
+    "plot_pod",
+    "render",
+    "sweep",
+    "table",
+    "target",
+]
 
 
 def target(
@@ -73,7 +94,8 @@ def target(
 
     >>> len(tofpod.target("thesis").damages), len(tofpod.target("thesis", hole_free=True).damages)
     (11, 0)
-    >>> family = {"name": "drawn", "damage": {"kind": "through", "per_board": 3, "diameter_mm": [2, 8]}}
+    >>> damage = {"kind": "through", "per_board": 3, "diameter_mm": [2, 8]}
+    >>> family = {"name": "drawn", "damage": damage}
     >>> len(tofpod.target(family, board=7).damages)
     3
     """

@@ -552,7 +552,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     warning = ""
     if off >= MISFIT_FROM:
         warning = (
-            f"the surface does not fit here: {100 * off:.0f} % of the target lies off it ({name}), "
+            f"the surface does not fit here: {100 * off:.0f} % of the target lies off it "
+            f"({name}), "
             "as beside a step between two surfaces; findings there may be due to its shape "
             "(--crop can leave a surface out)"
         )

@@ -42,8 +42,8 @@ def free_form(
     # LAPACK's upper bands
     width = int(3 * counts[1] + 3)
     banded, right = _normal_bands(values, numbers, fitted_weights, z, width, int(counts.prod()))
-    # the weights are near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem
-    # gives the factor
+    # the weights are near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's
+    # theorem gives the factor
     stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
     penalty = _penalty(int(counts[0]), int(counts[1]))
     banded[width + penalty.row - penalty.col, penalty.col] += stiffness * penalty.data

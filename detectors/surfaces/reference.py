@@ -22,7 +22,8 @@ from harness.vocabulary.meshes import front_first, read_mesh
 
 SAMPLE = 4000
 STEPS = 20
-"""Number of steps by closest points (twice as many by distances follow, then as many by planes)."""
+"""Number of steps by closest points (twice as many by distances follow, then as many by planes).
+"""
 LEAST_SCALE_M = 0.1 * MM
 FAR_M = 10.0
 EDGE_PX = 1.5  # pixels within this distance of a step or edge of the part are not judged

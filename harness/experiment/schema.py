@@ -96,7 +96,8 @@ class CaptureConfig(Config):
     )
     exact: bool = Field(
         False,
-        description="true simulates each frame; false draws the mean if its distribution is the same",
+        description="true simulates each frame; "
+        "false draws the mean if its distribution is the same",
     )
 
 
@@ -135,10 +136,10 @@ class CalibrateConfig(Config):
             raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
         if self.boards is None and self.false_calls_per_m2 is not None:
             raise ValueError(
-                (
+                
                     "`false_calls_per_m2` needs `boards`, since repeats of one board cannot "
                     "show a rate"
-                )
+                
             )
         return self
 
@@ -166,7 +167,8 @@ class MatchingConfig(Config):
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
     overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
         None,
-        description="a detection also counts as a hit, wherever its centre is, if at least this share "
+        description="a detection also counts as a hit, wherever its centre is, "
+        "if at least this share "
         "of its pixels is "
         "on the damage (outline grown by two pixels); further such detections are parts of "
         "it, not false calls",

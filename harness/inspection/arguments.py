@@ -139,7 +139,8 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
 def detector_of(
     arguments: argparse.Namespace, crop: str, assignments: Sequence[str]
 ) -> tuple[Detector, dict[str, Any]]:
-    """Return the detector with the crop and settings of --crop and --set, and all of its settings."""
+    """Return the detector with the crop and settings of --crop and --set, and all of its
+    settings."""
     from detectors import detector_type, load_detector
 
     settings: dict[str, Any] = {}
@@ -247,7 +248,8 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
 def opened(
     paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any
 ) -> Recording:
-    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
+    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of
+    `open_capture`."""
     from detectors.recordings import open_capture
 
     file = None if intrinsics is None else Path(intrinsics)

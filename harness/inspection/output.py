@@ -145,9 +145,13 @@ def pictures(
 def print_registrations(data: Mapping[str, Any]) -> None:
     """Print ``data`` of registrations.json: a table with one view per line, then notes."""
     columns = {
-        "residual mm": ("residual_mm", 3), "overlap": ("overlap", 2), "in plane mm": ("predicted_in_plane_mm", 3),
-        "across mm": ("predicted_across_mm", 3), "held out mm": ("held_out_mark_mm", 3), "pairs": ("pairs", 0),
-    }  # fmt: skip
+        "residual mm": ("residual_mm", 3),
+        "overlap": ("overlap", 2),
+        "in plane mm": ("predicted_in_plane_mm", 3),
+        "across mm": ("predicted_across_mm", 3),
+        "held out mm": ("held_out_mark_mm", 3),
+        "pairs": ("pairs", 0),
+    }
     rows = [
         (
             row["view"],
@@ -157,10 +161,8 @@ def print_registrations(data: Mapping[str, Any]) -> None:
         for row in data["views"]
     ]
     print(
-        (
-            "registration to the first view (in plane, across: predicted root mean square error "
-            "over the target)"
-        )
+        "registration to the first view (in plane, across: predicted root mean square error "
+        "over the target)"
     )
     show([Grid.of(("view", "method", *columns), rows, left=0)])
     for row in data["views"]:

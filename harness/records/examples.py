@@ -118,7 +118,8 @@ class Scene3d:
     points_mm: np.ndarray
     """(n, 3): the points in the scene's frame."""
     frame: Literal["board", "camera"]
-    """The frame: "board" has x right, y up, z to the viewer; "camera" has x right, y down, z away."""
+    """The frame: "board" has x right, y up, z to the viewer; "camera" has x right, y down, z away.
+    """
     rgb: np.ndarray | None = None
     """(n, 3) uint8: colours of the points."""
     residual_mm: np.ndarray | None = None
@@ -141,7 +142,8 @@ class Scene3d:
 
 @dataclass(frozen=True)
 class MappedExample:
-    """A merged cloud of a variant with the true holes and the findings, in the board's true frame."""
+    """A merged cloud of a variant with the true holes and the findings, in the board's true
+    frame."""
 
     variant: str
     """Name of the set-up or variation."""

@@ -74,8 +74,8 @@ class ClaimSet:
 
 
 def claim_set_of(facts: Mapping[str, Any]) -> ClaimSet | None:
-    """Return the claims about the target of the resolved experiment ``facts``, or None if there are
-    none."""
+    """Return the claims about the target of the resolved experiment ``facts``, or None if there
+    are none."""
     target = facts.get("source", {}).get("target") or {}
     address = CLAIM_SETS.get(target.get("name", ""))
     if address is None:

@@ -259,7 +259,8 @@ HIGHEST_IN = 30.0
 DPI = 150
 TAKEN = "#ff00ff"
 OTHERS = ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
-"""Colours that differ from grey and from one another, also for viewers with red-green blindness."""
+"""Colours that differ from grey and from one another, also for viewers with red-green blindness.
+"""
 Box = tuple[float, float, float, float]
 """Left, right, bottom and top ends of axes; down is positive."""
 

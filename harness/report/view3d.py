@@ -60,7 +60,8 @@ def packed(scene: Scene3d) -> dict[str, Any]:
     """Return the cloud as the page reads it: plain numbers, and arrays as base64 of little-endian
     numbers. Places are 16-bit integers within the bounding box."""
     shown = _shown(scene)
-    # the page's frame has x right, y up, z to the viewer: half a turn about x from a camera's frame
+    # the page's frame has x right, y up, z to the viewer: half a turn about x from a camera's
+    # frame
     turn = np.array([1.0, 1.0, 1.0] if scene.frame == "board" else [1.0, -1.0, -1.0])
     points_mm = scene.points_mm[shown].astype(float) * turn
     low_mm = points_mm.min(axis=0)

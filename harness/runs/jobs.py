@@ -131,7 +131,8 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: no limit."""
+    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: no
+    limit."""
 
     seconds: float | None = None
     memory_mb: int | None = None

@@ -56,7 +56,8 @@ if CAN_FORK:
 
 
 def start_server() -> None:
-    """Start the server process, which then imports its modules while this process imports its own."""
+    """Start the server process, which then imports its modules while this process imports its
+    own."""
     if CAN_FORK:
         from multiprocessing import forkserver
 

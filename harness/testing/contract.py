@@ -402,10 +402,21 @@ def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
 
 
 CHECKS = (
-    declares_itself, gives_sound_evidence, gives_the_same_twice, keeps_its_input, orders_findings_by_score,
-    is_silent_at_the_quiet_threshold, finds_no_more_at_higher_thresholds, finds_valid_pixels, survives_missing_pixels,
-    refuses_an_empty_cloud, survives_pickling, learns_plain_arrays, turns_with_the_cloud, moves_with_the_cloud,
-)  # fmt: skip
+    declares_itself,
+    gives_sound_evidence,
+    gives_the_same_twice,
+    keeps_its_input,
+    orders_findings_by_score,
+    is_silent_at_the_quiet_threshold,
+    finds_no_more_at_higher_thresholds,
+    finds_valid_pixels,
+    survives_missing_pixels,
+    refuses_an_empty_cloud,
+    survives_pickling,
+    learns_plain_arrays,
+    turns_with_the_cloud,
+    moves_with_the_cloud,
+)
 
 
 def _sound(look: Look) -> None:
@@ -539,7 +550,8 @@ def turned_once(cloud: Cloud) -> Cloud:
 
 
 def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
-    """Return an image turned by 90 degrees; a cloud without a grid keeps the order of its points."""
+    """Return an image turned by 90 degrees; a cloud without a grid keeps the order of its
+    points."""
     return np.ascontiguousarray(np.rot90(image)) if cloud.organised else image
 
 

@@ -1,7 +1,7 @@
 """A board in front of a camera: what is true of it, and what a view shows.
 
-`Board` is a target before one unit of a camera, as the rendered view shows it. `LabelledCloud` is a
-cloud of a board (the average of one view, or a map) with the truth on its pixels. Detectors get
+`Board` is a target before one unit of a camera, as the rendered view shows it. `LabelledCloud` is
+a cloud of a board (the average of one view, or a map) with the truth on its pixels. Detectors get
 only the cloud."""
 
 from collections import OrderedDict

@@ -1,4 +1,5 @@
-"""Formats numbers and tables as text: for a terminal with colours, as plain lines, and for a page."""
+"""Formats numbers and tables as text: for a terminal with colours, as plain lines, and for a
+page."""
 
 from __future__ import annotations
 

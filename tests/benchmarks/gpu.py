@@ -160,10 +160,8 @@ def main() -> int:
                 first = spent[name][work][0]
                 ratio = warm[last] / seconds
                 print(
-                    (
-                        f"  {name:8} {seconds:8.3f} s a board, first {first:6.2f} s, "
-                        f"{ratio:7.2f} times as fast as {last}"
-                    )
+                    f"  {name:8} {seconds:8.3f} s a board, first {first:6.2f} s, "
+                    f"{ratio:7.2f} times as fast as {last}"
                 )
             for name in remaining:
                 pairs = [

@@ -327,10 +327,8 @@ def peers_of_renders(runs: int) -> None:
         products.append(spent * error_rad**2)
         error_mm = 1e3 * error_rad * 299_702_547 / (4 * np.pi * FREQUENCIES[0])
         print(
-            (
-                f"  {name:34} {1e3 * spent:10.1f} ms, error {error_mm:.4f} mm in {inside.sum()} "
-                "pixels of a hole"
-            )
+            f"  {name:34} {1e3 * spent:10.1f} ms, error {error_mm:.4f} mm in {inside.sum()} "
+            "pixels of a hole"
         )
     print(f"  at equal error mitransient takes {products[1] / products[0]:.1f} times our time")
 
@@ -379,10 +377,8 @@ def trials(runs: int) -> None:
     study's rows; of detectors that learn nothing, as what `matched` has learned comes from boards
     of its own."""
     print(
-        (
-            "\nwhole trials of 50 frames, damaged board of 30,000 pixels with eight holes, a "
-            "second and core"
-        )
+        "\nwhole trials of 50 frames, damaged board of 30,000 pixels with eight holes, a "
+        "second and core"
     )
     with tempfile.TemporaryDirectory() as folder:
         detectors = {
@@ -454,10 +450,8 @@ def growth(runs: int) -> None:
             with ProcessPoolExecutor(workers, mp_context=context) as pool:
                 rates.append(sum(pool.map(rate_of, [tasks] * workers)))
         print(
-            (
-                f"  workers: two processes do {rates[1] / rates[0]:.2f} times the trials of "
-                "one, by the wall clock"
-            )
+            f"  workers: two processes do {rates[1] / rates[0]:.2f} times the trials of "
+            "one, by the wall clock"
         )
 
 

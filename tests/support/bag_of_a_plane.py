@@ -224,7 +224,7 @@ def number(value: float) -> Any:
 def write_ros1(
     path: Path, messages: Sequence[tuple[str, str, Any]], compression: str | None = None
 ) -> Path:
-    """The same messages as a bag of ROS 1, whose headers count and whose CameraInfo has capitals."""
+    """The same messages as a bag of ROS 1: headers count, and CameraInfo has capitals."""
     writer = Ros1Writer(path)
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression.upper()])

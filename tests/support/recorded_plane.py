@@ -78,8 +78,8 @@ def write_pcd(path: Path, points: np.ndarray, organised: bool = True, cut: int =
     height, width = points.shape[:2] if organised else (1, points[..., 0].size)
     header = (
         "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-        f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS "
-        f"{width * height}\nDATA binary\n"
+        f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {width * height}\nDATA binary\n"
     )
     rows = np.zeros(width * height, dtype=[("xyz", "<f4", 3), ("rgb", "<u4")])
     rows["xyz"] = points.reshape(-1, 3)

@@ -113,10 +113,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--boards", nargs="+", default=list(BOARDS), choices=list(BOARDS))
     options = parser.parse_args(arguments)
     print(
-        (
-            "camera, board, pixels | variance | sample variance | beyond 3 | lags 1 to 4 | mean "
-            "| count"
-        )
+        "camera, board, pixels | variance | sample variance | beyond 3 | lags 1 to 4 | mean | count"
     )
     for name in options.cameras:
         for board in options.boards:

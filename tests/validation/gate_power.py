@@ -194,7 +194,10 @@ def main() -> None:
     }
     for content, change in changes.items():
         print(
-            f"{content}: {share(size, options.changed, change):.2f} of {options.changed} checks fail",
+            (
+                f"{content}: {share(size, options.changed, change):.2f} of {options.changed} "
+                "checks fail"
+            ),
             flush=True,
         )
     print(f"another noise: {share(size, options.quiet):.4f} of {options.quiet}", flush=True)

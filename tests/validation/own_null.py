@@ -175,10 +175,8 @@ def main(arguments: list[str]) -> int:
     detector = load_detector(options.detector, {"crop": {"kind": "auto"}})
     options.cache.mkdir(parents=True, exist_ok=True)
     print(
-        (
-            "camera, kind, frames | asked | boards | refused | expected | counted | ratio +- "
-            "standard error"
-        )
+        "camera, kind, frames | asked | boards | refused | expected | counted | ratio +- "
+        "standard error"
     )
     for name in options.cameras:
         for kind in options.kinds:

@@ -294,7 +294,8 @@ def fuse(
 
 
 def _roughness(view: placing.PlacedView) -> np.ndarray:
-    """Return z minus the view's own smooth surface (h, w); computed only if frames do not repeat."""
+    """Return z minus the view's own smooth surface (h, w); computed only if frames do not
+    repeat."""
     inside = view.chosen.inside
     rough = np.full(inside.shape, np.nan)
     if not (view.chosen.cloud.count[inside] > 1).any():
@@ -359,10 +360,8 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
         )
     if found.rejected:
         notes.append(
-            (
-                f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations "
-                "were outliers"
-            )
+            f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations "
+            "were outliers"
         )
     return tuple(notes)
 

@@ -276,7 +276,8 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
 def _adjust(
     views: Sequence[PreparedView], marked: Sequence[registered.Registration]
 ) -> list[registered.Registration]:
-    """Return registrations of views 1.., adjusted from those by their marks, none of which failed."""
+    """Return registrations of views 1.., adjusted from those by their marks, none of which
+    failed."""
     T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera

@@ -257,7 +257,10 @@ def _departures(
     rules = [
         (
             facts.get("source", {}).get("kind") == "simulated",
-            "Boards and camera are simulated. The handbook demands real flaws and the real system.",
+            (
+                "Boards and camera are simulated. The handbook demands real flaws and the real "
+                "system."
+            ),
         ),
         (
             per_board > 1,

@@ -96,8 +96,10 @@ ATLAS = Table(
             "a90_mm",
             "a90 (mm)",
             _a90,
-            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest"
-            " inspected size if all neighbouring set-ups miss such damage; empty if one of them has"
+            "size found 90 % of the time, with the 95 % interval of the surface; beyond the "
+            "largest"
+            " inspected size if all neighbouring set-ups miss such damage; empty if one of "
+            "them has"
             " no limit",
             interval=True,
         ),
@@ -117,7 +119,10 @@ ATLAS = Table(
             "found",
             "found?",
             "verdict",
-            "whether damage of the given size is found nine times out of ten: yes, no or undecided",
+            (
+                "whether damage of the given size is found nine times out of ten: yes, no or "
+                "undecided"
+            ),
         ),
     ),
     title="the atlas: size found 90 % of the time",

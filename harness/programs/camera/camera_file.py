@@ -45,12 +45,10 @@ UNIT = CameraConfig(
     effects=EffectsConfig().model_copy(update={"unit_offset": False, "warm_up_drift": False})
 )
 """Effects of a simulated unit that captures of a real unit also show."""
-STEPS = 5
-CLOSE = 0.01
-FARTHEST = 100.0
-FEW_FRAMES = 12
-"""Most steps of the fit of the gain, the relative error at which it ends, its largest change, and
-frames per step."""
+STEPS = 5  # most steps of the fit of the gain
+CLOSE = 0.01  # relative error of the noise at which the fit ends
+FARTHEST = 100.0  # largest change of the gain
+FEW_FRAMES = 12  # frames that are simulated for each step
 # width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian
 EDGE_SHARE = 2.56
 UNKNOWN = "not determined by the captures"
@@ -68,17 +66,14 @@ def camera_of_size(lens: Lens) -> str:
     measured_cameras = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(measured_cameras or fitting) == 1:
         return (measured_cameras or fitting)[0]
-    wrong = f"{lens.width} x {lens.height} pixels"
-    size = "record the camera's own depth images, not those of a"
-    raise UserError(
-        f"several cameras have {wrong}: {', '.join(fitting)}"
-        if fitting
-        else f"no simulated camera has {wrong}",
-        legal=", ".join(f"{name} {size.width} x {size.height}" for name, size in sizes.items()),
-        fix="name the capture's camera with --camera"
-        if fitting
-        else f"{size} colour camera or of another mode",
-    )
+    pixels = f"{lens.width} x {lens.height} pixels"
+    problem = f"no simulated camera has {pixels}"
+    fix = "record the camera's own depth images, not those of a colour camera or of another mode"
+    if fitting:
+        problem = f"several cameras have {pixels}: {', '.join(fitting)}"
+        fix = "name the capture's camera with --camera"
+    legal = ", ".join(f"{name} {size.width} x {size.height}" for name, size in sizes.items())
+    raise UserError(problem, legal=legal, fix=fix)
 
 
 def with_lens(name: str, lens: Lens) -> AnyCamera:
@@ -97,13 +92,16 @@ def with_lens(name: str, lens: Lens) -> AnyCamera:
 
 
 class Stated(NamedTuple):
-    """A number of a camera file; the tag O means "measured on the owner's captures"."""
+    """A number of a camera file."""
 
     section: str
+    """Section of the file; empty for the top level."""
     key: str
     value: Any
     source: str
+    """Sentence on the origin of the value."""
     tag: str = "O"
+    """Kind of origin: O for "measured on the owner's captures", M for "assumed"."""
 
 
 def write_camera(
@@ -128,14 +126,12 @@ def write_camera(
     lines += [f"name: {path.stem}", f"title: {json.dumps(title)}", kind]
     for section in dict.fromkeys(fact.section for fact in (*facts, rate)):
         lines += [f"{section}:"] if section else []
+        indent = "  " if section else ""
         for fact in (*facts, rate):
-            text = (
-                f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: "
-                f"{json.dumps(fact.source)}}}"
-            )
-            lines += (
-                [f"{'  ' if section else ''}{fact.key}: {text}"] if fact.section == section else []
-            )
+            if fact.section == section:
+                value = f"value: {_text(fact.value)}"
+                origin = f"tag: {fact.tag}, source: {json.dumps(fact.source)}"
+                lines.append(f"{indent}{fact.key}: {{{value}, {origin}}}")
     write_text(path, "\n".join(lines) + "\n")
     return read_camera(path)
 
@@ -190,41 +186,34 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
         yield Stated(
             "unit", key, value, f"constant error and drift after power-on are {UNKNOWN}", "M"
         )
-    recorded = (
-        (law.light_at_1m, source)
-        if measured.has_amplitude
-        else (1.0, "amplitudes are not recorded", "M")
-    )
-    yield Stated("light", "amplitude_at_1m", *recorded)
+    if measured.has_amplitude:
+        yield Stated("light", "amplitude_at_1m", law.light_at_1m, source)
+    else:
+        yield Stated("light", "amplitude_at_1m", 1.0, "amplitudes are not recorded", "M")
     yield Stated("light", "albedo", albedo, "assumed of the recorded surface", "M")
     yield Stated("noise", "range_mm", law.range_m / MM, source)
     yield Stated("noise", "sigma_mm", law.sigma_m / MM, source)
     for key, value, error in zip(
         ("range_exponent", "brightness_exponent"), law.exponents, law.errors, strict=True
     ):
-        origin = (
-            (f"standard error {error:.2g}; {source}", "O")
-            if np.isfinite(error)
-            else (f"assumed: {UNKNOWN}", "M")
-        )
-        yield Stated("noise", key, value, *origin)
-    doubt = (
-        "not determined without a flat surface"
-        if pattern is None
-        else "; ".join((source, *pattern.field.warnings))
-    )
-    yield Stated(
-        "fixed_pattern", "deviation_mm", 0.0 if pattern is None else pattern.field.rms_m / MM, doubt
-    )
-    shared = (
-        np.ones((2, 1)) if measured.pattern_correlation is None else measured.pattern_correlation
-    )
-    for section, lag_table, reason in (
-        ("noise", measured.correlation, source),
-        ("fixed_pattern", shared, doubt),
-    ):
-        yield Stated(section, "rows", taps_of(lag_table[1]), reason)
-        yield Stated(section, "columns", taps_of(lag_table[0]), reason)
+        if np.isfinite(error):
+            yield Stated("noise", key, value, f"standard error {error:.2g}; {source}")
+        else:
+            yield Stated("noise", key, value, f"assumed: {UNKNOWN}", "M")
+    pattern_mm = 0.0
+    doubt = "not determined without a flat surface"
+    if pattern is not None:
+        pattern_mm = pattern.field.rms_m / MM
+        doubt = "; ".join((source, *pattern.field.warnings))
+    yield Stated("fixed_pattern", "deviation_mm", pattern_mm, doubt)
+    along_x, along_y = measured.correlation
+    yield Stated("noise", "rows", taps_of(along_y), source)
+    yield Stated("noise", "columns", taps_of(along_x), source)
+    along_x = along_y = np.ones(1)
+    if measured.pattern_correlation is not None:
+        along_x, along_y = measured.pattern_correlation
+    yield Stated("fixed_pattern", "rows", taps_of(along_y), doubt)
+    yield Stated("fixed_pattern", "columns", taps_of(along_x), doubt)
     yield Stated("dropouts", "amplitude", np.nan_to_num(drops.amplitude, nan=1.0), source)
     yield Stated(
         "dropouts",
@@ -232,19 +221,15 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
         drops.share,
         f"of {int(drops.pixels.sum())} pixels on surfaces; {source}",
     )
-    origin = (
-        (f"{edge.lines} lines of pixels across edges; {source}", "O")
-        if edge
-        else (f"edges are {UNKNOWN}", "M")
-    )
-    blurred = edge is not None and edge.flying_px > 0.05
-    yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *origin)
-    yield Stated(
-        "edge",
-        "blur_px",
-        (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0,
-        *origin,
-    )
+    if edge is None:
+        yield Stated("edge", "gap_px", 0.0, f"edges are {UNKNOWN}", "M")
+        yield Stated("edge", "blur_px", 0.0, f"edges are {UNKNOWN}", "M")
+    else:
+        of_edges = f"{edge.lines} lines of pixels across edges; {source}"
+        is_blurred = edge.flying_px > 0.05
+        blur_px = (edge.gap_px + edge.flying_px) / EDGE_SHARE if is_blurred else 0.0
+        yield Stated("edge", "gap_px", edge.gap_px, of_edges)
+        yield Stated("edge", "blur_px", blur_px, of_edges)
     yield Stated(
         "edge",
         "least_step_mm",
@@ -262,20 +247,18 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
 def _refitted(like: str, measured: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
     camera = with_lens(like, measured.captures[0].lens)
     if isinstance(camera, EmpiricalCamera) or not measured.surfaces:
-        reason = (
-            "is an empirical camera"
-            if measured.surfaces
-            else "needs flat surfaces for the fit, but none was found"
-        )
+        reason = "is an empirical camera"
+        if not measured.surfaces:
+            reason = "needs flat surfaces for the fit, but none was found"
         raise UserError(
             f"--like {like}: {reason}", fix="leave out --like to write an empirical camera"
         )
-    for key, value in _field(camera, measured) if isinstance(camera, AmcwCamera) else ():
-        camera = with_number(camera, "emitter", key, value)
-        yield Stated("emitter", key, value, f"covers every pixel with a return; {source}")
-    camera, gain = _gain(
-        with_number(camera, "engine", "output_step_mm", _step_mm(measured)), measured, albedo
-    )
+    if isinstance(camera, AmcwCamera):
+        for key, value in _field(camera, measured):
+            camera = with_number(camera, "emitter", key, value)
+            yield Stated("emitter", key, value, f"covers every pixel with a return; {source}")
+    camera = with_number(camera, "engine", "output_step_mm", _step_mm(measured))
+    camera, gain = _gain(camera, measured, albedo)
     yield Stated(
         "photons",
         "signal_electrons",
@@ -286,9 +269,8 @@ def _refitted(like: str, measured: Characteristics, albedo: float, source: str) 
     simulated_pattern = measure.characteristics(again).pattern
     if measured.pattern is not None and simulated_pattern is not None:
         times = measured.pattern.field.rms_m / max(simulated_pattern.field.rms_m, 1e-9)
-        doubt = "; ".join(
-            (f"{times:.3g} times the known camera's; {source}", *measured.pattern.field.warnings)
-        )
+        origin = f"{times:.3g} times the known camera's; {source}"
+        doubt = "; ".join((origin, *measured.pattern.field.warnings))
         for key, fact in camera.fixed_pattern.to_data().items():
             if key.endswith("_mm"):
                 yield Stated("fixed_pattern", key, fact["value"] * times, doubt)
@@ -342,19 +324,19 @@ def _gain(camera: Any, measured: Characteristics, albedo: float) -> tuple[Any, f
             np.log(face.temporal.value / wanted[face.capture, face.number])
             for face in simulated_surfaces
         ]
-        tried.append(
-            (np.log(gain), float(np.mean(ratios)) if ratios else 1.0)
-        )  # too dim counts as too noisy
-        if abs(tried[-1][1]) < CLOSE:
+        log_gain = np.log(gain)
+        # without a surface, the light is too dim, which counts as too noisy
+        log_ratio = float(np.mean(ratios)) if ratios else 1.0
+        tried.append((log_gain, log_ratio))
+        if abs(log_ratio) < CLOSE:
             break
-        slope = (
-            -0.6
-            if len(tried) < 2
-            else (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0] or 1.0)
-        )
-        ahead = tried[-1][0] - tried[-1][1] / min(slope, -0.2)
+        slope = -0.6
+        if len(tried) > 1:
+            last_gain, last_ratio = tried[-2]
+            slope = (log_ratio - last_ratio) / (log_gain - last_gain or 1.0)
+        ahead = log_gain - log_ratio / min(slope, -0.2)
         gain = float(np.exp(np.clip(ahead, np.log(start / FARTHEST), np.log(start * FARTHEST))))
-    return camera, float(np.exp(tried[-1][0]))
+    return camera, float(np.exp(log_gain))
 
 
 def simulated(
@@ -365,14 +347,16 @@ def simulated(
     simulated: relief finer than the fits, light between surfaces, the emitter's shadow behind an
     edge, and the scene beside the surfaces."""
     return [
-        _again(camera, still, albedo, frames or len(still.z_m), n)
-        for n, still in enumerate(measured.captures)
+        _again(camera, capture, albedo, frames or len(capture.z_m), number)
+        for number, capture in enumerate(measured.captures)
     ]
 
 
 def _again(
     camera: AnyCamera, capture: StillCapture, albedo: float, frames: int, number: int
 ) -> StillCapture:
+    """Return a capture as a unit of the camera would have recorded it; ``number`` selects the
+    noise."""
     z_m = capture.mean_m
     lens = camera.nominal_lens
     config = UNIT.model_copy(update={"name": camera.name})
@@ -390,25 +374,19 @@ def _again(
         z_m = np.full(halves.shape, np.nan)
         for label, shape_m in enumerate(capture.shapes_m, start=1):
             z_m = np.where(halves == label, shape_m, z_m)
-    light = (
-        albedo * capture.cosine / (z_m * capture.stretch) ** 2 / (z_m.size / capture.cosine.size)
-    )
+    layers = z_m.size / capture.cosine.size
+    light = albedo * capture.cosine / (z_m * capture.stretch) ** 2 / layers
     light *= camera.optics.cone(capture.slopes)
     unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light))
     if capture.amplitude is not None:
-        ratio = capture.amplitude / measure.mean_amplitude(
-            [next(iter(unit.capture(1, SEED).frames())).amplitude]
-        )
-        ratio = np.clip(
-            np.nan_to_num(ratio / np.nanmedian(ratio[capture.steady]), nan=1.0), 0.02, 50.0
-        )
+        first_frame = next(iter(unit.capture(1, SEED).frames()))
+        ratio = capture.amplitude / measure.mean_amplitude([first_frame.amplitude])
+        relative = np.nan_to_num(ratio / np.nanmedian(ratio[capture.steady]), nan=1.0)
+        ratio = np.clip(relative, 0.02, 50.0)
         unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light * ratio))
     taken = list(unit.capture(frames, SEED, "own camera", number).frames())
-    amplitude = (
-        measure.mean_amplitude([frame.amplitude for frame in taken])
-        if capture.amplitude is not None
-        else None
-    )
-    return replace(
-        capture, z_m=np.stack([f.z_m for f in taken]), amplitude=amplitude, step_m=camera.z_step_m
-    )
+    amplitude = None
+    if capture.amplitude is not None:
+        amplitude = measure.mean_amplitude([frame.amplitude for frame in taken])
+    z_m = np.stack([frame.z_m for frame in taken])
+    return replace(capture, z_m=z_m, amplitude=amplitude, step_m=camera.z_step_m)

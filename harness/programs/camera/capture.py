@@ -64,7 +64,15 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     }
     sources = {MEASURED: measured, SIMULATED: twin}
     write_page(
-        options.out / "capture.html", sources, rows, title, answer, "", command, facts, warnings
+        path=options.out / "capture.html",
+        sources=sources,
+        rows=rows,
+        title=title,
+        answer=answer,
+        known_title="",
+        command=command,
+        facts=facts,
+        warnings=warnings,
     )
     return 0
 

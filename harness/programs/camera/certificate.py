@@ -86,25 +86,22 @@ def spacings_mm(measured: Characteristics, poses: Sequence[np.ndarray]) -> Itera
 
 def of_surfaces(measured: Characteristics) -> Iterator[dict[str, Any]]:
     """Yield the rows of `FLAT_SURFACES`."""
-    names = ("frame_rms_mm", "average_rms_mm", "form95_mm", "form997_mm", "fill_rate")
     for face in measured.surfaces:
-        lods = [
-            level_of_detection_mm(measured, (face.temporal.value * MM) ** 2, frames)
-            for frames in LOD_FRAMES
-        ]
-        ends = face.temporal.interval
-        temporal = {
-            "temporal_mm": face.temporal.value,
-            "temporal_low_mm": ends.low,
-            "temporal_high_mm": ends.high,
-        }
-        levels = {f"lod95_{frames}_mm": lod for frames, lod in zip(LOD_FRAMES, lods, strict=True)}
-        yield {
+        row = {
             "surface": face.where,
-            **temporal,
-            **{name: getattr(face, name) for name in names},
-            **levels,
+            "temporal_mm": face.temporal.value,
+            "temporal_low_mm": face.temporal.interval.low,
+            "temporal_high_mm": face.temporal.interval.high,
+            "frame_rms_mm": face.frame_rms_mm,
+            "average_rms_mm": face.average_rms_mm,
+            "form95_mm": face.form95_mm,
+            "form997_mm": face.form997_mm,
+            "fill_rate": face.fill_rate,
         }
+        variance_m2 = (face.temporal.value * MM) ** 2
+        for frames in LOD_FRAMES:
+            row[f"lod95_{frames}_mm"] = level_of_detection_mm(measured, variance_m2, frames)
+        yield row
 
 
 def certified(
@@ -119,22 +116,17 @@ def certified(
     for name, where, unit, value, meaning in shared_figures(measured):
         if name.endswith("correlation") and not where.endswith(" lag 1"):
             continue  # the page of the camera shows the other lags
-        yield row(name, where, f"{round(value, 3) + 0.0:.3g} {unit}".removesuffix(" 1"), meaning)
-    flat = all(capture.planes for capture in measured.captures)
-    errors = [] if poses is None or not flat else list(spacings_mm(measured, poses))
+        rounded = round(value, 3) + 0.0  # 0.0 turns -0.0 into 0
+        yield row(name, where, f"{rounded:.3g} {unit}".removesuffix(" 1"), meaning)
+    errors = []
+    if poses is not None and all(capture.planes for capture in measured.captures):
+        errors = list(spacings_mm(measured, poses))
+    spacings = f"{len(errors)} spacings"
     largest_error = f"{max(map(abs, errors)):.3g} mm at most" if errors else "not measured"
-    yield row(
-        "spacing error",
-        f"{len(errors)} spacings",
-        largest_error,
-        "between planes, with --poses, as in ISO 10360-13",
-    )
-    yield row(
-        "probing-form and size error",
-        "",
-        "not measured",
-        "VDI/VDE 2634-2 requires a calibrated sphere",
-    )
+    manner = "between planes, with --poses, as in ISO 10360-13"
+    yield row("spacing error", spacings, largest_error, manner)
+    manner = "VDI/VDE 2634-2 requires a calibrated sphere"
+    yield row("probing-form and size error", "", "not measured", manner)
 
 
 def write_certificate(
@@ -145,36 +137,21 @@ def write_certificate(
     study: StudyRecord | None,
     command: str,
 ) -> None:
-    """Write certificate.html and .json. ``about`` states unit, mode, firmware and warm-up. May
+    """Write certificate.html and .json. ``facts`` state unit, mode, firmware and warm-up. May
     raise UserError."""
     rows = list(certified(measured, poses))
     limits = [limit_of(set_up) for set_up in study.set_ups] if study else []
     surfaces = list(of_surfaces(measured))
     share = "The camera's figures were measured."
-    if study is not None:
-        implanted = (
-            "For the detection limits, the frames were measured and the damage was simulated."
-        )
-        share += (
-            f" {implanted if study.name == 'implant' else 'The detection limits were simulated.'}"
-        )
-    answer = (
-        f"{many(measured.frames, 'frame')} in {many(len(measured.captures), 'capture')}, "
-        f"{len(measured.jumps_m)} displaced."
-    )
-    for face in measured.surfaces[:1]:
-        recorded = next(
-            int(capture.kept.sum()) for capture in measured.captures if capture.name == face.capture
-        )
-        lod_mm = level_of_detection_mm(
-            measured, (face.temporal.value * MM) ** 2, frames := min(recorded, LOD_FRAMES[-1])
-        )
-        noise = f"A pixel's noise is {face.temporal.value:.3g} mm at {face.distance_m:.2f} m"
-        lod = (
-            f"the mean of {many(frames, 'recorded frame')} reveals a change of {lod_mm:.3g} mm "
-            "(LoD95)"
-        )
-        answer = f"{noise}; {lod}. {answer}"
+    if study is not None and study.name == "implant":
+        share += " For the detection limits, the frames were measured and the damage was simulated."
+    elif study is not None:
+        share += " The detection limits were simulated."
+    captures = many(len(measured.captures), "capture")
+    displaced = f"{len(measured.jumps_m)} displaced"
+    answer = f"{many(measured.frames, 'frame')} in {captures}, {displaced}."
+    if measured.surfaces:
+        answer = f"{_noise_sentence(measured)} {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in facts.items())]
     body += [
         heading("Measured"),
@@ -190,11 +167,28 @@ def write_certificate(
         bullets((share, *CONDITIONS)),
         note(f"{date.today().isoformat()}: {command}"),
     ]
-    text = page(
-        f"Certificate of measurement: {facts['unit']}", answer, body, warnings=measured.doubts
-    )
-    data = {"results_version": RESULTS_VERSION, "about": facts, "answer": answer, "figures": rows}
-    data |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
-    data |= {"limits": LIMITS.data(limits), "doubts": measured.doubts, "command": command}
-    write_text(folder / "certificate.html", text)
+    title = f"Certificate of measurement: {facts['unit']}"
+    data = {
+        "results_version": RESULTS_VERSION,
+        "about": facts,
+        "answer": answer,
+        "figures": rows,
+        "surfaces": FLAT_SURFACES.data(surfaces),
+        "conditions": [share, *CONDITIONS],
+        "limits": LIMITS.data(limits),
+        "doubts": measured.doubts,
+        "command": command,
+    }
+    write_text(folder / "certificate.html", page(title, answer, body, warnings=measured.doubts))
     write_json(folder / "certificate.json", data)
+
+
+def _noise_sentence(measured: Characteristics) -> str:
+    """State the noise on the first surface, and the change that its capture reveals."""
+    face = measured.surfaces[0]
+    capture = next(capture for capture in measured.captures if capture.name == face.capture)
+    frames = min(int(capture.kept.sum()), LOD_FRAMES[-1])
+    lod_mm = level_of_detection_mm(measured, (face.temporal.value * MM) ** 2, frames)
+    noise = f"A pixel's noise is {face.temporal.value:.3g} mm at {face.distance_m:.2f} m"
+    mean = f"the mean of {many(frames, 'recorded frame')}"
+    return f"{noise}; {mean} reveals a change of {lod_mm:.3g} mm (LoD95)."

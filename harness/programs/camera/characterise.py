@@ -116,18 +116,15 @@ def main(options: argparse.Namespace, command: str) -> int:
     ]
     captures = list(map(read_still, recordings))
     if options.like:
-        with_lens(
-            options.like, captures[0].lens
-        )  # a camera with another image size cannot be refitted
+        # a camera with another image size cannot be refitted
+        with_lens(options.like, captures[0].lens)
     measured = characteristics(captures, poses)
-    rate_of = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
-    if options.like and not options.rate:
-        rate_of = (
-            load_camera(options.like).unit.frames_per_second.value,
-            f"of {options.like}",
-            "M",
-        )
-    rate = Stated("unit", "frames_per_second", *rate_of)
+    rate = Stated("unit", "frames_per_second", 30.0, "assumed", "M")
+    if options.rate:
+        rate = rate._replace(value=options.rate, source="stated by the user", tag="U")
+    elif options.like:
+        frames_per_second = load_camera(options.like).unit.frames_per_second.value
+        rate = rate._replace(value=frames_per_second, source=f"of {options.like}")
     names = ", ".join(capture.name for capture in captures)
     print("fitting the camera file ..", file=sys.stderr)
     camera = write_camera(
@@ -139,19 +136,16 @@ def main(options: argparse.Namespace, command: str) -> int:
     known_camera = options.like
     with suppress(UserError):  # no camera has this image size, or it sees none of the surfaces
         known_camera = known_camera or camera_of_size(captures[0].lens)
-        sources[KNOWN] = characteristics(
-            simulated(with_lens(known_camera, captures[0].lens), measured, options.albedo), poses
-        )
+        nearest = with_lens(known_camera, captures[0].lens)
+        sources[KNOWN] = characteristics(simulated(nearest, measured, options.albedo), poses)
     rows = beside(measured, twin, sources.get(KNOWN))
     label = load_camera(known_camera).title if known_camera else ""
     noise = ", ".join(
         f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in measured.surfaces[:3]
     )
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
-    warnings = [
-        *(warning for recording in recordings for warning in recording.warnings),
-        *measured.doubts,
-    ]
+    warnings = [warning for recording in recordings for warning in recording.warnings]
+    warnings += measured.doubts
     repeated = []
     for figure in ("fill rate", "temporal noise"):
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
@@ -172,19 +166,30 @@ def main(options: argparse.Namespace, command: str) -> int:
     page = options.out / "characterise.html"
     title = f"{options.title}, characterised"
     facts = {"like": options.like, "camera_file": CAMERA_FILE}
-    write_page(page, sources, rows, title, answer, label, command, facts, warnings)
+    write_page(
+        path=page,
+        sources=sources,
+        rows=rows,
+        title=title,
+        answer=answer,
+        known_title=label,
+        command=command,
+        facts=facts,
+        warnings=warnings,
+    )
     if options.certificate:
         lens = captures[0].lens
-        size = f"{lens.width} x {lens.height} pixels" + (
-            f", as {options.like}" if options.like else ""
-        )
+        mode = f"{lens.width} x {lens.height} pixels"
+        if options.like:
+            mode += f", as {options.like}"
         unit_facts = {
             "unit": options.title,
-            "mode": size,
+            "mode": mode,
             "firmware": "not recorded",
             "warm-up": "not stated",
+            "captures": names,
         }
-        unit_facts |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
+        unit_facts |= dict(text.split("=", 1) for text in options.about)
         write_certificate(options.out, measured, unit_facts, poses, study, command)
     return 0
 

@@ -2,8 +2,8 @@
 
 The files are for simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc):
 ``NAME.npz`` with the table, and ``depth_noise.py`` (NumPy or torch), a copy of
-`scenes.sensor.common.tabled`, which states what is not modelled. The full model is measured on planes of
-many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
+`scenes.sensor.common.tabled`, which states what is not modelled. The full model is measured on
+planes of many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
 
-# Albedo of the planes; outside the camera's range, darker or brighter planes stand for other
+# albedo of the planes; outside the camera's range, darker or brighter planes stand for other
 # distances
 ALBEDO = 0.6
-DARKEST = 0.02
-# Brightnesses measured per octave; table entries per octave, of which the nearest counts
-MEASURED = 2
-PER_OCTAVE = 16
-# Frames of 3,000 pixels give a deviation to 1 %
-FRAMES = 40
+DARKEST = 0.02  # least albedo of the table
+MEASURED = 2  # brightnesses measured per octave
+PER_OCTAVE = 16  # table entries per octave, of which the nearest counts
+FRAMES = 40  # frames of 3,000 pixels give a deviation to 1 %
 FRAMES_OF_CORRELATION = 100
-LONGEST_LAG = 12  # Largest lag in pixels of the correlation of neighbours
+LONGEST_LAG = 12  # largest lag in pixels of the correlation of neighbours
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -59,9 +57,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     file = io.BytesIO()
     np.savez_compressed(file, **table, command=np.array(command))  # type: ignore[arg-type]
     write_bytes(options.out / f"{camera.name}.npz", file.getvalue())
-    write_text(
-        options.out / "depth_noise.py", Path(str(tabled.__file__)).read_text(encoding="utf-8")
-    )
+    code = Path(str(tabled.__file__)).read_text(encoding="utf-8")
+    write_text(options.out / "depth_noise.py", code)
     is_returned = table["seen"] > 0.5
     low = 1000.0 * float(table["sigma_m"][is_returned][-1])
     high = 1000.0 * float(table["sigma_m"][is_returned][0])
@@ -74,29 +71,31 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
-    """Return the arrays of `scenes.sensor.common.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are
-    the deviation and the probability of a return over log2 of intensity / range^2, from ``first``
-    on, with ``per_octave`` entries each. There are filters of the noise and of the pattern, whose
-    deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w), each pixel's light
-    relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
+    """Return the arrays of `scenes.sensor.common.tabled.DepthNoise`.
+
+    ``sigma_m`` and ``seen`` (n,) are the deviation and the probability of a return over log2 of
+    intensity / range^2, from ``first`` on, with ``per_octave`` entries an octave. ``rows`` and
+    ``columns`` are filters of the noise; ``pattern_rows`` and ``pattern_columns`` are those of the
+    pattern, whose deviation is ``pattern_m``. ``slopes`` (h, w, 2) are those of the pixels' rays,
+    ``falloff`` (h, w) is each pixel's light relative to the axis.
+    """
     from scenes.sensor.calibration import with_number
 
-    # the table rounds by itself
     optics = camera.optics
+    # the table rounds by itself
     fine = with_number(camera, "engine", "output_step_mm", 1e-3)
     nearest_m = max(1.05 * optics.nearest_m, 0.1)
     farthest_m = 0.95 * min(optics.farthest_m, 15.0)
-    levels = np.arange(
-        np.log2(DARKEST / farthest_m**2), np.log2(1.0 / nearest_m**2), 1.0 / MEASURED
-    )
+    faintest = np.log2(DARKEST / farthest_m**2)
+    brightest = np.log2(1.0 / nearest_m**2)
+    levels = np.arange(faintest, brightest, 1.0 / MEASURED)
     measured = [_before_plane(fine, level, nearest_m, farthest_m) for level in levels]
-    sigma_m, return_share = np.array([row[:2] for row in measured]).T
+    sigma_m, return_share = np.array(measured).T
     has_sigma = np.isfinite(sigma_m)
     fine_levels = np.arange(levels[0], levels[-1], 1.0 / PER_OCTAVE)
     sigma_m = np.exp(np.interp(fine_levels, levels[has_sigma], np.log(sigma_m[has_sigma])))
-    middle_index = int(
-        np.argmin(np.abs(levels - np.log2(ALBEDO / np.sqrt(nearest_m * min(farthest_m, 4.0)) ** 2)))
-    )
+    middle_m = np.sqrt(nearest_m * min(farthest_m, 4.0))
+    middle_index = int(np.argmin(np.abs(levels - np.log2(ALBEDO / middle_m**2))))
     stack_m = _stack_m(fine, levels[middle_index], nearest_m, farthest_m, FRAMES_OF_CORRELATION)
     residuals = stack_m - np.nanmean(stack_m, axis=0)
     pattern = _pattern_m(fine)
@@ -106,17 +105,11 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
         "per_octave": np.float32(PER_OCTAVE),
         "sigma_m": sigma_m.astype(np.float32),
         "seen": np.interp(fine_levels, levels, return_share).astype(np.float32),
-        **dict(
-            zip(("rows", "columns"), (_filter(residuals, axis) for axis in (1, 2)), strict=True)
-        ),
+        "rows": _filter(residuals, axis=1),
+        "columns": _filter(residuals, axis=2),
         "pattern_m": np.float32(np.sqrt(np.nanmean(pattern**2))),
-        **dict(
-            zip(
-                ("pattern_rows", "pattern_columns"),
-                (_filter(pattern, axis) for axis in (1, 2)),
-                strict=True,
-            )
-        ),
+        "pattern_rows": _filter(pattern, axis=1),
+        "pattern_columns": _filter(pattern, axis=2),
         "slopes": slopes,
         "falloff": falloff,
         "step_m": np.float32(camera.z_step_m),
@@ -133,11 +126,12 @@ def _stack_m(
     from scenes.sensor.calibration import unit_before_plane
 
     distance_m = float(np.clip(np.sqrt(ALBEDO / 2.0**level), nearest_m, farthest_m))
-    unit = unit_before_plane(camera, distance_m, float(min(distance_m**2 * 2.0**level, 1.0)))
-    z_m = np.stack([frame.z_m for frame in unit.capture(frames, 1, "noise table").frames()]).astype(
-        float
-    )
-    return np.asarray(z_m * np.sqrt(1.0 + (unit.view.slopes[unit.cut] ** 2).sum(axis=-1)))
+    albedo = float(min(distance_m**2 * 2.0**level, 1.0))
+    unit = unit_before_plane(camera, distance_m, albedo)
+    capture = unit.capture(frames, 1, "noise table")
+    z_m = np.stack([frame.z_m for frame in capture.frames()]).astype(float)
+    stretch = np.sqrt(1.0 + (unit.view.slopes[unit.cut] ** 2).sum(axis=-1))
+    return np.asarray(z_m * stretch)
 
 
 def _before_plane(
@@ -148,15 +142,15 @@ def _before_plane(
     range_m = _stack_m(camera, level, nearest_m, farthest_m, FRAMES)
     valid = np.isfinite(range_m)
     often = valid.sum(axis=0) > FRAMES // 4
+    return_share = float(valid.mean())
     if not often.any():
-        return float("nan"), float(valid.mean())
+        return float("nan"), return_share
     # a robust deviation excludes ranges with a wrong period, which are rare and far off
     middle = np.nanmedian(range_m[:, often], axis=0)
     deviation_m = np.abs(range_m[:, often] - middle)
     kept = deviation_m < 8.0 * np.nanmedian(deviation_m) / 0.6745
-    return float(np.sqrt(np.mean(deviation_m[kept] ** 2) * FRAMES / (FRAMES - 1))), float(
-        valid.mean()
-    )
+    variance_m2 = np.mean(deviation_m[kept] ** 2) * FRAMES / (FRAMES - 1)
+    return float(np.sqrt(variance_m2)), return_share
 
 
 def _pattern_m(camera: AnyCamera) -> np.ndarray:
@@ -171,18 +165,17 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
     column = int(lens.cx)
     half_h = min(80, row - 8, lens.height - row - 8)
     half_w = min(100, column - 8, lens.width - column - 8)
-    view = plane_view(
-        camera, Region(row - half_h, row + half_h, column - half_w, column + half_w), 1.0, ALBEDO
-    )
+    region = Region(row - half_h, row + half_h, column - half_w, column + half_w)
+    view = plane_view(camera, region, 1.0, ALBEDO)
     patterns_m = []
     for seed in (1, 2, 3):
         ranges = []
         for has_pattern in (True, False):
             effects = NO_EFFECTS.model_copy(update={"fixed_pattern": has_pattern})
-            unit = SimulatedUnit(
-                camera, CameraConfig(name=camera.name, unit_seed=seed, effects=effects), view
-            )
-            ranges.append(next(iter(unit.capture(1, 1).frames())).z_m.astype(float))
+            config = CameraConfig(name=camera.name, unit_seed=seed, effects=effects)
+            unit = SimulatedUnit(camera, config, view)
+            frame = next(iter(unit.capture(1, 1).frames()))
+            ranges.append(frame.z_m.astype(float))
         patterns_m.append(ranges[0] - ranges[1])
     return np.asarray(patterns_m)
 

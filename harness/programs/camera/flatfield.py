@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,14 +81,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     lens, captures, doubted = _captures(options)
     separated_field = separated(captures, lens)
     field = replace(separated_field.field, warnings=(*doubted, *separated_field.field.warnings))
-    nearest_m, far = field.distances_m
-    distance_text = (
-        f"{nearest_m:.2f} m" if far < nearest_m * 1.01 else f"{nearest_m:.2f} to {far:.2f} m"
-    )
-    answer = (
-        f"fixed pattern {mm(field.rms_m)} rms at {distance_text}, known to "
-        f"{mm(separated_field.noise_m)}"
-    )
+    nearest_m, farthest_m = field.distances_m
+    distance = f"{nearest_m:.2f} to {farthest_m:.2f} m"
+    if farthest_m < nearest_m * 1.01:
+        distance = f"{nearest_m:.2f} m"
+    pattern = f"fixed pattern {mm(field.rms_m)} rms"
+    answer = f"{pattern} at {distance}, known to {mm(separated_field.noise_m)}"
     figures = list(figures_of(separated_field))
     error_m = field.error_m
     print_warnings(field.warnings)
@@ -97,9 +95,15 @@ def main(options: argparse.Namespace, command: str) -> int:
     data = options.out.with_suffix(".json")
     picture = options.out.with_suffix(".png")
     save_flat_field(options.out, field)
-    provenance = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
-    provenance |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
-    write_json(data, {**provenance, "provenance": record(command)})
+    facts = {
+        "results_version": RESULTS_VERSION,
+        "answer": answer,
+        "warnings": field.warnings,
+        "figures": FLAT_FIGURES.data(figures),
+        "captures": FLAT_CAPTURES.data(captures),
+        "provenance": record(command),
+    }
+    write_json(data, facts)
     save_png(picture, (7.0, 5.4), lambda figure: _draw(figure, error_m, answer))
     print(f"wrote {options.out}, {data.name}, {picture.name}")
     return 0
@@ -107,9 +111,9 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
     axes = figure.subplots()
-    limit = SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
+    limit_mm = SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
     shown = axes.imshow(
-        error_m / MM, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
+        error_m / MM, cmap="RdBu_r", vmin=-limit_mm, vmax=limit_mm, interpolation="nearest"
     )
     axes.set(xlabel="u, px", ylabel="v, px")
     axes.grid(visible=False)
@@ -127,14 +131,11 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
     from detectors.methods.local import LocalConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 
-    config = settings_of(
-        LocalConfig, {"crop": crop_from_text(options.crop)}, f"--crop {options.crop}"
-    ).crop
-    poses = (
-        read_poses(options.poses, len(options.paths))
-        if options.poses
-        else (None,) * len(options.paths)
-    )
+    settings = {"crop": crop_from_text(options.crop)}
+    config = settings_of(LocalConfig, settings, f"--crop {options.crop}").crop
+    poses: Sequence[np.ndarray | None] = (None,) * len(options.paths)
+    if options.poses:
+        poses = read_poses(options.poses, len(options.paths))
     refuse_repeats(options.paths)
     recordings = [
         opened([path], options.intrinsics, **reading_of(options)) for path in options.paths
@@ -152,21 +153,25 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
             )
     captures = []
     for recording, pose in zip(recordings, poses, strict=True):
-        for part in _halves(recording) if len(recordings) == 1 else (recording,):
+        parts = list(_halves(recording)) if len(recordings) == 1 else [recording]
+        for part in parts:
             cloud = average(part, RECORDED)
             captures.append(flattened(cloud, crop(cloud, config), part.name, pose))
     assert first.lens is not None
-    return first.lens, captures, [doubt for recording in recordings for doubt in recording.warnings]
+    doubts = [doubt for recording in recordings for doubt in recording.warnings]
+    return first.lens, captures, doubts
 
 
 def _halves(recording: Recording) -> Iterator[Recording]:
+    """Yield the first and second half of the frames; the whole recording if it is short."""
     from detectors.pixels.noise import LEAST_FRAMES
 
     count = sum(1 for _ in recording.selected())
     if count < 2 * LEAST_FRAMES:
         yield recording
         return
-    for name, part in (("first half", slice(count // 2)), ("second half", slice(count // 2, None))):
+    halves = (("first half", slice(count // 2)), ("second half", slice(count // 2, None)))
+    for name, part in halves:
         yield replace(recording, name=f"{recording.name}, {name}", selection=part)
 
 

@@ -654,8 +654,8 @@ class Characteristics:
             nearest_m = law.range_m.min()
             farthest_m = law.range_m.max()
             notes.append(
-                f"surfaces between {nearest_m:.2f} and {farthest_m:.2f} m do not show how the noise "
-                f"grows with range: the power {law.exponents[0]:g} is assumed"
+                f"surfaces between {nearest_m:.2f} and {farthest_m:.2f} m do not show how the "
+                f"noise grows with range: the power {law.exponents[0]:g} is assumed"
             )
         if not self.has_amplitude:
             notes.append(

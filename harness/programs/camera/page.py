@@ -36,13 +36,14 @@ MEASURED = "measured"
 SIMULATED = "simulated"
 KNOWN = "known camera"
 LOOKS = {MEASURED: (BLUE, "o"), SIMULATED: (ORANGE, "x"), KNOWN: (GREY, "+")}
-RANGE = f"noise, mm against {'range, m'}"
-ANGLE = f"noise, mm against {'angle, deg'}"
-AMPLITUDE = f"noise, mm against {'amplitude'}"
-NEIGHBOURS = f"correlation of {'noise'} against pixels apart"
-PATTERN = f"correlation of {'fixed pattern'} against pixels apart"
-SPECTRUM = f"spectrum of {'noise'} against cycles per pixel"
-OF_PATTERN = f"spectrum of {'fixed pattern'} against cycles per pixel"
+# titles of the diagrams: what y is, and what it is plotted against
+RANGE = "noise, mm against range, m"
+ANGLE = "noise, mm against angle, deg"
+AMPLITUDE = "noise, mm against amplitude"
+NEIGHBOURS = "correlation of noise against pixels apart"
+PATTERN = "correlation of fixed pattern against pixels apart"
+SPECTRUM = "spectrum of noise against cycles per pixel"
+OF_PATTERN = "spectrum of fixed pattern against cycles per pixel"
 FRAMES = "displacement, mm against frame"
 DROPPED = "share without return against amplitude"
 SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRAMES, DROPPED)
@@ -186,26 +187,40 @@ def beside(
 ) -> list[OwnFigure]:
     """Return each figure of the captures with those of the simulations; surfaces are matched by
     their numbers."""
-    sources = (captured, twin, nearest_known)
-    positions = [
-        {face.where: (face.capture, face.number) for face in source.surfaces} if source else {}
-        for source in sources
-    ]
-    values = [
-        {(row[0], position.get(row[1], row[1])): row[3] for row in own_figures(source)}
-        if source
-        else {}
-        for source, position in zip(sources, positions, strict=True)
-    ]
+    twin_values = _values(twin)
+    known_values = {} if nearest_known is None else _values(nearest_known)
+    positions = _positions(captured)
     ends = {("temporal noise", face.where): face.temporal.interval for face in captured.surfaces}
     rows = []
     for name, where, unit, value, meaning in own_figures(captured):
-        key = name, positions[0].get(where, where)
-        simulated, of_known = (value_of.get(key, float("nan")) for value_of in values[1:])
+        key = name, positions.get(where, where)
         interval = ends.get((name, where), UNKNOWN)
-        measured = Estimate(value, interval.low, interval.high)
-        rows.append(OwnFigure(name, where, unit, measured, simulated, of_known, meaning))
+        rows.append(
+            OwnFigure(
+                figure=name,
+                where=where,
+                unit=unit,
+                measured=Estimate(value, interval.low, interval.high),
+                simulated=twin_values.get(key, float("nan")),
+                known=known_values.get(key, float("nan")),
+                meaning=meaning,
+            )
+        )
     return rows
+
+
+def _positions(source: Characteristics) -> dict[str, tuple[str, int]]:
+    """Return each surface's capture and number by its name, which differs between sources."""
+    return {face.where: (face.capture, face.number) for face in source.surfaces}
+
+
+def _values(source: Characteristics) -> dict[tuple[str, str | tuple[str, int]], float]:
+    """Return the values of a source by figure, and by surface or other place."""
+    positions = _positions(source)
+    values = {}
+    for name, where, _, value, _ in own_figures(source):
+        values[name, positions.get(where, where)] = value
+    return values
 
 
 def write_page(
@@ -220,8 +235,8 @@ def write_page(
     warnings: Sequence[str],
 ) -> None:
     """Print the figures; write a page, its tables and provenance.json with further ``facts``.
-    ``sources`` are measured, simulated, and perhaps those of the ``known`` camera. Raises
-    UserError if they cannot be written."""
+    ``sources`` are measured, simulated, and perhaps those of the known camera. Raises UserError if
+    they cannot be written."""
     measured = sources[MEASURED]
     folder = path.parent
     heads = {"known camera": known_title, "its ratio": known_title and "its ratio"}
@@ -255,34 +270,28 @@ def _curves(source: str, measured: Characteristics) -> Iterator[dict[str, Any]]:
         return {"diagram": diagram, "source": source, "series": series, "x": x, "y": y}
 
     for cell in measured.cells:
-        for diagram, x in (
-            (RANGE, cell.range_m),
-            (ANGLE, cell.angle_deg),
-            (AMPLITUDE, cell.amplitude),
-        ):
-            if np.isfinite(x):
-                yield point(diagram, cell.capture, x, cell.sigma_m / MM)
+        sigma_mm = cell.sigma_m / MM
+        yield point(RANGE, cell.capture, cell.range_m, sigma_mm)
+        yield point(ANGLE, cell.capture, cell.angle_deg, sigma_mm)
+        if np.isfinite(cell.amplitude):
+            yield point(AMPLITUDE, cell.capture, cell.amplitude, sigma_mm)
     pairs = (
         (NEIGHBOURS, SPECTRUM, measured.correlation),
         (PATTERN, OF_PATTERN, measured.pattern_correlation),
     )
     for diagram, spectrum, correlations in pairs:
-        for axis, along in zip("xy", [] if correlations is None else correlations, strict=False):
-            yield from (
-                point(diagram, axis, *lag_and_value) for lag_and_value in enumerate(along.tolist())
-            )
-            yield from (
-                point(spectrum, axis, *frequency_and_density)
-                for frequency_and_density in zip(FREQUENCIES, density_of(along), strict=True)
-            )
+        if correlations is None:
+            continue
+        for axis, along in zip("xy", correlations, strict=True):
+            for lag, value in enumerate(along.tolist()):
+                yield point(diagram, axis, lag, value)
+            for frequency, density in zip(FREQUENCIES, density_of(along), strict=True):
+                yield point(spectrum, axis, frequency, density)
     for capture in measured.captures:
-        yield from (
-            point(FRAMES, capture.name, k, off / MM)
-            for k, off in enumerate(capture.offsets_m.tolist())
-        )
-    for level, share in zip(
-        measured.dropouts.amplitude.tolist(), measured.dropouts.share.tolist(), strict=True
-    ):
+        for number, offset_m in enumerate(capture.offsets_m.tolist()):
+            yield point(FRAMES, capture.name, number, offset_m / MM)
+    dropouts = measured.dropouts
+    for level, share in zip(dropouts.amplitude.tolist(), dropouts.share.tolist(), strict=True):
         if np.isfinite(level):
             yield point(DROPPED, "all", level, share)
 
@@ -293,9 +302,8 @@ def density_of(correlation: np.ndarray) -> np.ndarray:
     from scipy.signal.windows import parzen  # whose package takes a third of a second to load
 
     faded = correlation * parzen(2 * len(correlation) - 1)[len(correlation) - 1 :]
-    return np.asarray(
-        2 * np.cos(2 * np.pi * np.outer(FREQUENCIES, np.arange(len(faded)))) @ faded - faded[0]
-    )
+    phases = 2 * np.pi * np.outer(FREQUENCIES, np.arange(len(faded)))
+    return np.asarray(2 * np.cos(phases) @ faded - faded[0])
 
 
 def _draw(canvas: Figure, measured: Characteristics, curves: list[dict[str, Any]]) -> None:
@@ -310,15 +318,13 @@ def _draw(canvas: Figure, measured: Characteristics, curves: list[dict[str, Any]
     for axis, diagram in zip(axes[1:], SHOWN, strict=True):
         diagram_rows = [row for row in curves if row["diagram"] == diagram]
         for source, (colour, marker) in LOOKS.items():
-            points = [(row["x"], row["y"]) for row in diagram_rows if row["source"] == source]
-            if points and not (diagram == FRAMES and source != MEASURED):
-                axis.plot(
-                    *zip(*points, strict=True), marker, color=colour, markersize=4, label=source
-                )
-        x, y = diagram.split(" against ")[::-1]
-        axis.set(
-            xlabel=x, ylabel=y, yscale="log" if diagram in (SPECTRUM, OF_PATTERN) else "linear"
-        )
+            x = [row["x"] for row in diagram_rows if row["source"] == source]
+            y = [row["y"] for row in diagram_rows if row["source"] == source]
+            if x and (diagram != FRAMES or source == MEASURED):
+                axis.plot(x, y, marker, color=colour, markersize=4, label=source)
+        y_label, x_label = diagram.split(" against ")
+        scale = "log" if diagram in (SPECTRUM, OF_PATTERN) else "linear"
+        axis.set(xlabel=x_label, ylabel=y_label, yscale=scale)
         if not diagram_rows:
             axis.text(
                 0.5,

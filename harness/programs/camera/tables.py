@@ -10,22 +10,27 @@ import numpy as np
 from harness.records.schema import Column, Estimate, Table
 from harness.vocabulary.geometry import MM
 
+# least measured value of each unit that a ratio divides by
 LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
-"""Measured values below these (by unit) are too small to divide by."""
 
 
 @dataclass(frozen=True)
 class OwnFigure:
-    """A figure as measured, as simulated from the camera file, and for the nearest known camera
-    (or NaN)."""
+    """A figure as measured, and as simulated."""
 
     figure: str
     where: str
+    """Surface, or direction and lag."""
     unit: str
+    """Unit of the values: mm, px, 1 or 1/px."""
     measured: Estimate
+    """Value in the captures, with its 95 % interval if known."""
     simulated: float
+    """Value in frames that are simulated from the camera file."""
     known: float
+    """Value of the nearest known camera; NaN if there is none."""
     meaning: str
+    """Meaning of the figure, for the table."""
 
     @property
     def ratio(self) -> float:
@@ -209,11 +214,9 @@ def figures_of(separated: Any) -> Iterator[dict[str, Any]]:
         "rms of the unit's fixed pattern, corrected for the map's noise",
     )
     yield row("noise of the map", separated.noise_m / MM, "rms of the map's standard deviation")
-    shape = (
-        "the surface's shape"
-        if separated.separated
-        else "the surface's shape, or a part of the pattern that changes"
-    )
+    shape = "the surface's shape"
+    if not separated.separated:
+        shape += ", or a part of the pattern that changes"
     yield row(
         "between captures",
         separated.surface_m / MM,
@@ -223,12 +226,11 @@ def figures_of(separated: Any) -> Iterator[dict[str, Any]]:
         (separated.in_time, "first and last captures"),
         (separated.in_range, "near and far captures"),
     ):
-        excess, correlation = (
-            (None, None) if part is None else (part.excess_m / MM, part.correlation)
-        )
+        excess_mm = None if part is None else part.excess_m / MM
+        correlation = None if part is None else part.correlation
         yield row(
             f"change, {compared}",
-            excess,
+            excess_mm,
             f"rms of the difference of the maps of {compared} beyond their noise",
         )
         yield row(

@@ -318,10 +318,8 @@ class ClusterEngine:
             # it died in the meantime, or the network failed; this says nothing about its
             # installation
             self._print_once(
-                (
-                    f"{where} did not state its version ({type(answer).__name__}: {answer}); it "
-                    "is not used"
-                )
+                f"{where} did not state its version ({type(answer).__name__}: {answer}); it "
+                "is not used"
             )
         elif answer.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
             message = (

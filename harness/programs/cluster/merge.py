@@ -78,10 +78,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         return 1
     out = into.parent.parent
     print(
-        (
-            f"next: run the sweep without --shard, with --out {out}, to run missing trials and "
-            "write the report"
-        )
+        f"next: run the sweep without --shard, with --out {out}, to run missing trials and "
+        "write the report"
     )
     return 0
 

@@ -103,9 +103,15 @@ def warnings_of(findable: Findable, seen_by_view: Mapping[Any, Seen]) -> list[st
 
 
 def coverage_html(
-    name: str, sentence: str, first: str, scene: Scene3d, poses: Sequence[Mapping[str, Any]],
-    goals: Sequence[Mapping[str, Any]], warnings: Sequence[str], command: str,
-) -> str:  # fmt: skip
+    name: str,
+    sentence: str,
+    first: str,
+    scene: Scene3d,
+    poses: Sequence[Mapping[str, Any]],
+    goals: Sequence[Mapping[str, Any]],
+    warnings: Sequence[str],
+    command: str,
+) -> str:
     """Return the page as text; it needs no network. ``sentence`` is the answer, ``first`` the note
     below it."""
     turns = tag(

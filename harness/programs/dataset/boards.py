@@ -61,15 +61,18 @@ AGAIN = "run the command that wrote the data set again"
 
 @dataclass(frozen=True)
 class Sample:
-    """One board: the render that it needs, and the trial whose average it is. ``label``: good, a
-    kind, or combined."""
+    """One board of the data set."""
 
     category: str
     split: str
+    """train, validation or test."""
     label: str
+    """good, the only kind of its damages, or combined."""
     number: int
     render: RenderJob
+    """The view that the board needs."""
     task: Trial
+    """The trial whose average is the board's cloud."""
 
     @property
     def name(self) -> str:
@@ -83,9 +86,8 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     points: dict[str, Point] = {}
     for point in experiment.points:
         if not point.is_variation:
-            points.setdefault(
-                canonical_json([point.frames_key, point.config.capture.to_data()]), point
-            )
+            key = canonical_json([point.frames_key, point.config.capture.to_data()])
+            points.setdefault(key, point)
     axes = [path for path in experiment.config.sweep if path.startswith(("source.", "capture."))]
     values = {path: [point.values[path] for point in points.values()] for path in axes}
     axes = [path for path in axes if any(value != values[path][0] for value in values[path])]
@@ -93,16 +95,15 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     points_by_name = dict[str, Point]()
     for point in points.values():
         words = []
-        for path, axis_value in ((path, point.values[path]) for path in axes):
-            text = value_text(
-                path,
-                differing(axis_value, (value for value in values[path] if value != axis_value)),
-            )
+        for path in axes:
+            axis_value = point.values[path]
+            differing_values = (value for value in values[path] if value != axis_value)
+            text = value_text(path, differing(axis_value, differing_values))
             words.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
         name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(words)).strip("_.") or experiment.config.name
-        points_by_name[name if name not in points_by_name else f"{name}_{len(points_by_name)}"] = (
-            point
-        )
+        if name in points_by_name:
+            name = f"{name}_{len(points_by_name)}"
+        points_by_name[name] = point
     return points_by_name
 
 
@@ -125,16 +126,15 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
                 if study and study.units:
                     unit = number % study.units if role == "damaged" else number
                     units = (unit_of(source.camera, seed, role, unit),)
-                batch = batch_of(
-                    source.target.drawn(role, number), role, source, cache, number, units
-                )
-                (ref,), (job,) = batch.before(0), batch.renders
-                kinds = {
-                    damage.kind for damage in truth_of(ref.target, ref.target.pose.T_camera_board)
-                }
-                label = (
-                    "good" if role != "damaged" else kinds.pop() if len(kinds) == 1 else "combined"
-                )
+                target = source.target.drawn(role, number)
+                batch = batch_of(target, role, source, cache, number, units)
+                (ref,) = batch.before(0)
+                (job,) = batch.renders
+                truth = truth_of(ref.target, ref.target.pose.T_camera_board)
+                kinds = {damage.kind for damage in truth}
+                label = "good"
+                if role == "damaged":
+                    label = kinds.pop() if len(kinds) == 1 else "combined"
                 task = Trial(
                     views=(ref,),
                     seed=seed,
@@ -143,7 +143,15 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
                     points=(trial_point(point, None, None),),
                     board=number,
                 )
-                samples.append(Sample(category, split, label, number, job, task))
+                sample = Sample(
+                    category=category,
+                    split=split,
+                    label=label,
+                    number=number,
+                    render=job,
+                    task=task,
+                )
+                samples.append(sample)
     return samples
 
 
@@ -169,16 +177,17 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     damage = np.zeros(cloud.region.shape, np.uint16)
     for flaw in truth:
         damage.ravel()[labelled.outlines[flaw.id]] = flaw.id
-    intensity = (
-        np.zeros(damage.shape) if cloud.amplitude is None else np.nan_to_num(cloud.amplitude)
-    )
+    intensity = np.zeros(damage.shape)
+    if cloud.amplitude is not None:
+        intensity = np.nan_to_num(cloud.amplitude)
+    inspected = shrunk(np.isfinite(labelled.places_m[..., 0]), 2 * INSET_PX + 1)
     arrays = {
         "points_m": put(cloud.points_m.astype(np.float32), np.nan),
         "intensity": put(intensity.astype(np.float32), 0.0),
         "reason": put(cloud.reason, Reason.OUTSIDE_MASK),
         "count": put(cloud.count.astype(np.uint16), 0),
         "damage": put(damage, 0),
-        "inspected": put(shrunk(np.isfinite(labelled.places_m[..., 0]), 2 * INSET_PX + 1), False),
+        "inspected": put(inspected, False),
         "board_xy_m": put(labelled.places_m.astype(np.float32), np.nan),
     }
     mask = arrays["damage"]
@@ -187,23 +196,22 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     white = float(np.quantile(arrays["intensity"], BRIGHTEST)) or 1.0
     shown = np.clip(arrays["intensity"] / white, 0, 1)
     grey = np.repeat(np.rint(255 * shown).astype(np.uint8)[..., None], 3, axis=2)
+    grey_16_bits = np.rint(65535 * shown).astype(np.uint16)
+    z_y_x = np.where(valid[..., None], points, 0)[..., ::-1]
     file = f"{sample.number:04d}"
-    folder = out / "boards" / Path(sample.name).parent
-    mvtec = out / "." / Path(sample.name).parent
+    folder = out / "boards" / Path(sample.name).parent / file
+    mvtec = out / Path(sample.name).parent
     stored = io.BytesIO()
     np.savez_compressed(stored, **arrays)  # type: ignore[arg-type]
     files = {
-        folder / file / CLOUD: stored.getvalue(),
-        folder / file / "depth.png": picture_bytes(".png", depth_units(points[..., 2])),
-        folder / file / "intensity.png": picture_bytes(
-            ".png", np.rint(65535 * shown).astype(np.uint16)
-        ),
-        folder / file / "valid.png": picture_bytes(".png", np.uint8(255) * valid),
-        folder / file / "mask.png": picture_bytes(".png", mask),
+        folder / CLOUD: stored.getvalue(),
+        folder / "depth.png": picture_bytes(".png", depth_units(points[..., 2])),
+        folder / "intensity.png": picture_bytes(".png", grey_16_bits),
+        folder / "valid.png": picture_bytes(".png", np.uint8(255) * valid),
+        folder / "mask.png": picture_bytes(".png", mask),
         mvtec / "rgb" / f"{file}.png": picture_bytes(".png", grey),
-        mvtec / "xyz" / f"{file}.tiff": picture_bytes(
-            ".tiff", np.where(valid[..., None], points, 0)[..., ::-1]
-        ),
+        # OpenCV stores the channels of a picture in reverse
+        mvtec / "xyz" / f"{file}.tiff": picture_bytes(".tiff", z_y_x),
     }
     if sample.split == "test":
         files[mvtec / "gt" / f"{file}.png"] = picture_bytes(".png", np.uint8(255) * (mask > 0))
@@ -214,17 +222,18 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     for flaw in truth:
         damage_mask = np.zeros(damage.shape, bool)
         damage_mask.ravel()[labelled.outlines[flaw.id]] = True
-        rows, columns = np.nonzero(damage_mask := put(damage_mask, False))
-        box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
+        damage_mask = put(damage_mask, False)
+        rows, columns = np.nonzero(damage_mask)
+        box = (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)
         facts = {
+            **flaw.to_row(),
+            "seen_depth_mm": labelled.seen_depth_m[flaw.id] / MM,
             "pixels": len(rows),
-            "bbox": box,
+            "bbox": [int(length_px) for length_px in box],
             "run_lengths": run_lengths(damage_mask),
             "line_m": flaw.line_m.tolist(),
         }
-        damages.append(
-            {**flaw.to_row(), "seen_depth_mm": labelled.seen_depth_m[flaw.id] / MM, **facts}
-        )
+        damages.append(facts)
     facts_of_board = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
         "height": window.shape[0],
@@ -239,9 +248,8 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "intensity_at_65535": white,
         "damages": damages,
     }
-    write_text(
-        folder / file / TRUTH, json.dumps(facts_of_board, allow_nan=False) + "\n", durable=False
-    )
+    truth_text = json.dumps(facts_of_board, allow_nan=False) + "\n"
+    write_text(folder / TRUTH, truth_text, durable=False)
 
 
 def read_index(folder: Path) -> dict[str, Any]:

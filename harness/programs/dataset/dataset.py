@@ -98,11 +98,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     write_text(out / INDEX, json.dumps({**facts, "samples": None}, indent=1) + "\n")
     write_text(out / "experiment.yaml", resolved_yaml(experiment))
-    with (
-        in_use(cache),
-        locked(out),
-        engine_of(EngineOptions(jobs=options.jobs, serial=options.serial)) as engine,
-    ):
+    engine_options = EngineOptions(jobs=options.jobs, serial=options.serial)
+    with in_use(cache), locked(out), engine_of(engine_options) as engine:
         failures = _written(out, samples, engine)
     if failures:
         print(f"{len(failures)} jobs failed; the first failure: {failures[0]}", file=sys.stderr)
@@ -134,19 +131,16 @@ def _about(
             "camera": cameras[0].name,
             "units": len({camera.unit_seed for camera in cameras}),
             "frames": point.config.capture.frames,
-            "boards": dict(
-                Counter(f"{sample.split}/{sample.label}" for sample in category_samples)
-            ),
+            "boards": Counter(f"{sample.split}/{sample.label}" for sample in category_samples),
         }
     calibrate = experiment.config.threshold.calibrate
     boards = [[sample.name, sample.render.path.stem] for sample in samples]
     points = [[point.frames_key, point.config.capture.to_data()] for point in experiment.points]
+    code = source_digest(("harness.programs.dataset.boards",), PACKAGES)
     return {
         "dataset_version": DATASET_VERSION,
         "name": experiment.config.name,
-        "content": digest(
-            [source_digest(("harness.programs.dataset.boards",), PACKAGES), boards, points]
-        ),
+        "content": digest([code, boards, points]),
         "licence": licence,
         "false_calls_per_m2": (calibrate and calibrate.false_calls_per_m2) or 1.0,
         "hit_radius_mm": experiment.config.matching.radius_mm,
@@ -168,16 +162,20 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     failures = list[str]()
     renders = {sample.render.path: sample.render for sample in samples}
     missing = [sample for sample in samples if not (out / "boards" / sample.name / TRUTH).exists()]
-    outcome.renders.total, outcome.trials.total = len(renders), len(samples)
+    outcome.renders.total = len(renders)
+    outcome.trials.total = len(samples)
     outcome.trials.found = len(samples) - len(missing)
     with progress_display() as show:
 
         def carry_out(jobs: list[Job], counts: StageCounts) -> dict[str, Any]:
             values = {}
             for job, ended in carried_out(jobs, engine):
-                values[job.name], is_done = ended.value, ended.state == "done"
-                counts.done, counts.failed = counts.done + is_done, counts.failed + (not is_done)
-                failures.extend([] if is_done else [f"{job.name}: {ended.why.strip()}"])
+                values[job.name] = ended.value
+                if ended.state == "done":
+                    counts.done += 1
+                else:
+                    counts.failed += 1
+                    failures.append(f"{job.name}: {ended.why.strip()}")
                 show(outcome)
             return values
 
@@ -219,12 +217,9 @@ def _finish(out: Path, samples: list[Sample], facts: dict[str, Any]) -> None:
             ]
             text = json.dumps(coco_data(pictures, kinds, info), separators=(",", ":"))
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")
-    write_text(
-        out / "README.md",
-        template("dataset_card.md", Path(__file__).parent).render(
-            about=facts, inset=INSET_PX, title=camera_title
-        ),
-    )
+    card = template("dataset_card.md", Path(__file__).parent)
+    text = card.render(about=facts, inset=INSET_PX, title=camera_title)
+    write_text(out / "README.md", text)
     write_text(out / INDEX, json.dumps({**facts, "samples": [*truths]}, indent=1) + "\n")
 
 

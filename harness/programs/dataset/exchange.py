@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert
 
-START_NS = (
-    1_000_000_000 * 10**9
-)  # time of the first frame, in 2001; 0 would mean "the latest" to ROS's tf
+# time of the first frame, in 2001; 0 would mean "the latest" to ROS's tf
+START_NS = 1_000_000_000 * 10**9
 PAUSE_NS = 10**9  # time between two views to move the camera
 # the world frame: x along the row of holes, y up the face, z out of it, origin at its centre
 BOARD_FRAME = "board"
@@ -25,15 +24,17 @@ BOARD_FRAME = "board"
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of a view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4) is the
-    camera's pose."""
+    """Frames of a view."""
 
     name: str
     source: FrameSource
+    """The frames, with a lens and a pixel grid."""
     T_board_camera: np.ndarray
+    """Pose (4, 4) of the camera in the board's frame."""
     n_frames: int
     frames_per_second: float
     start_ns: int
+    """Time of the first frame."""
 
     @property
     def lens(self) -> Lens:
@@ -56,17 +57,20 @@ class ExportedView:
             return on_window(values, region, lens.whole, outside)
 
         for number, frame in enumerate(self.source.frames()):
-            rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
-            amplitude = (
-                frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
+            rgb = frame.rgb
+            if rgb is None:
+                rgb = np.zeros((*region.shape, 3), np.uint8)
+            amplitude = frame.amplitude
+            if amplitude is None:
+                amplitude = np.full(region.shape, np.nan)
+            on_whole_sensor = Frame(
+                frame.name,
+                on_sensor(frame.z_m.astype(np.float32), np.nan),
+                on_sensor(frame.reason, Reason.OUTSIDE_MASK),
+                rgb=on_sensor(rgb, 0),
+                amplitude=on_sensor(amplitude.astype(np.float32), np.nan),
             )
-            z_m = on_sensor(frame.z_m.astype(np.float32), np.nan)
-            amplitude = on_sensor(amplitude.astype(np.float32), np.nan)
-            reason = on_sensor(frame.reason, Reason.OUTSIDE_MASK)
-            yield (
-                self.stamp_ns(number),
-                Frame(frame.name, z_m, reason, rgb=on_sensor(rgb, 0), amplitude=amplitude),
-            )
+            yield self.stamp_ns(number), on_whole_sensor
 
 
 def on_window(values: np.ndarray, region: Region, window: Region, outside: float) -> np.ndarray:
@@ -87,15 +91,18 @@ def in_turn(
     ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
-    starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
-    return tuple(
-        ExportedView(
-            f"view_{number:0{digits}d}", source, invert(pose), n_frames, frames_per_second, start_ns
+    views = []
+    for number, (source, pose) in enumerate(zip(sources, poses, strict=True)):
+        view = ExportedView(
+            name=f"view_{number:0{digits}d}",
+            source=source,
+            T_board_camera=invert(pose),
+            n_frames=n_frames,
+            frames_per_second=frames_per_second,
+            start_ns=START_NS + number * length_ns,
         )
-        for number, (source, pose, start_ns) in enumerate(
-            zip(sources, poses, starts_ns, strict=True)
-        )
-    )
+        views.append(view)
+    return tuple(views)
 
 
 def quaternion_of(T_a_b: np.ndarray) -> tuple[float, float, float, float]:
@@ -110,9 +117,9 @@ def quaternion_of(T_a_b: np.ndarray) -> tuple[float, float, float, float]:
 UNITS_PER_M = 5000  # the benchmark's depth scale
 FARTHEST_M = (2**16 - 1) / UNITS_PER_M
 CALIBRATION = "rtabmap_calib.yaml"
+# the (3, 4) matrix from the camera's optical frame (z forward, y down) to RTAB-Map's base (x
+# forward, z up)
 OPTICAL_ROTATION = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
-"""The (3, 4) matrix from the camera's optical frame (z forward, y down) to RTAB-Map's base (x
-forward, z up)."""
 
 
 def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
@@ -131,17 +138,15 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         "associations.txt": [],
     }
     for view in views:
-        pose_text = " ".join(
-            f"{value:.9g}"
-            for value in (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
-        )
+        pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
+        pose_text = " ".join(f"{value:.9g}" for value in pose)
         for stamp_ns, frame in view.exposures():
             assert frame.rgb is not None
             time = seconds_text(stamp_ns)
-            for name, picture in (("rgb", frame.rgb[..., ::-1]), ("depth", depth_units(frame.z_m))):
-                (folder / name / f"{time}.png").write_bytes(
-                    picture_bytes(".png", undistorted(lens, picture))
-                )
+            pictures = {"rgb": frame.rgb[..., ::-1], "depth": depth_units(frame.z_m)}
+            for name, picture in pictures.items():
+                content = picture_bytes(".png", undistorted(lens, picture))
+                (folder / name / f"{time}.png").write_bytes(content)
                 lines[f"{name}.txt"].append(f"{time} {name}/{time}.png")
             lines["associations.txt"].append(f"{time} rgb/{time}.png {time} depth/{time}.png")
             lines["groundtruth.txt"].append(f"{time} {pose_text}")
@@ -155,9 +160,8 @@ def depth_units(z_m: np.ndarray) -> np.ndarray:
     hold."""
     with np.errstate(invalid="ignore"):
         is_storable = (z_m > 0) & (z_m <= FARTHEST_M)
-    return np.rint(np.where(is_storable, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(
-        np.uint16
-    )
+    stored_m = np.where(is_storable, z_m, 0.0).astype(np.float64)
+    return np.rint(stored_m * UNITS_PER_M).astype(np.uint16)
 
 
 def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
@@ -185,10 +189,10 @@ def calibration_text(lens: Lens) -> str:
         "camera_name": "rtabmap_calib",
         "image_width": lens.width,
         "image_height": lens.height,
-    }
-    facts |= {"camera_matrix": lens.matrix, "distortion_model": "plumb_bob"}
-    facts |= {"distortion_coefficients": np.zeros((1, 5)), "rectification_matrix": np.eye(3)}
-    facts |= {
+        "camera_matrix": lens.matrix,
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": np.zeros((1, 5)),
+        "rectification_matrix": np.eye(3),
         "projection_matrix": np.pad(lens.matrix, ((0, 0), (0, 1))),
         "local_transform": OPTICAL_ROTATION * 1.0,
     }
@@ -203,13 +207,12 @@ def calibration_text(lens: Lens) -> str:
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
-BAG_VERSION: Literal[8] = (
-    8  # of metadata.yaml: the oldest that the library writes; later ROS versions read it too
-)
+# version of metadata.yaml: the oldest that the library writes; later ROS versions read it too
+BAG_VERSION: Literal[8] = 8
 FLOAT32 = 7  # sensor_msgs/PointField's code
+# ``rgb`` holds the bytes of 0x00RRGGBB; by ROS's convention, its field is declared as a float of
+# these bytes
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
-"""``rgb`` holds the bytes of 0x00RRGGBB; by ROS's convention, its field is declared as a float of
-these bytes."""
 FOREVER = (9223372036, 854775807)  # seconds and nanoseconds of an unlimited duration in ROS 2
 
 
@@ -225,27 +228,25 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
     if is_mcap:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
-    def write(topic: str, stamp_ns: int, message: Any) -> None:
-        writer.write(topics[topic], stamp_ns, types.serialize_cdr(message, topics[topic].msgtype))
+    def connection(topic: str, kind: str, latched: bool = False) -> Any:
+        return writer.add_connection(
+            topic, kind, typestore=types, offered_qos_profiles=_qos(latched)
+        )
+
+    def write(topic: Any, stamp_ns: int, message: Any) -> None:
+        writer.write(topic, stamp_ns, types.serialize_cdr(message, topic.msgtype))
 
     try:
         with writer:
-            topics = {
-                topic: writer.add_connection(
-                    topic, kind, typestore=types, offered_qos_profiles=_qos(latched)
-                )
-                for topic, kind, latched in (
-                    (POSE_TOPIC, "tf2_msgs/msg/TFMessage", True),
-                    (INFO_TOPIC, "sensor_msgs/msg/CameraInfo", False),
-                    (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
-                )
-            }
+            poses = connection(POSE_TOPIC, "tf2_msgs/msg/TFMessage", latched=True)
+            lenses = connection(INFO_TOPIC, "sensor_msgs/msg/CameraInfo")
+            clouds = connection(POINTS_TOPIC, "sensor_msgs/msg/PointCloud2")
             slopes = view.lens.region_slopes(view.lens.whole)
-            write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
+            write(poses, view.start_ns, _pose_message(types.types, view))
             for stamp_ns, frame in view.exposures():
                 header = _header(types.types, frame_name(view), stamp_ns)
-                write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
-                write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, frame, slopes, header))
+                write(lenses, stamp_ns, _info_message(types.types, view.lens, header))
+                write(clouds, stamp_ns, _cloud_message(types.types, frame, slopes, header))
     except sqlite3.OperationalError as error:
         # SQLite hides the system's error number; for a new file in a writable folder, only a full
         # disk is an error
@@ -268,20 +269,23 @@ def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, head
     assert frame.rgb is not None
     points = np.zeros(frame.z_m.shape, POINT)
     x_y = slopes * frame.z_m[..., None].astype(np.float64)
-    points["x"], points["y"], points["z"] = x_y[..., 0], x_y[..., 1], frame.z_m
+    points["x"] = x_y[..., 0]
+    points["y"] = x_y[..., 1]
+    points["z"] = frame.z_m
     red, green, blue = np.moveaxis(frame.rgb.astype(np.uint32), -1, 0)
     points["rgb"] = red << 16 | green << 8 | blue
     points["intensity"] = frame.amplitude
     field = types["sensor_msgs/msg/PointField"]
+    fields = [
+        field(name=name, offset=4 * number, datatype=FLOAT32, count=1)
+        for number, name in enumerate(POINT.names or ())
+    ]
     height, width = frame.z_m.shape
     return types["sensor_msgs/msg/PointCloud2"](
         header=header,
         height=height,
         width=width,
-        fields=[
-            field(name=name, offset=i * 4, datatype=FLOAT32, count=1)
-            for i, name in enumerate(POINT.names or ())
-        ],
+        fields=fields,
         is_bigendian=False,
         point_step=POINT.itemsize,
         row_step=POINT.itemsize * width,
@@ -313,10 +317,9 @@ def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
 
 
 def _pose_message(types: dict[str, Any], view: ExportedView) -> Any:
+    x, y, z = view.T_board_camera[:3, 3].tolist()
+    shift = types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
     x, y, z, w = quaternion_of(view.T_board_camera)
-    shift = types["geometry_msgs/msg/Vector3"](
-        **dict(zip("xyz", view.T_board_camera[:3, 3].tolist(), strict=True))
-    )
     turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
     transform = types["geometry_msgs/msg/TransformStamped"](
         header=_header(types, BOARD_FRAME, view.start_ns),
@@ -339,9 +342,18 @@ def _qos(latched: bool) -> tuple[Any, ...]:
     )
 
     endless = QosTime(*FOREVER)
-    history = (QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE)
-    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-    return (Qos(*history, durability, endless, endless, QosLiveliness.AUTOMATIC, endless, False),)
+    profile = Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        deadline=endless,
+        lifespan=endless,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=endless,
+        avoid_ros_namespace_conventions=False,
+    )
+    return (profile,)
 
 
 # ---------------------------------------------------------------- pictures and masks of data sets
@@ -375,19 +387,21 @@ def coco_data(
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for number, picture in enumerate(pictures, start=1):
-        images.append(
-            {"id": number, **{key: picture[key] for key in ("file_name", "width", "height")}}
-        )
+        width = picture["width"]
+        height = picture["height"]
+        file_name = picture["file_name"]
+        images.append({"id": number, "file_name": file_name, "width": width, "height": height})
         for damage in picture["damages"]:
-            mask = {"size": [picture["height"], picture["width"]], "counts": damage["run_lengths"]}
-            facts = {
+            annotation = {
+                "id": len(annotations) + 1,
+                "image_id": number,
+                "category_id": numbers[damage["kind"]],
                 "area": damage["pixels"],
                 "bbox": damage["bbox"],
-                "segmentation": mask,
+                "segmentation": {"size": [height, width], "counts": damage["run_lengths"]},
                 "iscrowd": 0,
             }
-            ids = {"image_id": number, "category_id": numbers[damage["kind"]]}
-            annotations.append({"id": len(annotations) + 1, **ids, **facts})
+            annotations.append(annotation)
     categories = [{"id": number, "name": kind} for kind, number in numbers.items()]
     return {
         "info": licence_facts,

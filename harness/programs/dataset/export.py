@@ -86,10 +86,10 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     with atomic_folder(arguments.out) as folder:
         for number, job in enumerate(batch.renders[:count]):
             view, from_cache = cached_view(job.target, camera.optics, job.config, cache)
-            print(
-                f"view {number}: "
-                f"{'render from the cache' if from_cache else f'rendered in {view.seconds:.1f} s'}"
-            )
+            origin = f"rendered in {view.seconds:.1f} s"
+            if from_cache:
+                origin = "render from the cache"
+            print(f"view {number}: {origin}")
             unit = SimulatedUnit(camera, job.camera, view)
             labels = ("view", number) if number else ()
             captures.append(unit.capture(frames, seed, role, REPEAT, *labels))
@@ -98,8 +98,9 @@ def main(arguments: argparse.Namespace, command: str) -> int:
         views = in_turn(captures, [target.pose.T_camera_board for target in targets], frames, rate)
         if arguments.format == "tum":
             write_tum(folder, views)
-        for exported in () if arguments.format == "tum" else views:
-            write_bag(folder / exported.name, exported, arguments.format == "mcap")
+        else:
+            for exported in views:
+                write_bag(folder / exported.name, exported, arguments.format == "mcap")
         _write_beside(folder, arguments, experiment, targets, views, command)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:

@@ -106,18 +106,16 @@ def main(options: argparse.Namespace, command: str) -> int:
         set_ups=tuple(limit.record for limit in limits),
     )
     write_text(options.out / "study.json", record_text(study))
-    for table, table_rows in ((SCORES, rows), (LIMITS, limits)):
-        write_table(options.out, table, table.frame(table_rows), origin)
+    write_table(options.out, SCORES, SCORES.frame(rows), origin)
+    write_table(options.out, LIMITS, LIMITS.frame(limits), origin)
     for limit in limits:
         if limit.statement is not None:
-            write_text(
-                options.out / f"{limit.record.variant}.html", pod_html(limit.statement, command)
-            )
+            page = options.out / f"{limit.record.variant}.html"
+            write_text(page, pod_html(limit.statement, command))
     single = [name for name, facts in index["categories"].items() if facts["units"] == 1]
-    warned = [
-        f"warning: the limit holds for one unit of the camera only: {', '.join(single)}"
-    ] * bool(single)
-    show([*warned, LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
+    if single:
+        show([f"warning: the limit holds for one unit of the camera only: {', '.join(single)}"])
+    show([LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
     print(f"wrote {options.out}: study.json, limits.csv, scores.csv, a page for each curve")
     return 0
 
@@ -129,11 +127,10 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
 
     wanted = {name for name in samples if name.split("/")[1] in JUDGED}
     files: dict[str, list[Path]] = {}
-    for path in sorted(predictions.rglob("*")) if predictions.is_dir() else ():
+    for path in sorted(predictions.rglob("*")):
         if path.suffix.lower() in ENDINGS:
-            files.setdefault(path.relative_to(predictions).with_suffix("").as_posix(), []).append(
-                path
-            )
+            name = path.relative_to(predictions).with_suffix("").as_posix()
+            files.setdefault(name, []).append(path)
     faults: dict[str, list[str]] = {}
     for name in sorted(wanted | files.keys()):
         if name not in files:
@@ -142,8 +139,10 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
             faults.setdefault("not for a board of validation or test", []).append(name)
         elif len(files[name]) > 1:
             faults.setdefault("there twice", []).append(name)
-        elif fault := _fault(files[name][0], *read_arrays(dataset, name, "inspected")):
-            faults.setdefault("invalid", []).append(f"{name} ({fault})")
+        else:
+            (inspected,) = read_arrays(dataset, name, "inspected")
+            if fault := _fault(files[name][0], inspected):
+                faults.setdefault("invalid", []).append(f"{name} ({fault})")
     if faults:
         lines = [
             f"{len(names)} maps are {fault}: "
@@ -154,9 +153,8 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
             "a .npy or .tiff of real numbers with the pictures' size for each board of validation "
             "and test"
         )
-        raise UserError(
-            f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards again"
-        )
+        problem = f"{predictions}: {'; '.join(lines)}"
+        raise UserError(problem, legal=legal, fix="write maps for all boards again")
     return {name: files[name][0] for name in wanted}
 
 
@@ -172,11 +170,9 @@ def _fault(path: Path, inspected: np.ndarray) -> str:
             f"{' x '.join(map(str, inspected.shape))}"
         )
     lacking = int((~np.isfinite(scores[inspected])).sum())
-    return (
-        f"no finite number at {lacking} inspected pixels; write the lowest score there"
-        if lacking
-        else ""
-    )
+    if lacking:
+        return f"no finite number at {lacking} inspected pixels; write the lowest score there"
+    return ""
 
 
 def _read(path: Path) -> np.ndarray:
@@ -221,13 +217,8 @@ def _judged(
             inspected, board_xy_m, damage = read_arrays(options.dataset, sample, *JUDGED_BY)
             scores = np.where(inspected, _read(maps[sample]), np.nan)
             places_m = board_xy_m.astype(float)
-            yield (
-                sample,
-                scores,
-                places_m,
-                damage,
-                float(np.nansum(pixel_areas(places_m)[inspected])),
-            )
+            area_m2 = float(np.nansum(pixel_areas(places_m)[inspected]))
+            yield sample, scores, places_m, damage, area_m2
 
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
     highest, areas_m2 = np.array(quiet, float).T
@@ -259,30 +250,33 @@ def _judged(
             "threshold": float(threshold),
             "scale_mm": np.nan,
         }
-        calls = {
+        run = {
+            **common,
+            "role": "hole_free" if "/good/" in name else "damaged",
             "false_calls": len(findings.scores) - len(pairs) - parts,
             "no_return_calls": 0,
             "inspected_m2": area_m2,
         }
-        runs.append({**common, "role": "hole_free" if "/good/" in name else "damaged", **calls})
+        runs.append(run)
         for number, flaw in enumerate(damages):
-            measurements = {
+            hole = {
+                **common,
+                "hole": str(flaw["id"]),
+                "true_diameter_mm": flaw["diameter_mm"],
+                "true_depth_mm": flaw["depth_mm"],
                 "true_x_mm": flaw["x_board_mm"],
                 "true_y_mm": flaw["y_board_mm"],
                 "signal": float(signals[number]),
-            }
-            sizes = {f"true_{key}": flaw[key] for key in ("diameter_mm", "depth_mm")}
-            hit = {
                 "detected": number in pairs,
                 "no_return": False,
                 "size_of": flaw.get("size_of", "diameter"),
             }
-            holes.append({**common, "hole": str(flaw["id"]), **sizes, **measurements, **hit})
-        scored = np.isfinite(scores)
-        pixels.append(scores[scored])
-        regions.append(
-            np.where(damage[scored] > 0, damage[scored].astype(int) + (len(truths) << 16), 0)
-        )
+            holes.append(hole)
+        is_scored = np.isfinite(scores)
+        pixels.append(scores[is_scored])
+        damage_ids = damage[is_scored].astype(int)
+        # a damage's number is unique only on its board
+        regions.append(np.where(damage_ids > 0, damage_ids + (len(truths) << 16), 0))
         tops.append((float(np.nanmax(scores)), bool(damages)))
 
     if not holes:
@@ -301,10 +295,12 @@ def _judged(
     )
     scores = np.concatenate(pixels)
     region = np.unique(np.concatenate(regions), return_inverse=True)[1]
-    damaged, (top, is_flawed) = (region > 0) * 1.0, np.array(tops, float).T
+    damaged = (region > 0) * 1.0
+    share_of_damage = damaged / np.bincount(region)[region]
+    top, is_flawed = np.array(tops, float).T
     return limit_of(record), {
         "category": category,
-        "au_pro": area_under(scores, damaged / np.bincount(region)[region], 1 - damaged, PRO_LIMIT),
+        "au_pro": area_under(scores, share_of_damage, 1 - damaged, PRO_LIMIT),
         "pixel_auroc": area_under(scores, damaged, 1 - damaged),
         "board_auroc": area_under(top, is_flawed, 1 - is_flawed),
     }
@@ -327,9 +323,9 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 def area_under(
     scores: np.ndarray, true_weight: np.ndarray, false: np.ndarray, limit: float = 1.0
 ) -> float:
-    """Return the area under the share of the weights ``found`` (n,) above a threshold against the
-    share of ``false`` (n,), up to ``limit`` and divided by it; NaN if either has no weight. Equal
-    scores form a single threshold."""
+    """Return the area under the share of ``true_weight`` (n,) above a threshold against the share
+    of ``false`` (n,), up to ``limit`` and divided by it; NaN if either has no weight. Equal scores
+    form a single threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
     up = np.append(0.0, np.cumsum(true_weight[order])[last])
@@ -339,8 +335,9 @@ def area_under(
     up = up / up[-1]
     across = across / across[-1]
     inside = across <= limit
-    ends = np.append(up[inside], np.interp(limit, across, up)), np.append(across[inside], limit)
-    return float(np.trapezoid(*ends) / limit)
+    y = np.append(up[inside], np.interp(limit, across, up))
+    x = np.append(across[inside], limit)
+    return float(np.trapezoid(y, x) / limit)
 
 
 if __name__ == "__main__":

@@ -95,10 +95,8 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
     if intact.sum() < FEWEST_PIXELS:
         raise UserError(
-            (
-                f"only {intact.sum()} pixels of the board are far from damage and rim: its "
-                "noise is not known"
-            )
+            f"only {intact.sum()} pixels of the board are far from damage and rim: its "
+            "noise is not known"
         )
     face_xy_m = set_up.board_xy_m[set_up.on_board]
     basis = Chebyshev.over(face_xy_m, DEGREE).basis(face_xy_m)

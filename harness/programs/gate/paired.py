@@ -245,7 +245,8 @@ class CallsChange:
 
     @property
     def ratio(self) -> float:
-        """The second rate over the first: infinite if only the second has calls, 1 if neither has."""
+        """The second rate over the first: infinite if only the second has calls, 1 if neither
+        has."""
         before, now = self.rates_per_m2
         return now / before if before else (np.inf if now else 1.0)
 

@@ -298,9 +298,13 @@ def damages_placed(
 
 
 def judge_scans(
-    scans: Sequence[Scan], implanted: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
+    scans: Sequence[Scan],
+    implanted: Sequence[Implanted],
+    family: DrawnTargetConfig,
+    camera: str,
+    judging: Judging,
     frames: Sequence[int],
-) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
+) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:
     """Set a threshold for each number of frames, count false calls on undamaged frames, and judge
     all placements. Return tables, a set-up for each number of frames, and warnings. If a recording
     has two groups of that many frames or more, every second group sets the threshold; otherwise
@@ -321,10 +325,8 @@ def judge_scans(
         setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
         if len(groups) == 1:
             warnings.append(
-                (
-                    f"{count} frames: one average sets the threshold, shows the false calls and "
-                    "is damaged too"
-                )
+                f"{count} frames: one average sets the threshold, shows the false calls and "
+                "is damaged too"
             )
         setting = setting[:MOST_SETTING] if judging.threshold is None else []
         quiet = judged[:MOST_HOLE_FREE]

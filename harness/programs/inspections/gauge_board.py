@@ -24,12 +24,10 @@ from harness.vocabulary.provenance import check_version
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
-SIDES = (
-    8  # directions around a hole in which judged points must lie; otherwise a miss is not evidence
-)
-WORST_FIT_MM = (
-    2.0  # Root mean square distance of marks from their places above which the fit is doubtful
-)
+# directions around a hole in which judged points must lie; otherwise a miss is not evidence
+SIDES = 8
+# Root mean square distance of marks from their places above which the fit is doubtful
+WORST_FIT_MM = 2.0
 Length = Annotated[float, Field(gt=0, le=5e3)]
 CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
 

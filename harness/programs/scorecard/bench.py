@@ -23,13 +23,16 @@ PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 
 @dataclass(frozen=True)
 class Effort:
-    """Numbers of frames for each kind of measurement, and of units for measurements of a unit's
-    error."""
+    """How much is simulated for each kind of measurement."""
 
     noise_frames: int
+    """Frames for the noise of single pixels."""
     few_frames: int
+    """Frames for shares of pixels and widths of edges, which need few."""
     whole_frames: int
+    """Frames for noise that whole frames share, such as jitter and jumps."""
     units: int
+    """Units of the camera, for the error of a unit."""
 
 
 FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
@@ -66,9 +69,8 @@ class Bench:
     ) -> FrameStack:
         """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels``
         select the noise."""
-        unit = SimulatedUnit(
-            self.camera, CameraConfig(name=self.camera_name, effects=effects, **settings), view
-        )
+        config = CameraConfig(name=self.camera_name, effects=effects, **settings)
+        unit = SimulatedUnit(self.camera, config, view)
         cut = unit.cut
         taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)
         true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
@@ -78,10 +80,13 @@ class Bench:
 
 @dataclass(frozen=True)
 class FrameStack:
-    """A static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w,
-    2); ``region``."""
+    """Frames of a static scene."""
 
     z_m: np.ndarray
+    """Frames (n, h, w), NaN where invalid."""
     true_z_m: np.ndarray
+    """True z (h, w)."""
     slopes: np.ndarray
+    """Slopes (h, w, 2) of the pixels' rays."""
     region: Region
+    """The pixels of the sensor."""

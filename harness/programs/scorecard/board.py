@@ -46,13 +46,11 @@ if TYPE_CHECKING:
 
     from detectors.recordings import Recording
 
-PEAK_MM = 6.0
-RING_MM = (6.5, 13.5)
-"""Distances from a hole's centre on the board: the largest for its peak, and the radii of the ring
-around it."""
+PEAK_MM = 6.0  # largest distance of a hole's peak from the hole's centre on the board
+RING_MM = (6.5, 13.5)  # radii of the ring around a hole to which the surface is fitted
+# robust standard deviations beyond which a ring's pixel is excluded, since it belongs to an object
+# such as a tag
 OFF_RING = 4.0
-"""Robust standard deviations beyond which a ring's pixel is excluded, since it belongs to an
-object such as a tag."""
 PATTERN_PX = (3, 6, 12)
 ANGLES_DEG = (0, 20, 35, 60)
 CLOSE = 0.3  # largest difference of a ratio from 1 that counts as agreement
@@ -75,20 +73,19 @@ Readings = dict[tuple[str, str, str], tuple[Reading, int]]
 
 @dataclass(frozen=True)
 class Image:
-    """The pixels on which board and capture are compared: their lens, and the frames of board and
-    depth camera."""
+    """The pixels on which board and capture are compared."""
 
     lens: Lens
     T_image_board: np.ndarray
+    """Pose (4, 4) of the board in the image's frame."""
     T_image_depth: np.ndarray
+    """Pose (4, 4) of the depth camera in the image's frame."""
 
     @cached_property
     def rays(self) -> np.ndarray:
         """The rays (h, w, 3) of the pixels, with z = 1."""
-        return np.concatenate(
-            [self.lens.region_slopes(self.lens.whole), np.ones((*self.lens.whole.shape, 1))],
-            axis=-1,
-        )
+        slopes = self.lens.region_slopes(self.lens.whole)
+        return np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
 
     @cached_property
     def plan_mm(self) -> np.ndarray:
@@ -132,9 +129,8 @@ def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Imag
             "places"
         )
         raise UserError(problem, legal=legal)
-    lens = (
-        lens if any(lens.distortion) else replace(lens, distortion=tuple(colour.distortion.value))
-    )
+    if not any(lens.distortion):
+        lens = replace(lens, distortion=tuple(colour.distortion.value))
     return Image(lens, colour.T_colour_depth @ T_depth_board, colour.T_colour_depth)
 
 
@@ -150,43 +146,22 @@ def measured(
     Raises UserError if no hole is in view."""
     cloud = _cloud(z_m, image)
     noises = []
-    centres, (height, width) = (
-        np.array([hole.centre_mm for hole in target.holes]),
-        image.lens.whole.shape,
-    )
+    centres = np.array([hole.centre_mm for hole in target.holes])
     peaks = np.full(len(centres), np.nan)
     patterns: dict[int, list[np.ndarray]] = {size: [np.zeros(0)] for size in PATTERN_PX}
     for number, centre in enumerate(centres):
-        rows, columns = np.nonzero(np.linalg.norm(image.plan_mm - centre, axis=-1) < RING_MM[1])
-        if (
-            not rows.size
-            or min(*rows, *columns) == 0
-            or rows.max() == height - 1
-            or columns.max() == width - 1
-        ):
+        cut = _cut_around(image, centre)
+        if cut is None:
             continue
-        cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
         plan = image.plan_mm[cut] - centre
-        z = cloud.points_m[*cut, 2]
-        from_centre, (x, y) = np.linalg.norm(plan, axis=-1), np.moveaxis(plan, -1, 0)
-        ring = (from_centre > RING_MM[0]) & (from_centre < RING_MM[1]) & np.isfinite(z)
-        basis = np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
-        weight = np.ones(int(ring.sum()))
-        for _ in range(10):
-            surface = np.linalg.lstsq(basis[ring] * weight[:, None], z[ring] * weight, rcond=None)[
-                0
-            ]
-            off = np.abs(z[ring] - basis[ring] @ surface)
-            weight = (off <= OFF_RING * 1.4826 * np.median(off)).astype(float)
-        ring[ring] = weight > 0
-        residual_mm = (z - basis @ surface) / MM
-        peaks[number] = float(np.nanmax(residual_mm[from_centre < PEAK_MM]))
+        residual_mm, ring = _residual_mm(plan, cloud.points_m[*cut, 2])
+        is_centre = np.linalg.norm(plan, axis=-1) < PEAK_MM
+        peaks[number] = float(np.nanmax(residual_mm[is_centre]))
         noises.append(z_m[:, *cut][:, ring])
         for size, pattern in patterns.items():
             is_inside = ndimage.uniform_filter(ring.astype(float), size) > 1 - 1e-6
-            pattern.append(
-                ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)[is_inside]
-            )
+            smooth_mm = ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)
+            pattern.append(smooth_mm[is_inside])
     if not noises:
         raise UserError(
             "no hole is in view together with the face around it", fix="check the declared pose"
@@ -208,22 +183,48 @@ def measured(
     for name, settings in detectors.items():
         detector = load_detector(name, settings)
         findings = detector.find(cloud, detector.analyse(cloud), config.threshold.k or 0.0)
-        at_mm = np.array(
-            [image.plan_mm.reshape(-1, 2)[spot.pixels].mean(axis=0) for spot in findings]
-        ).reshape(-1, 2)
-        hits = len(match(centres[in_view], at_mm, config.matching.radius_mm))
-        readings["share of holes found", name, ""] = (
-            Reading(hits / int(in_view.sum())),
-            int(in_view.sum()),
-        )
+        plan = image.plan_mm.reshape(-1, 2)
+        found_mm = [plan[spot.pixels].mean(axis=0) for spot in findings]
+        hits = match(centres[in_view], np.reshape(found_mm, (-1, 2)), config.matching.radius_mm)
+        holes = int(in_view.sum())
+        readings["share of holes found", name, ""] = Reading(len(hits) / holes), holes
     return readings, peaks
+
+
+def _cut_around(image: Image, centre_mm: np.ndarray) -> tuple[slice, slice] | None:
+    """Return the rows and columns of the ring around a hole and of what is in it; None if they
+    reach the image's rim."""
+    in_reach = np.linalg.norm(image.plan_mm - centre_mm, axis=-1) < RING_MM[1]
+    rows, columns = np.nonzero(in_reach)
+    height, width = in_reach.shape
+    if not rows.size or rows.min() == 0 or columns.min() == 0:
+        return None
+    if rows.max() == height - 1 or columns.max() == width - 1:
+        return None
+    return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+
+
+def _residual_mm(plan_mm: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (h, w) minus the quadratic surface through the ring around a hole, in mm, and the
+    ring's pixels (h, w) bool that count. ``plan_mm`` (h, w, 2) is relative to the hole."""
+    x, y = np.moveaxis(plan_mm, -1, 0)
+    from_centre = np.linalg.norm(plan_mm, axis=-1)
+    ring = (from_centre > RING_MM[0]) & (from_centre < RING_MM[1]) & np.isfinite(z)
+    basis = np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
+    weight = np.ones(int(ring.sum()))
+    for _ in range(10):
+        design = basis[ring] * weight[:, None]
+        surface = np.linalg.lstsq(design, z[ring] * weight, rcond=None)[0]
+        off = np.abs(z[ring] - basis[ring] @ surface)
+        weight = (off <= OFF_RING * 1.4826 * np.median(off)).astype(float)
+    ring[ring] = weight > 0
+    return (z - basis @ surface) / MM, ring
 
 
 def _angles_deg(target: TargetConfig) -> np.ndarray:
     """Return the angle (n,) of each hole from the depth camera's axis."""
-    centres_m = transform_points(
-        target.pose.T_camera_board, np.array([[*hole.centre_m, 0.0] for hole in target.holes])
-    )
+    on_board_m = np.array([[*hole.centre_m, 0.0] for hole in target.holes])
+    centres_m = transform_points(target.pose.T_camera_board, on_board_m)
     return np.degrees(np.arctan2(np.linalg.norm(centres_m[:, :2], axis=-1), centres_m[:, 2]))
 
 
@@ -233,15 +234,14 @@ def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.nansum(z_m, axis=0) / count
         variance = np.nansum((z_m - z) ** 2, axis=0) / np.where(count > 1, count - 1, np.nan)
-    reason = (count == 0).astype(np.uint8)
     return Cloud(
-        image.rays * z[..., None],
-        reason,
-        count,
-        variance,
-        image.lens.whole,
-        MM,
-        len(z_m),
+        points_m=image.rays * z[..., None],
+        reason=(count == 0).astype(np.uint8),
+        count=count,
+        variance_m2=variance,
+        region=image.lens.whole,
+        z_step_m=MM,
+        n_frames=len(z_m),
         lens=image.lens,
     )
 
@@ -274,28 +274,35 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     if recording is not None:
         left_out = {frame.name: frame.why for frame in average(recording, AverageConfig()).left_out}
         remarks = [f"{name} is left out: {why}" for name, why in left_out.items()]
-        z_m = np.stack(
-            [frame.z_m for frame in recording.frames() if frame.name not in left_out]
-        ).astype(float)
+        taken = [frame.z_m for frame in recording.frames() if frame.name not in left_out]
+        z_m = np.stack(taken).astype(float)
         frames = len(z_m)
         judged["capture"] = measured(z_m, image, target, config, detectors)
     for point in points:
         label = point.variant.split(", detector=")[0]
-        judged[label] = measured(
-            _simulated(point, image, frames, options), image, target, config, detectors
-        )
+        z_m = _simulated(point, image, frames, options)
+        judged[label] = measured(z_m, image, target, config, detectors)
         real = judged["capture"][0] if recording else {}
         for key, (value, count) in judged[label][0].items():
-            recorded = real[key][0] if key in real else Reading(float("nan"))
-            rows.append(Beside(label, *key, count, recorded, value))
+            quantity, condition, unit = key
+            rows.append(
+                Beside(
+                    where=label,
+                    quantity=quantity,
+                    at=condition,
+                    unit=unit,
+                    pixels=count,
+                    measured=real[key][0] if key in real else Reading(float("nan")),
+                    simulated=value,
+                )
+            )
         print(f"simulated: {label}", flush=True)
-    answer = (
-        _answer(rows) if recording else "No capture is given, so there is nothing to compare with."
-    )
+    answer = "No capture is given, so there is nothing to compare with."
+    if recording:
+        answer = _answer(rows)
     print("\n".join([answer, *remarks]))
-    drawn = svg(
-        "peaks", (7.2, 4.4), "Peaks of the holes", lambda canvas: _draw(canvas, target, judged)
-    )
+    title = "Peaks of the holes"
+    drawn = svg("peaks", (7.2, 4.4), title, lambda canvas: _draw(canvas, target, judged))
     body = [
         figure({"peaks": drawn}, "peaks", CAPTION),
         heading("All numbers"),
@@ -305,9 +312,8 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     title = f"{config.title or config.name} compared with the simulated {camera.title}"
     show([BESIDE.grid(rows)])
     write_table(options.out, BESIDE, BESIDE.frame(rows))
-    write_text(
-        options.out / "capture.html", page(title, answer, [*body, *command_of(command)], under)
-    )
+    body += command_of(command)
+    write_text(options.out / "capture.html", page(title, answer, body, under))
     files = [str(path) for path in recording.files] if recording else []
     origin = {
         "results_version": RESULTS_VERSION,
@@ -338,27 +344,25 @@ def _answer(rows: list[Beside]) -> str:
     """Return a sentence that names the set-up closest to the capture and its figures that
     differ."""
     ratios: dict[str, dict[str, float]] = {}
+    off: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.measured.value > 0 and np.isfinite(row.simulated.value):
-            ratios.setdefault(row.where, {})[f"{row.quantity}, {row.at}"] = (
-                row.simulated.value / row.measured.value
-            )
-    off = {
-        where: {k: r for k, r in ratio.items() if abs(r - 1) > CLOSE}
-        for where, ratio in ratios.items()
-    }
-    best = min(
-        off,
-        key=lambda where: (len(off[where]), sum(abs(np.log(r)) for r in ratios[where].values())),
-    )
-    share = (
-        f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within "
-        f"{100 * CLOSE:.0f} %"
-    )
-    other_ratios = "".join(
-        f"; {quantity}: {ratio:.2f} of the capture's" for quantity, ratio in off[best].items()
-    )
-    return f"Of {len(ratios)} set-ups, {best} is closest: {share} of the capture{other_ratios}."
+            figure = f"{row.quantity}, {row.at}"
+            ratio = row.simulated.value / row.measured.value
+            ratios.setdefault(row.where, {})[figure] = ratio
+            far_off = off.setdefault(row.where, {})
+            if abs(ratio - 1) > CLOSE:
+                far_off[figure] = ratio
+
+    def distance(set_up: str) -> tuple[int, float]:
+        return len(off[set_up]), sum(abs(np.log(ratio)) for ratio in ratios[set_up].values())
+
+    best = min(off, key=distance)
+    agreeing = len(ratios[best]) - len(off[best])
+    share = f"{agreeing} of {len(ratios[best])} figures within {100 * CLOSE:.0f} %"
+    differing = [f"; {name}: {ratio:.2f} of the capture's" for name, ratio in off[best].items()]
+    answer = f"Of {len(ratios)} set-ups, {best} is closest: {share} of the capture"
+    return f"{answer}{''.join(differing)}."
 
 
 def _draw(
@@ -367,9 +371,10 @@ def _draw(
     """Draw the peaks of the holes against their angle from the depth camera's axis."""
     axes = figure.subplots()
     for number, (label, (_, peaks_mm)) in enumerate(judged.items()):
-        colour, size = ("black", 60) if label == "capture" else (COLOURS[number % len(COLOURS)], 10)
-        marker = "+" if label == "capture" else "o"
-        axes.scatter(_angles_deg(target), peaks_mm, s=size, c=colour, marker=marker, label=label)
+        look: dict[str, Any] = {"s": 10, "c": COLOURS[number % len(COLOURS)], "marker": "o"}
+        if label == "capture":
+            look = {"s": 60, "c": "black", "marker": "+"}
+        axes.scatter(_angles_deg(target), peaks_mm, label=label, **look)
     axes.set_xlabel("angle from the depth camera's axis / degrees")
     axes.set_ylabel("peak behind the face / mm")
     axes.legend(fontsize=7)

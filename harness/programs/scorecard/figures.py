@@ -67,12 +67,15 @@ class Published(Config):
     def ends(self) -> tuple[float, float]:
         """The lowest and highest value that agree with the publication; infinite if there is no
         bound."""
-        low, high = (self.above, self.below) if self.value is None else (self.value, self.value)
-        return (-float("inf") if low is None else low), (float("inf") if high is None else high)
+        if self.value is not None:
+            return self.value, self.value
+        low = -float("inf") if self.above is None else self.above
+        high = float("inf") if self.below is None else self.below
+        return low, high
 
     def limits(self, nearest: float, tolerance: float = 0.0) -> tuple[float, float]:
         """Return the lowest and highest value that pass: ``tolerance`` beyond the ends, or a share
-        ``near`` if more."""
+        ``nearest`` of the value if that is more."""
         slack = max(tolerance, nearest * abs(self.value or 0.0))
         return self.ends[0] - slack, self.ends[1] + slack
 
@@ -86,10 +89,7 @@ class Published(Config):
 
 
 class Figure(Config):
-    """A published figure in the file. ``calibration``: the camera file was, or may have been,
-    fitted to it. ``kind``: a figure of real cameras, or a check of the code against the arithmetic
-    of a stated filter or limit. ``fails``: why it is known to fail; a failure without a reason
-    counts as a regression."""
+    """A published figure in the file."""
 
     name: Annotated[
         str,
@@ -101,23 +101,30 @@ class Figure(Config):
     published: Published
     source: Annotated[str, Field(min_length=3)]
     tag: Literal["R", "D", "S", "W", "M"]
+    """Kind of source, as on the page."""
     calibration: bool
+    """The camera file was, or may have been, fitted to the figure."""
     kind: Literal["reality", "code"] = "reality"
+    """A figure of real cameras, or a check of the code against the arithmetic of a stated filter
+    or limit."""
     note: str = ""
+    """Assumptions."""
     fails: str = ""
+    """Why the figure is known to fail; a failure without a reason counts as a regression."""
 
     @property
     def limits(self) -> tuple[float, float]:
         """The lowest and highest simulated value that pass."""
-        return self.published.limits(
-            NEAR if self.kind == "reality" else 0.0, self.published.tolerance or 0.0
-        )
+        nearest = NEAR if self.kind == "reality" else 0.0
+        return self.published.limits(nearest, self.published.tolerance or 0.0)
 
     @property
     def use(self) -> Literal["blind", "calibration", "code"]:
         """The use of the figure; a blind figure tests the model against real cameras and was not
         used to fit it."""
-        return "code" if self.kind == "code" else "calibration" if self.calibration else "blind"
+        if self.kind == "code":
+            return "code"
+        return "calibration" if self.calibration else "blind"
 
     @cached_property
     def measures(self) -> Quantity:
@@ -148,35 +155,26 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
     problems = list[Problem]()
     first: dict[str, int] = {}
     splices: dict[KeyPath, type[Config]] = {}
-    for number, data in enumerate(entries if isinstance(entries, list) else []):
+    if not isinstance(entries, list):
+        entries = []
+    for number, data in enumerate(entries):
         for key, legal in (("quantity", QUANTITIES), ("camera", camera_names())):
             word = child(data, key)
             yaml_path = ("figures", number, key)
-            if (
-                isinstance(word, str)
-                and word not in legal
-                and not (key == "camera" and word.endswith(".yaml"))
-            ):
+            if not isinstance(word, str) or (key == "camera" and word.endswith(".yaml")):
+                continue
+            if word not in legal:
                 problems.append(wrong_choice(yaml_path, word, legal, source.place_of(yaml_path)))
         quantity = child(data, "quantity")
         name = child(data, "name")
-        if (
-            isinstance(quantity, str)
-            and quantity in QUANTITIES
-            and isinstance(child(data, "conditions"), dict)
-        ):
+        conditions = child(data, "conditions")
+        if isinstance(quantity, str) and quantity in QUANTITIES and isinstance(conditions, dict):
             splices["figures", number, "conditions"] = QUANTITIES[quantity].conditions
         if isinstance(name, str) and first.setdefault(name, number) != number:
             location = source.place_of(("figures", number, "name"))
             used = source.place_of(("figures", first[name], "name"))
-            problems.append(
-                Problem(
-                    f"two figures have the name {name}",
-                    location,
-                    other=used,
-                    other_says="first used at",
-                )
-            )
+            text = f"two figures have the name {name}"
+            problems.append(Problem(text, location, other=used, other_says="first used at"))
     file, declared = validated(FiguresFile, source, splices)
     if problems or file is None:
         raise DeclarationError(str(path), [*problems, *declared])
@@ -208,12 +206,10 @@ class Score:
     def passes_by_tolerance(self) -> bool:
         """True if a figure of a real camera passes only by the source's tolerance, which is wider
         than `NEAR`."""
+        if self.figure.kind != "reality" or not self.passes:
+            return False
         low, high = self.figure.published.limits(NEAR)
-        return (
-            self.figure.kind == "reality"
-            and self.passes
-            and not low <= self.simulated.value <= high
-        )
+        return not low <= self.simulated.value <= high
 
     @property
     def fell_behind(self) -> bool:
@@ -224,8 +220,10 @@ class Score:
     def verdict(self) -> str:
         """The verdict: ``pass``, ``pass (tolerance)``, ``fail`` with a reason in the file, or
         ``FAIL (new)``."""
+        if self.passes_by_tolerance:
+            return "pass (tolerance)"
         if self.passes:
-            return "pass (tolerance)" if self.passes_by_tolerance else "pass"
+            return "pass"
         return "FAIL (new)" if self.fell_behind else "fail"
 
 
@@ -242,17 +240,13 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
     # libraries
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         mapped = map if jobs == 1 else pool.map
-        for group, readings in zip(
-            groups, mapped(measure_group, groups, [effort] * len(groups)), strict=True
-        ):
+        measurements = mapped(measure_group, groups, [effort] * len(groups))
+        for group, readings in zip(groups, measurements, strict=True):
             results |= zip(group, readings, strict=True)
             if time.monotonic() - last_s > PROGRESS_EVERY_S:
                 last_s = time.monotonic()
-                print(
-                    f"measured {len(results)} of {sum(map(len, groups))} numbers",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                progress = f"measured {len(results)} of {sum(map(len, groups))} numbers"
+                print(progress, file=sys.stderr, flush=True)
     return results
 
 
@@ -269,13 +263,17 @@ SCORE_FILE: dict[str, Any] = {"formats": ("csv",), "digits": "%.9g"}
 
 @dataclass(frozen=True)
 class Beside:
-    """A reading of the capture and of the simulation; ``at`` is the condition."""
+    """A reading of the capture and of the simulation."""
 
     where: str
+    """Plane, edge, or simulated set-up."""
     quantity: str
     at: str
+    """Condition of the reading."""
     unit: str
+    """Unit of the values; empty for shares."""
     pixels: int
+    """Number of pixels, of holes, or of lines across an edge."""
     measured: Reading
     simulated: Reading
 
@@ -286,12 +284,16 @@ def number(value: float) -> str:
         return "none"
     if 0.0995 <= abs(value) < 99.95:
         return f"{value:#.3g}"
-    return f"{value:.3g}" if abs(value) >= 99.95 or value == 0 else f"{value:.2g}"
+    if abs(value) >= 99.95 or value == 0:
+        return f"{value:.3g}"
+    return f"{value:.2g}"
 
 
 def _interval(between: Interval) -> str:
+    if not between.known:
+        return "–"
     high = number(between.high) if np.isfinite(between.high) else "inf"
-    return f"{number(between.low)} to {high}" if between.known else "–"
+    return f"{number(between.low)} to {high}"
 
 
 def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
@@ -306,8 +308,10 @@ def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
 
 
 def _ratio(row: Beside) -> str:
-    is_comparable = row.unit == "mm" and row.measured.value > 0 and np.isfinite(row.simulated.value)
-    return f"{row.simulated.value / row.measured.value:.2f}" if is_comparable else "–"
+    measured = row.measured.value
+    simulated = row.simulated.value
+    is_comparable = row.unit == "mm" and measured > 0 and np.isfinite(simulated)
+    return f"{simulated / measured:.2f}" if is_comparable else "–"
 
 
 def _named(score: Score) -> str:

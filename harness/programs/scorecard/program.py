@@ -97,9 +97,8 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         if score.passes and score.figure.fails:
             print(f"{score.figure.name} passes now: remove `fails` from its entry", file=sys.stderr)
         if score.fell_behind:
-            text = "simulated {:.4g}, passes from {:g} to {:g}".format(
-                score.simulated.value, *score.figure.limits
-            )
+            low, high = score.figure.limits
+            text = f"simulated {score.simulated.value:.4g}, passes from {low:g} to {high:g}"
             print(f"{score.figure.name} ({score.figure.what()}) fails: {text}", file=sys.stderr)
     return int(any(score.fell_behind for score in scores))
 
@@ -120,36 +119,31 @@ def _page(
     ]
     if ratios:
         size = (9.5, 1.2 + 0.17 * len(ratios))
-        name = "ratios"
-        drawn = {
-            name: svg(
-                name, size, "Simulated over published value", lambda canvas: _draw(canvas, ratios)
-            )
-        }
-        body.append(figure(drawn, name, CAPTION))
+        title = "Simulated over published value"
+        drawn = svg("ratios", size, title, lambda canvas: _draw(canvas, ratios))
+        body.append(figure({"ratios": drawn}, "ratios", CAPTION))
     if failing := [score for score in real if not score.passes]:
         body += [heading("Failures and their reasons"), scoring.SCORES.grid(failing).html()]
-    without = [
-        title
-        for camera, title in titles.items()
-        if all(score.figure.camera != camera for score in real)
-    ]
-    body += [heading("Figures of real cameras"), scoring.SCORES.grid(real).html()] if real else []
-    body += [note(f"The file has no published figure for {'; '.join(without)}.")] if without else []
+    scored = {score.figure.camera for score in real}
+    without = [title for camera, title in titles.items() if camera not in scored]
+    if real:
+        body += [heading("Figures of real cameras"), scoring.SCORES.grid(real).html()]
+    if without:
+        body.append(note(f"The file has no published figure for {'; '.join(without)}."))
     code = [score for score in scores if score.figure.kind == "code"]
     if code:
         body += [heading("Checks of the code"), note(CHECKS), scoring.SCORES.grid(code).html()]
-    meanings = [
-        (f"{q.title} ({q.unit})" if q.unit else q.title, q.says) for q in QUANTITIES.values()
-    ]
+    meanings = []
+    for quantity in QUANTITIES.values():
+        unit = f" ({quantity.unit})" if quantity.unit else ""
+        meanings.append((f"{quantity.title}{unit}", quantity.says))
     for title, rows in (("Quantities", meanings), ("Provenance", provenance.items())):
         lines = [
             tag("tr", tag("th", key, scope="row"), tag("td", plain(value))) for key, value in rows
         ]
         body += [heading(title), tag("table", tag("tbody", *lines), kind="prov")]
-    return page(
-        "Scorecard of the simulated cameras", answer, [*body, *command_of(command)], [note(HOW)]
-    )
+    body += command_of(command)
+    return page("Scorecard of the simulated cameras", answer, body, [note(HOW)])
 
 
 def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
@@ -162,12 +156,8 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
         value = score.figure.published.value
         colour = BLUE if score.passes else RED
         if interval.known and value:
-            axis.plot(
-                np.maximum([interval.low / value, interval.high / value], 1e-3),
-                [row, row],
-                color=colour,
-                linewidth=1,
-            )
+            ends = np.maximum([interval.low / value, interval.high / value], 1e-3)
+            axis.plot(ends, [row, row], color=colour, linewidth=1)
         face = colour if score.figure.use == "blind" else "none"
         axis.plot(score.ratio, row, "o", color=colour, markerfacecolor=face, markersize=4)
     axis.set(
@@ -175,11 +165,8 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
     )
     axis.set_xticks([0.1, 0.25, 0.5, 1, 2, 4], ["0.1", "0.25", "0.5", "1", "2", "4"])
     axis.minorticks_off()
-    axis.set_yticks(
-        range(len(scores)),
-        [score.figure.what().partition(", stored")[0] for score in scores],
-        fontsize=6,
-    )
+    labels = [score.figure.what().partition(", stored")[0] for score in scores]
+    axis.set_yticks(range(len(scores)), labels, fontsize=6)
     cameras = [camera_title(score.figure.camera) for score in scores]
     for row, title in enumerate(cameras):
         if row == 0 or title != cameras[row - 1]:
@@ -200,22 +187,21 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     blind = by_use["blind"]
     families: dict[str, list[scoring.Score]] = {}
     for score in blind:
-        families.setdefault(
-            FAMILIES.get(score.figure.camera.partition("_")[0], "other cameras"), []
-        ).append(score)
-    by_family = ", ".join(f"{name} {share(family)}" for name, family in families.items())
+        first_word = score.figure.camera.partition("_")[0]
+        families.setdefault(FAMILIES.get(first_word, "other cameras"), []).append(score)
+    by_family = ""
+    if len(families) > 1:
+        shares = [f"{name} {share(family)}" for name, family in families.items()]
+        by_family = f" ({', '.join(shares)})"
     values = [score for score in blind if score.figure.published.value is not None]
     bounds = [score for score in blind if score.figure.published.value is None]
     wide = sum(score.passes_by_tolerance for score in blind)
-    text = (
-        f"{share(blind)} blind figures pass{f' ({by_family})' if len(families) > 1 else ''}: "
-        f"{share(values)} values "
-    )
-    text += (
-        f"within 25 %{f' ({wide} by a wider tolerance of the source)' if wide else ''}, "
-        f"{share(bounds)} bounds; "
-    )
+    by_tolerance = f" ({wide} by a wider tolerance of the source)" if wide else ""
+    text = f"{share(blind)} blind figures pass{by_family}: "
+    text += f"{share(values)} values within 25 %{by_tolerance}, {share(bounds)} bounds; "
     text += f"{share(by_use['calibration'])} figures that calibrated a camera pass; "
     text += f"{share(by_use['code'])} checks of the code pass."
     new = [score.figure.name for score in scores if score.fell_behind]
-    return text + (f" Failures without a stated reason: {', '.join(new)}." if new else "")
+    if new:
+        text += f" Failures without a stated reason: {', '.join(new)}."
+    return text

@@ -35,17 +35,17 @@ from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.common.config import CameraConfig, EffectsConfig
 
+# Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by
+# 6 % to either side on the coarsest camera, and the mean deviation by less than 1 %.
 PATCH = (40, 24)
-"""Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by
-6 % to either side on the coarsest camera, and the mean deviation by less than 1 %."""
 PATTERN_PATCH = (140, 180)
+# slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step
+# occur
 LEAST_TILT = (0.05, 0.02)
-"""Slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step
-occur."""
 EDGE_PATCH = (40, 96)
+# distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m,
+# under 44 pixels
 REACH_PX = 44.0
-"""Distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m,
-under 44 pixels."""
 # pixels across per pixel along the edge: all positions of an edge in a pixel occur, as in ISO
 # 12233
 SLANT = 0.1
@@ -151,14 +151,18 @@ Measure = Callable[[Bench, Any], Reading]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured quantity. ``unit`` is empty for ratios; ``says`` is a sentence for the page."""
+    """A quantity that the scorecard measures."""
 
     name: str
     title: str
+    """Words for tables and pages."""
     unit: str
+    """mm or px; empty for ratios."""
     conditions: type[Config]
+    """Conditions of a measurement, with their defaults."""
     measure: Measure
     says: str
+    """Sentence for the page: what is measured."""
 
 
 QUANTITIES: dict[str, Quantity] = {}
@@ -173,7 +177,9 @@ def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measu
         says = " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
         ending = name.rpartition("_")[2]
         unit = ending if ending in ("mm", "px") else ""
-        QUANTITIES[name] = Quantity(name, title, unit, conditions, measure, says)
+        QUANTITIES[name] = Quantity(
+            name=name, title=title, unit=unit, conditions=conditions, measure=measure, says=says
+        )
         return measure
 
     return listed
@@ -195,20 +201,23 @@ def plane_stack(
     if c.amplitude_units is not None:
         camera = bench.camera
         if not isinstance(camera, AmcwCamera):
-            raise UserError(
-                f"{camera.name}: does not support amplitude_units", fix="give the plane's albedo"
-            )
-        electrons = c.amplitude_units * camera.photons.electrons_per_unit.value * c.distance_m**2
-        albedo = electrons / (
-            camera.photons.signal_electrons.value * sum(camera.modulation.contrast.value)
-        )
-    view = plane_view(
-        bench.camera, bench.patch(*patch), c.distance_m, albedo, slope_x, LEAST_TILT[1]
-    )
-    labels = ("plane", digest([c.to_data(), effects.to_data()]), unit)
-    count = frames or bench.effort.noise_frames
+            problem = f"{camera.name}: does not support amplitude_units"
+            raise UserError(problem, fix="give the plane's albedo")
+        photons = camera.photons
+        electrons = c.amplitude_units * photons.electrons_per_unit.value * c.distance_m**2
+        contrast = sum(camera.modulation.contrast.value)
+        albedo = electrons / (photons.signal_electrons.value * contrast)
+    region = bench.patch(*patch)
+    view = plane_view(bench.camera, region, c.distance_m, albedo, slope_x, LEAST_TILT[1])
     return bench.taken(
-        view, effects, count, *labels, unit_seed=unit, ambient_uw_cm2_nm=c.ambient_uw_cm2_nm
+        view,
+        effects,
+        frames or bench.effort.noise_frames,
+        "plane",
+        digest([c.to_data(), effects.to_data()]),
+        unit,
+        unit_seed=unit,
+        ambient_uw_cm2_nm=c.ambient_uw_cm2_nm,
     )
 
 
@@ -232,36 +241,42 @@ def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
 @_quantity("noise correlation", LagConditions)
 def noise_correlation(bench: Bench, c: LagConditions) -> Reading:
     """Correlation of the temporal noise of two pixels, noise alone."""
-    return jackknifed(
-        plane_stack(bench, _plane(c)).z_m, lambda z: correlation_at(z, True, c.lag_x_px, c.lag_y_px)
-    )
+    z_m = plane_stack(bench, _plane(c)).z_m
+    return jackknifed(z_m, lambda frames: correlation_at(frames, True, c.lag_x_px, c.lag_y_px))
 
 
 @_quantity("valid fraction", PlaneConditions)
 def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
     """Share of pixels about the axis that have a range."""
     # all neighbours that the camera's own filter mixes count as a single pixel
+    pixels_each = (2 * bench.camera.optics.margin_px + 1) ** 2
     stack = plane_stack(bench, c, NOISE, bench.effort.few_frames)
-    return share_of(np.isfinite(stack.z_m), (2 * bench.camera.optics.margin_px + 1) ** 2)
+    return share_of(np.isfinite(stack.z_m), pixels_each)
 
 
 def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
     """Return z (h, w) as square patches (patches, n, n) minus each patch's own plane, mm."""
     v, u = np.mgrid[:n, :n].reshape(2, -1) - n / 2
     plane = np.column_stack([np.ones(n * n), u, v])
-    corners = [
-        (i, j) for i in range(0, len(z_m) - n + 1, n) for j in range(0, z_m.shape[1] - n + 1, n)
-    ]
-    patches = np.stack([z_m[i : i + n, j : j + n].ravel() for i, j in corners], axis=1) / MM
-    return np.asarray((patches - plane @ np.linalg.lstsq(plane, patches)[0]).T.reshape(-1, n, n))
+    height, width = z_m.shape
+    pixels = []
+    for row in range(0, height - n + 1, n):
+        for column in range(0, width - n + 1, n):
+            pixels.append(z_m[row : row + n, column : column + n].ravel())
+    patches = np.stack(pixels, axis=1) / MM
+    fitted = plane @ np.linalg.lstsq(plane, patches)[0]
+    return np.asarray((patches - fitted).T.reshape(-1, n, n))
 
 
 @lru_cache(maxsize=4)
 def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
     """Return one frame's z (h, w) for each of several units, cached for all patches of this
     plane."""
-    units = range(1, bench.effort.few_frames + 1)
-    return tuple(plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] for unit in units)
+    frames = []
+    for unit in range(1, bench.effort.few_frames + 1):
+        stack = plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH)
+        frames.append(stack.z_m[0])
+    return tuple(frames)
 
 
 def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
@@ -269,26 +284,27 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
     product at the lag."""
     n = c.patch_px
     k = c.apart_px
+    variances = []
     products = []
     for z_m in _single_frames(bench, _plane(c)):
-        stored_m = (
-            np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
-        )
-        residual_m = _left_of_patches(stored_m, n)
-        beside = residual_m[:, :, k:] * residual_m[:, :, : n - k]
-        below = residual_m[:, k:] * residual_m[:, : n - k]
-        products.append(
-            (residual_m.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2)
-        )
-    variance, product = np.transpose(products, (1, 0, 2))
-    return variance, product
+        stored_m = z_m
+        if c.rounded_mm:
+            step_m = c.rounded_mm * MM
+            stored_m = np.round(z_m / step_m) * step_m
+        residual_mm = _left_of_patches(stored_m, n)
+        beside = residual_mm[:, :, k:] * residual_mm[:, :, : n - k]
+        below = residual_mm[:, k:] * residual_mm[:, : n - k]
+        variances.append(residual_mm.var(axis=(1, 2)))
+        products.append((beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2)
+    return np.array(variances), np.array(products)
 
 
 @_quantity("deviation within patches", PatchConditions)
 def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Standard deviation of a single frame about the patch's own plane, with noise and fixed
     pattern: median over patches, mean over units."""
-    return mean_of(np.sqrt(np.median(_patch_products(bench, c)[0], axis=1)))
+    variance, _ = _patch_products(bench, c)
+    return mean_of(np.sqrt(np.median(variance, axis=1)))
 
 
 @_quantity("pattern within patches", PatchConditions)
@@ -297,11 +313,10 @@ def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     rms over patches, mean over units."""
     deviations_mm = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
-        z_m = plane_stack(
-            bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
-        ).z_m
-        even = _left_of_patches(z_m[::2].mean(axis=0), c.patch_px)
-        odd = _left_of_patches(z_m[1::2].mean(axis=0), c.patch_px)
+        frames = bench.effort.noise_frames // 4
+        stack = plane_stack(bench, _plane(c), PATTERNED, frames, unit, PATTERN_PATCH)
+        even = _left_of_patches(stack.z_m[::2].mean(axis=0), c.patch_px)
+        odd = _left_of_patches(stack.z_m[1::2].mean(axis=0), c.patch_px)
         deviations_mm.append(float(np.sqrt(max((even * odd).mean(), 0.0))))
     return mean_of(deviations_mm)
 
@@ -332,14 +347,12 @@ def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
     noise, mean of 5 units."""
     deviations_mm = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
-        stack = plane_stack(
-            bench, c, PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
-        )
+        frames = bench.effort.noise_frames // 4
+        stack = plane_stack(bench, c, PATTERNED, frames, unit, PATTERN_PATCH)
         where = np.isfinite(stack.z_m).all(axis=0)
         if where.mean() > 0.5:
-            deviations_mm.append(
-                fixed_pattern(np.nan_to_num(stack.z_m), where, stack.slopes, lags=12).std_m / MM
-            )
+            pattern = fixed_pattern(np.nan_to_num(stack.z_m), where, stack.slopes, lags=12)
+            deviations_mm.append(pattern.std_m / MM)
     return mean_of(deviations_mm)
 
 
@@ -350,7 +363,7 @@ def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
     camera = bench.camera
     axis = ("x", "y").index(c.across)
     lens = camera.nominal_lens
-    region = bench.patch(*(EDGE_PATCH if axis == 0 else EDGE_PATCH[::-1]))
+    region = bench.patch(*EDGE_PATCH) if axis == 0 else bench.patch(*EDGE_PATCH[::-1])
     toward_emitter = -1.0 if camera.optics.emitter_m[axis] < 0 else 1.0
     # in front, sign * (position across) < edge; for a shadow, the front is on the emitter's side
     sign = -toward_emitter if c.shadow else toward_emitter
@@ -364,9 +377,8 @@ def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
     view = layered_view(camera, region, front, back, lambda slopes: signed_px(slopes) < 0, c.albedo)
     stack = bench.taken(view, NOISE, bench.effort.few_frames, "step", digest(c.to_data()))
     from_edge = signed_px(lens.region_slopes(stack.region))
-    tolerance_m = on_surface_tolerance_m(
-        temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX), c.step_mm * MM
-    )
+    sigma_m = temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX)
+    tolerance_m = on_surface_tolerance_m(sigma_m, c.step_mm * MM)
     front_z = front.z_along_m(stack.slopes)
     back_z = back.z_along_m(stack.slopes)
     widths = edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, 2 - axis)

@@ -114,6 +114,7 @@ def borne_out_if(posterior: pd.DataFrame) -> str:
     return (
         f"The thesis' outcome is borne out if {'; '.join(required)} (of {int(is_set_up.sum())}"
         " set-ups; values that the outcome makes less than half as probable are left out). In the"
-        f" likeliest set-up, {in_words(likeliest['value'])}, the exact outcome has a probability of"
+        f" likeliest set-up, {in_words(likeliest['value'])}, the exact outcome has a "
+        "probability of"
         f" {likeliest['likelihood']:.2g}."
     )

@@ -98,7 +98,8 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     change = maps.against_one(case, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if change is None:
         return "undecided", (
-            "Not judged: the experiment has not finished both one view and two views, registered by"
+            "Not judged: the experiment has not finished both one view and two views, "
+            "registered by"
             " CPD and merged on the grid."
         )
     # if no smaller hole can be compared, one that only the single view finds speaks for the claim
@@ -327,8 +328,8 @@ def _of_equal_frames(
 def _of_equal_exposures(
     case: maps.MapCase, fused: Sequence[maps.MapSetUp]
 ) -> tuple[maps.Map, maps.Map] | None:
-    """Return the first map with the most frames that has a rival of as many exposures in total, and
-    the rival."""
+    """Return the first map with the most frames that has a rival of as many exposures in total,
+    and the rival."""
     preferred = case.single()
     singles = [set_up for set_up in case.maps if set_up.views == 1]
     singles.sort(

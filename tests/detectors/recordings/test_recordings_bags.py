@@ -42,7 +42,6 @@ def refusal(path: Path, **options: Any) -> str:
 
 
 # ---- a message
-# -------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
@@ -77,7 +76,8 @@ def test_every_layout_of_one_cloud_is_one_frame(
     )
     frame = frame_of_message("m", message, 1.0)
     shape = VALID.shape if organised else (1, VALID.size)
-    assert frame.z_m.dtype == np.float32 and frame.xy_m is not None
+    assert frame.z_m.dtype == np.float32
+    assert frame.xy_m is not None
     np.testing.assert_array_equal(frame.z_m, POINTS[..., 2].astype(np.float32).reshape(shape))
     np.testing.assert_array_equal(frame.xy_m, POINTS[..., :2].astype(number).reshape(*shape, 2))
     np.testing.assert_array_equal(
@@ -132,7 +132,6 @@ def test_layouts_that_contradict_themselves_are_refused() -> None:
 
 
 # ---- a bag
-# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mcap", (False, True))
@@ -145,7 +144,9 @@ def test_a_bag_is_read_as_its_folder_and_as_its_file(tmp_path: Path, mcap: bool)
     folder = bags.write_bag(tmp_path / "bag", messages, mcap=mcap)
     for path in (folder, folder / f"bag.{'mcap' if mcap else 'db3'}"):
         recording = open_capture([path])
-        assert recording.lens == plane.LENS and recording.z_step_m == 1e-3 and recording.notes == ()
+        assert recording.lens == plane.LENS
+        assert recording.z_step_m == 1e-3
+        assert recording.notes == ()
         frames = list(recording.frames())
         assert len(frames) == 3
         for i, frame in enumerate(frames):
@@ -185,7 +186,8 @@ def test_a_lens_counts_only_where_the_points_lie_on_its_rays(tmp_path: Path) -> 
     points = bags.clouds(2)
     beside = [("/a", bags.INFO, bags.info(shift_px=0.02)), ("/b", bags.INFO, bags.info(width=97))]
     separate = open_capture([bags.write_bag(tmp_path / "apart", [*beside, *points])])
-    assert separate.lens is None and "no CameraInfo in the bag fits" in separate.notes[0]
+    assert separate.lens is None
+    assert "no CameraInfo in the bag fits" in separate.notes[0]
     assert next(separate.frames()).xy_m is not None
     right = [*beside, ("/c", bags.INFO, bags.info(shift_px=0.005))]
     assert open_capture([bags.write_bag(tmp_path / "right", [*right, *points])]).lens is not None
@@ -213,16 +215,15 @@ def test_single_points_stay_single_points(tmp_path: Path) -> None:
     flat = bags.cloud(POINTS, organised=False)
     messages = [("/c", bags.INFO, bags.info()), ("/points2", bags.CLOUD, flat)]
     recording = open_capture([bags.write_bag(tmp_path / "bag", messages)])
-    assert (
-        not recording.organised
-        and recording.lens is None
-        and "unorganised points" in recording.notes[0]
-    )
+    assert not recording.organised
+    assert recording.lens is None
+    assert "unorganised points" in recording.notes[0]
 
 
 def test_the_usual_topic_the_only_one_or_the_named_one(tmp_path: Path) -> None:
     two = bags.write_bag(tmp_path / "two", [*bags.clouds(1, "/near"), *bags.clouds(2, "/far")])
-    assert "2 topics hold clouds" in refusal(two) and "legal: /far, /near" in refusal(two)
+    assert "2 topics hold clouds" in refusal(two)
+    assert "legal: /far, /near" in refusal(two)
     assert len(list(open_capture([two], topic="far").frames())) == 2
     assert len(list(open_capture([two], topic="/near").frames())) == 1
     usual = bags.write_bag(
@@ -234,7 +235,6 @@ def test_the_usual_topic_the_only_one_or_the_named_one(tmp_path: Path) -> None:
 
 
 # ---- depth images
-# ----------------------------------------------------------------------------------------------------
 
 STORED = plane.depth_mm()
 DEPTH = "/camera/depth/image_raw"
@@ -286,7 +286,8 @@ def test_a_bag_of_depth_images_has_their_lens(tmp_path: Path, kind: str, compres
             tmp_path / "a", [*unrelated, *pictures], mcap=kind == "mcap", compression=mode
         )
     recording = open_capture([path])
-    assert recording.lens == plane.LENS and recording.z_step_m == 1e-3
+    assert recording.lens == plane.LENS
+    assert recording.z_step_m == 1e-3
     frames = list(recording.frames())
     assert len(frames) == 3
     for i, frame in enumerate(frames):
@@ -300,7 +301,8 @@ def test_clouds_of_ros_1_are_read(tmp_path: Path) -> None:
         tmp_path / "a.bag", [("/c", bags.INFO, bags.info()), *bags.clouds(2)], "bz2"
     )
     recording = open_capture([path])
-    assert recording.lens == plane.LENS and len(list(recording.frames())) == 2
+    assert recording.lens == plane.LENS
+    assert len(list(recording.frames())) == 2
 
 
 def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None:
@@ -308,9 +310,8 @@ def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None
     lens = (LENS_TOPIC, bags.INFO, bags.info())
     combined = bags.write_bag(tmp_path / "both", [picture, lens, *bags.clouds(1)])
     recording = open_capture([combined])
-    assert (
-        next(recording.frames()).rgb is None and "not the clouds on /points2" in recording.notes[0]
-    )
+    assert next(recording.frames()).rgb is None
+    assert "not the clouds on /points2" in recording.notes[0]
     assert next(open_capture([combined], topic="points2").frames()).rgb is not None
     lacking = bags.write_bag(tmp_path / "lacking", [picture, *bags.clouds(1)])
     assert "the clouds on /points2 are read" in open_capture([lacking]).notes[0]
@@ -320,7 +321,8 @@ def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None
         lens,
     ]
     message = refusal(bags.write_bag(tmp_path / "several", several))
-    assert "2 topics hold depth images" in message and f"instance --topic {DEPTH}" in message
+    assert "2 topics hold depth images" in message
+    assert f"instance --topic {DEPTH}" in message
     copies = [picture, (f"{DEPTH}/compressedDepth", bags.PACKED, bags.packed_depth(STORED)), lens]
     assert open_capture([bags.write_bag(tmp_path / "copies", copies)]).lens == plane.LENS
 
@@ -335,7 +337,8 @@ def test_realsense_names_and_its_unit(tmp_path: Path) -> None:
         (f"{sensor}/Infrared_0/image/data", bags.IMAGE, bags.depth_image(STORED, "mono16")),
     ]
     recording = open_capture([bags.write_ros1(tmp_path / "a.bag", messages)])
-    assert recording.lens == plane.LENS and recording.scale_m == 0.00025
+    assert recording.lens == plane.LENS
+    assert recording.scale_m == 0.00025
     np.testing.assert_allclose(np.nan_to_num(next(recording.frames()).z_m), STORED / 1e3, rtol=1e-6)
     assert recording.unit_text.startswith("depth unit 0.25 mm, from /device_0")
 
@@ -344,11 +347,13 @@ def test_the_lens_of_a_camera_info() -> None:
     shape = plane.LENS.height, plane.LENS.width
     distorted = (0.1, -0.2, 0.001, 0.002, 0.03)
     lens = lens_of_info(bags.info(d=distorted), shape)
-    assert isinstance(lens, Lens) and lens.distortion == (*distorted, 0, 0, 0)
+    assert isinstance(lens, Lens)
+    assert lens.distortion == (*distorted, 0, 0, 0)
     rectified = bags.info(d=distorted)
     rectified.p = np.array([140.0, 0, 45, 0, 0, 141, 35, 0, 0, 0, 1, 0])
     flat = lens_of_info(rectified, shape, is_rectified=True)
-    assert isinstance(flat, Lens) and (flat.fx, flat.cy, any(flat.distortion)) == (140, 35, False)
+    assert isinstance(flat, Lens)
+    assert (flat.fx, flat.cy, any(flat.distortion)) == (140, 35, False)
     # the centre of a binned pixel lies between those of its four; the region's first pixel is (10,
     # 20)
     binned = bags.info()
@@ -369,7 +374,8 @@ def test_the_lens_of_a_camera_info() -> None:
 def test_depth_images_without_their_lens_are_refused(tmp_path: Path) -> None:
     picture = (DEPTH, bags.IMAGE, bags.depth_image(STORED))
     none = bags.write_bag(tmp_path / "none", [picture])
-    assert "the bag's: none" in refusal(none) and "--intrinsics FILE" in refusal(none)
+    assert "the bag's: none" in refusal(none)
+    assert "--intrinsics FILE" in refusal(none)
     assert open_capture([none], lens=plane.LENS).lens == plane.LENS
     fisheye = bags.info(d=(0.1, 0, 0, 0), model="equidistant")
     assert "equidistant" in refusal(
@@ -408,7 +414,8 @@ def test_a_truncated_bag_of_ros_1_is_named(tmp_path: Path, part: float) -> None:
     path = bags.write_ros1(tmp_path / "a.bag", bags.clouds(2))
     path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
     message = refusal(path)
-    assert "a.bag: is truncated or damaged" in message and "rosbag reindex" in message
+    assert "a.bag: is truncated or damaged" in message
+    assert "rosbag reindex" in message
 
 
 @settings(max_examples=12, deadline=None)
@@ -439,7 +446,6 @@ def test_a_chunk_of_ros_1_may_not_fill_the_memory(
 
 
 # ---- what it refuses
-# -------------------------------------------------------------------------------------------------
 
 
 def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
@@ -472,7 +478,8 @@ def test_a_topic_without_messages_is_refused(tmp_path: Path) -> None:
 def test_a_recording_that_was_not_closed_has_no_metadata(tmp_path: Path) -> None:
     folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
     (folder / "metadata.yaml").unlink()
-    assert "has no metadata.yaml" in refusal(folder) and "bag.db3" in refusal(folder)
+    assert "has no metadata.yaml" in refusal(folder)
+    assert "bag.db3" in refusal(folder)
     assert next(open_capture([folder / "bag.db3"]).frames()).z_m.shape == VALID.shape
 
 
@@ -505,7 +512,8 @@ def test_a_truncated_file_is_named(tmp_path: Path, mcap: bool, part: float) -> N
     file.write_bytes(content[: int(part * len(content))])
     for path in (folder, file):
         message = refusal(path)
-        assert file.name in message and "is truncated or damaged" in message
+        assert file.name in message
+        assert "is truncated or damaged" in message
 
 
 @settings(max_examples=12, deadline=None)

@@ -31,7 +31,6 @@ def refusal(path: Path) -> str:
 
 
 # ---- the calibration
-# -------------------------------------------------------------------------------------------------
 
 
 def test_the_nfov_lens_by_hand() -> None:
@@ -68,7 +67,8 @@ def test_modes_look_along_the_same_rays(
 def test_colour_modes_are_crops_of_one_picture() -> None:
     full_sensor = colour_camera("test", CAMERAS, 4096, 3072)
     cropped = colour_camera("test", CAMERAS, 1280, 720)
-    assert full_sensor is not None and cropped is not None
+    assert full_sensor is not None
+    assert cropped is not None
     # 1280 x 960 scaled down from 4096 x 3072, then rows 120 to 839
     u = 300.0
     v = 200.0
@@ -88,7 +88,8 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
     numbers[1], numbers[3] = (0.5 * 3072 - 384) / 2304, 0.64 * 3072 / 2304
     early = colour_camera("test", parse_calibration("test", json.dumps(data).encode()), 1280, 720)
     late = colour_camera("test", CAMERAS, 1280, 720)
-    assert early is not None and late is not None
+    assert early is not None
+    assert late is not None
     assert (early.lens.fy, early.lens.cy) == pytest.approx((late.lens.fy, late.lens.cy))
 
 
@@ -115,7 +116,6 @@ def test_a_calibration_that_is_not_understood_is_refused(
 
 
 # ---- colour
-# ----------------------------------------------------------------------------------------------------------
 
 
 def test_colour_is_taken_where_the_point_appears_in_the_colour_camera() -> None:
@@ -136,7 +136,6 @@ def test_colour_is_taken_where_the_point_appears_in_the_colour_camera() -> None:
 
 
 # ---- the file
-# --------------------------------------------------------------------------------------------------------
 
 
 def test_a_recording_gives_its_pictures_together(tmp_path: Path) -> None:
@@ -150,8 +149,10 @@ def test_a_recording_gives_its_pictures_together(tmp_path: Path) -> None:
     assert [frame.name for frame in read] == ["r.mkv frame 0", "r.mkv frame 1", "r.mkv frame 2"]
     for i, frame in enumerate(read):
         np.testing.assert_allclose(frame.z_m, 1.0 + i / 1000, atol=1e-6)
-        assert frame.amplitude is not None and (frame.amplitude == 100 + i).all()
-        assert frame.rgb is not None and frame.rgb[288, 320].tolist() == [10 + i, 20 + i, 30 + i]
+        assert frame.amplitude is not None
+        assert (frame.amplitude == 100 + i).all()
+        assert frame.rgb is not None
+        assert frame.rgb[288, 320].tolist() == [10 + i, 20 + i, 30 + i]
 
 
 def test_captures_without_depth_are_skipped(tmp_path: Path) -> None:
@@ -172,9 +173,8 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
     content = intact.read_bytes()
     for part in (0.0, 0.001, 0.3, 0.7, 0.99):
         (tmp_path / "cut.mkv").write_bytes(content[: int(part * len(content))])
-        assert "cut.mkv" in refusal(tmp_path / "cut.mkv") and "truncated" in refusal(
-            tmp_path / "cut.mkv"
-        )
+        assert "cut.mkv" in refusal(tmp_path / "cut.mkv")
+        assert "truncated" in refusal(tmp_path / "cut.mkv")
     assert "no DEPTH track (its tracks: IR)" in refusal(
         plane.write_mkv(tmp_path / "ir.mkv", [{"IR": DEPTH}])
     )
@@ -184,7 +184,8 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
     odd = plane.write_mkv(
         tmp_path / "odd.mkv", [{"DEPTH": DEPTH}], "PASSIVE_IR", plane.calibration()
     )
-    assert "PASSIVE_IR" in refusal(odd) and "NFOV_UNBINNED" in refusal(odd)
+    assert "PASSIVE_IR" in refusal(odd)
+    assert "NFOV_UNBINNED" in refusal(odd)
     wrong = plane.write_mkv(
         tmp_path / "wrong.mkv", [{"DEPTH": DEPTH}], "WFOV_UNBINNED", plane.calibration()
     )
@@ -195,7 +196,6 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
 
 
 # ---- a real one
-# ------------------------------------------------------------------------------------------------------
 
 
 def plane_rms_mm(points: np.ndarray) -> float:
@@ -206,7 +206,9 @@ def plane_rms_mm(points: np.ndarray) -> float:
 def test_the_calibration_flattens_a_real_wall(shared_data: Path) -> None:
     recording = open_capture([shared_data / "azure_mkv" / "recording.mkv"])
     (frame,) = recording.frames()
-    assert frame.rgb is not None and frame.amplitude is not None and recording.lens is not None
+    assert frame.rgb is not None
+    assert frame.amplitude is not None
+    assert recording.lens is not None
     cut = slice(60, 260), slice(20, 230)  # the papered wall on the left
     valid = frame.reason[cut] == Reason.VALID
     z = frame.z_m[cut][valid].astype(float)[:, None]
@@ -224,7 +226,8 @@ def test_real_colour_falls_on_the_depth_pixels(shared_data: Path) -> None:
     """The window's blind is bright in colour and dark in infrared: its edge must lie on the same
     pixels in both."""
     (frame,) = open_capture([shared_data / "azure_mkv" / "recording.mkv"]).frames()
-    assert frame.rgb is not None and frame.amplitude is not None
+    assert frame.rgb is not None
+    assert frame.amplitude is not None
     rows = slice(160, 300)
     grey = np.abs(np.diff(frame.rgb[rows, 380:450].mean(axis=(0, 2))))
     infrared = np.abs(np.diff(frame.amplitude[rows, 380:450].mean(axis=0)))
@@ -239,6 +242,5 @@ def test_a_recording_without_the_tag_of_its_mode_has_the_mode_of_its_size(tmp_pa
         tmp_path / "femto.mkv", [{"DEPTH": depth}], mode="", attached=plane.calibration()
     )
     lens = open_capture([path]).lens
-    assert lens is not None and (lens.fx, lens.cx) == pytest.approx(
-        (0.49 * 1024, 0.51 * 1024 - 192.5)
-    )
+    assert lens is not None
+    assert (lens.fx, lens.cx) == pytest.approx((0.49 * 1024, 0.51 * 1024 - 192.5))

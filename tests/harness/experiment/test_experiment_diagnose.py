@@ -91,10 +91,8 @@ def only(text: str, splices: shape.Splices | None = None) -> str:
 def test_a_valid_text_has_no_problem() -> None:
     assert (
         messages(
-            (
-                "name: a\nboard: {damages: [{kind: dimple, depth_mm: 1}], body: {radius: 1}, "
-                "loose: [1, 2]}"
-            )
+            "name: a\nboard: {damages: [{kind: dimple, depth_mm: 1}], body: {radius: 1}, "
+            "loose: [1, 2]}"
         )
         == []
     )
@@ -240,10 +238,8 @@ def test_board_that_is_no_mapping() -> None:
 
 def test_all_problems_at_once() -> None:
     result = messages(
-        (
-            "nam: a\nboard: {width_mm: 1, damages: [{kind: hole}, {kind: dent, depth_mm: x}], "
-            "flag: 2}\n"
-        )
+        "nam: a\nboard: {width_mm: 1, damages: [{kind: hole}, {kind: dent, depth_mm: x}], "
+        "flag: 2}\n"
     )
     assert len(result) == 6
     text = "\n".join(result)

@@ -402,3 +402,10 @@ def test_an_axis_is_numeric_if_all_its_lines_are(two: list[SetUpLimit]) -> None:
     mixed = replace(group, lines={"a": line, "b": replace(line, numeric=False)})
     assert group.numeric
     assert not mixed.numeric
+    words = replace(line, fixed={"camera": "b"}, values=("off", 1), numeric=False)
+    (joined,) = axis_groups([replace(line, fixed={"camera": "a"}, values=(50, 1)), words])
+    assert joined.values == (50, 1, "off")
+    assert list(joined.lines) == ["a", "b"]
+    numbers = replace(line, fixed={"camera": "b"}, values=(7, 60))
+    (joined,) = axis_groups([replace(line, fixed={"camera": "a"}), numbers])
+    assert joined.values == (1, 7, 50, 60)

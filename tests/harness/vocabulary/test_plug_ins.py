@@ -204,10 +204,8 @@ def acme_camera(monkeypatch, tmp_path) -> Path:
     )
     (tmp_path / "acme_tof.yaml").write_text(text)
     (tmp_path / "acme_cameras.py").write_text(
-        (
-            "from pathlib import Path\nFILE = Path(__file__).parent / 'acme_tof.yaml'\nTEXT = "
-            "str(FILE)\nNUMBER = 7\n"
-        )
+        "from pathlib import Path\nFILE = Path(__file__).parent / 'acme_tof.yaml'\nTEXT = "
+        "str(FILE)\nNUMBER = 7\n"
     )
     offer(monkeypatch, tmp_path, "acme-cameras", cameras.GROUP, {"acme_tof": "acme_cameras:FILE"})
     monkeypatch.delitem(sys.modules, "acme_cameras", raising=False)

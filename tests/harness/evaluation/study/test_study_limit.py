@@ -154,6 +154,8 @@ class TestWithoutACurve:
         limit = limit_of(with_hits(record, np.ones(28, bool)))
         assert not limit.a90_95.demonstrated
         assert "29 are needed" in limit.a90_95.why
+        for bound_of_all in (limit.a90_95, limit.over_boards):
+            assert (bound_of_all.pod, bound_of_all.confidence) == (0.9, 0.95)
 
     def test_nothing_found(self, small):
         limit = limit_of(with_hits(small, np.zeros(120, bool)))

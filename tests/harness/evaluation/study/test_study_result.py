@@ -57,7 +57,7 @@ def study() -> Study:
     return Study(
         (SetUp(), SetUp(frames=10, a50_mm=4.5)),
         boards=16,
-        hole_free_boards=16,
+        hole_free_boards=15,
         depths_mm=(2.0, 9.0),
         repeats=2,
     )
@@ -97,6 +97,10 @@ class TestStudy:
             frames = set_up.limit.record.frames
             holes = tables.holes[tables.holes["frames"] == frames]
             assert set_up.limit.hits == holes["detected"].sum()
+            sites = tables.sites[tables.sites["frames"] == frames]
+            assert set_up.roc.damages == len(holes)
+            assert set_up.roc.unflawed == len(sites) != len(holes)
+            assert set_up.roc.in_use[1] == holes["detected"].mean()
             assert set_up.free_response.in_use[1] == pytest.approx(
                 set_up.limit.hits / set_up.limit.inspections
             )

@@ -11,7 +11,7 @@ from scipy import stats
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.limit import limit_of
-from harness.evaluation.study.units import over_units
+from harness.evaluation.study.units import METHOD, over_units
 from tests.support.synthetic_study import Study, study_record
 
 A50_MM = np.array([3.5, 4.0, 5.0])
@@ -59,6 +59,8 @@ def test_a_unit_that_found_everything_cannot_be_compared() -> None:
     assert judged.spread == np.inf
     assert not judged.new_unit.demonstrated
     assert "a unit found every damage or none" in judged.new_unit.why
+    assert (judged.new_unit.pod, judged.new_unit.confidence) == (0.9, 0.95)
+    assert judged.new_unit.method == METHOD
 
 
 def test_without_a_limit_over_boards_there_is_none_of_a_new_unit() -> None:
@@ -68,6 +70,8 @@ def test_without_a_limit_over_boards_there_is_none_of_a_new_unit() -> None:
     judged = over_units(SIZE_MM, hit, TARGET, UNIT, curve, nothing)
     assert judged.new_unit.value == np.inf
     assert judged.new_unit.why == "not demonstrated: a reason"
+    assert (judged.new_unit.pod, judged.new_unit.confidence) == (0.9, 0.95)
+    assert judged.new_unit.method == METHOD
     assert np.isfinite(judged.spread)
 
 

@@ -80,7 +80,8 @@ def test_departures_of_a_plain_study(two: list[SetUpLimit]) -> None:
         "Targets share boards, 8 per board. a90/95 takes them as independent; the bound with "
         "their design effect stands beside it (Rao and Scott 1984). Other calibration boards "
         "would give another threshold; no interval here includes this scatter. The same data "
-        "chose the model: a90/95 is the largest over models whose deviance is at most 2 above the least. "
+        "chose the model: a90/95 is the largest over models whose deviance is at most 2 above the "
+        "least. "
         "2 limits are stated; each interval holds for one limit, not for all jointly."
     )
 

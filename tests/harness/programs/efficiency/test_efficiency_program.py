@@ -37,10 +37,8 @@ def test_detectors_stand_beside_the_ideal_observer(
     assert main([str(results), "--serial"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith(
-        (
-            "The ideal observer judges a new unit of azure_kinect_nfov by the noise of 8 units, "
-            "at 4 false"
-        )
+        "The ideal observer judges a new unit of azure_kinect_nfov by the noise of 8 units, "
+        "at 4 false"
     )
     tables = [pd.read_parquet(results / table.files[1]) for table in EFFICIENCY_TABLES]
     efficiency, damages = tables
