@@ -315,7 +315,8 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
     assert len(list(recording.frames())) == 1
     # the same pixel by pixel
     pixels = np.zeros(STORED.shape, np.dtype([("depth", "<u2"), ("rest", "u1", 3)]))
-    pixels["depth"], pixels["rest"] = STORED, 77
+    pixels["depth"] = STORED
+    pixels["rest"] = 77
     path.write_bytes(pixels.tobytes())
     assert "this layout is wrong" in refusal(path, raw="96x72", lens=plane.LENS, array=":0")
     read = next(open_capture([path], raw="96x72:u2/5", lens=plane.LENS).frames())
