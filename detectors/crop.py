@@ -376,7 +376,8 @@ def _doubts_about_others(candidates: tuple[Candidate, ...], contact_m: float) ->
     large = sum(2 * candidate.share >= first.share for candidate in candidates[1:])
     if large >= CROWD:
         doubts.append(
-            f"{large} other surfaces are half as large as target 1 or larger: the scene may hold no"
+            f"{large} other surfaces are half as large as target 1 or larger: the scene may "
+            "hold no"
             " target"
         )
     in_plane = [

@@ -8,7 +8,15 @@ damage:
     ...     {
     ...         "name": "custom",
     ...         "board": {"width_mm": 160, "height_mm": 100, "thickness_mm": 20},
-    ...         "holes": [{"id": 1, "diameter_mm": 20, "centre_mm": [30, 0], "kind": "blind", "depth_mm": 12}],
+    ...         "holes": [
+    ...             {
+    ...                 "id": 1,
+    ...                 "diameter_mm": 20,
+    ...                 "centre_mm": [30, 0],
+    ...                 "kind": "blind",
+    ...                 "depth_mm": 12,
+    ...             }
+    ...         ],
     ...     }
     ... )
     >>> unit = tofpod.render(board, "azure_kinect_nfov", bounces=0)
@@ -41,7 +49,7 @@ from harness.experiment.load import load_experiment
 from harness.inspection.arguments import DEFAULT_DETECTOR
 from harness.inspection.judging import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
-from harness.report.study_page import draw_overlay
+from harness.report.study_figures import draw_overlay
 from harness.runs.options import EngineOptions
 from harness.target import declared
 from harness.vocabulary.declaration.diagnose import settings_of
@@ -59,9 +67,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Cloud", "Finding", "UserError", "average", "detect", "findings_table", "frames", "limits", "load", "plot",
-    "plot_pod", "render", "sweep", "table", "target",
-]  # fmt: skip
+    "Cloud",
+    "Finding",
+    "UserError",
+    "average",
+    "detect",
+    "findings_table",
+    "frames",
+    "limits",
+    "load",
+    "plot",
+    "plot_pod",
+    "render",
+    "sweep",
+    "table",
+    "target",
+]
 
 
 def target(
@@ -73,7 +94,8 @@ def target(
 
     >>> len(tofpod.target("thesis").damages), len(tofpod.target("thesis", hole_free=True).damages)
     (11, 0)
-    >>> family = {"name": "drawn", "damage": {"kind": "through", "per_board": 3, "diameter_mm": [2, 8]}}
+    >>> damage = {"kind": "through", "per_board": 3, "diameter_mm": [2, 8]}
+    >>> family = {"name": "drawn", "damage": damage}
     >>> len(tofpod.target(family, board=7).damages)
     3
     """

@@ -12,8 +12,10 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `tofpod detect`, which other programs that inspect a capture have too."""
     add = parser.add_argument
     formats = (
-        "folder or list of depth .png, .ply, .pcd, .xyz; folder of .npy, .tiff; one .npy .npz .mat .tiff .pfm .mkv .r3d"
-        " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch a height map"
+        "folder or list of depth .png, .ply, .pcd, .xyz; folder of .npy, .tiff; one .npy "
+        ".npz .mat .tiff .pfm .mkv .r3d"
+        " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch "
+        "a height map"
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
     add(
@@ -23,7 +25,10 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
         help="folder for tables, pictures and clouds (docs/recordings.md)",
     )
     cli.add_reading(add)
-    crop = f"the target: {cli.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
+    crop = (
+        f"the target: {cli.LEGAL_CROP}; auto: the nearest large smooth surface without its rim "
+        "(crop.inset_px)"
+    )
     add("--crop", default="auto", metavar="KIND", help=crop)
     target = (
         "with --crop auto: inspect surface N of the list that a run prints and targets.png shows"
@@ -36,7 +41,10 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     )
     setting = "a setting of the detector by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
-    mesh = "mesh of the undamaged part, registered to the cloud; --set surface.reference.unit=m, .front=-y"
+    mesh = (
+        "mesh of the undamaged part, registered to the cloud; --set surface.reference.unit=m, "
+        ".front=-y"
+    )
     add("--reference", metavar="MESH", help=mesh)
     averages = ("mean", "median", "clipped")
     add(
@@ -46,7 +54,10 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
         help="how frames are averaged (default: mean)",
     )
     add("--max-frames", type=whole_number(10**9), metavar="N", help="use only the first N frames")
-    calls = f"expected number of false calls, by the noise towards the camera (default: {cli.DEFAULT_FALSE_CALLS:g})"
+    calls = (
+        "expected number of false calls, by the noise towards the camera (default: "
+        f"{cli.DEFAULT_FALSE_CALLS:g})"
+    )
     add("--false-calls", type=float, metavar="N", help=calls)
     add(
         "--threshold",
@@ -60,9 +71,12 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add = parser.add_argument_group(
         "several views of one target",
-        "Each PATH is one view. --crop cuts the target out of each view, and the detector judges the merged cloud (or"
-        " --set crop.kind=..). --set mapping.KEY=VALUE changes other settings: mapping.merge.cell_mm=1,"
-        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd use the whole target"
+        "Each PATH is one view. --crop cuts the target out of each view, and the detector "
+        "judges the merged cloud (or"
+        " --set crop.kind=..). --set mapping.KEY=VALUE changes other settings: "
+        "mapping.merge.cell_mm=1,"
+        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and "
+        "cpd use the whole target"
         " instead of the points of the marks).",
     ).add_argument
     add(
@@ -77,16 +91,24 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
         metavar="KIND",
         help=f"merge them by {', '.join(cli.MERGES)} (default: fusion)",
     )
-    marks = "marks: colour (separate coloured strips; default), red (the thesis' rule), coded (ArUco, AprilTag)"
+    marks = (
+        "marks: colour (separate coloured strips; default), red (the thesis' rule), coded "
+        "(ArUco, AprilTag)"
+    )
     add("--marks", choices=cli.MARKS, metavar="KIND", help=marks)
-    poses = "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
+    poses = (
+        "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's "
+        "groundtruth.txt"
+    )
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 
 @program(
     detect_options,
-    "Find damage in a real capture: average its frames, fit the surface, and list what deviates from it."
-    " With --register, each PATH is one view of the same target, and all views are merged into one cloud.",
+    "Find damage in a real capture: average its frames, fit the surface, and list what "
+    "deviates from it."
+    " With --register, each PATH is one view of the same target, and all views are merged "
+    "into one cloud.",
     epilog="examples: tofpod detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
     "; tofpod detect left.mcap right.mcap --register marks --merge fusion --out found/",
 )

@@ -15,11 +15,20 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod, such as averaging",
     )
-    help = "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
+    help = (
+        "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be "
+        "repeated"
+    )
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
-    help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
+    help = (
+        "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit "
+        "is simulated"
+    )
     add("--calibration", type=Path, metavar="FILE", help=help)
-    help = "a first look: at most 5 repeats, a third of a study's boards, no sensitivity; wider intervals"
+    help = (
+        "a first look: at most 5 repeats, a third of a study's boards, no sensitivity; wider "
+        "intervals"
+    )
     add("--quick", action="store_true", help=help)
     add(
         "--out",
@@ -34,7 +43,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Run an experiment: render its targets, simulate the camera, detect and measure damage, and write a report.",
+    (
+        "Run an experiment: render its targets, simulate the camera, detect and measure damage, "
+        "and write a report."
+    ),
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

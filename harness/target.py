@@ -20,7 +20,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "target",
-        help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one",
+        help=(
+            f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one"
+        ),
     )
     add("--out", type=Path, metavar="MESH", help="file for the mesh: .glb (textured) or .ply")
     add("--truth", type=Path, metavar="JSON", help="file for each damage's size, place and axis")

@@ -74,7 +74,8 @@ def unsteadiness(cloud: Cloud) -> str:
     if out <= MOST_LEFT_OUT * frames:
         return ""
     return (
-        f"{out} of {frames} frames differ from the others and are left out: the camera or the scene"
+        f"{out} of {frames} frames differ from the others and are left out: the camera or "
+        "the scene"
         " moved"
     )
 
@@ -324,7 +325,9 @@ class FrameSums:
                 f"{frame.name}: the median of {kept + 1} frames of {frame.z_m.size} pixels needs"
                 f" {needed / 1e6:.0f} MB, more than median_memory_mb = {allowed / 1e6:.0f}",
                 legal=f"up to {kept} frames",
-                fix="use method clipped (constant memory), fewer frames, or raise median_memory_mb",
+                fix=(
+                    "use method clipped (constant memory), fewer frames, or raise median_memory_mb"
+                ),
             )
 
     def cloud(self) -> Cloud:

@@ -253,8 +253,8 @@ def _solved(
     w), by the least sum of squares of noise, pattern and shape, each over its own variance.
 
     The variance follows from beliefs passed between pixels and cells, exact but for loops and for
-    what smooth fits take of the shape: before a wall rough by half of an Azure Kinect's pattern the
-    true deviation is 1.3 times as large."""
+    what smooth fits take of the shape: before a wall rough by half of an Azure Kinect's pattern
+    the true deviation is 1.3 times as large."""
     finite = np.isfinite(residuals)
     pixels = finite[0].size
     pixel = np.flatnonzero(finite) % pixels

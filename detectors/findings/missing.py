@@ -2,10 +2,10 @@
 came back.
 
 Size distinguishes a hole from chance. A cluster that touches the edge of the outline or image is
-not a finding. Chance is simulated: scattered dropouts are pixels where white noise, averaged over a
-square of 1 to 5 pixels, falls below a level. The square gives the share of missing neighbours and
-the level the local rate; both come from clusters that are too small to be findings. Not modelled:
-dropouts in equal blobs wider than 3 pixels."""
+not a finding. Chance is simulated: scattered dropouts are pixels where white noise, averaged over
+a square of 1 to 5 pixels, falls below a level. The square gives the share of missing neighbours
+and the level the local rate; both come from clusters that are too small to be findings. Not
+modelled: dropouts in equal blobs wider than 3 pixels."""
 
 from __future__ import annotations
 

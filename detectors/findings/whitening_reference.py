@@ -12,8 +12,8 @@ def autocovariance(
     down: int,
     across: int,
 ) -> float:
-    """Return the mean product of pairs of quiet pixels at one lag (down, across >= 0), faded out by
-    Parzen's window: 1 - 6 x^2 (1 - x) up to x = 1/2, then 2 (1 - x)^3, of the lag x over the
+    """Return the mean product of pairs of quiet pixels at one lag (down, across >= 0), faded out
+    by Parzen's window: 1 - 6 x^2 (1 - x) up to x = 1/2, then 2 (1 - x)^3, of the lag x over the
     longest one."""
     height, width = noise.shape
     first = np.s_[: height - down, : width - across]

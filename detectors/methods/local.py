@@ -40,7 +40,8 @@ FAINT = 0.02  # weight of the value 0 in every mean
 CLIP_SIGMAS = 6.0
 """Clipping of single pixels in deviations of the local noise, because a flying pixel alone is no
 finding."""
-LEVEL_SIGMAS = 2.0  # the same for the local level and for surroundings, which damage must not shift
+# the same for the local level and for surroundings, which damage must not shift
+LEVEL_SIGMAS = 2.0
 STRONG = 4.0
 """Pixels with such scores are excluded from surroundings and noise; with twice as much, from
 others' wider means."""
@@ -292,9 +293,9 @@ def _scored(
     weights: np.ndarray,
     rounding_m2: tuple[float, float],
 ) -> tuple[np.ndarray, list[int], float]:
-    """Return signed scores (r, c) of a picture of residuals (r, c) with ``weights`` (r, c), 0 where
-    nothing is known; the filters' widths in pixels; and the deviation of the narrowest at a typical
-    point, metres.
+    """Return signed scores (r, c) of a picture of residuals (r, c) with ``weights`` (r, c), 0
+    where nothing is known; the filters' widths in pixels; and the deviation of the narrowest at a
+    typical point, metres.
 
     Filters are applied from the narrowest to the widest. A pixel that is sure in one filter, by a
     share from 0 to 1, is excluded from the wider means of other pixels; a strong pixel is excluded

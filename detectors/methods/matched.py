@@ -449,8 +449,8 @@ class _View:
     """The seen pixels, all or halved to every second one, as templates are compared with them.
 
     ``seen`` (r, c) float32: 1 where seen, a share where halved. ``depth_px`` (r, c): distance from
-    the outline of the seen pixels. ``spectrum``: of C^-1 r on the grid of transforms. ``score`` (r,
-    c) and ``products``: memory for one template's scores and one pair's transform."""
+    the outline of the seen pixels. ``spectrum``: of C^-1 r on the grid of transforms. ``score``
+    (r, c) and ``products``: memory for one template's scores and one pair's transform."""
 
     def __init__(
         self,

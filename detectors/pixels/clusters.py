@@ -12,9 +12,8 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 
 AXIS_BITS = 21  # of a cell's key that hold its number along one axis
-NEAR_CELLS = (
-    2  # a cell's side is distance / sqrt(3): points farther apart than two cells never touch
-)
+# a cell's side is distance / sqrt(3): points farther apart than two cells never touch
+NEAR_CELLS = 2
 MAX_CELLS = 1 << 20  # cells along one axis that a 63-bit key of three axes can hold
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 

@@ -21,7 +21,7 @@ from PIL import ImageFile, JpegImagePlugin, PngImagePlugin
 
 from detectors.recordings.distances import UNITS_M, frame_of
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame
@@ -54,23 +54,19 @@ def refuse_broken_png(name: str, content: bytes) -> None:
     try:
         _header(name, content).verify()
     except (SyntaxError, OSError, ValueError) as error:
-        what = "damaged" if "broken" in str(error) or "checksum" in str(error) else "truncated"
-        what = f"{name}: is {what} ({error}; {len(content)} bytes)"
-        fix = "copy or export it again"
-        raise UserError(what, legal="a whole PNG", fix=fix) from error
+        is_damaged = "broken" in str(error) or "checksum" in str(error)
+        state = "damaged" if is_damaged else "truncated"
+        problem = f"{name}: is {state} ({error}; {len(content)} bytes)"
+        raise UserError(problem, legal="a whole PNG", fix="copy or export it again") from error
 
 
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
     """Read only the header of a picture, as the kind that its first bytes show."""
-    kind = (
-        PngImagePlugin.PngImageFile
-        if content.startswith(PNG_SIGNATURE)
-        else JpegImagePlugin.JpegImageFile
-    )
-    with read_errors(
-        f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated", LEGAL_PICTURE
-    ):
-        return kind(io.BytesIO(content))
+    problem = f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated"
+    with read_errors(problem, LEGAL_PICTURE):
+        if content.startswith(PNG_SIGNATURE):
+            return PngImagePlugin.PngImageFile(io.BytesIO(content))
+        return JpegImagePlugin.JpegImageFile(io.BytesIO(content))
 
 
 COLOUR_FOLDERS = ("color", "colour", "rgb")
@@ -79,6 +75,7 @@ TUM_MATCH_S = 0.02
 """Largest difference of time stamps of depth and colour that belong together (the benchmark's own
 default)."""
 LEGAL_PNG = "16-bit single-channel PNG (uint16, 0 = no depth)"
+PNG_CHANNELS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 NOT_DEPTH = re.compile(
     r"(?i)(^|[/_.-])(ir|infra\w*|conf\w*|amplitude|intensity|reflectivity|mask)([/_.-]|\d|$)"
@@ -87,43 +84,61 @@ NOT_DEPTH = re.compile(
 or floating point."""
 
 
-def open_depth_folder(folder: Path, given: Given) -> Recording:
+def open_depth_folder(folder: Path, options: CaptureOptions) -> Recording:
     """Open a folder of depth PNGs. Raises UserError if it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
-    is_tum = any((place / "depth.txt").is_file() for place in (folder, folder.parent))
-
-    colour_folder = next((root / name for name in COLOUR_FOLDERS if (root / name).is_dir()), None)
-    beside = [
-        path
-        for path in shown(root)
-        if re.search("colou?r|rgb", path.stem.lower()) and path not in depths
-    ]
-    found = beside if colour_folder is None else shown(colour_folder)
-    pictures = [path for path in found if path.suffix.lower() in COLOUR_SUFFIXES]
-    # the colour picture of each depth picture: the same number in its name, or the nearest time
-    # stamp
-    stamps = {number: path for path in pictures if (number := _last_number(path)) is not None}
-    colours: list[Path | None] = []
-    for number in map(_last_number, depths):
-        apart = (
-            {abs(stamp - number): path for stamp, path in stamps.items()}
-            if number is not None
-            else {}
-        )
-        is_near = bool(apart) and min(apart) <= (TUM_MATCH_S if is_tum else 0.0)
-        colours.append(apart[min(apart)] if is_near else None)
+    is_tum = any((parent / "depth.txt").is_file() for parent in (folder, folder.parent))
+    pictures = _colour_pictures(root, depths)
+    colours = _colours_of(depths, pictures, TUM_MATCH_S if is_tum else 0.0)
     note = ""
     if pictures and (None in colours or len(pictures) != len(depths)):
         without = f"{colours.count(None)} depth pictures have no colour"
         note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without}"
-    return open_depth_list(depths, given, folder.name, root, colours, is_tum, note)
+    return open_depth_list(depths, options, folder.name, root, colours, is_tum, note)
+
+
+def _colour_pictures(root: Path, depths: Sequence[Path]) -> list[Path]:
+    """Return a capture's colour pictures: in a folder of their own, or beside the depth."""
+    folders = [root / name for name in COLOUR_FOLDERS if (root / name).is_dir()]
+    if folders:
+        candidates = shown(folders[0])
+    else:
+        candidates = [
+            path
+            for path in shown(root)
+            if re.search("colou?r|rgb", path.stem.lower()) and path not in depths
+        ]
+    return [path for path in candidates if path.suffix.lower() in COLOUR_SUFFIXES]
+
+
+def _colours_of(
+    depths: Sequence[Path], pictures: Sequence[Path], tolerance: float
+) -> list[Path | None]:
+    """Return the colour picture of each depth picture: the same number in its name, or the nearest
+    time stamp within the tolerance."""
+    stamps: dict[float, Path] = {}
+    for path in pictures:
+        stamp = _last_number(path)
+        if stamp is not None:
+            stamps[stamp] = path
+    colours: list[Path | None] = []
+    for depth in depths:
+        number = _last_number(depth)
+        colour = None
+        if number is not None and stamps:
+            differences = {abs(stamp - number): path for stamp, path in stamps.items()}
+            nearest = min(differences)
+            if nearest <= tolerance:
+                colour = differences[nearest]
+        colours.append(colour)
+    return colours
 
 
 def open_depth_list(
     depths: Sequence[Path],
-    given: Given,
+    options: CaptureOptions,
     name: str,
     root: Path | None = None,
     colours: Sequence[Path | None] = (),
@@ -135,27 +150,31 @@ def open_depth_list(
     their lens is not known."""
     root = root or depths[0].parent
     width, height = _depth_size(depths[0])
-    lens, lens_files = lens_for(
-        str(root), given, width, height, beside=(root, depths[0].parent, root.parent)
-    )
+    beside = (root, depths[0].parent, root.parent)
+    lens, lens_files = lens_for(str(root), options, width, height, beside=beside)
     notes = [note]
     first = next((path for path in colours if path), None)
-    if first is not None and (found := _colour(first).shape)[:2] != (height, width):
-        colours = ()
-        notes = [
-            f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"
-        ]
+    if first is not None:
+        rows, columns, _ = _colour(first).shape
+        if (rows, columns) != (height, width):
+            colours = ()
+            notes = [
+                f"colour pictures of {columns} x {rows} pixels are not aligned with the depth "
+                "and are not used"
+            ]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are assumed to be undistorted")
-    scale_m = given.scale_m or UNITS_M["tum" if is_tum else "mm"]
-    is_whole = (
-        scale_m != UNITS_M["tum"]
-    )  # its unit of 0.2 mm is finer than the steps of most cameras
-    files = (*depths, *filter(None, colours), *lens_files)
-    unit_from = "depth.txt, which marks TUM RGB-D" * is_tum
-    more = {"files": files, "lens": lens, "notes": tuple(notes), "unit_from": unit_from}
+    scale_m = options.scale_m or UNITS_M["tum" if is_tum else "mm"]
     recording = Recording.begun(
-        name, partial(_frames, depths, colours, scale_m), scale_m, is_whole, **more
+        name,
+        partial(_frames, depths, colours, scale_m),
+        scale_m,
+        # TUM's unit of 0.2 mm is finer than the steps of most cameras
+        is_whole=scale_m != UNITS_M["tum"],
+        files=(*depths, *filter(None, colours), *lens_files),
+        lens=lens,
+        notes=tuple(notes),
+        unit_from="depth.txt, which marks TUM RGB-D" if is_tum else "",
     )
     return replace(recording, z_step_m=recording.z_step_m or scale_m)
 
@@ -179,23 +198,23 @@ def depth_files(folder: Path) -> tuple[Path, ...]:
     """Return a folder's depth pictures by their numbers, without masks. Raises UserError if there
     is none."""
     pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
-    numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
-    # a 16-bit infrared picture looks like depth
-    chosen = depth_named(
-        pictures, numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)]
-    )
+    candidates = [path for path in pictures if NUMBER.fullmatch(path.stem)]
+    if not candidates:
+        # a 16-bit infrared picture looks like depth
+        candidates = [path for path in pictures if png_kind(path)[2:] == (16, 0)]
+    chosen = depth_named(pictures, candidates)
     if not chosen:
-        raise UserError(
-            f"{folder}: contains no depth picture ({len(pictures)} PNG files)", legal=LEGAL_PNG
-        )
+        problem = f"{folder}: contains no depth picture ({len(pictures)} PNG files)"
+        raise UserError(problem, legal=LEGAL_PNG)
     return chosen
 
 
-def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the files whose names contain "depth", else ``others`` without `NOT_DEPTH`, sorted by
-    number."""
+def depth_named(paths: Sequence[Path], candidates: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the files whose names contain "depth", else ``candidates`` without `NOT_DEPTH`,
+    sorted by number."""
     chosen = [path for path in paths if "depth" in path.stem.lower()]
-    chosen = chosen or [path for path in others if not NOT_DEPTH.search(path.stem)]
+    if not chosen:
+        chosen = [path for path in candidates if not NOT_DEPTH.search(path.stem)]
 
     def natural(path: Path) -> tuple[object, ...]:  # 9 before 10
         parts = re.split(f"({NUMBER.pattern})", path.stem)
@@ -210,9 +229,8 @@ def png_kind(path: Path) -> tuple[int, int, int, int]:
     with read_errors(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
-        raise UserError(
-            f"{path}: is not a PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again"
-        )
+        problem = f"{path}: is not a PNG, or is truncated"
+        raise UserError(problem, legal=LEGAL_PNG, fix="copy or export it again")
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
     refuse_pixels(str(path), width, height)
     return width, height, bits, kind
@@ -230,14 +248,9 @@ def read_depth_png(path: Path) -> np.ndarray:
 def _depth_size(path: Path) -> tuple[int, int]:
     width, height, bits, kind = png_kind(path)
     if (bits, kind) != (16, 0):
-        channels = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}.get(
-            kind, f"type {kind}"
-        )
-        what = (
-            f"{path}: {bits} bits per channel, {channels}: a picture or a mask, not a depth image"
-        )
+        channels = PNG_CHANNELS.get(kind, f"type {kind}")
         raise UserError(
-            what,
+            f"{path}: {bits} bits per channel, {channels}: a picture or a mask, not a depth image",
             legal=LEGAL_PNG,
             fix="export the depth itself; a preview scaled to 0..255 has lost it",
         )

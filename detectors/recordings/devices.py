@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ from detectors.recordings.intrinsics import (
     lens_for,
     parse_calibration,
 )
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import (
     FRAME_PIXELS,
@@ -47,55 +47,64 @@ SEGMENT_ID = bytes.fromhex("18538067")
 WAITING = 4
 
 
-def open_mkv(path: Path, given: Given) -> Recording:
+def open_mkv(path: Path, options: CaptureOptions) -> Recording:
     """Open a recording with its own calibration, or with the given lens. Raises UserError if it
     has no depth."""
     _refuse_truncated(path)
     with _opened(path) as container:
         tracks = _tracks(container)
         if "DEPTH" not in tracks:
-            found = ", ".join(sorted(tracks)) or "none"
-            raise UserError(f"{path}: has no DEPTH track (its tracks: {found})", legal=LEGAL_MKV)
-        sizes = {
-            title: (t.codec_context.width, t.codec_context.height) for title, t in tracks.items()
-        }
-        for title in sizes:
-            refuse_pixels(f"{path}: its track {title}", *sizes[title])
-        width, height = sizes["DEPTH"]
+            titles = ", ".join(sorted(tracks)) or "none"
+            raise UserError(f"{path}: has no DEPTH track (its tracks: {titles})", legal=LEGAL_MKV)
+        sizes = {}
+        for title, track in tracks.items():
+            size = (track.codec_context.width, track.codec_context.height)
+            refuse_pixels(f"{path}: its track {title}", size[0], size[1])
+            sizes[title] = size
         # recorders of other makers (Orbbec's Femto) may omit the tag; each mode has its own size
-        stated = tracks["DEPTH"].metadata.get("K4A_DEPTH_MODE") or container.metadata.get(
-            "K4A_DEPTH_MODE"
-        )
-        attached = [
-            s
-            for s in container.streams
-            if s.type == "attachment" and "calib" in (s.name or "").lower()
-        ]
-        calibration = bytes(attached[0].data) if attached else None
-    cameras = (
-        None
-        if calibration is None
-        else parse_calibration(f"{path} (calibration.json)", calibration)
-    )
+        tag = "K4A_DEPTH_MODE"
+        stated = tracks["DEPTH"].metadata.get(tag) or container.metadata.get(tag)
+        calibration = _calibration(container)
+    width, height = sizes["DEPTH"]
+    cameras = None
+    if calibration is not None:
+        cameras = parse_calibration(f"{path} (calibration.json)", calibration)
 
-    def own() -> Lens | None:
+    def capture_lens() -> Lens | None:
         mode = stated or depth_mode_of_size(width, height) or "(not stated)"
         return None if cameras is None else depth_lens(str(path), cameras, mode)
 
-    lens, lens_files = lens_for(str(path), given, width, height, own)
-    colour = (
-        colour_camera(str(path), cameras, *sizes["COLOR"])
-        if cameras is not None and "COLOR" in sizes
-        else None
-    )
-    note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
-    scale_m = given.scale_m or UNITS_M["mm"]
-    read = partial(_frames, path, scale_m, lens, colour)
-    notes = () if colour is None else (note,)
-    more = {"files": (path, *lens_files), "lens": lens, "notes": notes}
+    lens, lens_files = lens_for(str(path), options, width, height, capture_lens)
+    colour = None
+    if cameras is not None and "COLOR" in sizes:
+        colour_width, colour_height = sizes["COLOR"]
+        colour = colour_camera(str(path), cameras, colour_width, colour_height)
+    notes: tuple[str, ...] = ()
+    if colour is not None:
+        note = (
+            "colour sampled at each depth point's place in the colour picture, "
+            "without a test for occlusion"
+        )
+        notes = (note,)
+    scale_m = options.scale_m or UNITS_M["mm"]
     return Recording.begun(
-        path.name, read, scale_m, True, unit_from="k4arecorder, which writes millimetres", **more
+        path.name,
+        partial(_frames, path, scale_m, lens, colour),
+        scale_m,
+        is_whole=True,
+        unit_from="k4arecorder, which writes millimetres",
+        files=(path, *lens_files),
+        lens=lens,
+        notes=notes,
     )
+
+
+def _calibration(container: Any) -> bytes | None:
+    """Return the attached factory calibration."""
+    for stream in container.streams:
+        if stream.type == "attachment" and "calib" in (stream.name or "").lower():
+            return bytes(stream.data)
+    return None
 
 
 def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
@@ -103,15 +112,13 @@ def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None)
     decoded."""
     slopes = lens.region_slopes(lens.whole)
     for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
+        name = f"{path.name} frame {number}"
         infrared = pictures.get("IR")
         amplitude = infrared.astype(np.float32) if infrared is not None else None
-        frame = frame_of(
-            f"{path.name} frame {number}", pictures["DEPTH"], scale_m, amplitude=amplitude
-        )
+        frame = frame_of(name, pictures["DEPTH"], scale_m, amplitude=amplitude)
         if colour is not None and "COLOR" in pictures:
-            frame = replace(
-                frame, rgb=colour_on_depth(frame.z_m, slopes, colour, pictures["COLOR"])
-            )
+            rgb = colour_on_depth(frame.z_m, slopes, colour, pictures["COLOR"])
+            frame = replace(frame, rgb=rgb)
         yield frame
 
 
@@ -121,26 +128,22 @@ def colour_on_depth(
     """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour
     is missing. Not modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect).
     """
-    points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1) * z_m[..., None]
-    points_colour = transform_points(colour.T_colour_depth, points)
-    seen = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
-    at = np.full((*z_m.shape, 2), -1e3, np.float32)
-    at[seen] = colour.lens.project(points_colour[seen])
+    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    points_colour = transform_points(colour.T_colour_depth, rays * z_m[..., None])
+    lens = colour.lens
+    is_visible = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
+    colour_px = np.full((*z_m.shape, 2), -1e3, np.float32)
+    colour_px[is_visible] = lens.project(points_colour[is_visible])
     # Beyond the frame the rational distortion may fold back into it; true rays there are steeper
     # than the corner's.
-    corner = np.abs(
-        colour.lens.slopes(
-            np.array([0, colour.lens.width - 1]), np.array([0, colour.lens.height - 1])
-        )
-    )
-    steep = np.abs(
-        points_colour[..., :2] / np.where(seen, points_colour[..., 2], 1.0)[..., None]
-    ) > 1.2 * corner.max(0)
-    at[steep.any(axis=-1)] = -1e3
+    corner = np.abs(lens.slopes(np.array([0, lens.width - 1]), np.array([0, lens.height - 1])))
+    depths = np.where(is_visible, points_colour[..., 2], 1.0)[..., None]
+    is_steep = np.abs(points_colour[..., :2] / depths) > 1.2 * corner.max(0)
+    colour_px[is_steep.any(axis=-1)] = -1e3
     return cv2.remap(
         picture,
-        at[..., 0],
-        at[..., 1],
+        colour_px[..., 0],
+        colour_px[..., 1],
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
@@ -158,9 +161,12 @@ def _opened(path: Path) -> Any:
 
 
 def _tracks(container: Any) -> dict[str, Any]:
-    return {
-        s.metadata["title"]: s for s in container.streams.video if s.metadata.get("title") in TITLES
-    }
+    """Return the recorder's video tracks by title."""
+    tracks = {}
+    for stream in container.streams.video:
+        if stream.metadata.get("title") in TITLES:
+            tracks[stream.metadata["title"]] = stream
+    return tracks
 
 
 def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
@@ -168,31 +174,30 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
     time."""
     waiting: list[tuple[float, dict[str, np.ndarray]]] = []
     for title, time_s, period_s, picture in _pictures(path, with_colour):
-        home = next(
-            (
-                held
-                for at_s, held in waiting
-                if abs(at_s - time_s) < period_s / 2 and title not in held
-            ),
-            None,
-        )
-        if home is None:
-            home = {}
-            waiting = sorted([*waiting, (time_s, home)], key=lambda capture: capture[0])
-        home[title] = picture
-        if len(waiting) > WAITING and "DEPTH" in (ready := waiting.pop(0)[1]):
-            yield ready
-    yield from (held for _, held in waiting if "DEPTH" in held)
+        for capture_s, capture in waiting:
+            if abs(capture_s - time_s) < period_s / 2 and title not in capture:
+                capture[title] = picture
+                break
+        else:
+            waiting.append((time_s, {title: picture}))
+            waiting.sort(key=lambda capture: capture[0])
+        if len(waiting) > WAITING:
+            _, oldest = waiting.pop(0)
+            if "DEPTH" in oldest:
+                yield oldest
+    for _, capture in waiting:
+        if "DEPTH" in capture:
+            yield capture
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
     """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError
     if it is broken."""
     with _opened(path) as container:
-        tracks = {
-            title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"
-        }
-        title_of = {s.index: title for title, s in tracks.items()}
+        tracks = _tracks(container)
+        if not with_colour:
+            tracks.pop("COLOR", None)
+        title_of = {track.index: title for title, track in tracks.items()}
         period_s = 1.0 / float(tracks["DEPTH"].average_rate or 30)
         for track in tracks.values():
             # A picture may state another size than its track.
@@ -201,21 +206,16 @@ def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float
             delay_s = int(container.metadata.get("K4A_DEPTH_DELAY_NS", 0)) * 1e-9
             for packet in container.demux(*tracks.values()):
                 title = title_of[packet.stream.index]
+                # The depth camera may be set to expose after the colour camera; both belong to one
+                # capture.
+                shift_s = 0.0 if title == "COLOR" else delay_s
+                form = "rgb24" if title == "COLOR" else "gray16le"
                 for picture in packet.decode():
-                    form = "rgb24" if title == "COLOR" else "gray16le"
-                    # The depth camera may be set to expose after the colour camera; both belong to
-                    # one capture.
-                    shift_s = 0.0 if title == "COLOR" else delay_s
-                    yield (
-                        title,
-                        float(picture.time or 0.0) - shift_s,
-                        period_s,
-                        picture.to_ndarray(format=form),
-                    )
+                    time_s = float(picture.time or 0.0) - shift_s
+                    yield title, time_s, period_s, picture.to_ndarray(format=form)
         except (OSError, ValueError) as error:
-            raise UserError(
-                f"{path}: cannot be decoded ({error})", legal=LEGAL_MKV, fix="record it again"
-            ) from error
+            problem = f"{path}: cannot be decoded ({error})"
+            raise UserError(problem, legal=LEGAL_MKV, fix="record it again") from error
 
 
 def _refuse_truncated(path: Path) -> None:
@@ -223,21 +223,21 @@ def _refuse_truncated(path: Path) -> None:
     variable-length size)."""
     with path.open("rb") as file:
         head = file.read(4096)
-    at = head.find(SEGMENT_ID) + len(SEGMENT_ID)
-    if at < len(SEGMENT_ID) or at >= len(head) or head[at] == 0:
-        raise UserError(
-            f"{path}: is truncated, or is not Matroska",
-            legal=LEGAL_MKV,
-            fix="copy or record it again",
-        )
-    length = 9 - head[at].bit_length()
-    bits = 7 * length
-    size = int.from_bytes(head[at : at + length], "big") & ((1 << bits) - 1)
-    expected = at + length + size
-    found = path.stat().st_size
-    if size != (1 << bits) - 1 and found < expected:
-        what = f"{path}: is truncated: {found} of {expected} bytes"
-        raise UserError(what, legal="a whole recording", fix="copy or record it again")
+    fix = "copy or record it again"
+    start = head.find(SEGMENT_ID) + len(SEGMENT_ID)
+    if start < len(SEGMENT_ID) or start >= len(head) or head[start] == 0:
+        problem = f"{path}: is truncated, or is not Matroska"
+        raise UserError(problem, legal=LEGAL_MKV, fix=fix)
+    length = 9 - head[start].bit_length()
+    end = start + length
+    # all ones mean that the size is unknown
+    unknown = (1 << 7 * length) - 1
+    size = int.from_bytes(head[start:end], "big") & unknown
+    expected = end + size
+    file_bytes = path.stat().st_size
+    if size != unknown and file_bytes < expected:
+        problem = f"{path}: is truncated: {file_bytes} of {expected} bytes"
+        raise UserError(problem, legal="a whole recording", fix=fix)
 
 
 LEGAL_STRAY = (
@@ -250,89 +250,120 @@ depth."""
 BLUR_PX = 0.5  # motion by this much of a pixel blurs an edge more than the sensor does
 
 
+class _Phone(NamedTuple):
+    """A phone's capture, as one of the two programs writes it."""
+
+    # its folder or archive
+    path: Path
+    # width and height of the depth, pixels
+    size: tuple[int, int]
+    # metres in one stored number
+    scale_m: float
+    # all files that are read
+    files: tuple[Path, ...]
+    # the program and its unit
+    writer: str
+    # the camera's positions (n, 3), metres
+    positions_m: np.ndarray
+    # its turns as quaternions (n, 4)
+    turns: np.ndarray
+    # the file that states them
+    poses_from: str
+
+
 def _recording(
-    path: Path,
-    given: Given,
+    phone: _Phone,
+    options: CaptureOptions,
     read: Callable[[], Iterator[Frame]],
-    size: tuple[int, int],
     scaled_lens: Callable[[], Lens],
-    files: tuple[Path, ...],
-    poses: tuple[np.ndarray, np.ndarray, str],
-    scale_m: float,
-    writer: str,
 ) -> Recording:
-    """Return the recording of either program. ``size``: width, height. ``poses``: places,
-    quaternions, their source."""
-    lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
-    notes = (
-        ()
-        if lens_files or given.lens
-        else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
-    )
+    """Return the recording of either program."""
+    width, height = phone.size
+    lens, lens_files = lens_for(str(phone.path), options, width, height, scaled_lens)
+    notes: tuple[str, ...] = ()
+    if not lens_files and not options.lens:
+        notes = (f"lens scaled from the colour pixels to {width} x {height}",)
     first_m = next(read()).z_m
-    median_m = (
-        float(np.median(first_m[np.isfinite(first_m)])) if np.isfinite(first_m).any() else 1.0
+    valid_m = first_m[np.isfinite(first_m)]
+    median_m = float(np.median(valid_m)) if valid_m.size else 1.0
+    return Recording.begun(
+        phone.path.name,
+        read,
+        phone.scale_m,
+        is_whole="milli" in phone.writer,
+        unit_from=phone.writer,
+        files=(*phone.files, *lens_files),
+        lens=lens,
+        notes=notes,
+        warnings=_motion_warnings(phone, options.frames, lens, median_m),
     )
-    warnings = _motion_warnings(*poses, given.frames, lens, median_m)
-    more = {"files": (*files, *lens_files), "lens": lens, "notes": notes, "warnings": warnings}
-    return Recording.begun(path.name, read, scale_m, "milli" in writer, unit_from=writer, **more)
 
 
 def _frame(name: str, stored: np.ndarray, confidence: np.ndarray | None, scale_m: float) -> Frame:
+    """Return a frame without the pixels of no confidence."""
     if confidence is not None:
         if confidence.shape != stored.shape:
-            raise UserError(
-                f"{name}: its confidence has {confidence.shape} pixels, the depth {stored.shape}"
-            )
+            sizes = f"{confidence.shape} pixels, the depth {stored.shape}"
+            raise UserError(f"{name}: its confidence has {sizes}")
         stored = np.where(confidence > 0, stored, stored.dtype.type(0))
     return frame_of(name, stored, scale_m)
 
 
 def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, int]) -> Lens:
     """Scale the lens of a colour picture to the depth picture of the same view."""
-    across = size[0] / max(colour[0], 1)
-    down = size[1] / max(colour[1], 1)
+    width, height = size
+    colour_width, colour_height = colour
+    across = width / max(colour_width, 1)
+    down = height / max(colour_height, 1)
     fx = float(k[0, 0])
     fy = float(k[1, 1])
     cx = float(k[0, 2])
     cy = float(k[1, 2])
-    good = (
-        np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
-    )
-    if not good or not (0 < cx < colour[0] and 0 < cy < colour[1] and fy > 0):
-        what = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is not a lens of {size} pixels"
+    is_same_view = abs(across / down - 1) < 0.02
+    is_focal = np.isfinite(k).all() and 0.1 < across * fx / width < 100 and fy > 0
+    is_inside = 0 < cx < colour_width and 0 < cy < colour_height
+    if not (is_same_view and is_focal and is_inside):
         raise UserError(
-            f"{name}: {what}", fix="pass --intrinsics FILE with the lens of the depth pictures"
+            f"{name}: fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour_width} x {colour_height} pixels "
+            f"is not a lens of {size} pixels",
+            fix="pass --intrinsics FILE with the lens of the depth pictures",
         )
-    # positions count from the first pixel's centre
-    return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
+    return Lens(
+        width=width,
+        height=height,
+        fx=fx * across,
+        fy=fy * down,
+        # positions count from the first pixel's centre
+        cx=(cx + 0.5) * across - 0.5,
+        cy=(cy + 0.5) * down - 0.5,
+    )
 
 
 def _motion_warnings(
-    places_m: np.ndarray,
-    turns: np.ndarray,
-    source: str,
-    frames: slice | None,
-    lens: Lens,
-    median_m: float,
+    phone: _Phone, frames: slice | None, lens: Lens, median_m: float
 ) -> tuple[str, ...]:
-    """Warn if the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the
-    target."""
+    """Warn if the poses of the selected frames differ by more than `BLUR_PX` on the target."""
     chosen = frames or slice(None)
-    places_m = places_m[chosen]
-    turns = turns[chosen]
-    if len(places_m) < 2 or not np.isfinite([*places_m.ravel(), *turns.ravel()]).all():
+    positions_m = phone.positions_m[chosen]
+    turns = phone.turns[chosen]
+    if len(positions_m) < 2:
         return ()
-    moved_m = float(np.linalg.norm(places_m - places_m[0], axis=1).max())
+    if not np.isfinite(positions_m).all() or not np.isfinite(turns).all():
+        return ()
+    moved_m = float(np.linalg.norm(positions_m - positions_m[0], axis=1).max())
     unit = turns / np.maximum(np.linalg.norm(turns, axis=1, keepdims=True), 1e-12)
-    turned = float(2 * np.arccos(np.clip(np.abs(unit @ unit[0]), 0, 1)).max())
+    cosines = np.clip(np.abs(unit @ unit[0]), 0, 1)
+    turned = float(2 * np.arccos(cosines).max())
     blur_px = lens.fx * (turned + moved_m / median_m)
     if blur_px <= BLUR_PX:
         return ()
-    moved = f"the camera moved by {1e3 * moved_m:.3g} mm and {np.degrees(turned):.2g} degrees"
-    blur = f"up to {blur_px:.2g} pixels on the target, so their average is blurred"
-    during = f"during the {len(places_m)} frames ({source})"
-    return (f"{moved} {during}, {blur}: --max-frames 1 takes the first frame alone",)
+    warning = (
+        f"the camera moved by {1e3 * moved_m:.3g} mm and {np.degrees(turned):.2g} degrees "
+        f"during the {len(positions_m)} frames ({phone.poses_from}), "
+        f"up to {blur_px:.2g} pixels on the target, so their average is blurred: "
+        "--max-frames 1 takes the first frame alone"
+    )
+    return (warning,)
 
 
 def is_stray(folder: Path) -> bool:
@@ -340,97 +371,110 @@ def is_stray(folder: Path) -> bool:
     return (folder / "camera_matrix.csv").is_file() and (folder / "depth").is_dir()
 
 
-def open_stray(folder: Path, given: Given) -> Recording:
+def open_stray(folder: Path, options: CaptureOptions) -> Recording:
     """Open Stray Scanner's folder. Raises UserError if a file is broken or the lens's resolution
     is unknown."""
     depths = depth_files(folder / "depth")
     height, width = read_depth_png(depths[0]).shape
-    beside = [folder / "confidence" / path.name for path in depths]
-    confidences = tuple(path if path.is_file() else None for path in beside)
-    scale_m = given.scale_m or UNITS_M["mm"]
+    confidences = [folder / "confidence" / path.name for path in depths]
+    scale_m = options.scale_m or UNITS_M["mm"]
     matrix = folder / "camera_matrix.csv"
     odometry = folder / "odometry.csv"
 
-    def scaled_lens() -> Lens:
-        k = _table(matrix)
-        if k.shape != (3, 3):
-            raise UserError(
-                f"{matrix}: holds no 3 x 3 matrix", legal=LEGAL_STRAY, fix="pass --intrinsics FILE"
-            )
-        across = next((w for w in COLOUR_WIDTHS if abs(2 * k[0, 2] - w) < 0.05 * w), None)
-        if across is None:
-            what = f"cx = {k[0, 2]:g} is not the centre of any ARKit picture"
-            raise UserError(f"{matrix}: {what}", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
-        return _scaled(str(matrix), k, (across, across * 3 // 4), (width, height))
+    def read() -> Iterator[Frame]:
+        for depth, path in zip(depths, confidences, strict=True):
+            confidence = read_picture(path, cv2.IMREAD_UNCHANGED) if path.is_file() else None
+            name = f"{depth.parent.name}/{depth.name}"
+            yield _frame(name, read_depth_png(depth), confidence, scale_m)
 
     # x y z, then the quaternion
     poses = _table(odometry)[:, 2:9] if odometry.is_file() else np.zeros((0, 7))
-    files = (path for path in (*depths, *confidences, matrix, odometry) if path and path.is_file())
-
-    def read() -> Iterator[Frame]:
-        for depth, confidence in zip(depths, confidences, strict=True):
-            sure = read_picture(confidence, cv2.IMREAD_UNCHANGED) if confidence else None
-            yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
-
-    motion = (poses[:, :3], poses[:, 3:], odometry.name)
-    writer = "Stray Scanner, which writes millimetres"
-    return _recording(
-        folder, given, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer
+    files = (*depths, *confidences, matrix, odometry)
+    phone = _Phone(
+        path=folder,
+        size=(width, height),
+        scale_m=scale_m,
+        files=tuple(path for path in files if path.is_file()),
+        writer="Stray Scanner, which writes millimetres",
+        positions_m=poses[:, :3],
+        turns=poses[:, 3:],
+        poses_from=odometry.name,
     )
+    return _recording(phone, options, read, partial(_stray_lens, matrix, phone.size))
+
+
+def _stray_lens(path: Path, size: tuple[int, int]) -> Lens:
+    """Return the lens of Stray Scanner's matrix for depth of this size. Raises UserError if the
+    colour picture's size is unknown."""
+    k = _table(path)
+    fix = "pass --intrinsics FILE"
+    if k.shape != (3, 3):
+        raise UserError(f"{path}: holds no 3 x 3 matrix", legal=LEGAL_STRAY, fix=fix)
+    for width in COLOUR_WIDTHS:
+        if abs(2 * k[0, 2] - width) < 0.05 * width:
+            return _scaled(str(path), k, (width, width * 3 // 4), size)
+    problem = f"{path}: cx = {k[0, 2]:g} is not the centre of any ARKit picture"
+    raise UserError(problem, legal=LEGAL_STRAY, fix=fix)
 
 
 def _table(path: Path) -> np.ndarray:
     """Return the numbers of a small CSV, (rows, columns), without its line of names."""
     with read_errors(f"{path}: cannot be read as a table of numbers", LEGAL_STRAY):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
-        lines = (line.strip(" ,\r") for line in text.splitlines() if re.match(r"\s*[-+.\d]", line))
-        table = np.array(
-            [[float(cell) for cell in re.split(r"[,;\s]+", line) if cell] for line in lines], float
-        )
+        rows = []
+        for line in text.splitlines():
+            if re.match(r"\s*[-+.\d]", line):
+                cells = re.split(r"[,;\s]+", line.strip(" ,\r"))
+                rows.append([float(cell) for cell in cells if cell])
+        table = np.array(rows, float)
         if table.ndim != 2 or (path.stem == "odometry" and table.shape[1] < 9):
             raise ValueError("its lines differ in length or are too short")
     return table
 
 
-def open_r3d(path: Path, given: Given) -> Recording:
+def open_r3d(path: Path, options: CaptureOptions) -> Recording:
     """Open Record3D's .r3d. Raises UserError if it is broken, or if pyliblzfse, which unpacks its
     depth, is missing."""
     with _archive(path) as archive:
-        if "metadata" not in archive.namelist() or not _depth_names(archive):
-            held = ", ".join(archive.namelist()[:6]) or "nothing"
-            raise UserError(f"{path}: contains no Record3D capture ({held[:200]})", legal=LEGAL_R3D)
+        names = archive.namelist()
+        if "metadata" not in names or not _depth_names(archive):
+            contents = ", ".join(names[:6]) or "nothing"
+            problem = f"{path}: contains no Record3D capture ({contents[:200]})"
+            raise UserError(problem, legal=LEGAL_R3D)
         content = _content(path, archive, "metadata")
     with read_errors(f"{path}: its metadata cannot be read", LEGAL_R3D):
         info = strict_json(content)
         k = np.array([float(x) for x in info["K"]]).reshape(3, 3).T
-        width = int(info.get("dw", 192))
-        height = int(info.get("dh", 256))
-        colour = int(info["w"]), int(info["h"])
+        size = (int(info.get("dw", 192)), int(info.get("dh", 256)))
+        colour_size = (int(info["w"]), int(info["h"]))
+        # the quaternion, then x y z
         poses = np.array(info.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
-    refuse_pixels(str(path), width, height)
-    scale_m = given.scale_m or UNITS_M["m"]
-    scaled_lens = partial(_scaled, f"{path}: metadata", k, colour, (width, height))
+    refuse_pixels(str(path), size[0], size[1])
+    scale_m = options.scale_m or UNITS_M["m"]
 
     def read() -> Iterator[Frame]:
         with _archive(path) as archive:
+            names = archive.namelist()
             for name in _depth_names(archive):
-                beside = f"{name.removesuffix('.depth')}.conf"
-                sure = (
-                    _plane(path, archive, beside, "u1", (width, height))
-                    if beside in archive.namelist()
-                    else None
-                )
-                yield _frame(
-                    f"{path.name} {name}",
-                    _plane(path, archive, name, "<f4", (width, height)),
-                    sure,
-                    scale_m,
-                )
+                confidence_name = f"{name.removesuffix('.depth')}.conf"
+                confidence = None
+                if confidence_name in names:
+                    confidence = _plane(path, archive, confidence_name, "u1", size)
+                depth = _plane(path, archive, name, "<f4", size)
+                yield _frame(f"{path.name} {name}", depth, confidence, scale_m)
 
-    motion = (poses[:, 4:], poses[:, :4], "its metadata")
-    writer = "Record3D, which writes metres"
+    phone = _Phone(
+        path=path,
+        size=size,
+        scale_m=scale_m,
+        files=(path,),
+        writer="Record3D, which writes metres",
+        positions_m=poses[:, 4:],
+        turns=poses[:, :4],
+        poses_from="its metadata",
+    )
     return _recording(
-        path, given, read, (width, height), scaled_lens, (path,), motion, scale_m, writer
+        phone, options, read, partial(_scaled, f"{path}: metadata", k, colour_size, size)
     )
 
 
@@ -440,8 +484,12 @@ def _archive(path: Path) -> zipfile.ZipFile:
 
 
 def _depth_names(archive: zipfile.ZipFile) -> list[str]:
-    found = [name for name in archive.namelist() if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name)]
-    return sorted(found, key=lambda name: int(Path(name).stem))
+    """Return the names of an archive's depth pictures by their numbers."""
+    names = []
+    for name in archive.namelist():
+        if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name):
+            names.append(name)
+    return sorted(names, key=lambda name: int(Path(name).stem))
 
 
 def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
@@ -460,7 +508,10 @@ def _plane(
     try:
         import liblzfse  # type: ignore[import-not-found]
     except ImportError as error:
-        what = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
-        raise UserError(what, fix="pip install pyliblzfse, or export the capture as PLY") from error
+        raise UserError(
+            f"{path}: {name}: is compressed by LZFSE, "
+            "and the package that unpacks it is not installed",
+            fix="pip install pyliblzfse, or export the capture as PLY",
+        ) from error
     with read_errors(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
         return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detectors.recordings.recording import Given, read_errors
+from detectors.recordings.recording import CaptureOptions, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, strict_json
@@ -30,10 +30,10 @@ OWN_LENS = "record again, or give a lens with --intrinsics FILE"
 
 
 class ColourCamera(NamedTuple):
-    """The colour camera beside the depth camera: ``T_colour_depth`` maps points (metres) from
-    depth to colour."""
+    """The colour camera beside the depth camera."""
 
     lens: Lens
+    # maps points (metres) from the depth camera's frame to its own (4, 4)
     T_colour_depth: np.ndarray
 
 
@@ -54,9 +54,8 @@ def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
     """Return the lens of a depth mode such as ``NFOV_UNBINNED``. Raises UserError for another mode
     or a bad file."""
     if mode not in DEPTH_MODES:
-        raise UserError(
-            f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES)
-        )
+        legal = ", ".join(DEPTH_MODES)
+        raise UserError(f"{name}: depth mode {mode} has no depth image", legal=legal)
     camera, numbers = _camera(name, cameras, "Depth")
     if (camera["SensorWidth"], camera["SensorHeight"]) != (1024, 1024):
         raise UserError(
@@ -67,9 +66,10 @@ def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
 
 def depth_mode_of_size(width: int, height: int) -> str | None:
     """Return the depth mode whose image has this size, None if there is none."""
-    return next(
-        (name for name, (_, _, image) in DEPTH_MODES.items() if image == (width, height)), None
-    )
+    for name, (_, _, image) in DEPTH_MODES.items():
+        if image == (width, height):
+            return name
+    return None
 
 
 def colour_camera(
@@ -87,11 +87,8 @@ def colour_camera(
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
         parameters[3] = parameters[3] * 2304 / 3072
     T_colour_depth = np.eye(4)
-    with read_errors(
-        f"{name}: the colour camera's place cannot be read",
-        "Rt with Rotation and Translation",
-        OWN_LENS,
-    ):
+    problem = f"{name}: the colour camera's place cannot be read"
+    with read_errors(problem, "Rt with Rotation and Translation", OWN_LENS):
         T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
         T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
     mode = ((width, rows), (0, (rows - height) // 2), (width, height))
@@ -101,64 +98,79 @@ def colour_camera(
 def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str, Any], list[float]]:
     """Return a camera and its 14 numbers cx, cy, fx, fy, k1..k6, codx, cody, p2, p1."""
     if purpose not in cameras:
-        raise UserError(
-            f"{name}: the calibration has no camera for {purpose}",
-            legal="cameras Depth and PhotoVideo",
-        )
+        problem = f"{name}: the calibration has no camera for {purpose}"
+        raise UserError(problem, legal="cameras Depth and PhotoVideo")
     camera: dict[str, Any] = cameras[purpose]
     legal = f"SensorWidth and SensorHeight, {MODEL} with 14 finite parameters"
     with read_errors(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
         is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
         model = camera["Intrinsics"]["ModelType"]
         numbers = [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
-    known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
-    if not known or numbers[10] or numbers[11]:
-        what = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
-        raise UserError(f"{name}: {what}", legal=legal, fix=OWN_LENS)
+    is_known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
+    if not is_known or numbers[10] or numbers[11]:
+        problem = (
+            f"{name}: lens model {model} with {len(numbers)} parameters, "
+            "or with a centre of distortion, is not known"
+        )
+        raise UserError(problem, legal=legal, fix=OWN_LENS)
     return camera, numbers
 
 
 def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:
+    """Return the lens of a readout from parameters that are shares of the sensor's sides."""
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters
     if not (fx > 0 and fy > 0):
         raise UserError(f"{name}: the focal length is {fx:g}, {fy:g}", legal="above 0")
-    (across, down), (left, top), image = mode
-    centre = cx * across - left - 0.5, cy * down - top - 0.5
-    return Lens(*image, fx * across, fy * down, *centre, (k1, k2, p1, p2, k3, k4, k5, k6))
+    (across, down), (left_px, top_px), (width, height) = mode
+    return Lens(
+        width=width,
+        height=height,
+        fx=fx * across,
+        fy=fy * down,
+        cx=cx * across - left_px - 0.5,
+        cy=cy * down - top_px - 0.5,
+        distortion=(k1, k2, p1, p2, k3, k4, k5, k6),
+    )
 
 
 LEGAL_LENS = (
-    "JSON or YAML with fx, fy, cx, cy (RealSense: ppx, ppy) in pixels [distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's "
-    "intrinsic.json; OpenCV's or ROS' camera_info YAML; BOP's scene_camera.json; a matrix of 3 x 3 or 4 x 4 numbers; "
-    "an Azure Kinect's calibration.json"
+    "JSON or YAML with fx, fy, cx, cy (RealSense: ppx, ppy) in pixels "
+    "[distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
+    "OpenCV's or ROS' camera_info YAML; BOP's scene_camera.json; "
+    "a matrix of 3 x 3 or 4 x 4 numbers; an Azure Kinect's calibration.json"
 )
 FOUND_BESIDE = (
-    *(
-        "intrinsic",
-        "intrinsics",
-        "camera_intrinsic",
-        "camera_intrinsics",
-        "camera",
-        "camera_info",
-        "calibration",
-    ),
-    *("rtabmap_calib", "scene_camera", "depth_intrinsics", "intrinsic_depth", "transforms"),
-)  # stems of the files that count as the lens of the frames beside or below them
+    "intrinsic",
+    "intrinsics",
+    "camera_intrinsic",
+    "camera_intrinsics",
+    "camera",
+    "camera_info",
+    "calibration",
+    "rtabmap_calib",
+    "scene_camera",
+    "depth_intrinsics",
+    "intrinsic_depth",
+    "transforms",
+)
+"""Stems of the files that count as the lens of the frames beside or below them."""
 BARE_MATRICES = (
-    *(
-        "intrinsics.txt",
-        "intrinsic.txt",
-        "camera-intrinsics.txt",
-        "intrinsic_depth.txt",
-        "K.txt",
-        "cam_K.txt",
-    ),
-    *("camera_intrinsics.txt", "camera_intrinsic.txt", "depth_intrinsics.txt"),
+    "intrinsics.txt",
+    "intrinsic.txt",
+    "camera-intrinsics.txt",
+    "intrinsic_depth.txt",
+    "K.txt",
+    "cam_K.txt",
+    "camera_intrinsics.txt",
+    "camera_intrinsic.txt",
+    "depth_intrinsics.txt",
 )
 """The same for text files: other text beside frames is mostly something different."""
 SPELLINGS = {
-    **{"fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y")},
-    **{"cx": ("cx", "ppx", "c_x"), "cy": ("cy", "ppy", "c_y")},
+    "fx": ("fx", "fl_x", "focal_x"),
+    "fy": ("fy", "fl_y", "focal_y"),
+    "cx": ("cx", "ppx", "c_x"),
+    "cy": ("cy", "ppy", "c_y"),
 }
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 SIZES = (
@@ -192,46 +204,59 @@ KNOWN_MODELS = (
 
 def lens_for(
     name: str,
-    given: Given,
+    options: CaptureOptions,
     width: int,
     height: int,
-    own: Callable[[], Lens | None] = lambda: None,
+    capture_lens: Callable[[], Lens | None] = lambda: None,
     beside: Sequence[Path] = (),
     hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
     """Return the lens of depth images and the files that state it: --intrinsics, the named
-    camera's, the capture's ``own``, or the first file named like a lens in the folders ``beside``.
+    camera's, the capture's own, or the first file named like a lens in the folders ``beside``.
     Raises UserError if no lens is stated (``hint`` ends its advice), or only that of other images.
     """
-    lens = given.lens
-    file = given.intrinsics
+    lens = options.lens
+    file = options.intrinsics
     if lens is None and file is None:
-        lens = own()
-        names = [
-            *(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")),
-            *BARE_MATRICES,
-        ]
-        file = next(
-            filter(Path.is_file, (folder / name for folder in beside for name in names)), None
-        )
+        lens = capture_lens()
+        file = _lens_file_in(beside)
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
-        what = f"{name}: the lens of these depth images is unknown; without it they give no points"
-        fix = f"pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough{hint}"
-        raise UserError(what, legal=LEGAL_LENS, fix=fix)
+        raise UserError(
+            f"{name}: the lens of these depth images is unknown; without it they give no points",
+            legal=LEGAL_LENS,
+            fix="pass --intrinsics FILE, or the name of a camera whose nominal lens is good "
+            f"enough{hint}",
+        )
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
     for mode in modes:
         if (mode.width, mode.height) == (width, height):
             return mode, (file,) if file else ()
-    known = ", ".join(
-        f"{each.mode} {each.width} x {each.height}"
-        for each in modes[1:]
-        if isinstance(each, OtherLens)
+    sizes = []
+    for mode in modes[1:]:
+        if isinstance(mode, OtherLens):
+            sizes.append(f"{mode.mode} {mode.width} x {mode.height}")
+    raise UserError(
+        f"{name}: depth images of {width} x {height} pixels, "
+        f"but the lens is of {lens.width} x {lens.height}",
+        legal=f"the modes of this camera: {', '.join(sizes)}" if sizes else None,
+        fix="pass --intrinsics FILE with the lens of these images "
+        "(of the colour camera, if the depth was aligned to it)",
     )
-    what = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
-    fix = "pass --intrinsics FILE with the lens of these images (of the colour camera, if the depth was aligned to it)"
-    raise UserError(what, legal=f"the modes of this camera: {known}" if known else None, fix=fix)
+
+
+def _lens_file_in(folders: Sequence[Path]) -> Path | None:
+    """Return the first file in the folders that is named like a lens."""
+    names = []
+    for stem in FOUND_BESIDE:
+        names += [f"{stem}.json", f"{stem}.yaml", f"{stem}.yml"]
+    names += BARE_MATRICES
+    for folder in folders:
+        for name in names:
+            if (folder / name).is_file():
+                return folder / name
+    return None
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
@@ -241,24 +266,20 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     if "CalibrationInformation" in data:
         mode = depth_mode_of_size(width, height)
         if mode is None:
-            raise UserError(
-                f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels",
-                legal=LEGAL_LENS,
-            )
-        return depth_lens(
-            str(path), parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES)), mode
-        )
+            problem = f"{path}: no depth mode of an Azure Kinect has {width} x {height} pixels"
+            raise UserError(problem, legal=LEGAL_LENS)
+        cameras = parse_calibration(str(path), bounded_bytes(path, TEXT_BYTES))
+        return depth_lens(str(path), cameras, mode)
     stated = _size(data)
     data = _the_lens(path, data, (width, height))
     across, down = _size(data) or stated or (width, height)
     if not isinstance(across, int) or not isinstance(down, int):
-        raise UserError(
-            f"{path}: the lens' width and height are not whole numbers", legal=LEGAL_LENS
-        )
+        problem = f"{path}: the lens' width and height are not whole numbers"
+        raise UserError(problem, legal=LEGAL_LENS)
     if across * height != down * width:
-        what = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
         raise UserError(
-            what,
+            f"{path}: is for images of {across} x {down} pixels, "
+            f"but the depth images have {width} x {height}",
             fix="give the lens of the depth images (or of the colour camera they are aligned to)",
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
@@ -269,22 +290,41 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     cy = (cy + 0.5) / side - 0.5
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
-    if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
-        what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for {width} x {height}"
-        fix = "multiply a normalised focal length by the image's width"
+    is_focal = 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width
+    if not (is_near and is_focal):
         raise UserError(
-            f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix
+            f"{path}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} "
+            f"is impossible for {width} x {height}",
+            legal="pixels, from the centre of the first one",
+            fix="multiply a normalised focal length by the image's width",
         )
-    numbers = (width, height, fx, fy, cx, cy, _distortion(path, data))
+    distortion = _distortion(path, data)
+    off = max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5))
+    warning = ""
     if (across, down) != (width, height):
-        warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
-        warning += " which is right unless the smaller image is a crop of the larger"
-        return OtherLens(*numbers, warning=warning)
-    if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= FAR_OFF:
-        return Lens(*numbers)
-    off = f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of {width} x {height} pixels"
-    doubt = "unless the images are crops of larger images, the lens is for another size, and all sizes are wrong"
-    return OtherLens(*numbers, warning=f"{off}: {doubt}")
+        warning = (
+            f"{path.name} is the lens of images of {across} x {down} pixels; "
+            f"it is scaled to {width} x {height}, "
+            "which is right unless the smaller image is a crop of the larger"
+        )
+    elif off > FAR_OFF:
+        warning = (
+            f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, "
+            f"far from the middle of {width} x {height} pixels: "
+            "unless the images are crops of larger images, "
+            "the lens is for another size, and all sizes are wrong"
+        )
+    lens = OtherLens(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=distortion,
+        warning=warning,
+    )
+    return lens if warning else lens.plain
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
@@ -294,39 +334,49 @@ def parsed_lens(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
-        words = re.sub(r"[\[\](),;]|#.*", " ", text).split() if len(text) < MAX_MATRIX_TEXT else []
-        if len(words) in (4, 9, 12, 16) and all(re.fullmatch(NUMBER, word) for word in words):
-            numbers = list(map(float, words))
-            if len(words) == 4:
-                return dict(zip(SPELLINGS, numbers, strict=True))
-            row = 3 if len(words) == 9 else 4
-            return {"K": [numbers[row * i + j] for i in range(3) for j in range(3)]}
+        lens = _bare_lens(text)
+        if lens is not None:
+            return lens
         try:
             if text.lstrip().startswith("{"):
-                data = strict_json(
-                    text, nan=True
-                )  # `_number` names a key whose value is not a number
+                # `_number` names a key whose value is not a number
+                data = strict_json(text, nan=True)
             else:
                 refuse_bytes(str(path), len(text), MAX_BYTES)
-                # OpenCV's first line, "%YAML:1.0", is not a YAML directive; its matrices are
-                # mappings under a tag
-                body = "\n".join(
-                    "" if line.startswith("%YAML") else line for line in text.splitlines()
-                )
-                data = parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
+                data = parse_yaml(_plain_yaml(text), str(path)).data
         except json.JSONDecodeError as error:
-            raise UserError(
-                f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS
-            ) from error
+            problem = f"{path}:{error.lineno}:{error.colno}: {error.msg}"
+            raise UserError(problem, legal=LEGAL_LENS) from error
         except DeclarationError as error:
             first = error.problems[0]
-            at = error.problems[0].place
-            raise UserError(
-                f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS
-            ) from error
+            position = first.place.head if first.place else path
+            raise UserError(f"{position}: {first.message}", legal=LEGAL_LENS) from error
     if not isinstance(data, dict):
         raise UserError(f"{path}: contains no keys with values", legal=LEGAL_LENS)
     return data
+
+
+def _bare_lens(text: str) -> dict[str, Any] | None:
+    """Return the lens in a text of 4 bare numbers or of a matrix, None in any other text."""
+    if len(text) >= MAX_MATRIX_TEXT:
+        return None
+    words = re.sub(r"[\[\](),;]|#.*", " ", text).split()
+    if len(words) not in (4, 9, 12, 16):
+        return None
+    if not all(re.fullmatch(NUMBER, word) for word in words):
+        return None
+    numbers = [float(word) for word in words]
+    if len(numbers) == 4:
+        return dict(zip(SPELLINGS, numbers, strict=True))
+    columns = 3 if len(numbers) == 9 else 4
+    return {"K": [numbers[columns * i + j] for i in range(3) for j in range(3)]}
+
+
+def _plain_yaml(text: str) -> str:
+    """Return OpenCV's YAML as plain YAML of the same columns: its first line, "%YAML:1.0", is not
+    a YAML directive, and its matrices are mappings under a tag."""
+    lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
+    return "\n".join(lines).replace("!!opencv-matrix", " " * 15)
 
 
 def mappings(
@@ -344,103 +394,109 @@ def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[s
     """Return the mapping in a file that holds the lens: if several differ, those of this image
     size, then those with a name that contains "depth". Raises UserError if there is none, or if
     several remain."""
-    found = [
-        pair
-        for pair in mappings(data)
-        if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)
-    ]
-    for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
-        if len(found) > 1:
-            found = [(name, each) for name, each in found if fits(name, each)] or found
-    if not found:
+    lenses = []
+    for name, mapping in mappings(data):
+        has_numbers = all(_named(mapping, key) for key in SPELLINGS)
+        if has_numbers or _matrix_key(mapping):
+            lenses.append((name, mapping))
+    if not lenses:
         keys = ", ".join(str(key)[:40] for key in list(data)[:20]) or "none"
         raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
-    if len({_focal_and_centre(path, each) for _, each in found}) > 1:
-        names = ", ".join(name for name, _ in found[:9])
+    if len(lenses) > 1:
+        of_size = [(name, mapping) for name, mapping in lenses if _size(mapping) == size]
+        lenses = of_size or lenses
+    if len(lenses) > 1:
+        of_depth = [(name, mapping) for name, mapping in lenses if "depth" in name.lower()]
+        lenses = of_depth or lenses
+    if len({_focal_and_centre(path, mapping) for _, mapping in lenses}) > 1:
+        names = ", ".join(name for name, _ in lenses[:9])
+        problem = f"{path}: holds {len(lenses)} different lenses ({names})"
         fix = "write the lens of these images to a file of its own"
-        raise UserError(
-            f"{path}: holds {len(found)} different lenses ({names})", legal=LEGAL_LENS, fix=fix
-        )
-    return found[0][1]
+        raise UserError(problem, legal=LEGAL_LENS, fix=fix)
+    return lenses[0][1]
 
 
 def _named(data: dict[str, Any], quantity: str) -> str | None:
     """Return the key by which a mapping names one of `SPELLINGS`."""
-    return next((key for key in SPELLINGS[quantity] if key in data), None)
+    for key in SPELLINGS[quantity]:
+        if key in data:
+            return key
+    return None
 
 
 def _matrix_key(data: dict[str, Any]) -> str | None:
-    return next((key for key in MATRICES if isinstance(data.get(key), list | dict)), None)
+    """Return the key under which a mapping holds a matrix."""
+    for key in MATRICES:
+        if isinstance(data.get(key), list | dict):
+            return key
+    return None
 
 
 def _size(data: dict[str, Any]) -> tuple[Any, Any] | None:
     """Return the width and height that a mapping states, None if it states none."""
-    return next(
-        ((data[across], data[down]) for across, down in SIZES if across in data and down in data),
-        None,
-    )
+    for across, down in SIZES:
+        if across in data and down in data:
+            return data[across], data[down]
+    return None
 
 
 def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return fx, fy, cx, cy from any of the known forms of a mapping."""
-    keys = [key for quantity in SPELLINGS if (key := _named(data, quantity)) is not None]
-    if len(keys) == len(SPELLINGS):
-        return tuple(_number(path, key, data[key]) for key in keys)
+    keys = [_named(data, quantity) for quantity in SPELLINGS]
+    if all(keys):
+        return tuple(_number(path, key, data[key]) for key in keys if key)
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
-    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as
-    # Open3D's
-    return (m[0], m[4], m[6], m[7]) if m[6] or m[7] else (m[0], m[4], m[2], m[5])
+    # the last row is 0 0 1: anything else there shows that it is by columns, as Open3D's
+    is_by_columns = m[6] or m[7]
+    return (m[0], m[4], m[6], m[7]) if is_by_columns else (m[0], m[4], m[2], m[5])
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return OpenCV's eight coefficients; absent ones are 0. Raises UserError for other models."""
     key = next((k for k in COEFFICIENTS if k in data), None)
-    if key is None or (isinstance(data[key], dict) and "data" not in data[key]):
-        given = data if key is None else data[key]
-        unknown = [] if key is None else sorted(map(str, set(given) - set(DISTORTION_NAMES)))
+    coefficients = data if key is None else data[key]
+    if isinstance(coefficients, dict) and (key is None or "data" not in coefficients):
+        unknown: list[str] = []
+        if key is not None:
+            unknown = sorted(map(str, set(coefficients) - set(DISTORTION_NAMES)))
         if unknown:
-            raise UserError(
-                f"{path}: {key} has unknown names: {', '.join(unknown)}",
-                legal=", ".join(DISTORTION_NAMES),
-            )
-        numbers = tuple(_number(path, name, given.get(name, 0.0)) for name in DISTORTION_NAMES)
+            problem = f"{path}: {key} has unknown names: {', '.join(unknown)}"
+            raise UserError(problem, legal=", ".join(DISTORTION_NAMES))
+        values = [(name, coefficients.get(name, 0.0)) for name in DISTORTION_NAMES]
+        numbers = tuple(_number(path, name, value) for name, value in values)
     else:
-        numbers = _numbers(path, key, data[key], None)
+        numbers = _numbers(path, str(key), coefficients, None)
     if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):
         legal = "0, 4, 5 or 8 in OpenCV's order k1 k2 p1 p2 k3 .. k6; no thin prism, no tilt"
         raise UserError(f"{path}: {key} has {len(numbers)} numbers", legal=legal)
     model = str(next((data[name] for name in MODELS if name in data), ""))
-    if (
-        any(numbers)
-        and re.sub(r"[ -]", "_", model.lower().removeprefix("distortion.")) not in KNOWN_MODELS
-    ):
-        raise UserError(
-            f"{path}: distortion model {model} is not known", legal=", ".join(KNOWN_MODELS[1:])
-        )
+    usual_model = re.sub(r"[ -]", "_", model.lower().removeprefix("distortion."))
+    if any(numbers) and usual_model not in KNOWN_MODELS:
+        problem = f"{path}: distortion model {model} is not known"
+        raise UserError(problem, legal=", ".join(KNOWN_MODELS[1:]))
     return (numbers + (0.0,) * 8)[:8]
 
 
 def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float, ...]:
     """Return the numbers of a flat list, a list of rows, or an OpenCV matrix (``data``)."""
-    value = value.get("data") if isinstance(value, dict) else value
+    if isinstance(value, dict):
+        value = value.get("data")
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [x for row in value for x in row]
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        raise UserError(
-            f"{path}: {key} is not a list of {count or 'any'} numbers", legal=LEGAL_LENS
-        )
+        problem = f"{path}: {key} is not a list of {count or 'any'} numbers"
+        raise UserError(problem, legal=LEGAL_LENS)
     return tuple(_number(path, key, x) for x in value)
 
 
 def _number(path: Path, key: str, value: Any) -> float:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
     # Python's integers have no largest value, and lists may be too long to print
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
-        shown = (
-            repr(value)[:40]
-            if isinstance(value, str | bool | float | None)
-            else type(value).__name__
-        )
+    if not is_number or not abs(value) < LARGEST:
+        shown = type(value).__name__
+        if isinstance(value, str | bool | float | None):
+            shown = repr(value)[:40]
         raise UserError(f"{path}: {key} is {shown}", legal=f"a number within {LARGEST:g}")
     return float(value)

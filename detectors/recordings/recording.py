@@ -24,65 +24,71 @@ NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
-def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
-    """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and
-    limit its memory."""
+def read_errors(problem: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
+    """Turn a library's exception on a damaged file into a UserError that begins with ``problem``,
+    and limit its memory."""
     try:
         with limited_memory():
             yield
     except UserError:
         raise
     except Exception as error:
-        why = (
-            "there is not enough memory for the size that it states"
-            if isinstance(error, MemoryError)
-            else str(error)
-        )
-        raise UserError(
-            f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix
-        ) from error
+        reason = str(error) or type(error).__name__
+        if isinstance(error, MemoryError):
+            reason = "there is not enough memory for the size that it states"
+        raise UserError(f"{problem} ({reason[:200]})", legal=legal, fix=fix) from error
 
 
 @dataclass(frozen=True)
-class Given:
-    """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the
-    format's usual one. ``intrinsics``: a file with the depth pixels' lens, preferred to one that
-    comes with the frames. ``lens``: the same as a value. ``frames``: selects frames by number.
-    ``topic``: of a ROS bag. ``array``: NAME or NAME:NUMBER in a file of arrays. ``pitch``: of a
-    height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
+class CaptureOptions:
+    """The user's statements about a capture; None where nothing is stated."""
 
+    # metres in one stored unit; None for the format's usual one
     scale_m: float | None = None
+    # a file with the depth pixels' lens, preferred to one that comes with the frames
     intrinsics: Path | None = None
+    # the same as a value
     lens: Lens | None = None
+    # selects frames by number
     frames: slice | None = None
+    # a topic of a ROS bag
     topic: str | None = None
+    # NAME or NAME:NUMBER in a file of arrays
     array: str | None = None
+    # distance between a height map's pixels (``0.5mm``)
     pitch: str | None = None
+    # layout of bare numbers
     raw: str | None = None
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A real capture as a `harness.vocabulary.geometry.FrameSource`.
-
-    ``read``: yields the frames in order; each call starts again. ``shape``: (height, width).
-    ``scale_m``: metres in one stored unit. ``files``: all files whose content can change a result.
-    ``notes``: how the files were interpreted. ``warnings``: full sentences on doubts about the
-    distances; every program shows them first. ``selection``: picks frames. ``unit_from``: origin
-    of the unit; "" if the data decide."""
+    """A real capture as a `harness.vocabulary.geometry.FrameSource`."""
 
     name: str
+    # yields the frames in order; each call starts again
     read: Callable[[], Iterator[Frame]]
+    # height and width, pixels
     shape: tuple[int, int]
+    # metres in one stored unit
     scale_m: float
+    # rounding step of one frame's z; 0 if there is none
     z_step_m: float
+    # all files whose content can change a result
     files: tuple[Path, ...] = ()
+    # of the depth pixels; None if frames carry points
     lens: Lens | None = None
+    # whether there is a pixel grid
     organised: bool = True
+    # how the files were interpreted
     notes: tuple[str, ...] = ()
+    # full sentences on doubts about the distances; every program shows them first
     warnings: tuple[str, ...] = ()
+    # whether rays leave the lens, or run along z as in a height map
     projection: Literal["central", "parallel"] = "central"
+    # picks frames
     selection: slice | None = None
+    # origin of the unit; "" if the data decide
     unit_from: str = ""
 
     @classmethod
@@ -92,18 +98,16 @@ class Recording:
         read: Callable[[], Iterator[Frame]],
         scale_m: float,
         is_whole: bool = False,
-        **more: Any,
+        **fields: Any,
     ) -> Recording:
-        """Return a recording of the first frame's size and step. Raises UserError without a frame."""
+        """Return a recording of the first frame's size and step. ``is_whole``: stored numbers are
+        whole. ``fields``: others of the class. Raises UserError without a frame."""
         first = next(read(), None)
         if first is None:
-            raise UserError(
-                f"{name}: contains no frame",
-                legal="at least one frame",
-                fix="copy or record it again",
-            )
+            problem = f"{name}: contains no frame"
+            raise UserError(problem, legal="at least one frame", fix="copy or record it again")
         step_m = scale_m if is_whole else rounding_step_m(first.z_m)
-        return cls(name, read, first.z_m.shape, scale_m, step_m, **more)
+        return cls(name, read, first.z_m.shape, scale_m, step_m, **fields)
 
     @property
     def region(self) -> Region:
@@ -131,23 +135,10 @@ class Recording:
         pixel is valid."""
         count = 0
         judged = False
-        for frame in self.selected():
+        for stored in self.selected():
             count += 1
-            if frame.z_m.shape != self.shape:
-                what = "pixels" if self.organised else "points"
-                sizes = [
-                    f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)
-                ]
-                what = f"{frame.name}: {sizes[0]} {what}, but the first frame has {sizes[1]}"
-                raise UserError(
-                    what, legal="frames of one size", fix="run the differing frames separately"
-                )
-            if self.slopes is not None and frame.xy_m is None:
-                rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)
-                if rayless.any():
-                    z_m = np.where(rayless, np.float32(np.nan), frame.z_m)
-                    reason = np.where(rayless, np.uint8(Reason.OUTSIDE_MASK), frame.reason)
-                    frame = replace(frame, z_m=z_m, reason=reason)
+            self._refuse_other_size(stored)
+            frame = self._without_rayless(stored)
             if not judged and np.isfinite(frame.z_m).any():
                 refuse_implausible(frame, self.scale_m)
                 if self.projection == "central":
@@ -155,10 +146,39 @@ class Recording:
                 judged = True
             yield frame
         if not judged:
-            fix = "check the selected frames, and that the target was within the camera's range"
+            frames = "1 frame" if count == 1 else f"{count} frames"
             raise UserError(
-                f"{self.name}: no valid pixel in {count} frame{'s' * (count != 1)}", fix=fix
+                f"{self.name}: no valid pixel in {frames}",
+                fix="check the selected frames, and that the target was within the camera's range",
             )
+
+    def _refuse_other_size(self, frame: Frame) -> None:
+        """Raise UserError if a frame's size is not the first one's."""
+        if frame.z_m.shape == self.shape:
+            return
+        elements = "pixels" if self.organised else "points"
+        size = _size_text(frame.z_m.shape)
+        problem = (
+            f"{frame.name}: {size} {elements}, but the first frame has {_size_text(self.shape)}"
+        )
+        fix = "run the differing frames separately"
+        raise UserError(problem, legal="frames of one size", fix=fix)
+
+    def _without_rayless(self, frame: Frame) -> Frame:
+        """Return a frame without the pixels for which the lens has no direction."""
+        if self.slopes is None or frame.xy_m is not None:
+            return frame
+        rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)
+        if not rayless.any():
+            return frame
+        z_m = np.where(rayless, np.float32(np.nan), frame.z_m)
+        reason = np.where(rayless, np.uint8(Reason.OUTSIDE_MASK), frame.reason)
+        return replace(frame, z_m=z_m, reason=reason)
+
+
+def _size_text(shape: tuple[int, ...]) -> str:
+    height, width = shape
+    return f"{width} x {height}" if height > 1 else str(width)
 
 
 @lru_cache(maxsize=2)

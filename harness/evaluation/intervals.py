@@ -57,11 +57,25 @@ class Interval:
 UNKNOWN = Interval(np.nan, np.nan)
 
 
+def _floats(*values: ArrayLike) -> tuple[np.ndarray, ...]:
+    """Return values as arrays of numbers of one shape."""
+    return np.broadcast_arrays(*(np.asarray(value, float) for value in values))
+
+
+def _ends_where(
+    is_defined: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of intervals, NaN where they are not defined."""
+    return np.where(is_defined, low, np.nan), np.where(is_defined, high, np.nan)
+
+
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where
     ``trials`` is 0. Its average coverage over the proportion is near nominal; `clopper_pearson` is
     never below nominal and wider."""
-    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    k, n = _floats(successes, trials)
     z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
@@ -69,34 +83,36 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndar
     # rounding would give 1e-17 instead of exactly 0 or 1
     low = np.where(k == 0, 0.0, centre - half)
     high = np.where(k == n, 1.0, centre + half)
-    return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
+    return _ends_where(n > 0, low, high)
 
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Clopper and Pearson's exact interval of a proportion, element by element; NaN where
     ``trials`` is 0."""
-    k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
+    k, n = _floats(successes, trials)
     low = np.where(k == 0, 0.0, special.betaincinv(k, n - k + 1, 1 - UPPER))
     high = np.where(k == n, 1.0, special.betaincinv(k + 1, n - k, UPPER))
-    return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
+    return _ends_where(n > 0, low, high)
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that
     is 0."""
-    k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
+    k, time = _floats(count, exposure)
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
+        return _ends_where(time > 0, low / time, high / time)
 
 
-def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def mean_t(
+    mean: ArrayLike,
+    std: ArrayLike,
+    n: ArrayLike,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN
     below two values."""
-    centre, deviation, count = np.broadcast_arrays(
-        np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float)
-    )
+    centre, deviation, count = _floats(mean, std, n)
     size = np.where(count >= 2, count, np.nan)
     half = special.stdtrit(size - 1, UPPER) * deviation / np.sqrt(size)
     return centre - half, centre + half
@@ -118,7 +134,11 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     return Interval(float(ends.low), float(ends.high))
 
 
-def standardised_bias(bias: float, std: float, n: int) -> Interval:
+def standardised_bias(
+    bias: float,
+    std: float,
+    n: int,
+) -> Interval:
     """Return the interval of bias / standard deviation (an effect size) from ``n`` normal values,
     by the large-sample variance 1/n + d^2/(2n) (Hedges and Olkin 1985). Exact if they do not vary;
     unknown below two values."""
@@ -133,7 +153,10 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
 
 
 def bootstrap(
-    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES
+    statistic: Callable[[np.ndarray], np.ndarray],
+    n: int,
+    *,
+    resamples: int = RESAMPLES,
 ) -> Interval:
     """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of
     pixels), with the same draws every time. ``statistic`` maps indices (resamples, n) to values
@@ -195,7 +218,7 @@ class Threshold:
     upper_per_m2: float
     """Bound on the true rate at one-sided ``confidence``."""
     confidence: float
-    """Of that bound."""
+    """Confidence of that bound."""
     runs: int
     """Number of hole-free runs that set the threshold."""
     calling_runs: int
@@ -203,7 +226,10 @@ class Threshold:
 
 
 def threshold_for_rate(
-    highest_scores_per_run: ArrayLike, area_m2: float, rate_per_m2: float, confidence: float = 0.95
+    highest_scores_per_run: ArrayLike,
+    area_m2: float,
+    rate_per_m2: float,
+    confidence: float = 0.95,
 ) -> Threshold:
     """Return the lowest observed score whose rate of false calls is at most the wanted rate, from
     hole-free runs of ``area_m2`` each. ``highest_scores_per_run`` (runs,): -inf without a finding.

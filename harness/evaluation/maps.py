@@ -48,9 +48,9 @@ class MapSetUp:
     conditions: str
     """The other axes' values as text."""
     is_variation: bool
-    """Whether it varies a fact of another set-up."""
+    """True if it varies a fact of another set-up."""
     reference: str
-    """That set-up, or "" for a set-up."""
+    """Name of that set-up, or "" for a set-up."""
 
 
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
@@ -180,7 +180,11 @@ def size_errors(first: pd.DataFrame, second: pd.DataFrame) -> SizeErrors:
     return SizeErrors(tuple(map(str, holes)), sizes, differences)
 
 
-def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
+def run_ratio(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    column: str,
+) -> Change:
     """Return the paired change of a column's logarithm over runs on the damaged board; its ``exp``
     is a ratio."""
     ratio = _by_repeat(second)[column] / _by_repeat(first)[column]
@@ -209,9 +213,9 @@ class MapCase:
     merging."""
 
     tables: ResultTables
-    """Of the whole experiment."""
+    """Tables of the whole experiment."""
     summary: pd.DataFrame
-    """Of `harness.evaluation.summary.summarise_holes`."""
+    """Rows of `harness.evaluation.summary.summarise_holes`."""
     maps: Sequence[MapSetUp]
     """The set-ups and variations of the case."""
     conditions: str
@@ -224,7 +228,12 @@ class MapCase:
         """Maps of set-ups, without variations."""
         return [set_up for set_up in self.maps if not set_up.is_variation]
 
-    def variant(self, views: int, registration: str, merge: str) -> str | None:
+    def variant(
+        self,
+        views: int,
+        registration: str,
+        merge: str,
+    ) -> str | None:
         """Return the name of the set-up. All registrations of a single view are the same, so any
         of them will do."""
         merged = [
@@ -252,7 +261,11 @@ class MapCase:
         return MANY if MANY in shared else max(shared, default=None)
 
     def named(
-        self, views: int, registration: str, merge: str, frames: int | None = None
+        self,
+        views: int,
+        registration: str,
+        merge: str,
+        frames: int | None = None,
     ) -> Map | None:
         """Return the map of that name with this number of frames (default: that of
         `common_frames`), if any."""
@@ -336,7 +349,11 @@ class AgainstOne:
     """Holes found only by the several views."""
 
 
-def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | None:
+def against_one(
+    case: MapCase,
+    registration: str,
+    merge: str,
+) -> AgainstOne | None:
     """Compare two views with the most frames that both have (`MapCase.common_frames`); None if a
     map is missing."""
     of_one = case.variant(1, registration, merge)
@@ -376,7 +393,11 @@ def _found_only(first: dict[str, HoleState], second: dict[str, HoleState]) -> tu
     )
 
 
-def label_of(registration: str, merge: str, conditions: str = "") -> str:
+def label_of(
+    registration: str,
+    merge: str,
+    conditions: str = "",
+) -> str:
     """Return the name of a way to make a map: ``cpd, grid``."""
     stated = [part for part in (registration, merge, conditions) if part]
     return ", ".join(stated) or "as declared"
@@ -418,7 +439,11 @@ UNIT = ["frames", "repeat", "role"]
 MOST_REASONS = 3
 
 
-def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
+def of_map(
+    registrations: pd.DataFrame,
+    method: str,
+    views: int,
+) -> pd.DataFrame:
     """Return the registrations behind a map of this number of views: those of exactly ``views``,
     else of the nearest number, since a method that registers each view alone gives the same result
     for any number."""
@@ -471,7 +496,9 @@ def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
 
 
 def paired_ratio(
-    first: pd.DataFrame, second: pd.DataFrame, column: str
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    column: str,
 ) -> tuple[float, float, float, int]:
     """Return the geometric mean of second / first over pairs of views, Student's interval, number;
     NaN below two."""

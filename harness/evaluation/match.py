@@ -4,7 +4,11 @@ calls."""
 import numpy as np
 
 
-def match(truth_m: np.ndarray, finding_m: np.ndarray, radius_m: float) -> dict[int, int]:
+def match(
+    truth_m: np.ndarray,
+    finding_m: np.ndarray,
+    radius_m: float,
+) -> dict[int, int]:
     """Return pairs {index of truth: index of finding} of centres (n, d), (m, d) in one frame; see
     `closest_pairs`."""
     offset_m = truth_m[:, None] - finding_m[None]

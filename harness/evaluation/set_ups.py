@@ -117,7 +117,11 @@ def set_ups_of(tables: ResultTables) -> list[str]:
 
 
 def compare_set_ups(
-    tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
+    tables: ResultTables,
+    summary: pd.DataFrame,
+    variants: list[str],
+    *,
+    half_sizes: bool = True,
 ) -> pd.DataFrame:
     """Return one row per finished (variant, frames), variants in the given order, with the axes'
     columns. ``half_*``: only for set-ups, and with ``half_sizes``, as they need a bootstrap.
@@ -151,7 +155,11 @@ def compare_set_ups(
     )
 
 
-def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str, Any]:
+def _row(
+    tables: ResultTables,
+    part: pd.DataFrame,
+    half_sizes: bool,
+) -> dict[str, Any]:
     """Return a summary of the holes of one set-up at one number of frames, from its summary rows
     ``part``."""
     first = part.iloc[0]

@@ -76,7 +76,11 @@ def found_rule(trials: int) -> str:
     return f"{FOUND_RULE} {too_few}: at least {FEWEST_TRIALS} are needed."
 
 
-def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:
+def found_holes(
+    summary: pd.DataFrame,
+    variant: str,
+    frames: int,
+) -> dict[str, HoleState]:
     """Return each hole's status by `FOUND_RULE`, in the holes' order; empty if the variant lacks
     these frames."""
     rows = summary[(summary["variant"] == variant) & (summary["frames"] == frames)]
@@ -109,7 +113,11 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
     return out.sort_values([*keys, "role"], key=_order, kind="stable", ignore_index=True)
 
 
-def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+def _measured(
+    groups: Any,
+    truth: pd.DataFrame,
+    measure: Measure,
+) -> pd.DataFrame:
     """Return means, standard deviations and biases of one measure's diameters and offsets."""
     diameter = groups[f"{measure}_diameter_mm"]
     offset = groups[f"{measure}_offset_mm"]

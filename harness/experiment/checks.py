@@ -74,7 +74,10 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     calibrate = config.threshold.calibrate
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
     if config.study is None and drawn:
-        fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
+        fix = (
+            "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: "
+            "{name: thesis}"
+        )
         yield Problem("a family of boards needs a study", source.place_of(TARGET), fix=fix)
     elif config.study is None and calibrate is not None and calibrate.boards is not None:
         yield Problem("only a study draws boards", boards_at, fix="write `repeats` instead")
@@ -140,7 +143,10 @@ def _target_problems(
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
-        message = f"within a matching radius of {config.matching.radius_mm:g} mm, a detection can match two damages"
+        message = (
+            f"within a matching radius of {config.matching.radius_mm:g} mm, a detection can "
+            "match two damages"
+        )
         legal = f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart"
         yield Problem(message, source.place_of(("matching", "radius_mm")), legal=legal)
 
@@ -178,7 +184,10 @@ def _unseen(
         if message:
             path, first = message
             aside = f"{pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off the axis"
-            turned = f"tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
+            turned = (
+                f"tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by "
+                f"{pose.roll_deg:.3g}°"
+            )
             where = f"a board drawn at {pose.distance_m:.3g} m, {aside}, {turned}"
             return path, UserError(f"{where}: {first.message}", legal=first.legal, fix=first.fix)
     return None

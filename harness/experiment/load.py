@@ -53,7 +53,10 @@ def load_experiment(
     # a file in a result folder states its version; a file that is written by hand states none
     stamp = stamp_of(written.text, STAMP_KIND)
     if stamp is not None:
-        again = "use the original experiment, or remove the first line and correct the problems that are then reported"
+        again = (
+            "use the original experiment, or remove the first line and correct the problems "
+            "that are then reported"
+        )
         check_version(stamp, EXPERIMENT_VERSION, path, "an experiment", again=again)
     overrides = [*_quick(written.data), *overrides] if quick else overrides
     source, problems = overridden(written, overrides, declared_of)
@@ -195,7 +198,10 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         )
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
-            fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
+            fix = (
+                "name a recording of the same camera in the same mode, or choose another "
+                "source.camera.name"
+            )
             message = f"{recording}: its calibration is for {lens.width} x {lens.height} pixels"
             raise UserError(message, legal=legal, fix=fix)
     return numbers_of_lens(lens)

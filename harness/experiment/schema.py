@@ -96,7 +96,8 @@ class CaptureConfig(Config):
     )
     exact: bool = Field(
         False,
-        description="true simulates each frame; false draws the mean if its distribution is the same",
+        description="true simulates each frame; "
+        "false draws the mean if its distribution is the same",
     )
 
 
@@ -135,7 +136,10 @@ class CalibrateConfig(Config):
             raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
         if self.boards is None and self.false_calls_per_m2 is not None:
             raise ValueError(
-                "`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate"
+                
+                    "`false_calls_per_m2` needs `boards`, since repeats of one board cannot "
+                    "show a rate"
+                
             )
         return self
 
@@ -163,8 +167,11 @@ class MatchingConfig(Config):
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
     overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
         None,
-        description="a detection also counts as a hit, wherever its centre is, if at least this share of its pixels is "
-        "on the damage (outline grown by two pixels); further such detections are parts of it, not false calls",
+        description="a detection also counts as a hit, wherever its centre is, "
+        "if at least this share "
+        "of its pixels is "
+        "on the damage (outline grown by two pixels); further such detections are parts of "
+        "it, not false calls",
     )
 
 
@@ -214,7 +221,10 @@ class StudyConfig(Config):
     hole_free_boards: Boards
     units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
         None,
-        description="number of units; null: only source.camera.unit_seed, so that limits hold for that unit alone",
+        description=(
+            "number of units; null: only source.camera.unit_seed, so that limits hold for that "
+            "unit alone"
+        ),
     )
 
 
@@ -242,11 +252,15 @@ class ExperimentConfig(Config):
     )
     draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
         None,
-        description="number of set-ups of the sweep to run, drawn at random without duplicates; null: all",
+        description=(
+            "number of set-ups of the sweep to run, drawn at random without duplicates; null: all"
+        ),
     )
     switches: DottedPath | None = Field(
         None,
-        description="path of a mapping of switches, which are on: none, each alone, all but each, and all",
+        description=(
+            "path of a mapping of switches, which are on: none, each alone, all but each, and all"
+        ),
     )
     sensitivity: SensitivityConfig | None = None
 

@@ -48,7 +48,10 @@ def add_reading(add: Callable[..., Any]) -> None:
     """Add the options for reading captures with ``add_argument`` of a parser or group."""
     add(
         "--unit",
-        help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data",
+        help=(
+            "unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from "
+            "the data"
+        ),
     )
     add(
         "--intrinsics",
@@ -89,7 +92,10 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)
         ]
         if given_options:
-            message = f"--{given_options[0]}: concerns several views, but without --register all PATHs are one capture"
+            message = (
+                f"--{given_options[0]}: concerns several views, but without --register all "
+                "PATHs are one capture"
+            )
             raise UserError(message, legal=several)
         whole_captures = [
             path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES
@@ -109,7 +115,10 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             "--register nominal uses the stated poses, and none are stated", fix="give --poses FILE"
         )
     if arguments.quiet_capture is not None:
-        message = "--quiet-capture is one cloud, and its noise differs from that of a cloud merged from several views"
+        message = (
+            "--quiet-capture is one cloud, and its noise differs from that of a cloud merged "
+            "from several views"
+        )
         raise UserError(
             message, fix="use --threshold with a value at which undamaged views have no finding"
         )
@@ -130,7 +139,8 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
 def detector_of(
     arguments: argparse.Namespace, crop: str, assignments: Sequence[str]
 ) -> tuple[Detector, dict[str, Any]]:
-    """Return the detector with the crop and settings of --crop and --set, and all of its settings."""
+    """Return the detector with the crop and settings of --crop and --set, and all of its
+    settings."""
     from detectors import detector_type, load_detector
 
     settings: dict[str, Any] = {}
@@ -183,7 +193,10 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
-        message = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
+        message = (
+            f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} "
+            "is another crop"
+        )
         raise UserError(message, fix="leave out one of the two")
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
@@ -235,7 +248,8 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
 def opened(
     paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any
 ) -> Recording:
-    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
+    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of
+    `open_capture`."""
     from detectors.recordings import open_capture
 
     file = None if intrinsics is None else Path(intrinsics)
@@ -272,7 +286,8 @@ POSES_KEY = (
     "T_reference_view"  # key of the list in a file of `tofpod export`, beside the file's version
 )
 LEGAL_POSES = (
-    "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
+    "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one "
+    "common frame, bare or"
     f" under the key {POSES_KEY}; or lines of"
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
@@ -304,7 +319,10 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
         )
         raise UserError(f"{path}: {why}", legal=LEGAL_POSES) from error
     if len(poses) != count:
-        fix = "keep one pose for each PATH, in the same order (one line per view for groundtruth.txt of a sequence)"
+        fix = (
+            "keep one pose for each PATH, in the same order (one line per view for "
+            "groundtruth.txt of a sequence)"
+        )
         raise UserError(f"{path}: {len(poses)} poses for {count} views", legal=LEGAL_POSES, fix=fix)
     from_first = [np.eye(4)]
     for number, pose in enumerate(poses):
@@ -322,7 +340,10 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
                 from_first.append(invert(poses[0]) @ pose)
                 distance_m = float(np.linalg.norm(from_first[-1][:3, 3]))
             if not distance_m <= FARTHEST_M:  # or NaN, where numbers are near the largest
-                message = f"{path}: pose {number} is {distance_m:.4g} m from pose 0 (up to {FARTHEST_M:g} m)"
+                message = (
+                    f"{path}: pose {number} is {distance_m:.4g} m from pose 0 (up to "
+                    f"{FARTHEST_M:g} m)"
+                )
                 raise UserError(message, fix="write translations in metres, not millimetres")
     return tuple(from_first)
 

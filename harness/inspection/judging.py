@@ -1,4 +1,5 @@
-"""Judges one cloud: what deviates from the surface, at which threshold, and which doubts are due."""
+"""Judges one cloud: what deviates from the surface, at which threshold, and which doubts are
+due."""
 
 import argparse
 import math
@@ -20,7 +21,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 DEFAULT_K = 5.0
-"""Robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond."""
+"""Robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond.
+"""
 FAINT_CALLS = 0.05
 """Noise explains a finding if at least this many false calls of its score are expected."""
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
@@ -97,8 +99,8 @@ def threshold_of(
     """Return the threshold, its origin, and the evidence to search with it.
 
     The threshold is given, calibrated on a quiet capture (by ``quiet``), the detector's own, or
-    from the capture's peaks towards the camera, which may leave out a rim that cannot be judged; if
-    these cannot be trusted, it is a fallback with warnings."""
+    from the capture's peaks towards the camera, which may leave out a rim that cannot be judged;
+    if these cannot be trusted, it is a fallback with warnings."""
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from detectors.views.mapping.merge import Mapped
     from detectors.views.view import PreparedView
 
-WIDEST_NATIVE_PX = (
-    6.5  # filters of known cameras average at most 5 pixels; a measured reach scatters by one
-)
+# filters of known cameras average at most 5 pixels; a measured reach scatters by one
+WIDEST_NATIVE_PX = 6.5
 
 
 def mm(metres: float) -> str:
@@ -60,7 +59,10 @@ def print_capture(
     print(recording.unit_text)
     print_notes(recording.notes)
     if cloud.noise_reach_px > WIDEST_NATIVE_PX:
-        why = "the depth was upsampled, aligned to another camera or smoothed; sizes are measured with that blur"
+        why = (
+            "the depth was upsampled, aligned to another camera or smoothed; sizes are measured "
+            "with that blur"
+        )
         print(f"note: {cloud.noise_reach_px:.0f} pixels share their noise: {why}")
     for left_out in cloud.left_out:
         print(f"left out: {left_out.name}: {left_out.why}")
@@ -143,9 +145,13 @@ def pictures(
 def print_registrations(data: Mapping[str, Any]) -> None:
     """Print ``data`` of registrations.json: a table with one view per line, then notes."""
     columns = {
-        "residual mm": ("residual_mm", 3), "overlap": ("overlap", 2), "in plane mm": ("predicted_in_plane_mm", 3),
-        "across mm": ("predicted_across_mm", 3), "held out mm": ("held_out_mark_mm", 3), "pairs": ("pairs", 0),
-    }  # fmt: skip
+        "residual mm": ("residual_mm", 3),
+        "overlap": ("overlap", 2),
+        "in plane mm": ("predicted_in_plane_mm", 3),
+        "across mm": ("predicted_across_mm", 3),
+        "held out mm": ("held_out_mark_mm", 3),
+        "pairs": ("pairs", 0),
+    }
     rows = [
         (
             row["view"],
@@ -155,7 +161,8 @@ def print_registrations(data: Mapping[str, Any]) -> None:
         for row in data["views"]
     ]
     print(
-        "registration to the first view (in plane, across: predicted root mean square error over the target)"
+        "registration to the first view (in plane, across: predicted root mean square error "
+        "over the target)"
     )
     show([Grid.of(("view", "method", *columns), rows, left=0)])
     for row in data["views"]:
@@ -166,7 +173,10 @@ def threshold_text(threshold: float, evidence: Evidence) -> str:
     """Return the threshold and, if a unit of score has a length, its length at a typical point."""
     if evidence.unit:
         return f"{threshold:.4g} units of score"
-    return f"{threshold:.4g} x {mm(evidence.scale_m)} = {mm(threshold * evidence.scale_m)} at the median point"
+    return (
+        f"{threshold:.4g} x {mm(evidence.scale_m)} = {mm(threshold * evidence.scale_m)} at the "
+        "median point"
+    )
 
 
 def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:

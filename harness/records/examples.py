@@ -77,7 +77,7 @@ class StudyExample:
     pod: float
     """Probability of detection by the curve at that size; NaN without a curve."""
     hit: bool
-    """Whether the damage was found."""
+    """True if the damage was found."""
     score: float
     """Highest score on the damage, in the threshold's unit; NaN if no pixel there was judged."""
     threshold: float
@@ -108,7 +108,7 @@ class Circle3d:
     label: str
     """Text beside the ring."""
     kind: CircleKind
-    """What the ring marks; decides its colour."""
+    """The marked thing; decides the ring's colour."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,8 @@ class Scene3d:
     points_mm: np.ndarray
     """(n, 3): the points in the scene's frame."""
     frame: Literal["board", "camera"]
-    """The frame: "board" has x right, y up, z to the viewer; "camera" has x right, y down, z away."""
+    """The frame: "board" has x right, y up, z to the viewer; "camera" has x right, y down, z away.
+    """
     rgb: np.ndarray | None = None
     """(n, 3) uint8: colours of the points."""
     residual_mm: np.ndarray | None = None
@@ -134,14 +135,15 @@ class Scene3d:
     facts: tuple[tuple[str, str], ...] = ()
     """(name, value) of what stands beside the picture."""
     shown: str = "camera's colours"
-    """What ``rgb`` represents."""
+    """Meaning of ``rgb``."""
     key: tuple[tuple[str, str], ...] = ()
     """(words, colour) that explain ``rgb``."""
 
 
 @dataclass(frozen=True)
 class MappedExample:
-    """A merged cloud of a variant with the true holes and the findings, in the board's true frame."""
+    """A merged cloud of a variant with the true holes and the findings, in the board's true
+    frame."""
 
     variant: str
     """Name of the set-up or variation."""
@@ -156,4 +158,4 @@ class MappedExample:
     scene: Scene3d
     """The cloud with its rings."""
     is_variation: bool = False
-    """Whether the variant is a variation of a set-up."""
+    """True if the variant is a variation of a set-up."""

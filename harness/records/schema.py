@@ -197,9 +197,9 @@ class Column:
 
 
 def declared_columns(row_type: type) -> tuple[Column, ...]:
-    """Return the columns that the fields of a class of rows declare, in order. A field is annotated
-    with its note or its `Column`; a field that is itself a dataclass adds the columns of that
-    class."""
+    """Return the columns that the fields of a class of rows declare, in order. A field is
+    annotated with its note or its `Column`; a field that is itself a dataclass adds the columns of
+    that class."""
     columns: list[Column] = []
     for name, hint in get_type_hints(row_type, include_extras=True).items():
         if isinstance(hint, type) and is_dataclass(hint):

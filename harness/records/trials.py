@@ -519,7 +519,9 @@ EFFECTS = Table(
         ),
         Column(
             "on_ladder",
-            note="whether both sizes lie within the range inspected; otherwise the loss is a bound",
+            note=(
+                "whether both sizes lie within the range inspected; otherwise the loss is a bound"
+            ),
         ),
     ),
 )

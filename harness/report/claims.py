@@ -6,10 +6,10 @@ programs of their own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,61 +34,48 @@ class Verdict:
     text: str
     """The claim in one sentence."""
     verdict: Answer
-    """Whether the experiment bears the claim out."""
+    """The answer of the experiment."""
     evidence: str
     """The numbers that support the verdict."""
     rule: str
     """The criterion, which was fixed in advance."""
 
 
-class ClaimSet(Protocol):
-    """The claims about one target, judged on the tables of an experiment with that target."""
+@dataclass(frozen=True)
+class ClaimSet:
+    """The claims about one target: headings, and functions that judge them on the tables of an
+    experiment with that target. ``summary`` has a row per set-up, number of frames and hole;
+    ``axes`` are the paths on which set-ups differ."""
 
-    @property
-    def title(self) -> str:
-        """The heading of the claims on the page of a plain sweep."""
-
-    @property
-    def title_of_set_ups(self) -> str:
-        """The heading of the claims on the page of several set-ups."""
-
-    @property
-    def title_of_views(self) -> str:
-        """The heading of the claims on the page of several views."""
-
-    def judge_sweep(
-        self,
-        tables: ResultTables,
-        examples: Sequence[ExampleCloud],
-        summary: pd.DataFrame,
-    ) -> Sequence[Verdict]:
-        """Return the verdicts on a plain sweep. ``summary`` has a row per set-up, number of frames
-        and hole; ``examples`` are averaged clouds."""
-
-    def judge_set_ups(self, summary: pd.DataFrame, axes: Sequence[str]) -> Sequence[Verdict]:
-        """Return the verdicts on several set-ups from the rows of all set-ups and variations.
-        ``axes`` are the paths on which set-ups differ."""
-
-    def judge_views(self, cases: Sequence[MapCase]) -> Sequence[Verdict]:
-        """Return the verdicts on an experiment with several views, for each of its places."""
-
-    def posterior_of(self, summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | None:
-        """Return rows of `harness.records.trials.POSTERIOR` from the rows of all set-ups, or None
-        if the experiment does not determine them."""
-
-    def posterior_section(self, posterior: pd.DataFrame) -> Sequence[Markup]:
-        """Return the section of a page on the result of `posterior_of`."""
-
-    def posterior_answer(self, posterior: pd.DataFrame) -> str:
-        """Return the sentence of the answer on the result of `posterior_of`."""
-
-    def lead_of_views(self, verdicts: Sequence[Verdict]) -> str:
-        """Return the first sentence of the answer on several views from their verdicts."""
+    title: str
+    """Heading of the claims on the page of a plain sweep."""
+    title_of_set_ups: str
+    """Heading of the claims on the page of several set-ups."""
+    title_of_views: str
+    """Heading of the claims on the page of several views."""
+    judge_sweep: Callable[
+        [ResultTables, Sequence[ExampleCloud], pd.DataFrame],
+        Sequence[Verdict],
+    ]
+    """(tables, averaged clouds, summary): the verdicts on a plain sweep."""
+    judge_set_ups: Callable[[pd.DataFrame, Sequence[str]], Sequence[Verdict]]
+    """(summary of all set-ups and variations, axes): the verdicts on several set-ups."""
+    judge_views: Callable[[Sequence[MapCase]], Sequence[Verdict]]
+    """(places): the verdicts on several views, for each place."""
+    lead_of_views: Callable[[Sequence[Verdict]], str]
+    """(verdicts): the first sentence of the answer on several views."""
+    posterior_of: Callable[[pd.DataFrame, Sequence[str]], pd.DataFrame | None]
+    """(summary of all set-ups, axes): rows of `harness.records.trials.POSTERIOR`, or None if the
+    experiment does not determine them."""
+    posterior_section: Callable[[pd.DataFrame], Sequence[Markup]]
+    """(posterior): the section of a page on it."""
+    posterior_answer: Callable[[pd.DataFrame], str]
+    """(posterior): the answer of the page."""
 
 
 def claim_set_of(facts: Mapping[str, Any]) -> ClaimSet | None:
-    """Return the claims about the target of the resolved experiment ``facts``, or None if there are
-    none."""
+    """Return the claims about the target of the resolved experiment ``facts``, or None if there
+    are none."""
     target = facts.get("source", {}).get("target") or {}
     address = CLAIM_SETS.get(target.get("name", ""))
     if address is None:

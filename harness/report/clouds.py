@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from harness.records.examples import ExampleCloud, StudyExample, Where
+from harness.records.examples import ExampleCloud, HoleInView, StudyExample, Where
 from harness.report.blocks import DAMAGE, INK, svg
 from harness.vocabulary.text import many
 
@@ -23,11 +23,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.image import AxesImage
 
-NOTHING = "#b9bec4"  # grey, for pixels without a valid point
+NOTHING = "#b9bec4"
+"""Grey, for pixels without a valid point."""
 LEAST_MM = 10.0
+"""Least end of the colour scale."""
 MOST_DOWN = 3
+"""Most examples below one another."""
 SMALLEST_RING_PX = 2.5
 WIDTH_IN = 10.0
+HIT_COLOUR = "#005b96"
+MISS_COLOUR = "#b34700"
 TITLES: dict[Where, str] = {
     "below": "Below the limit",
     "at": "At the limit",
@@ -36,83 +41,121 @@ TITLES: dict[Where, str] = {
 SIZES: dict[Where, str] = {"below": "Smaller", "at": "Middle", "above": "Larger"}
 """Titles for set-ups without a limit within the sizes inspected."""
 
-
-class Cut(NamedTuple):
-    """A crop of a pixel grid around a damage: residual and findings (h, w), rim (k, 2), a pixel's
-    width, and texts."""
-
-    residual_mm: np.ndarray
-    detected: np.ndarray
-    rim_px: np.ndarray
-    pitch_mm: float
-    title: str
-    below: str
-    colour: str = INK
+# ---------------------------------------------------------------- whole clouds
 
 
 def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
     """Draw each cloud's residuals, the pixels of findings, and rings at the true holes (dashed if
     not found)."""
     norm = residual_norm(np.concatenate([cloud.residual_mm[cloud.inside] for cloud in clouds]))
-    boxes = []
-    for cloud in clouds:
-        v, u = np.nonzero(cloud.inside if cloud.inside.any() else np.ones_like(cloud.inside))
-        boxes.append((u.min() - 0.5, u.max() + 0.5, v.max() + 0.5, v.min() - 0.5))
-    heights = [
-        min(max(0.92 * WIDTH_IN * (low - top) / (right - left), 1.1), 7.0)
-        for left, right, low, top in boxes
-    ]
+    boxes = [_box(cloud.inside) for cloud in clouds]
+    heights_in = [_height_in(box) for box in boxes]
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(len(clouds), 1, squeeze=False)[:, 0]
-        for axes, cloud, (left, right, low, top) in zip(panels, clouds, boxes, strict=True):
-            picture = _image(
-                axes, np.where(cloud.inside, cloud.residual_mm, np.nan), cloud.detected, norm
-            )
-            found = 0
+        for axes, cloud, box in zip(panels, clouds, boxes, strict=True):
+            residual_mm = np.where(cloud.inside, cloud.residual_mm, np.nan)
+            picture = _image(axes, residual_mm, cloud.detected, norm)
+            marked = 0
             for hole in cloud.truth:
-                v, u = np.indices(cloud.detected.shape)
-                near = np.hypot(u - hole.u_px, v - hole.v_px) <= max(hole.radius_px, 0.75)
-                is_found = bool(cloud.detected[near].any())
-                found += is_found
-                radius = max(hole.radius_px, SMALLEST_RING_PX)
-                turn = np.linspace(0, 2 * np.pi, 65)
-                ring = hole.u_px + radius * np.cos(turn), hole.v_px + radius * np.sin(turn)
-                axes.plot(*ring, color=INK, lw=1.2, ls="-" if is_found else (0, (2.5, 1.8)))
-                above = (hole.u_px, hole.v_px - radius)
-                axes.annotate(
-                    hole.hole, above, (0, 2.5), textcoords="offset points", ha="center", fontsize=9
-                )
+                is_marked = _is_marked(cloud, hole)
+                marked += is_marked
+                _ring(axes, hole, is_marked)
+            left, right, low, top = box
             axes.set(xlim=(left, right), ylim=(low, top), ylabel="row (pixels)")
-            marked = f"{found} of {len(cloud.truth)} holes marked"
             axes.set_title(
-                f"{many(cloud.frames, 'frame')}, distance behind the fitted surface: {marked}"
+                f"{many(cloud.frames, 'frame')}, distance behind the fitted surface:"
+                f" {marked} of {len(cloud.truth)} holes marked"
             )
             residual_bar(figure, picture, "mm", cax=axes.inset_axes((1.012, 0.0, 0.013, 1.0)))
         panels[-1].set_xlabel("column (pixels)")
 
-    alt = "Range residual of each pixel in millimetres, with detected pixels and a ring at each true hole."
-    return svg("residual", (WIDTH_IN, sum(heights) + 0.75 * len(clouds)), alt, draw)
+    alt = (
+        "Range residual of each pixel in millimetres, with detected pixels and a ring at each true"
+        " hole."
+    )
+    return svg("residual", (WIDTH_IN, sum(heights_in) + 0.75 * len(clouds)), alt, draw)
+
+
+def _box(inside: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the ends (left, right, low, top) of a crop (h, w) bool, or of all pixels if it is
+    empty."""
+    v, u = np.nonzero(inside if inside.any() else np.ones_like(inside))
+    return u.min() - 0.5, u.max() + 0.5, v.max() + 0.5, v.min() - 0.5
+
+
+def _height_in(box: tuple[float, float, float, float]) -> float:
+    left, right, low, top = box
+    return min(max(0.92 * WIDTH_IN * (low - top) / (right - left), 1.1), 7.0)
+
+
+def _is_marked(cloud: ExampleCloud, hole: HoleInView) -> bool:
+    """Return whether a finding has a pixel on the hole."""
+    v, u = np.indices(cloud.detected.shape)
+    on_hole = np.hypot(u - hole.u_px, v - hole.v_px) <= max(hole.radius_px, 0.75)
+    return bool(cloud.detected[on_hole].any())
+
+
+def _ring(axes: Axes, hole: HoleInView, is_marked: bool) -> None:
+    """Draw a ring around a hole, dashed if it is not marked, with its number above."""
+    radius = max(hole.radius_px, SMALLEST_RING_PX)
+    turn = np.linspace(0, 2 * np.pi, 65)
+    u = hole.u_px + radius * np.cos(turn)
+    v = hole.v_px + radius * np.sin(turn)
+    axes.plot(u, v, color=INK, lw=1.2, ls="-" if is_marked else (0, (2.5, 1.8)))
+    above = (hole.u_px, hole.v_px - radius)
+    axes.annotate(
+        hole.hole,
+        above,
+        (0, 2.5),
+        textcoords="offset points",
+        ha="center",
+        fontsize=9,
+    )
+
+
+# ---------------------------------------------------------------- single damages
 
 
 def examples_figure(
     name: str, examples: Sequence[StudyExample], title: str, *, by_limit: bool = True
 ) -> str:
-    """Draw a set-up's examples. The columns are below, at and above the limit, or sizes if not
-    ``by_limit``."""
+    """Draw a set-up's examples with a common colour scale, in mm from the middle of each crop. The
+    columns are below, at and above the limit, or sizes if not ``by_limit``."""
     titles = TITLES if by_limit else SIZES
-    columns = []
-    for where in get_args(Where):
-        alike = [example for example in examples if example.where == where]
-        columns.append(sorted(alike, key=lambda item: (item.diameter_mm, item.board))[:MOST_DOWN])
-    every = [example for line in columns for example in line]
-    cuts = ([_example_cut(example, titles) for example in line] for line in columns)
-    rows = list(zip_longest(*cuts))
-    captions = "; ".join(
-        f"{each.diameter_mm:.1f} mm, {titles[each.where].lower()}, {_outcome(each)}"
-        for each in every
+    columns = [_column(examples, where) for where in get_args(Where)]
+    rows = list(zip_longest(*columns))
+    shown = [example for column in columns for example in column]
+    captions = "; ".join(_caption(example, titles) for example in shown)
+    norm = residual_norm(
+        np.concatenate([example.residual_mm.ravel() for row in rows for example in row if example])
     )
-    return _cuts(name, rows, f"{title}: {captions}.")
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(len(rows), len(rows[0]), squeeze=False)
+        in_order = [example for row in rows for example in row]
+        for axes, example in zip(panels.ravel(), in_order, strict=True):
+            if example is None:
+                axes.set_visible(False)
+            else:
+                picture = _draw_example(axes, example, norm, titles)
+        label = "distance behind the surface (mm)"
+        residual_bar(figure, picture, label, ax=panels, shrink=0.8, pad=0.02)
+
+    size_in = (2.5 * len(rows[0]) + 1.4, 3.2 * len(rows) + 0.3)
+    return svg(name, size_in, f"{title}: {captions}.", draw)
+
+
+def _column(examples: Sequence[StudyExample], where: Where) -> list[StudyExample]:
+    """Return the first examples of a column, smallest first."""
+    chosen = [example for example in examples if example.where == where]
+    chosen.sort(key=lambda example: (example.diameter_mm, example.board))
+    return chosen[:MOST_DOWN]
+
+
+def _caption(example: StudyExample, titles: Mapping[Where, str]) -> str:
+    column = titles[example.where].lower()
+    return f"{example.diameter_mm:.1f} mm, {column}, {_outcome(example)}"
 
 
 def _outcome(example: StudyExample) -> str:
@@ -122,64 +165,55 @@ def _outcome(example: StudyExample) -> str:
     return f"{word}: score {example.score:.3g}, threshold {example.threshold:.3g}"
 
 
-def _example_cut(example: StudyExample, titles: Mapping[Where, str]) -> Cut:
+def _draw_example(
+    axes: Axes, example: StudyExample, norm: SymLogNorm, titles: Mapping[Where, str]
+) -> AxesImage:
+    """Draw the crop around a damage with its rim, its size above and its outcome below."""
+    height, width = example.residual_mm.shape
+    dot = 60 / max(height, width)
+    picture = _image(axes, example.residual_mm, example.detected, norm, dot)
+    rim_px = np.vstack([example.outline_px, example.outline_px[:1]])
+    axes.plot(rim_px[:, 0], rim_px[:, 1], color=INK, lw=1.3)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), yticks=[])
+    middle = (width - 1) / 2
+    step = 10 / example.pitch_mm
+    ticks = [middle - step, middle, middle + step]
+    axes.set_xticks(ticks, ["−10", "0", "10 mm"], fontsize=8)
     pod = f", POD {example.pod:.2f}" if np.isfinite(example.pod) else ""
-    title = f"{titles[example.where]}\n{example.diameter_mm:.1f} × {example.depth_mm:.3g} mm{pod}"
-    below = _outcome(example).replace(", threshold", "\nthreshold")
-    colour = "#005b96" if example.hit else "#b34700"
-    return Cut(
-        example.residual_mm,
-        example.detected,
-        example.outline_px,
-        example.pitch_mm,
-        title,
-        below,
-        colour,
-    )
+    size = f"{example.diameter_mm:.1f} × {example.depth_mm:.3g} mm{pod}"
+    axes.set_title(f"{titles[example.where]}\n{size}", fontsize=9.5)
+    outcome = _outcome(example).replace(", threshold", "\nthreshold")
+    colour = HIT_COLOUR if example.hit else MISS_COLOUR
+    axes.set_xlabel(outcome, color=colour, fontsize=9)
+    return picture
 
 
-def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
-    """Draw damages with a common colour scale; the axes are in mm from the middle of each crop."""
-    cuts = [cut for line in rows for cut in line if cut is not None]
-    norm = residual_norm(np.concatenate([cut.residual_mm.ravel() for cut in cuts]))
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(len(rows), len(rows[0]), squeeze=False)
-        for axes, cut in zip(panels.ravel(), (cut for line in rows for cut in line), strict=True):
-            if cut is None:
-                axes.set_visible(False)
-                continue
-            picture = _image(
-                axes, cut.residual_mm, cut.detected, norm, dot=60 / max(cut.residual_mm.shape)
-            )
-            axes.plot(*np.vstack([cut.rim_px, cut.rim_px[:1]]).T, color=INK, lw=1.3)
-            height, width = cut.residual_mm.shape
-            axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), yticks=[])
-            middle = (width - 1) / 2
-            step = 10 / cut.pitch_mm
-            axes.set_xticks(
-                [middle - step, middle, middle + step], ["−10", "0", "10 mm"], fontsize=8
-            )
-            axes.set_title(cut.title, fontsize=9.5)
-            axes.set_xlabel(cut.below, color=cut.colour, fontsize=9)
-        residual_bar(
-            figure, picture, "distance behind the surface (mm)", ax=panels, shrink=0.8, pad=0.02
-        )
-
-    return svg(name, (2.5 * len(rows[0]) + 1.4, 3.2 * len(rows) + 0.3), alt, draw)
+# ---------------------------------------------------------------- the common colour scale
 
 
 def residual_norm(residual_mm: np.ndarray) -> SymLogNorm:
     """Return the colour scale for residuals (any shape): linear within 1 mm, logarithmic beyond."""
     from matplotlib.colors import SymLogNorm
 
-    finite = np.abs(residual_mm[np.isfinite(residual_mm)])
-    limit = max(LEAST_MM, float(np.quantile(finite, 0.9995)) if finite.size else 0.0)
-    return SymLogNorm(linthresh=1, linscale=1.2, vmin=-limit, vmax=limit, base=10)
+    finite_mm = np.abs(residual_mm[np.isfinite(residual_mm)])
+    limit_mm = LEAST_MM
+    if finite_mm.size:
+        limit_mm = max(LEAST_MM, float(np.quantile(finite_mm, 0.9995)))
+    return SymLogNorm(
+        linthresh=1,
+        linscale=1.2,
+        vmin=-limit_mm,
+        vmax=limit_mm,
+        base=10,
+    )
 
 
 def _image(
-    axes: Axes, residual_mm: np.ndarray, detected: np.ndarray, norm: SymLogNorm, dot: float = 1.1
+    axes: Axes,
+    residual_mm: np.ndarray,
+    detected: np.ndarray,
+    norm: SymLogNorm,
+    dot: float = 1.1,
 ) -> AxesImage:
     """Draw residuals (h, w) with a dot of ``dot`` points on each pixel of a finding."""
     axes.set_facecolor(NOTHING)
@@ -191,12 +225,13 @@ def _image(
 
 
 def residual_bar(
-    figure: Figure | SubFigure, picture: ScalarMappable, label: str, **place: Any
+    figure: Figure | SubFigure, picture: ScalarMappable, label: str, **position: Any
 ) -> None:
-    """Draw the colour bar with round numbers; ``place`` is passed to `Figure.colorbar`."""
-    limit = picture.get_clim()[1] or LEAST_MM
-    bar = figure.colorbar(picture, extend="both", **place)
+    """Draw the colour bar with round numbers; ``position`` is passed to `Figure.colorbar`."""
+    limit_mm = picture.get_clim()[1] or LEAST_MM
+    bar = figure.colorbar(picture, extend="both", **position)
     bar.set_label(label)
-    ticks = [t for t in (-100, -10, -1, 0, 1, 10, 100) if abs(t) <= limit]
-    bar.set_ticks(ticks, labels=[f"{t:+d}".replace("-", "−") if t else "0" for t in ticks])
+    ticks_mm = [mm for mm in (-100, -10, -1, 0, 1, 10, 100) if abs(mm) <= limit_mm]
+    labels = [f"{mm:+d}".replace("-", "−") if mm else "0" for mm in ticks_mm]
+    bar.set_ticks(ticks_mm, labels=labels)
     bar.minorticks_off()

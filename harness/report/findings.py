@@ -6,9 +6,10 @@ All files of a run are first written under temporary names and renamed together 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,64 +23,91 @@ from harness.vocabulary.geometry import MM, Cloud
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 DAMAGE_RGB = (255, 0, 255)
-# least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1
-# mm
+OTHER_GREY = 160
+"""Grey of the points of a cloud without colours."""
 ELONGATED = 2.0
+"""Least ratio of length to width of a long finding."""
+LEAST_WIDTH_MM = 1.0
+"""A width below this, which is noise, counts as this."""
+MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
+"""Numbers of the model in the JSON."""
+
+# ---------------------------------------------------------------- rows
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A row: the better of both measures in the camera frame; NaN if nothing could be measured.
-    ``kind`` is ``hole``, ``bump`` or ``no return``. ``length_mm`` and ``width_mm`` are the sides
-    of a rectangle with the residual's second moments; ``angle_deg`` is the longer side's angle
-    from x towards y, -90 to 90, across the line of sight. ``size_from`` is ``model`` (blurred
-    hole, standard errors), ``contour`` (half depth), ``extent`` (extreme points) or ``area`` (no
-    return); ``depth_from`` is the same, ``extreme residual`` of the cluster's points, or ``none``.
-    """
+    """A row: the better of both measures in the camera frame; NaN if nothing could be measured."""
 
     id: int
+    """Number from 1, strongest first."""
     kind: str
+    """``hole``, ``bump`` or ``no return``."""
     u_px: float
+    """Column of its centre in the image."""
     v_px: float
+    """Row of its centre in the image."""
     x_mm: float
+    """x of its centre (to the right)."""
     y_mm: float
+    """y of its centre (down)."""
     z_mm: float
+    """z of its centre (away from the camera)."""
     diameter_mm: float
+    """Diameter, see ``size_from``."""
     depth_mm: float
+    """Depth, negative for a bump, see ``depth_from``."""
     volume_mm3: float
+    """Volume between the surface and the points behind it."""
     points: int
+    """Number of points of the cluster."""
     score: float
+    """The detector's score."""
     length_mm: float
+    """Longer side of a rectangle with the residual's second moments."""
     width_mm: float
+    """Shorter side of that rectangle."""
     angle_deg: float
+    """Angle of the longer side from x towards y, -90 to 90, across the line of sight."""
     size_from: str
+    """``model`` (blurred hole, standard errors), ``contour`` (half depth), ``extent`` (extreme
+    points) or ``area`` (no return)."""
     depth_from: str
+    """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
 
     @property
     def is_long(self) -> bool:
         """True if it is `ELONGATED`, so that its diameter is of little use."""
-        return self.length_mm > ELONGATED * max(self.width_mm, 1.0)
+        return self.length_mm > ELONGATED * max(self.width_mm, LEAST_WIDTH_MM)
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with a detector's results. ``missing`` are its missing returns, None without a pixel
-    grid."""
+    """A cloud with a detector's results."""
 
     cloud: Cloud
+    """The cloud."""
     evidence: Evidence
+    """The detector's scores and residuals."""
     detections: tuple[Detection, ...]
+    """The clusters, strongest first."""
     measurements: tuple[Measurement, ...]
+    """The size and place of each cluster."""
     missing: MissingReturns | None = None
+    """Missing returns; None without a pixel grid."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The findings, numbered from 1, strongest first."""
         pairs = zip(self.detections, self.measurements, strict=True)
-        return tuple(finding_of(i, self.evidence, d, m) for i, (d, m) in enumerate(pairs, start=1))
+        return tuple(
+            finding_of(number, self.evidence, detection, measured)
+            for number, (detection, measured) in enumerate(pairs, start=1)
+        )
 
 
 def finding_of(
@@ -87,40 +115,61 @@ def finding_of(
 ) -> Finding:
     """Return the row of a detection: the model's numbers if they exist, or else those of the
     extents."""
-    modelled = math.isfinite(measured.model_diameter_m)
-    placed = bool(np.isfinite(measured.model_centre_m).all())
-    x_mm, y_mm, z_mm = (
-        float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m)
-    )
-    diameter_m = measured.model_diameter_m if modelled else measured.extent_diameter_m
-    size_from = (
-        "extent"
-        if not modelled
-        else "contour"
-        if math.isnan(measured.model_diameter_se_m)
-        else "model"
-    )
-    depth_m = measured.model_depth_m
-    depth_from = size_from
-    if detection.kind == "no return":
-        size_from = "area"
-        depth_from = "none"
-    elif math.isnan(depth_m):
-        residuals = evidence.residual_m.reshape(-1)[detection.pixels]
-        depth_m = float(residuals[np.argmax(np.abs(residuals))])
-        depth_from = "extreme residual"
-    kind = detection.kind if detection.kind == "no return" else "bump" if depth_m < 0 else "hole"
-    place = (measured.u_px, measured.v_px, x_mm, y_mm, z_mm)
-    sizes = (diameter_m / MM, depth_m / MM, measured.volume_m3 / MM**3)
-    x, y, _ = measured.along
-    sides = (
-        measured.length_m / MM,
-        measured.width_m / MM,
-        float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90),
-    )
+    centre_m = measured.extent_centre_m
+    if np.isfinite(measured.model_centre_m).all():
+        centre_m = measured.model_centre_m
+    is_modelled = math.isfinite(measured.model_diameter_m)
+    diameter_m = measured.model_diameter_m if is_modelled else measured.extent_diameter_m
+    size_from = _size_from(detection, measured)
+    depth_m, depth_from = _depth_of(evidence, detection, measured)
+    kind: str = detection.kind
+    if kind != "no return":
+        kind = "bump" if depth_m < 0 else "hole"
+    along_x, along_y, _ = measured.along
+    # the angle of the direction, turned by multiples of 180 degrees into -90 to 90
+    angle_deg = float(np.degrees(np.arctan2(along_y, along_x) + np.pi / 2) % 180 - 90)
     return Finding(
-        number, kind, *place, *sizes, measured.points, measured.score, *sides, size_from, depth_from
+        id=number,
+        kind=kind,
+        u_px=measured.u_px,
+        v_px=measured.v_px,
+        x_mm=float(centre_m[0]) / MM,
+        y_mm=float(centre_m[1]) / MM,
+        z_mm=float(centre_m[2]) / MM,
+        diameter_mm=diameter_m / MM,
+        depth_mm=depth_m / MM,
+        volume_mm3=measured.volume_m3 / MM**3,
+        points=measured.points,
+        score=measured.score,
+        length_mm=measured.length_m / MM,
+        width_mm=measured.width_m / MM,
+        angle_deg=angle_deg,
+        size_from=size_from,
+        depth_from=depth_from,
     )
+
+
+def _size_from(detection: Detection, measured: Measurement) -> str:
+    """Return the measure of the diameter."""
+    if detection.kind == "no return":
+        return "area"
+    if not math.isfinite(measured.model_diameter_m):
+        return "extent"
+    return "contour" if math.isnan(measured.model_diameter_se_m) else "model"
+
+
+def _depth_of(evidence: Evidence, detection: Detection, measured: Measurement) -> tuple[float, str]:
+    """Return the depth in metres and its measure: the model's, or else the extreme residual."""
+    depth_m = measured.model_depth_m
+    if detection.kind == "no return":
+        return depth_m, "none"
+    if not math.isnan(depth_m):
+        return depth_m, _size_from(detection, measured)
+    residuals_m = evidence.residual_m.reshape(-1)[detection.pixels]
+    return float(residuals_m[np.argmax(np.abs(residuals_m))]), "extreme residual"
+
+
+# ---------------------------------------------------------------- files
 
 
 def write_findings(
@@ -134,10 +183,11 @@ def write_findings(
     """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about``
     besides the findings; ``beside`` maps names of further files to functions that write them.
     Raises UserError if writing fails."""
-    is_new, (cloud, missing, detections) = (
-        not folder.exists(),
-        (judged.cloud, judged.missing, judged.detections),
-    )
+    is_new = not folder.exists()
+    cloud = judged.cloud
+    detections = judged.detections
+    missing = judged.missing
+    figure_of_findings = partial(findings_figure, cloud, judged.evidence, detections, title)
     writers: dict[str, Callable[[Path], object]] = {
         outputs.FINDINGS.name: lambda path: path.write_text(
             csv_text(judged.findings), encoding="utf-8"
@@ -145,12 +195,10 @@ def write_findings(
         outputs.FINDINGS_DATA.name: lambda path: path.write_text(
             json_text(judged, about), encoding="utf-8"
         ),
-        outputs.ANNOTATED.name: lambda path: _save(
-            path, findings_figure(cloud, judged.evidence, detections, title)
-        ),
+        outputs.ANNOTATED.name: lambda path: _save(path, figure_of_findings()),
         cloud_name: lambda path: path.write_bytes(ply_bytes(cloud, detections)),
-        **(beside or {}),
     }
+    writers.update(beside or {})
     if missing is not None:
         writers[outputs.BLIND.name] = lambda path: save_blind_map(path, cloud, missing, detections)
     try:
@@ -167,31 +215,23 @@ def write_findings(
 
 def csv_text(findings: Sequence[Finding]) -> str:
     """Return the content of findings.csv; unknown numbers are empty cells."""
-    frame = trials.FINDINGS_OF_CAPTURE.frame(findings)
-    return str(
-        frame.to_csv(
-            index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"
-        )
-    )
+    table = trials.FINDINGS_OF_CAPTURE
+    frame = table.frame(findings)
+    return str(frame.to_csv(index=False, float_format=table.digits, lineterminator="\n"))
 
 
 def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
     """Return the findings with both measures and their standard errors, then ``about``; unknown
     numbers are null."""
-    rows = [
-        asdict(finding)
-        | {
-            "extent": {
-                "diameter_mm": m.extent_diameter_m / MM,
-                "centre_mm": m.extent_centre_m / MM,
-            },
-            "model": {
-                **{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED},
-                "note": m.model_note,
-            },
+    rows = []
+    for finding, measured in zip(judged.findings, judged.measurements, strict=True):
+        extent = {
+            "diameter_mm": measured.extent_diameter_m / MM,
+            "centre_mm": measured.extent_centre_m / MM,
         }
-        for finding, m in zip(judged.findings, judged.measurements, strict=True)
-    ]
+        model = {f"{name}_mm": getattr(measured, f"model_{name}_m") / MM for name in MODELLED}
+        model["note"] = measured.model_note
+        rows.append({**asdict(finding), "extent": extent, "model": model})
     return plain_json({"findings_version": trials.FINDINGS_VERSION, "findings": rows, **about})
 
 
@@ -200,9 +240,10 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
     rest coloured."""
     import trimesh
 
-    colours = np.full((cloud.valid.size, 3), 160, np.uint8)
-    if cloud.rgb is not None:
-        colours = np.clip(np.nan_to_num(cloud.rgb), 0, 255).reshape(-1, 3).astype(np.uint8)
+    if cloud.rgb is None:
+        colours = np.full((cloud.valid.size, 3), OTHER_GREY, np.uint8)
+    else:
+        colours = _bytes(cloud.rgb).reshape(-1, 3)
     for detection in detections:
         colours[detection.pixels] = DAMAGE_RGB
     valid = cloud.valid.reshape(-1)
@@ -211,14 +252,17 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
     return exported
 
 
-MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
+# ---------------------------------------------------------------- pictures
+
 WIDTH_IN = 11.0
+HIGHEST_IN = 30.0
 DPI = 150
 TAKEN = "#ff00ff"
 OTHERS = ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
 """Colours that differ from grey and from one another, also for viewers with red-green blindness.
 """
 Box = tuple[float, float, float, float]
+"""Left, right, bottom and top ends of axes; down is positive."""
 
 
 def findings_figure(
@@ -226,31 +270,41 @@ def findings_figure(
 ) -> Figure:
     """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan
     view in mm."""
-    panels = 2 if cloud.organised and cloud.rgb is not None else 1
+    has_image = cloud.organised and cloud.rgb is not None
+    panels = 2 if has_image else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
-    residual_mm = evidence.residual_m / MM
-    style: dict[str, Any] = {"cmap": "RdBu_r", "norm": residual_norm(residual_mm)}
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
-        if panels == 2:
+        if has_image:
             axes[0].imshow(_bytes(cloud.rgb), extent=_edges(cloud), interpolation="nearest")
-        axes[-1].set_facecolor("0.82")
-        if cloud.organised:
-            shown = axes[-1].imshow(
-                residual_mm, extent=_edges(cloud), interpolation="nearest", **style
-            )
-        else:
-            judged = np.isfinite(residual_mm)
-            x = cloud.points_m[..., 0][judged] / MM
-            y = cloud.points_m[..., 1][judged] / MM
-            shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
-        residual_bar(figure, shown, "mm behind (+) or before (−) the surface", ax=list(axes))
+        picture = _draw_residual(axes[-1], cloud, evidence.residual_m / MM)
+        residual_bar(figure, picture, "mm behind (+) or before (−) the surface", ax=list(axes))
         for panel in axes:
             _frame(panel, cloud, box)
-            _circle(panel, cloud, enumerate(detections, start=1))
+            for number, detection in enumerate(detections, start=1):
+                _circle(panel, cloud, number, detection)
 
     return _figure(title, panels * _height_in(box), draw)
+
+
+def _draw_residual(axes: Axes, cloud: Cloud, residual_mm: np.ndarray) -> ScalarMappable:
+    """Draw residuals as an image, or as points without a pixel grid."""
+    axes.set_facecolor("0.82")
+    style: dict[str, Any] = {"cmap": "RdBu_r", "norm": residual_norm(residual_mm)}
+    if cloud.organised:
+        return axes.imshow(residual_mm, extent=_edges(cloud), interpolation="nearest", **style)
+    judged = np.isfinite(residual_mm)
+    x_mm = cloud.points_m[..., 0][judged] / MM
+    y_mm = cloud.points_m[..., 1][judged] / MM
+    return axes.scatter(
+        x_mm,
+        y_mm,
+        c=residual_mm[judged],
+        s=2,
+        linewidths=0,
+        **style,
+    )
 
 
 def save_blind_map(
@@ -262,53 +316,47 @@ def save_blind_map(
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        style: dict[str, Any] = {
-            "interpolation": "nearest",
-            "cmap": "Greys",
-            "vmin": 0,
-            "vmax": 100,
-        }
-        shown = axes.imshow(100 * missing.unseen, extent=_edges(cloud), **style)
-        figure.colorbar(shown, ax=axes, shrink=0.6).set_label(
-            "frames without a return, %", fontsize=8
+        unseen_percent = 100 * missing.unseen
+        picture = axes.imshow(
+            unseen_percent,
+            extent=_edges(cloud),
+            interpolation="nearest",
+            cmap="Greys",
+            vmin=0,
+            vmax=100,
         )
+        bar = figure.colorbar(picture, ax=axes, shrink=0.6)
+        bar.set_label("frames without a return, %", fontsize=8)
         if min(missing.outline.shape) > 1 and not missing.outline.all():
             height, width = missing.outline.shape
             columns = np.arange(width) + cloud.region.col0
             rows = np.arange(height) + cloud.region.row0
             axes.contour(
-                columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8
+                columns,
+                rows,
+                missing.outline,
+                levels=[0.5],
+                colors="#0070c0",
+                linewidths=0.8,
             )
         _frame(axes, cloud, box)
-        _circle(
-            axes,
-            cloud,
-            (
-                (n, found)
-                for n, found in enumerate(detections, start=1)
-                if found.kind == "no return"
-            ),
-        )
+        for number, detection in enumerate(detections, start=1):
+            if detection.kind == "no return":
+                _circle(axes, cloud, number, detection)
 
-    _save(
-        path,
-        _figure(
-            f"{100 * missing.blind:.2g} % of the target's pixels returned nothing",
-            _height_in(box),
-            draw,
-        ),
-    )
+    title = f"{100 * missing.blind:.2g} % of the target's pixels returned nothing"
+    _save(path, _figure(title, _height_in(box), draw))
 
 
 def save_targets(
-    path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int
+    path: Path,
+    grid: Cloud,
+    outlines: Sequence[np.ndarray],
+    texts: Sequence[str],
+    taken: int,
 ) -> None:
     """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and
     numbers from 1."""
-    import cv2
-    from matplotlib.patheffects import withStroke
-
-    height, width = grid.valid.shape
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -316,40 +364,63 @@ def save_targets(
         axes.set_axis_off()
         colours = iter(OTHERS * 2)
         for number, (outline, text) in enumerate(zip(outlines, texts, strict=True), start=1):
-            chosen = number == taken
-            colour = TAKEN if chosen else next(colours)
-            x = np.arange(-1, width + 1)
-            y = np.arange(-1, height + 1)
-            padded = np.pad(outline, 1)
-            axes.contour(
-                x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4
-            )
-            # the pixel that is farthest from the outline
-            depth = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-            v, u = np.unravel_index(int(depth.argmax()), depth.shape)
-            style: dict[str, Any] = {
-                "fontsize": 22,
-                "weight": "bold",
-                "ha": "center",
-                "va": "center",
-                "color": colour,
-            }
-            style["path_effects"] = [withStroke(linewidth=4, foreground="black")]
-            axes.text(float(u), float(v), str(number), **style)
-            how = "taken" if chosen else f"--target {number}"
-            axes.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {text}")
+            is_taken = number == taken
+            colour = TAKEN if is_taken else next(colours)
+            _draw_outline(axes, outline, str(number), colour, 2.4 if is_taken else 1.4)
+            choice = "taken" if is_taken else f"--target {number}"
+            axes.plot([], [], color=colour, linewidth=3, label=f"{number} ({choice}): {text}")
         figure.legend(loc="outside lower center", fontsize=9, frameon=False)
 
-    _save(
-        path,
-        _figure("", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw),
+    height, width = grid.valid.shape
+    picture_in = min(WIDTH_IN * 0.97 * height / width, 24.0)
+    legend_in = 0.26 * len(outlines)
+    _save(path, _figure("", picture_in + legend_in + 0.6, draw))
+
+
+def _draw_outline(
+    axes: Axes,
+    outline: np.ndarray,
+    number: str,
+    colour: str,
+    line_width: float,
+) -> None:
+    """Draw the edge of an outline (h, w) bool, and its number at the pixel that is farthest from
+    the edge."""
+    import cv2
+    from matplotlib.patheffects import withStroke
+
+    height, width = outline.shape
+    padded = np.pad(outline, 1)
+    columns = np.arange(-1, width + 1)
+    rows = np.arange(-1, height + 1)
+    axes.contour(
+        columns,
+        rows,
+        padded.astype(float),
+        [0.5],
+        colors=colour,
+        linewidths=line_width,
+    )
+    distance_px = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    v, u = np.unravel_index(int(distance_px.argmax()), distance_px.shape)
+    axes.text(
+        float(u),
+        float(v),
+        number,
+        fontsize=22,
+        weight="bold",
+        ha="center",
+        va="center",
+        color=colour,
+        path_effects=[withStroke(linewidth=4, foreground="black")],
     )
 
 
 def _figure(title: str, height_in: float, draw: Callable[[Figure], None]) -> Figure:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH_IN, min(height_in + 0.4, 30.0)), dpi=DPI, layout="compressed")
+    size_in = (WIDTH_IN, min(height_in + 0.4, HIGHEST_IN))
+    figure = Figure(figsize=size_in, dpi=DPI, layout="compressed")
     figure.suptitle(title, fontsize=10, parse_math=False)  # a file may be called $x$
     draw(figure)
     return figure
@@ -367,66 +438,80 @@ def _height_in(box: Box) -> float:
 
 
 def _around(cloud: Cloud, part: np.ndarray) -> Box:
-    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a margin of
-    a twelfth."""
+    """Return the box of a part (h, w) bool of the cloud's grid with a margin of a twelfth, inside
+    the whole box."""
     left, right, bottom, top = _edges(cloud)
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
         return left, right, bottom, top
-    u0 = float(columns.min())
-    u1 = float(columns.max() + 1)
-    v0 = float(rows.min())
-    v1 = float(rows.max() + 1)
-    margin = max(u1 - u0, v1 - v0) / 12.0
-    sides = left + np.array([u0 - margin, u1 + margin]), top + np.array([v1 + margin, v0 - margin])
-    (a, b), (c, d) = np.clip(sides[0], left, right), np.clip(sides[1], top, bottom)
-    return float(a), float(b), float(c), float(d)
+    first_column = float(columns.min())
+    end_column = float(columns.max() + 1)
+    first_row = float(rows.min())
+    end_row = float(rows.max() + 1)
+    margin = max(end_column - first_column, end_row - first_row) / 12.0
+    u = left + np.array([first_column - margin, end_column + margin])
+    v = top + np.array([end_row + margin, first_row - margin])
+    part_left, part_right = np.clip(u, left, right)
+    part_bottom, part_top = np.clip(v, top, bottom)
+    return float(part_left), float(part_right), float(part_bottom), float(part_top)
 
 
 def _edges(cloud: Cloud) -> Box:
-    """Return (left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid;
-    down is positive."""
+    """Return the box of a whole cloud: sensor pixels, or millimetres without a grid."""
     if cloud.organised:
         region = cloud.region
         return region.col0 - 0.5, region.col1 - 0.5, region.row1 - 0.5, region.row0 - 0.5
-    x = cloud.points_m[..., 0][cloud.valid] / MM
-    y = cloud.points_m[..., 1][cloud.valid] / MM
-    return float(x.min()), float(x.max()), float(y.max()), float(y.min())
+    x_mm = cloud.points_m[..., 0][cloud.valid] / MM
+    y_mm = cloud.points_m[..., 1][cloud.valid] / MM
+    return float(x_mm.min()), float(x_mm.max()), float(y_mm.max()), float(y_mm.min())
 
 
 def _frame(axes: Axes, cloud: Cloud, box: Box) -> None:
-    unit = "cell" if cloud.projection == "parallel" else "px"
-    x, y = (f"u, {unit}", f"v, {unit}") if cloud.organised else ("x, mm", "y, mm")
-    axes.set(xlabel=x, ylabel=y, xlim=box[:2], ylim=box[2:], aspect="equal", autoscale_on=False)
+    """Set the ends and the labels of axes."""
+    if cloud.organised:
+        unit = "cell" if cloud.projection == "parallel" else "px"
+        axes.set(xlabel=f"u, {unit}", ylabel=f"v, {unit}")
+    else:
+        axes.set(xlabel="x, mm", ylabel="y, mm")
+    axes.set(
+        xlim=box[:2],
+        ylim=box[2:],
+        aspect="equal",
+        autoscale_on=False,
+    )
 
 
-def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]]) -> None:
-    """Draw a circle around each cluster, with its number at the upper right."""
+def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None:
+    """Draw a circle around a cluster, with its number at the upper right."""
     from matplotlib.patches import Circle
 
-    for number, detection in numbered:
-        if cloud.organised:
-            rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
-            u = columns + cloud.region.col0
-            v = rows + cloud.region.row0
-            margin = 3.0
-        else:
-            u, v = (cloud.points_m.reshape(-1, 3)[detection.pixels] / MM).T[:2]
-            margin = 2.0
-        centre = 0.5 * float(u.min() + u.max()), 0.5 * float(v.min() + v.max())
-        radius = 0.5 * float(max(np.ptp(u), np.ptp(v))) + margin
-        axes.add_patch(Circle(centre, radius, fill=False, color=TAKEN, linewidth=0.9))
-        at = (centre[0] + 0.71 * radius, centre[1] - 0.71 * radius)
-        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.4}
-        axes.annotate(
-            str(number),
-            at,
-            (1, 1),
-            textcoords="offset points",
-            bbox=box,
-            fontsize=7,
-            annotation_clip=True,
-        )
+    if cloud.organised:
+        rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+        u = columns + cloud.region.col0
+        v = rows + cloud.region.row0
+        margin = 3.0
+    else:
+        u, v, _ = (cloud.points_m.reshape(-1, 3)[detection.pixels] / MM).T
+        margin = 2.0
+    u_centre = 0.5 * float(u.min() + u.max())
+    v_centre = 0.5 * float(v.min() + v.max())
+    radius = 0.5 * float(max(np.ptp(u), np.ptp(v))) + margin
+    axes.add_patch(Circle((u_centre, v_centre), radius, fill=False, color=TAKEN, linewidth=0.9))
+    corner = (u_centre + 0.71 * radius, v_centre - 0.71 * radius)
+    axes.annotate(
+        str(number),
+        corner,
+        (1, 1),
+        textcoords="offset points",
+        bbox={
+            "facecolor": "white",
+            "edgecolor": "none",
+            "alpha": 0.6,
+            "pad": 0.4,
+        },
+        fontsize=7,
+        annotation_clip=True,
+    )
 
 
 def _bytes(rgb: Any) -> np.ndarray:
@@ -440,7 +525,7 @@ def _view(grid: Cloud) -> np.ndarray:
     values = -grid.points_m[..., 2]
     if grid.amplitude is not None and np.isfinite(grid.amplitude).any():
         values = np.sqrt(np.maximum(grid.amplitude, 0.0))
-    known = values[np.isfinite(values)]
-    low, high = np.quantile(known, (0.02, 0.98)) if len(known) else (0.0, 1.0)
+    finite = values[np.isfinite(values)]
+    low, high = np.quantile(finite, (0.02, 0.98)) if len(finite) else (0.0, 1.0)
     grey = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) * 190.0 + 50.0
     return np.repeat(np.nan_to_num(grey)[..., None], 3, axis=-1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Summaries of an experiment that is not a study, computed once for files, pages and the terminal."""
+"""Summaries of an experiment that is not a study, computed once for files, pages and terminal."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,55 +9,67 @@ from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
 from harness.evaluation.summary import false_calls, noise_against_frames, summarise_holes
 from harness.records import trials
+from harness.records.examples import ExampleCloud, MappedExample
 from harness.records.schema import Table
 from harness.report.claims import ClaimSet, Verdict
 from harness.vocabulary.provenance import RESULTS_VERSION
 
 Summaries = Mapping[Table, pd.DataFrame]
-LISTS = (
-    "found",
-    "undecided",
-    "reasons",
-)  # columns whose values are lists in memory and text in files
+LISTS = ("found", "undecided", "reasons")
+"""Columns whose values are lists in memory and text in files."""
+IN_FILES = {"conditions": "place"}
+"""Columns that have another name in files."""
 
 
 def summaries(
     tables: trials.ResultTables,
-    examples: Sequence[Any] = (),
+    examples: Sequence[ExampleCloud | MappedExample] = (),
     claim_set: ClaimSet | None = None,
 ) -> Summaries:
-    """Return all tables for a page. Claims, which use the pictures ``examples``, and the
-    posterior need a ``claim_set``."""
+    """Return all tables for a page. Claims, which use the pictures ``examples``, and the posterior
+    need a ``claim_set``."""
     paths = [str(path) for path in tables.axes["path"]]
-    set_ups = set_ups_of(tables)
     summary = summarise_holes(tables.holes, paths)
-    everything = [str(name) for name in tables.variants["variant"]]
-    found = {trials.SUMMARY: summary, trials.FALSE_CALLS: false_calls(tables.runs)}
-    found[trials.NOISE_BY_FRAMES] = noise_against_frames(tables.probes)
+    computed: dict[Table, pd.DataFrame] = {
+        trials.SUMMARY: summary,
+        trials.FALSE_CALLS: false_calls(tables.runs),
+        trials.NOISE_BY_FRAMES: noise_against_frames(tables.probes),
+    }
     verdicts: Sequence[Verdict] = ()
     if not tables.registrations.empty:
-        own = tables.registrations[tables.registrations["variant"].isin(set_ups)]
-        found[trials.SET_UPS] = compare_maps(tables, summary)
-        found[trials.REGISTRATION_ERRORS] = by_views(
-            own, sorted({set_up.views for set_up in maps_of(tables)})
-        )
+        computed[trials.SET_UPS] = compare_maps(tables, summary)
+        computed[trials.REGISTRATION_ERRORS] = _registration_errors(tables)
         if claim_set is not None:
             verdicts = claim_set.judge_views(map_cases(tables, summary))
     else:
-        several = len(set_ups) > 1
-        compared = compare_set_ups(tables, summary, everything, half_sizes=several)
-        if len(compared):
-            compared["is_variation"] = ~compared["variant"].isin(set_ups)
-        found[trials.SET_UPS] = compared
-        found[trials.EFFECTS] = effect_costs(tables)
-        if claim_set is not None and several:
+        has_several = len(set_ups_of(tables)) > 1
+        computed[trials.SET_UPS] = _compared(tables, summary, half_sizes=has_several)
+        computed[trials.EFFECTS] = effect_costs(tables)
+        if claim_set is not None and has_several:
             verdicts = claim_set.judge_set_ups(summary, paths)
             posterior = claim_set.posterior_of(of_set_ups(summary, tables), paths)
             if posterior is not None:
-                found[trials.POSTERIOR] = posterior
+                computed[trials.POSTERIOR] = posterior
         elif claim_set is not None:
-            verdicts = claim_set.judge_sweep(tables, examples, summary)
-    return {**found, trials.CLAIMS: trials.CLAIMS.frame(map(vars, verdicts))}
+            clouds = [example for example in examples if isinstance(example, ExampleCloud)]
+            verdicts = claim_set.judge_sweep(tables, clouds, summary)
+    computed[trials.CLAIMS] = trials.CLAIMS.frame(map(vars, verdicts))
+    return computed
+
+
+def _registration_errors(tables: trials.ResultTables) -> pd.DataFrame:
+    """Return the errors of the set-ups' registrations for each number of views that occurs."""
+    counts = sorted({set_up.views for set_up in maps_of(tables)})
+    return by_views(of_set_ups(tables.registrations, tables), counts)
+
+
+def _compared(tables: trials.ResultTables, summary: pd.DataFrame, half_sizes: bool) -> pd.DataFrame:
+    """Return the comparison of all set-ups and variations."""
+    variants = [str(name) for name in tables.variants["variant"]]
+    compared = compare_set_ups(tables, summary, variants, half_sizes=half_sizes)
+    if len(compared):
+        compared["is_variation"] = ~compared["variant"].isin(set_ups_of(tables))
+    return compared
 
 
 def of_set_ups(rows: pd.DataFrame, tables: trials.ResultTables) -> pd.DataFrame:
@@ -65,17 +77,17 @@ def of_set_ups(rows: pd.DataFrame, tables: trials.ResultTables) -> pd.DataFrame:
     return rows[rows["variant"].isin(set_ups_of(tables))] if len(rows) else rows
 
 
-def verdicts_of(found: Summaries) -> list[Verdict]:
+def verdicts_of(computed: Summaries) -> list[Verdict]:
     """Return the claims that were scored."""
-    return [Verdict(*row) for row in found[trials.CLAIMS].itertuples(index=False)]
+    rows: list[Any] = computed[trials.CLAIMS].to_dict("records")
+    return [Verdict(**row) for row in rows]
 
 
-def as_files(found: Summaries) -> dict[Table, pd.DataFrame]:
+def as_files(computed: Summaries) -> dict[Table, pd.DataFrame]:
     """Return the tables as files hold them, with lists converted to text."""
-    written = {
-        table: frame.assign(**{name: frame[name].map("; ".join) for name in LISTS if name in frame})
-        for table, frame in found.items()
-    }
-    return written | {
-        trials.SUMMARY: written[trials.SUMMARY].assign(results_version=RESULTS_VERSION)
-    }
+    written = {}
+    for table, frame in computed.items():
+        texts = {name: frame[name].map("; ".join) for name in LISTS if name in frame}
+        written[table] = frame.assign(**texts).rename(columns=IN_FILES)
+    written[trials.SUMMARY] = written[trials.SUMMARY].assign(results_version=RESULTS_VERSION)
+    return written

@@ -144,8 +144,8 @@ def refiled(entry: Ended, judged: Trial, task: Trial) -> Ended:
 def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | None:
     """Return a point's threshold: given, or from its hole-free runs; None without runs.
 
-    ``quiet``: (quiet threshold, judged area in m2) of each run. The threshold is the highest or, in
-    a study, the one for the wanted rate of false calls. Raises UserError."""
+    ``quiet``: (quiet threshold, judged area in m2) of each run. The threshold is the highest or,
+    in a study, the one for the wanted rate of false calls. Raises UserError."""
     given_k = point.config.threshold.k
     calibrate = point.config.threshold.calibrate
     runs = list(quiet)

@@ -69,7 +69,8 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         )
         print_warnings(f"{name}: {text}" for text in warnings)
         print(
-            f"{name} {point.label}: {len(result.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm"
+            f"{name} {point.label}: {len(result.findings)} findings beyond "
+            f"{rows[-1]['threshold_mm']:.2f} mm"
         )
         for left_out in cloud.left_out:
             print(f"  left out: {left_out.name}: {left_out.why}")

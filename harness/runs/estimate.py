@@ -113,7 +113,8 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     print(f"  trials: {trials}")
     if stored_records:
         print(
-            f"  the journal holds {many(stored_records, 'trial')}; those of the same code and settings are not run again"
+            f"  the journal holds {many(stored_records, 'trial')}; those of the same code "
+            "and settings are not run again"
         )
     print(f"  results would go to {folder}")
     return 0

@@ -131,7 +131,8 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: no limit."""
+    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: no
+    limit."""
 
     seconds: float | None = None
     memory_mb: int | None = None
@@ -156,7 +157,10 @@ def attempt(job: Job, worker: str) -> Ended:
         ends_all = isinstance(mistake, DiskFull)
     except MemoryError as error:
         where = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
-        why = f"out of memory ({str(error) or 'no more'}): its process has a limit (--memory-limit)\n{where}"
+        why = (
+            f"out of memory ({str(error) or 'no more'}): its process has a limit "
+            f"(--memory-limit)\n{where}"
+        )
     except Exception as error:
         why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
         is_bug = True

@@ -39,7 +39,10 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="run everything in this process, for a debugger; without limits",
     )
-    help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
+    help = (
+        "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask "
+        "configuration has it"
+    )
     add("--scheduler", metavar="ADDRESS", help=help)
     add(
         "--shard", metavar="K/N", help="run part K of N only, such as 3/10; tofpod merge joins them"

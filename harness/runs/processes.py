@@ -37,10 +37,8 @@ MOST_RENDERERS = 2  # processes that render; each needs 2 GB
 LOOKS_S = 1.0  # interval at which the driver checks the clock
 # time for a process to load its modules: normally seconds, but longer from a network's disk
 START_S = 300.0
-DUMP_S = (
-    # time for a hanging process to write its traceback; the signal handler needs a millisecond
-    0.3
-)
+# time for a hanging process to write its traceback; the signal handler needs a millisecond
+DUMP_S = 0.3
 # if a wait takes longer than `LOOKS_S` by this time, the machine or process was suspended (Ctrl-Z)
 STOPPED_S = 2.0
 IDLE_S: dict[Stage, float] = {
@@ -58,7 +56,8 @@ if CAN_FORK:
 
 
 def start_server() -> None:
-    """Start the server process, which then imports its modules while this process imports its own."""
+    """Start the server process, which then imports its modules while this process imports its
+    own."""
     if CAN_FORK:
         from multiprocessing import forkserver
 
@@ -247,7 +246,10 @@ class _Worker(threading.Thread):
                 message = (
                     f"{FALSE_STARTS} worker processes in a row died as they started: {digest.why}"
                 )
-                fix = "run the same command again, with fewer --jobs if memory is short, or a higher --memory-limit"
+                fix = (
+                    "run the same command again, with fewer --jobs if memory is short, or a "
+                    "higher --memory-limit"
+                )
                 raise UserError(
                     message,
                     legal="about 1 GB of memory per process for trials, 2 GB for renders",
@@ -256,7 +258,10 @@ class _Worker(threading.Thread):
             return
         engine.false_starts = 0
         if digest != engine.digests.get(self.stage):
-            message = f"the code of {self.stage} was edited while this sweep ran: a new process has loaded other sources"
+            message = (
+                f"the code of {self.stage} was edited while this sweep ran: a new process has "
+                "loaded other sources"
+            )
             raise UserError(
                 message,
                 fix="run the same command again: the trials that are left run by the new code",

@@ -82,7 +82,10 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
             raise UserError(message, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(
-                f"{path.parent}: cannot be locked on this system: do not start a second sweep in it",
+                (
+                    f"{path.parent}: cannot be locked on this system: do not start a second "
+                    "sweep in it"
+                ),
                 file=sys.stderr,
             )
         yield

@@ -219,7 +219,7 @@ def _write_report(
         resolved_yaml(experiment),
         title_of(experiment),
         facts,
-        found=summary_tables,
+        computed=summary_tables,
     )
     return final_tables(tables, summary_tables)
 

@@ -50,8 +50,8 @@ def bound_text(bound: Estimate) -> str:
 
 
 def size_estimate(limit: SetUpLimit, name: str) -> Estimate:
-    """Return a50 or a90 (``name``) with its interval; an upper bound if nothing was missed; unknown
-    if not above 0."""
+    """Return a50 or a90 (``name``) with its interval; an upper bound if nothing was missed;
+    unknown if not above 0."""
     size_mm = getattr(limit, f"{name}_mm")
     ends = getattr(limit, f"{name}_interval_mm")
     if size_mm <= 0:
@@ -189,7 +189,10 @@ LIMITS = Table(
             "new_unit_mm",
             "new unit (mm)",
             lambda row: bound_estimate(row, quoted(row)) if row.over_units else None,
-            "if there are several units: upper bound, at 95 % confidence, of the a90 of a new unit",
+            (
+                "if there are several units: upper bound, at 95 % confidence, of the a90 of a "
+                "new unit"
+            ),
             lambda bound: text.UNKNOWN_TEXT if bound is None else bound_text(bound),
         ),
         Column(
@@ -232,7 +235,10 @@ LIMITS = Table(
             "beside_per_m2",
             "beside/m²",
             ("beside.rate_per_m2", "beside.interval_per_m2"),
-            "findings on damaged boards that match no damage, with the exact 95 % Poisson interval",
+            (
+                "findings on damaged boards that match no damage, with the exact 95 % Poisson "
+                "interval"
+            ),
             CALLS[0].text,
             brief=lambda rate: text.UNKNOWN_TEXT if np.isnan(rate.value) else f"{rate.value:.2g}",
         ),

@@ -66,14 +66,14 @@ def check_detector(
     detector = made()
     loud = any(detector.quiet_threshold(cloud, detector.analyse(cloud)) > 0 for cloud in tried)
     require(
-        loud, "nothing was found on any cloud at any threshold, so that hardly anything was checked"
+        loud,
+        ("nothing was found on any cloud at any threshold, so that hardly anything was checked"),
     )
 
 
 STRONGEST = 5  # findings of a cloud that are checked individually
-CENTRE_MARGIN_M = (
-    0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
-)
+# distance outside the cloud's extent up to which the centre of a finding may lie
+CENTRE_MARGIN_M = 0.02
 # share of the highest score: robust fits stop early, and the order of sums affects rounding
 SCORE_TOLERANCE = 0.01
 CROP_TOLERANCE = 0.01  # share of the pixels: a crop may decide differently at the target's rim
@@ -235,7 +235,10 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
             require(
                 not np.isin(finding.pixels, _pixels_of(gone)).any()
                 and np.isin(finding.pixels, _pixels_of(kept)).any(),
-                f"a finding scores {finding.score:g}, but that is not the threshold at which it vanishes",
+                (
+                    f"a finding scores {finding.score:g}, but that is not the threshold at "
+                    "which it vanishes"
+                ),
             )
 
 
@@ -258,7 +261,10 @@ def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
     for threshold in look.thresholds():
         findings = look.find(threshold)
         strongest = findings[0].score if findings else float("nan")
-        message = f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but {quiet:g} is quiet"
+        message = (
+            f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but "
+            f"{quiet:g} is quiet"
+        )
         require(strongest == quiet, message)
 
 
@@ -272,7 +278,10 @@ def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
         added = int((~np.isin(pixels, lower)).sum())
         require(
             added == 0,
-            f"raising the threshold from {before:g} to {threshold:g} adds {added} pixels to findings",
+            (
+                f"raising the threshold from {before:g} to {threshold:g} adds {added} pixels to "
+                "findings"
+            ),
         )
         lower = pixels
 
@@ -306,7 +315,10 @@ def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
             continue
         except Exception as error:
             message = f"{type(error).__name__}: {error}"
-            text = f"a cloud with {points} valid points is not refused by a UserError but ends in {message}"
+            text = (
+                f"a cloud with {points} valid points is not refused by a UserError but ends in "
+                f"{message}"
+            )
             raise AssertionError(text) from error
         require(points > 0, "a cloud without any point was not refused")
         look.everything()
@@ -390,10 +402,21 @@ def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
 
 
 CHECKS = (
-    declares_itself, gives_sound_evidence, gives_the_same_twice, keeps_its_input, orders_findings_by_score,
-    is_silent_at_the_quiet_threshold, finds_no_more_at_higher_thresholds, finds_valid_pixels, survives_missing_pixels,
-    refuses_an_empty_cloud, survives_pickling, learns_plain_arrays, turns_with_the_cloud, moves_with_the_cloud,
-)  # fmt: skip
+    declares_itself,
+    gives_sound_evidence,
+    gives_the_same_twice,
+    keeps_its_input,
+    orders_findings_by_score,
+    is_silent_at_the_quiet_threshold,
+    finds_no_more_at_higher_thresholds,
+    finds_valid_pixels,
+    survives_missing_pixels,
+    refuses_an_empty_cloud,
+    survives_pickling,
+    learns_plain_arrays,
+    turns_with_the_cloud,
+    moves_with_the_cloud,
+)
 
 
 def _sound(look: Look) -> None:
@@ -527,7 +550,8 @@ def turned_once(cloud: Cloud) -> Cloud:
 
 
 def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
-    """Return an image turned by 90 degrees; a cloud without a grid keeps the order of its points."""
+    """Return an image turned by 90 degrees; a cloud without a grid keeps the order of its
+    points."""
     return np.ascontiguousarray(np.rot90(image)) if cloud.organised else image
 
 

@@ -77,15 +77,20 @@ def averages_of(
     return {n: corrected(cloud, field) for n, cloud in clouds.items()}
 
 
-@lru_cache(maxsize=4)
-def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no
-    pixel has a range."""
+def measured_flat_field(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
+    """Measure a unit's flat field on a plane across its axis. Raises UserError if no pixel has a
+    range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
-    cloud = averages_of(capture, [config.frames], AverageConfig(), exact=False)[config.frames]
-    return separated([flattened(cloud, cloud.valid, "flat field")], facts.nominal_lens).field
+    clouds = averages_of(capture, [config.frames], AverageConfig(), exact=False)
+    cloud = clouds[config.frames]
+    flat = flattened(cloud, cloud.valid, "flat field")
+    return separated([flat], facts.nominal_lens).field
+
+
+# all trials of a unit share its flat field
+flat_field_of = lru_cache(maxsize=4)(measured_flat_field)
 
 
 def _drawn_at_once(
@@ -99,7 +104,8 @@ def _drawn_at_once(
     if config.judge_frames and not summer.sure_pixels:
         return {}
     # noise of one frame, with rounding, as `detectors.averages.average` estimates it
-    noise_m = float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
+    rounding_m = capture.z_step_m / np.sqrt(12)
+    noise_m = float(np.hypot(summer.noise_m, rounding_m))
     left_out: dict[int, LeftOut] = {}
     if config.judge_frames:
         left_out = _left_out(capture, summer, config, noise_m)
@@ -147,7 +153,8 @@ def _is_disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
     lost = 1 - cloud.count[judged].mean() / cloud.n_frames
     # of pixels with less than a quarter of the change, 6 in 100,000 change
     loud = judged & (cloud.variance_m2 > (change_m / 4) ** 2)
-    changed = special.erfc(change_m / np.sqrt(2 * cloud.variance_m2[loud])).sum() / judged.sum()
+    spread_m = np.sqrt(2 * cloud.variance_m2[loud])
+    changed = special.erfc(change_m / spread_m).sum() / judged.sum()
     return bool(lost + changed > MOST_DISTURBED * config.disturbed_fraction)
 
 
@@ -168,8 +175,9 @@ def _cloud(
     lost = count == 0
     reason[lost] = totals.reasons[:, lost].argmax(axis=0)
     variance_m2 = np.maximum(variance, 0.0) * totals.step_m**2
+    xy_m = capture.slopes * z_m[..., None]
     return Cloud(
-        points_m=np.concatenate([capture.slopes * z_m[..., None], z_m[..., None]], axis=-1),
+        points_m=np.concatenate([xy_m, z_m[..., None]], axis=-1),
         reason=reason,
         count=count,
         variance_m2=np.where(count > 1, variance_m2, np.nan),

@@ -1,7 +1,7 @@
 """A board in front of a camera: what is true of it, and what a view shows.
 
-`Board` is a target before one unit of a camera, as the rendered view shows it. `LabelledCloud` is a
-cloud of a board (the average of one view, or a map) with the truth on its pixels. Detectors get
+`Board` is a target before one unit of a camera, as the rendered view shows it. `LabelledCloud` is
+a cloud of a board (the average of one view, or a map) with the truth on its pixels. Detectors get
 only the cloud."""
 
 from collections import OrderedDict
@@ -72,14 +72,19 @@ class Board:
         NaN off the board."""
         slopes = self.unit.view.slopes[self.unit.cut]
         T_board_camera = invert(self.T_camera_board)
-        rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+        h, w, _ = slopes.shape
+        rays = np.concatenate([slopes, np.ones((h, w, 1))], axis=-1)
+        directions = rotate_vectors(T_board_camera, rays)
         origin = np.broadcast_to(T_board_camera[:3, 3], rays.shape)
         board = self.target.board
-        met = met_on_face(origin, rotate_vectors(T_board_camera, rays), face_of(board))
+        met = met_on_face(origin, directions, face_of(board))
         x, y, z = np.moveaxis(met, -1, 0)
+        half_x_m = board.width_mm / 2 * MM
+        half_y_m = board.height_mm / 2 * MM
         with np.errstate(invalid="ignore"):
-            over = (np.abs(x) < board.width_mm / 2 * MM) & (np.abs(y) < board.height_mm / 2 * MM)
-        return np.where((over & np.isfinite(z))[..., None], met, np.nan)
+            on_board = (np.abs(x) < half_x_m) & (np.abs(y) < half_y_m)
+        on_board &= np.isfinite(z)
+        return np.where(on_board[..., None], met, np.nan)
 
     @property
     def board_xy_m(self) -> np.ndarray:
@@ -90,9 +95,10 @@ class Board:
     def seen_z_m(self) -> np.ndarray:
         """Depth z (h, w) of what each pixel's central ray meets in the rendered view, including
         the floors of holes."""
-        view = self.unit.view
-        cut = self.unit.cut
-        return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
+        range_m = self.unit.view.range_m[self.unit.cut]
+        slopes = self.unit.view.slopes[self.unit.cut]
+        range_per_z = np.sqrt(1 + (slopes**2).sum(axis=-1))
+        return np.asarray(range_m / range_per_z)
 
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
@@ -220,10 +226,11 @@ def outlined(truth: Sequence[Damage], places_m: np.ndarray) -> dict[int, np.ndar
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
     """Return a mask without a rim of `INTACT_MARGIN_PX`."""
-    square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, np.uint8)
-    return np.asarray(
-        cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    )
+    side = 2 * INTACT_MARGIN_PX + 1
+    square = np.ones((side, side), np.uint8)
+    image = mask.astype(np.uint8)
+    eroded = cv2.erode(image, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(eroded > 0)
 
 
 def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
@@ -322,13 +329,16 @@ class LabelledCloud:
         valid = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
             board = self.target.board
-            board_mm2 = board.width_mm * board.height_mm
-            return float(board_mm2 * MM**2 * float(valid.sum()) / max(valid.size, 1))
+            board_m2 = board.width_mm * board.height_mm * MM**2
+            return float(board_m2 * float(valid.sum()) / max(valid.size, 1))
         areas_m2 = pixel_areas(self.places_m)[valid]
         finite_m2 = areas_m2[np.isfinite(areas_m2)]
-        # at the outline a neighbour is off the board: such a pixel counts as an average one
-        usual_m2 = np.median(finite_m2) if 0 < len(finite_m2) < len(areas_m2) else 0.0
-        return float(finite_m2.sum() + (len(areas_m2) - len(finite_m2)) * usual_m2)
+        unknown = len(areas_m2) - len(finite_m2)
+        usual_m2 = 0.0
+        if unknown and len(finite_m2):
+            # at the outline a neighbour is off the board: such a pixel counts as an average one
+            usual_m2 = np.median(finite_m2)
+        return float(finite_m2.sum() + unknown * usual_m2)
 
 
 def far_from(truth: Sequence[Damage], places_m: np.ndarray, margin_m: float) -> np.ndarray:
@@ -350,7 +360,8 @@ def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
         y_m = _ticks_m(points_m[..., 1].T)
         grid_x_m, grid_y_m = np.meshgrid(x_m, y_m)
         level_m = float(np.nanmedian(points_m[..., 2]))
-        cells_m = np.stack([grid_x_m, grid_y_m, np.full(cloud.valid.shape, level_m)], axis=-1)
+        grid_z_m = np.full(cloud.valid.shape, level_m)
+        cells_m = np.stack([grid_x_m, grid_y_m, grid_z_m], axis=-1)
         points_m = np.where(cloud.valid[..., None], points_m, cells_m)
     return np.asarray(transform_points(T_board_cloud, points_m)[..., :2])
 
@@ -380,7 +391,8 @@ def face_errors_m(labelled: LabelledCloud, places_m: np.ndarray) -> np.ndarray:
         return np.full(len(places_m), np.nan)
     tree = cKDTree(points_m[:, :2], balanced_tree=False, compact_nodes=False)
     distance_m, nearest = tree.query(places_m)
-    spacing_m = float(np.sqrt(np.prod(np.ptp(points_m[:, :2], axis=0)) / len(points_m)))
+    covered_m2 = np.prod(np.ptp(points_m[:, :2], axis=0))
+    spacing_m = float(np.sqrt(covered_m2 / len(points_m)))
     face = face_of(labelled.target.board)
     face_z_m = face.height_m(points_m[nearest, 0], points_m[nearest, 1])
     error_m = face_z_m - points_m[nearest, 2]
@@ -429,5 +441,6 @@ def pixel_areas(places_m: np.ndarray) -> np.ndarray:
             ay = places_m[v, right, 1] - places_m[v, left, 1]
             bx = places_m[down, u, 0] - places_m[up, u, 0]
             by = places_m[down, u, 1] - places_m[up, u, 1]
-            areas[v, u] = abs(ax * by - ay * bx) / ((right - left) * (down - up))
+            steps = (right - left) * (down - up)
+            areas[v, u] = abs(ax * by - ay * bx) / steps
     return areas

@@ -94,11 +94,12 @@ class ViewClouds:
     def noise_rows(self, point: TrialPoint, origin: Origin) -> list[NoiseRow]:
         """Return the row of an average's pixels and of the noise of single frames."""
         pitch_u_mm, pitch_v_mm = self.board.pitch_mm
+        is_valid = self.averages[point.frames].valid[self.board.on_board]
         row = NoiseRow(
             variant=origin.variant,
             frames=origin.frames,
             repeat=origin.repeat,
-            valid_share=float(self.averages[point.frames].valid[self.board.on_board].mean()),
+            valid_share=float(is_valid.mean()),
             pitch_u_mm=pitch_u_mm,
             pitch_v_mm=pitch_v_mm,
             **self.frame_noise,
@@ -326,7 +327,8 @@ def mapping_of(point: TrialPoint) -> MappingConfig:
 
 def _registration_settings(mapping: MappingConfig) -> list[object]:
     """Return the settings that a registration depends on: crop, marks and the method's own."""
-    return [mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
+    settings = (mapping.crop, mapping.marks, mapping.registration)
+    return [part.to_data() for part in settings]
 
 
 def board_grid_m(board: Board) -> np.ndarray:
@@ -335,7 +337,8 @@ def board_grid_m(board: Board) -> np.ndarray:
     x_m = np.linspace(-0.5, 0.5, BOARD_STEPS) * sides.width_mm * MM
     y_m = np.linspace(-0.5, 0.5, BOARD_STEPS) * sides.height_mm * MM
     grid_x_m, grid_y_m = np.meshgrid(x_m, y_m)
-    return np.stack([grid_x_m, grid_y_m, np.zeros(grid_x_m.shape)], axis=-1).reshape(-1, 3)
+    face_z_m = np.zeros(grid_x_m.shape)
+    return np.stack([grid_x_m, grid_y_m, face_z_m], axis=-1).reshape(-1, 3)
 
 
 def registration_error_m(
@@ -348,10 +351,16 @@ def registration_error_m(
     frame, in metres: in the plane perpendicular to ``normal`` (3,), and along ``normal``
     (Fitzpatrick, West and Maurer 1998). An error that a whole view shares counts too: a camera
     that ranges d too far at an angle a adds d sin(a) in the plane."""
-    moved = transform_points(T_reference_view @ invert(true_T_reference_view), points_m) - points_m
-    across = moved @ normal
-    in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
-    return float(np.sqrt((in_plane**2).mean())), float(np.sqrt((across**2).mean()))
+    T_error = T_reference_view @ invert(true_T_reference_view)
+    moved_m = transform_points(T_error, points_m) - points_m
+    across_m = moved_m @ normal
+    in_plane_m = np.linalg.norm(moved_m - across_m[:, None] * normal, axis=-1)
+    return _rms(in_plane_m), _rms(across_m)
+
+
+def _rms(values: np.ndarray) -> float:
+    """Return the root mean square of values (n,)."""
+    return float(np.sqrt((values**2).mean()))
 
 
 def pair_noise(
@@ -367,7 +376,7 @@ def pair_noise(
         columns += [f"correlation_{way}{lag}" for way in "uv" for lag in LAGS]
         return dict.fromkeys(columns, np.nan)
     noise = np.where(valid, difference - np.median(difference[valid]), 0.0)
-    measured = {"single_frame_mm": float(np.sqrt((noise[valid] ** 2).mean())) / MM}
+    measured = {"single_frame_mm": _rms(noise[valid]) / MM}
     for lag in LAGS:
         measured[f"correlation_u{lag}"] = _correlation(noise, valid, lag)
         measured[f"correlation_v{lag}"] = _correlation(noise.T, valid.T, lag)

@@ -143,7 +143,8 @@ class Judgement:
         hits = [0] * len(levels)
         if self.labelled.damaged:
             rule = (self.criteria.radius_m, self.criteria.overlap)
-            hits = [len(pairs) for pairs, _ in _matched(self.labelled, levels, *rule)]
+            matches = _matched(self.labelled, levels, *rule)
+            hits = [len(pairs) for pairs, _ in matches]
         return thresholds, [len(level.scores) for level in levels], hits
 
     @cached_property
@@ -155,14 +156,15 @@ class Judgement:
     def pixels_above(self) -> dict[str, tuple[int, list[int]]]:
         """Numbers of judged pixels, and of those that exceed each of `pixel_thresholds`, by damage
         (text of its id; "" for the undamaged face)."""
-        regions = {
-            str(damage.id): self.labelled.outlines[damage.id] for damage in self.labelled.truth
-        }
+        regions = {}
+        for damage in self.labelled.truth:
+            regions[str(damage.id)] = self.labelled.outlines[damage.id]
         regions[""] = np.flatnonzero(self.labelled.undamaged.ravel())
         scores = self.evidence.score.ravel()
         counts = {}
         for name, pixels in regions.items():
-            judged = np.sort(scores[pixels][np.isfinite(scores[pixels])])
+            judged = scores[pixels]
+            judged = np.sort(judged[np.isfinite(judged)])
             below = np.searchsorted(judged, self.pixel_thresholds, side="right")
             counts[name] = (len(judged), (len(judged) - below).tolist())
         return counts

@@ -21,9 +21,8 @@ from typing import IO, Any, Literal
 
 from harness.vocabulary.errors import DiskFull, UserError
 
-FRAME_PIXELS = (
-    64_000_000  # A frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
-)
+# A frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
+FRAME_PIXELS = 64_000_000
 ARRAYS_BYTES = (
     4 << 30
 )  # All arrays of one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits

@@ -37,7 +37,10 @@ def read_mesh(file: str) -> Any:
 
     path = Path(file)
     if path.suffix.lower() in (".step", ".stp", ".iges", ".igs"):
-        fix = "convert it to triangles, for instance in FreeCAD: Mesh, Create mesh from shape, export as .stl"
+        fix = (
+            "convert it to triangles, for instance in FreeCAD: Mesh, Create mesh from shape, "
+            "export as .stl"
+        )
         raise UserError(f"{file}: holds CAD surfaces, not triangles", legal=FILES, fix=fix)
     try:
         content = bounded_bytes(path, MOST_BYTES)

@@ -63,9 +63,8 @@ class PlugIns:
             message = f"there is no {self.noun} {name!r}" + (
                 f"; did you mean {nearest_name!r}?" if nearest_name else ""
             )
-            fix = (
-                self.fix
-                or f"install the package that offers it through the entry point group {self.group!r}"
+            fix = self.fix or (
+                f"install the package that offers it through the entry point group {self.group!r}"
             )
             raise UserError(message, legal=", ".join(self.names()), fix=fix)
         if len({offer.target for offer in offers}) > 1:
@@ -98,7 +97,10 @@ class PlugIns:
         fix = f"repair or uninstall the package {offer.package}" + (
             f"; `{command}` shows more" if command else ""
         )
-        message = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
+        message = (
+            f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot "
+            f"be loaded: {why}"
+        )
         return UserError(message, fix=fix)
 
 

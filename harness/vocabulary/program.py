@@ -28,7 +28,8 @@ class Program:
     options: Options
     """Adds its arguments to a parser."""
     run: Run
-    """Does its work; takes the parsed arguments and the whole command, and returns the exit code."""
+    """Does its work; takes the parsed arguments and the whole command, and returns the exit code.
+    """
     description: str
     epilog: str | None = None
     further: Mapping[str, Program] = field(default_factory=dict)

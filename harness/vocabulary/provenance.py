@@ -83,9 +83,8 @@ def record(command: str) -> dict[str, Any]:
     }
 
 
-RESULTS_VERSION = (
-    1  # version of files that have none of their own; increased when the tables' meaning changes
-)
+# version of files that have none of their own; increased when the tables' meaning changes
+RESULTS_VERSION = 1
 GENERATOR = f"tofpod results {RESULTS_VERSION}"  # written into pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 

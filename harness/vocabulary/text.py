@@ -1,4 +1,5 @@
-"""Formats numbers and tables as text: for a terminal with colours, as plain lines, and for a page."""
+"""Formats numbers and tables as text: for a terminal with colours, as plain lines, and for a
+page."""
 
 from __future__ import annotations
 
@@ -205,7 +206,10 @@ class Grid:
                 _data_cell(cell, column >= self.left) for column, cell in enumerate(row[1:], 1)
             ]
             rows.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
-        table = '<div class="scroll"><table class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
+        table = (
+            '<div class="scroll"><table '
+            'class="{}"><thead><tr>{}</tr></thead><tbody>\n{}\n</tbody></table></div>'
+        )
         return Markup(table).format(self.kind, heads, Markup("\n").join(rows))
 
 

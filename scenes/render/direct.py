@@ -108,7 +108,8 @@ class OffFace(NamedTuple):
     pixel: np.ndarray
     """(p,): flat indices of the pixels that have any."""
     counts: np.ndarray
-    """(p,): number of those that stand for all: every second if there are twice KEPT, and so on."""
+    """(p,): number of those that stand for all: every second if there are twice KEPT, and so on.
+    """
     share: np.ndarray
     """(p,): share of all of them in the footprint."""
     slopes: np.ndarray
@@ -302,8 +303,8 @@ class _Sums:
         weights: np.ndarray,
         plane: bool,
     ) -> tuple[_LaneSums, Any]:
-        """Return the sums of each lane, which has A_LANE sub-rays of a pixel, and the bits of those
-        that met something off the face; pixels one after the other."""
+        """Return the sums of each lane, which has A_LANE sub-rays of a pixel, and the bits of
+        those that met something off the face; pixels one after the other."""
         mi = self.lit.mi
         dr = self.lit.dr
         lines = len(self.frequencies_hz)
@@ -411,8 +412,8 @@ def _error_m(
     count: int,
 ) -> np.ndarray:
     """Return the error of range (n,) to expect if MISPLACED of ``count`` sub-rays lie on the other
-    side of an edge: the spread of the paths in a pixel, over the number of sub-rays and the root of
-    its light over that of ``strongest`` (n,) alone."""
+    side of an edge: the spread of the paths in a pixel, over the number of sub-rays and the root
+    of its light over that of ``strongest`` (n,) alone."""
     light = means.light[-1]
     total = np.maximum(light, 1e-30)
     variance_m2 = means.second / total - (means.first / total) ** 2
@@ -477,12 +478,12 @@ def direct_light(
     """Return the direct light of every pixel of a region with central rays ``slopes`` (h, w, 2).
 
     If the rays to a pixel's centre and corners meet one evenly lit plane, its light follows from
-    these. Other pixels are sampled by sub-rays: a few on a curved surface, many where the footprint
-    meets an edge or the edge of a shadow.
+    these. Other pixels are sampled by sub-rays: a few on a curved surface, many where the
+    footprint meets an edge or the edge of a shadow.
 
     ``closely`` (h, w): many in the pixels that are 2, and in those that are 1 beside such edges;
-    where it is not 0, more follow if an error is left.
-    ``roughly`` (h, w): in these pixels there are a few at edges, too."""
+    where it is not 0, more follow if an error is left. ``roughly`` (h, w): in these pixels there
+    are a few at edges, too."""
     shape = slopes.shape[:2]
     sums = _Sums(lit, slopes, footprint, frequencies_hz)
     central = sums.central

@@ -29,8 +29,8 @@ FLOATS_AT_ONCE = 1 << 26  # results held on the device at once: 0.25 GB
 PER_VERTEX = 2  # low-discrepancy dimensions for each vertex: a direction
 START_DIMENSIONS = 4  # the first direction; which of a pixel's sub-rays, and one to spare
 
-# First directions from points are guided: a probe is sent through parts of the hemisphere, and most
-# paths begin where one met something.
+# First directions from points are guided: a probe is sent through parts of the hemisphere, and
+# most paths begin where one met something.
 CELLS = 16  # along each side of the square from which first directions are drawn
 PROBES = 2  # along each side of a cell
 GUIDED_SHARE = 0.9  # of paths; the rest begin anywhere
@@ -471,9 +471,10 @@ def _towards_bright(
     """Return directions from hits, and their weights.
 
     In front of the rectangle ``bright`` (its half axes and its middle), a direction goes with a
-    probability of a half to a uniform point of it, otherwise it is ``spread``, drawn by the cosine.
-    Its weight is cos / pi over the mixture's density (Veach and Guibas' balance heuristic),
-    2 / (1 + ratio) with the ratio of the rectangle's density to that of the cosine: 2 at most.
+    probability of a half to a uniform point of it, otherwise it is ``spread``, drawn by the
+    cosine. Its weight is cos / pi over the mixture's density (Veach and Guibas' balance
+    heuristic), 2 / (1 + ratio) with the ratio of the rectangle's density to that of the cosine: 2
+    at most.
 
     ``u1`` and ``u2``: in 0..1; the first decides, too."""
     dr = lit.dr

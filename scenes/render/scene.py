@@ -22,7 +22,8 @@ FIX = (
     "pip install karellen-llvm-core (Linux x86-64), "
     "or set DRJIT_LIBLLVM_PATH to the path of such a library"
 )
-ALIGNED_BYTES = 64  # Dr.Jit uses memory of NumPy as it is, and compiles a kernel for each alignment
+# Dr.Jit uses memory of NumPy as it is, and compiles a kernel for each alignment
+ALIGNED_BYTES = 64
 # of a ray's start from a surface: float32 places hits within 1e-6 m; Mitsuba's default is 0.15 mm
 LIFT_M = 1e-5
 

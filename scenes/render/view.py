@@ -208,7 +208,8 @@ def _light_in_pixels(
     work: PathWork,
     config: RenderConfig,
 ) -> np.ndarray:
-    """Return the light (B, f + 1, p) of paths through the sub-rays off the face, in enough of them.
+    """Return the light (B, f + 1, p) of paths through the sub-rays off the face, in enough of
+    them.
 
     In the pixels ``within`` (p,), a few first paths show how noisy the range is; the number of
     paths is then doubled until noise is expected to be ``hole_noise_mm``.
@@ -244,14 +245,15 @@ def _expected_noise_m(
     mean: np.ndarray,
     noise_m: np.ndarray,
 ) -> np.ndarray:
-    """Return the noise of range (p,) to expect in pixels off the face, from the pixels around them.
+    """Return the noise of range (p,) to expect in pixels off the face, from the pixels around
+    them.
 
     A pixel's own paths do not decide: those that missed rare bright light would end too soon, and
     the mean would be biased. Noise of range times the light is noise of the light; the mean of its
     square over the pixels around, over the light that they suggest, is noise of range again.
 
-    ``total`` (f, p): all other light. ``within`` (p,): which pixels count.
-    ``mean`` (p,): indirect phasors at the first frequency. ``noise_m`` (p,): their noise."""
+    ``total`` (f, p): all other light. ``within`` (p,): which pixels count. ``mean`` (p,): indirect
+    phasors at the first frequency. ``noise_m`` (p,): their noise."""
     rays = direct.off_face
     others = total[0] / rays.share
     light_variance = (noise_m * np.abs(others + mean)) ** 2

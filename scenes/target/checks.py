@@ -108,7 +108,10 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
     # A sphere at 0.8 of its radius has this slope exactly, hence the allowance for rounding.
     if steepest > STEEPEST_SLOPE * (1 + 1e-9):
         return [
-            f"board: its face is too steep: slope {steepest:.3g}, the limit is {STEEPEST_SLOPE:.3g}"
+            (
+                f"board: its face is too steep: slope {steepest:.3g}, the limit is "
+                f"{STEEPEST_SLOPE:.3g}"
+            )
         ]
     if face.rough:  # its back is flat
         relief_m = float(-face.height_m(x, y).min())

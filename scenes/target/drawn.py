@@ -204,8 +204,8 @@ class _Room(NamedTuple):
     rim_mm: float
     """Largest radius of a rim."""
     shrinkage: float
-    """Factor by which axes along a bent face's normals start farther apart in plan, so that they do
-    not meet within the board: parallel surfaces at a depth t shrink by 1 - t / radius of
+    """Factor by which axes along a bent face's normals start farther apart in plan, so that they
+    do not meet within the board: parallel surfaces at a depth t shrink by 1 - t / radius of
     curvature."""
     margin_mm: float
     """Least distance of centres from the edge."""
@@ -319,7 +319,8 @@ class DrawnTargetConfig(Config):
         if self.apart_mm < needed_mm:
             what = "damage" if isinstance(self.damage, DrawnFlaws) else "holes"
             problems.append(
-                f"apart_mm: {self.apart_mm:g} mm lets {what} of {self.damage.widest_mm:g} mm meet; "
+                f"apart_mm: {self.apart_mm:g} mm lets {what} of {self.damage.widest_mm:g} "
+                "mm meet; "
                 f"it must be {needed_mm:.4g} mm or more"
             )
         if min(board.width_mm, board.height_mm) / 2 < room.margin_mm:
@@ -523,7 +524,8 @@ class DrawnTargetConfig(Config):
             fullest = max(fullest, len(places_mm))
         raise UserError(
             f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too small for {count} "
-            f"damages with centres {self.apart_mm:g} mm apart and {room.margin_mm:.4g} mm from its "
+            f"damages with centres {self.apart_mm:g} mm apart and {room.margin_mm:.4g} mm "
+            "from its "
             f"edge: only {fullest} fit on the {2 * half_mm[0]:g} x {2 * half_mm[1]:g} mm that are "
             "left",
             legal=f"fewer than {fullest} damages on this board" if fullest > 1 else None,

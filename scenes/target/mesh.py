@@ -212,7 +212,8 @@ class TargetPart:
     rgb: np.ndarray
     """(3,): mean of ``texture_rgb``."""
     uv: np.ndarray | None = None
-    """(n_vertices, 2): texture co-ordinates in 0..1 (see the module); None if the part is plain."""
+    """(n_vertices, 2): texture co-ordinates in 0..1 (see the module); None if the part is plain.
+    """
     texture_850: np.ndarray | None = None
     """(h, w) float32: linear reflectance at 850 nm; None if the part is plain."""
     texture_rgb: np.ndarray | None = None

@@ -497,8 +497,8 @@ def _hole_measures(
 ) -> dict[str, Any]:
     """Return the size, depth and volume of a drilled hole, by field of `Damage`.
 
-    Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2) /
-    8 lower on average than at the centre. The back of a through-hole is a parallel surface,
+    Over a disc of radius a about the normal a face with principal curvatures k lies a^2 (k1 + k2)
+    / 8 lower on average than at the centre. The back of a through-hole is a parallel surface,
     curvatures k / (1 - t k)."""
     bends = face.curvatures(*item.centre_m)
     radius_m = item.radius_m

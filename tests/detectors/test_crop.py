@@ -8,8 +8,18 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from detectors import load_detector
-from detectors.crop import AutoCrop, BoxCrop, CropConfig, NoCrop, PolygonCrop, choice_of, crop
+from detectors.crop import (
+    AutoCrop,
+    BoxCrop,
+    CropConfig,
+    NoCrop,
+    PolygonCrop,
+    _Comparison,
+    choice_of,
+    crop,
+)
 from detectors.pixels.masks import holes_filled
+from detectors.surfaces.smooth_surfaces import smooth_surfaces
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region
 from tests.support.target_scenes import SCENES, Scene
@@ -124,6 +134,37 @@ def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
         crop(cloud, AutoCrop(target=3))
     assert "--target 1: 0.70 m" in str(caught.value)
     assert "--target 2: 1.20 m" in str(caught.value)
+
+
+def compared(z_m: np.ndarray) -> _Comparison:
+    """The surfaces of a picture of two, the nearer one first."""
+    cloud = cloud_of(z_m + 3e-4 * np.random.default_rng(0).standard_normal(z_m.shape))
+    comparison = _Comparison(smooth_surfaces(cloud, 35.0, 9), cloud)
+    assert len(comparison.numbers) == 2
+    return comparison
+
+
+def nearer_first(comparison: _Comparison) -> list[int]:
+    return sorted(comparison.numbers, key=lambda number: comparison.described[number].depths_m[1])
+
+
+def test_two_surfaces_apart_are_compared_by_weight_tilt_and_nearness() -> None:
+    z_m = np.full((150, 200), np.nan)
+    z_m[30:120, 10:80] = 0.6
+    columns = np.arange(200)
+    z_m[30:120, 100:190] = 0.9 + 3e-3 * (columns[100:190] - 145)
+    comparison = compared(z_m)
+    first, second = nearer_first(comparison)
+    this = comparison.described[first]
+    that = comparison.described[second]
+    facing = np.cos(np.radians(this.tilt_deg)) / np.cos(np.radians(that.tilt_deg))
+    nearness = that.depths_m[1] / this.depths_m[1]
+    odds = (np.sqrt(this.weight / that.weight) * facing**2 * nearness) ** 2
+    probability, why = comparison.judged(first, second)
+    assert probability == pytest.approx(odds / (1 + odds), rel=1e-6)
+    assert facing > 1.1
+    assert this.weight < 0.9 * that.weight
+    assert why == "two surfaces are about as large and as near"
 
 
 # ---------------------------------------------------------------- scenes of all kinds

@@ -205,6 +205,7 @@ def test_the_lists_can_be_read(tmp_path: Path):
     listed = entries(HERE / "named.yaml")
     assert len(listed) >= 17
     assert all(list(entry) == fields for entry in listed)
+    assert all(isinstance(text, str) for entry in listed for text in entry.values())
     fields = ["file", "function", "original", "mutant", "reason"]
     assert all(list(entry) == fields for entry in entries(HERE / "equivalent.yaml"))
 

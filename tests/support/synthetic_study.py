@@ -193,16 +193,16 @@ def _signals(study: Study, set_up: SetUp) -> pd.DataFrame:
 
 def _inspected(study: Study, set_up: SetUp) -> Inspected:
     rows = _signals(study, set_up)
-    truth = (rows[f"true_{name}_mm"].to_numpy(float) for name in ("diameter", "depth", "x", "y"))
-    hit = (rows["signal"] > THRESHOLD).to_numpy()
-    signal = rows["signal"].to_numpy(float)
     return Inspected(
-        rows["board"].to_numpy(),
-        rows["hole"].to_numpy(str),
-        rows["repeat"].to_numpy(),
-        *truth,
-        hit,
-        signal,
+        board=rows["board"].to_numpy(),
+        hole=rows["hole"].to_numpy(str),
+        repeat=rows["repeat"].to_numpy(),
+        diameter_mm=rows["true_diameter_mm"].to_numpy(float),
+        depth_mm=rows["true_depth_mm"].to_numpy(float),
+        x_mm=rows["true_x_mm"].to_numpy(float),
+        y_mm=rows["true_y_mm"].to_numpy(float),
+        hit=(rows["signal"] > THRESHOLD).to_numpy(),
+        signal=rows["signal"].to_numpy(float),
     )
 
 
@@ -233,13 +233,12 @@ def study_tables(study: Study | None = None) -> ResultTables:
     study = study or Study()
     parts = [_tables(study, set_up) for set_up in study.set_ups]
     names = ("holes", "sites", "runs", "findings", "operating", "pixels")
-    parts = {
-        name: pd.concat([part[k] for part in parts], ignore_index=True)
-        for k, name in enumerate(names)
-    }
-    return ResultTables(
-        **dict.fromkeys(("probes", "variants", "noise", "axes"), pd.DataFrame()), **parts
-    )
+    tables = {}
+    for index, name in enumerate(names):
+        tables[name] = pd.concat([part[index] for part in parts], ignore_index=True)
+    for name in ("probes", "variants", "noise", "axes"):
+        tables[name] = pd.DataFrame()
+    return ResultTables(**tables)
 
 
 def _tables(study: Study, set_up: SetUp) -> tuple[pd.DataFrame, ...]:
@@ -288,14 +287,15 @@ def _sites(study: Study, calls: pd.DataFrame) -> pd.DataFrame:
     sites = sites.merge(pd.DataFrame({"repeat": np.arange(study.repeats)}), how="cross")
     noise = np.random.default_rng([study.seed, 8]).normal(2.5, 0.4, len(sites))
     highest = np.full(len(sites), -np.inf)
-    names = ("board", "repeat", "x_mm", "y_mm", "score")
-    boards, repeats, x_mm, y_mm, scores = (calls[name].to_numpy() for name in names)
-    for row, (board, repeat, x, y) in enumerate(
-        sites[["board", "repeat", "true_x_mm", "true_y_mm"]].to_numpy()
-    ):
-        within_radius = (
-            (boards == board) & (repeats == repeat) & (np.hypot(x_mm - x, y_mm - y) <= RADIUS_MM)
-        )
+    boards = calls["board"].to_numpy()
+    repeats = calls["repeat"].to_numpy()
+    x_mm = calls["x_mm"].to_numpy()
+    y_mm = calls["y_mm"].to_numpy()
+    scores = calls["score"].to_numpy()
+    columns = ["board", "repeat", "true_x_mm", "true_y_mm"]
+    for row, (board, repeat, x, y) in enumerate(sites[columns].to_numpy()):
+        same_run = (boards == board) & (repeats == repeat)
+        within_radius = same_run & (np.hypot(x_mm - x, y_mm - y) <= RADIUS_MM)
         highest[row] = scores[within_radius].max(initial=-np.inf)
     return sites.assign(signal=np.maximum(highest, noise), detected=highest > THRESHOLD)
 
@@ -305,8 +305,11 @@ def _of_runs(
 ) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
     """Every run's role, board and repeat, and the scores and holes of its findings (as arrays,
     which is fast)."""
-    names = ("role", "board", "repeat", "score", "hole")
-    roles, boards, repeats, scores, holes = (findings[name].to_numpy() for name in names)
+    roles = findings["role"].to_numpy()
+    boards = findings["board"].to_numpy()
+    repeats = findings["repeat"].to_numpy()
+    scores = findings["score"].to_numpy()
+    holes = findings["hole"].to_numpy()
     for role in ("hole_free", "damaged"):
         for board, repeat in zip(*_runs(study, role), strict=True):
             of_run = (roles == role) & (boards == board) & (repeats == repeat)
@@ -318,14 +321,23 @@ def _run_rows(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
     for role, board, repeat, score, hole in _of_runs(
         study, findings[findings["score"] > THRESHOLD]
     ):
-        false_calls = int((hole == "").sum())
         rows.append(
-            (role, board, repeat, THRESHOLD, AREA_M2, len(score), false_calls, 0.2, 0.3, 0.01, 0.05)
+            {
+                "role": role,
+                "board": board,
+                "repeat": repeat,
+                "threshold": THRESHOLD,
+                "inspected_m2": AREA_M2,
+                "detections": len(score),
+                "false_calls": int((hole == "").sum()),
+                "scale_mm": 0.2,
+                "surface_noise_mm": 0.3,
+                "seconds_frames": 0.01,
+                "seconds_detect": 0.05,
+                "quiet_threshold": 4.5,
+            }
         )
-    names = "role board repeat threshold inspected_m2 detections false_calls scale_mm surface_noise_mm seconds_frames "
-    return pd.DataFrame(rows, columns=[*names.split(), "seconds_detect"]).assign(
-        quiet_threshold=4.5
-    )
+    return pd.DataFrame(rows)
 
 
 def _operating(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
@@ -339,10 +351,9 @@ def _operating(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
 
 
 def _pixels(study: Study, set_up: SetUp, holes: pd.DataFrame) -> pd.DataFrame:
-    """Scores of pixels as normal distributions, counted exactly: face at 0, damage at ``pixel_d``."""
-    face = pd.DataFrame(
-        {"board": (runs := _runs(study, "damaged"))[0], "repeat": runs[1], "hole": ""}
-    )
+    """Scores of pixels as normal distributions, counted exactly: face 0, damage ``pixel_d``."""
+    board, repeat = _runs(study, "damaged")
+    face = pd.DataFrame({"board": board, "repeat": repeat, "hole": ""})
     damaged = holes[["board", "repeat", "hole"]]
     tables = []
     for rows, pixels, mean in ((face, FACE_PIXELS, 0.0), (damaged, 1000, set_up.pixel_d)):

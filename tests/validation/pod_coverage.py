@@ -45,17 +45,22 @@ CHOSEN = ("best of 8", "as used")
 
 @dataclass(frozen=True)
 class Coverage:
-    """``above``: studies whose bound is at or over the true a90; ``undemonstrated`` those of them
-    without a finite bound; ``separated``: studies fitted by Firth's penalty; ``refused``: no
-    rising curve, left out of ``studies``."""
+    """How often a bound holds the true a90."""
 
     method: str
+    """Name of the bound."""
     studies: int
+    """Number of studies with a rising curve."""
     above: int
+    """Studies whose bound is at or over the true a90."""
     undemonstrated: int
+    """Studies of these without a finite bound."""
     separated: int
+    """Studies fitted by Firth's penalty."""
     refused: int
+    """Studies without a rising curve, left out."""
     median_mm: float
+    """Median bound."""
 
     @property
     def share(self) -> float:
@@ -80,7 +85,8 @@ def coverage(
     sizes = np.linspace(SMALLEST_MM, LARGEST_MM, targets)
     chance = truth.pod(sizes)
     limits: dict[str, list[float]] = {method: [] for method in methods}
-    separated = refused = 0
+    separated = 0
+    refused = 0
     for _ in range(studies):
         try:
             hits = random.random(targets) < chance
@@ -118,12 +124,12 @@ def main() -> None:
     wanted = parser.parse_args()
     for truth in TRUTHS:
         x = "ln a" if truth.log_size else "a"
-        print(
-            f"{truth.link} of {x}, a90 {truth.size_at(0.9):.2f} mm: {wanted.studies} studies, {wanted.targets} targets"
-        )
+        counts = f"{wanted.studies} studies, {wanted.targets} targets"
+        print(f"{truth.link} of {x}, a90 {truth.size_at(0.9):.2f} mm: {counts}")
         for row in coverage(wanted.studies, wanted.targets, truth=truth):
             print(
-                f"  {row.method:17s} {row.share:6.1%} +- {row.standard_error:.1%} (Monte Carlo, 1 s.e.), "
+                f"  {row.method:17s} {row.share:6.1%} +- {row.standard_error:.1%} "
+                "(Monte Carlo, 1 s.e.), "
                 f"median a90/95 {row.median_mm:.2f} mm, not demonstrated {row.undemonstrated}, "
                 f"separated {row.separated}, refused {row.refused}"
             )

@@ -36,20 +36,30 @@ DRAWS = 300
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares of ``studies`` whose bound is at or over the true a90, and medians of bounds and
-    design effect."""
+    """How often bounds of simulated studies hold the true a90."""
 
     boards: int
+    """Number of boards of a study."""
     shift_mm: float
+    """Standard deviation of a50 between boards."""
     studies: int
+    """Number of studies with a rising curve."""
     refused: int
+    """Studies without a rising curve, left out."""
     by_ratio: float
+    """Share of studies whose a90/95 is at or over the true a90."""
     over_boards: float
+    """The same of the bound with the boards' design effect."""
     by_percentile: float
+    """The same of the upper percentile over resampled boards."""
     median_ratio_mm: float
+    """Median a90/95."""
     median_boards_mm: float
+    """Median bound with the design effect."""
     median_effect: float
+    """Median design effect."""
     true_mm: float
+    """The true a90 of damage on a board drawn at random."""
 
 
 def true_a90(shift_mm: float) -> float:
@@ -88,17 +98,17 @@ def coverage(boards: int, shift_mm: float, studies: int, seed: int) -> Coverage:
         rows.append((bound(fit).value, with_effect.value, percentiles(drawn, 0.9).high, effect))
     ratio, of_boards, percentile, effects = np.array(rows).T
     return Coverage(
-        boards,
-        shift_mm,
-        len(rows),
-        refused,
-        float((ratio >= true_mm).mean()),
-        float((of_boards >= true_mm).mean()),
-        float((percentile >= true_mm).mean()),
-        float(np.median(ratio)),
-        float(np.median(of_boards)),
-        float(np.median(effects)),
-        true_mm,
+        boards=boards,
+        shift_mm=shift_mm,
+        studies=len(rows),
+        refused=refused,
+        by_ratio=float((ratio >= true_mm).mean()),
+        over_boards=float((of_boards >= true_mm).mean()),
+        by_percentile=float((percentile >= true_mm).mean()),
+        median_ratio_mm=float(np.median(ratio)),
+        median_boards_mm=float(np.median(of_boards)),
+        median_effect=float(np.median(effects)),
+        true_mm=true_mm,
     )
 
 
@@ -111,14 +121,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     print(
-        "boards  shift/mm  a90/mm  covered: ratio  with effect  percentile  median/mm: ratio  with effect  effect"
+        "boards  shift/mm  a90/mm  covered: ratio  with effect  percentile  "
+        "median/mm: ratio  with effect  effect"
     )
     for boards in (20, 60):
         for shift_mm in (0.0, 1.0, 2.0):
             result = coverage(boards, shift_mm, options.studies, options.seed)
             print(
-                f"{boards:6d}  {shift_mm:8.1f}  {result.true_mm:6.2f}  {result.by_ratio:14.3f}  {result.over_boards:11.3f}  "
-                f"{result.by_percentile:10.3f}  {result.median_ratio_mm:16.2f}  {result.median_boards_mm:11.2f}  "
+                f"{boards:6d}  {shift_mm:8.1f}  {result.true_mm:6.2f}  {result.by_ratio:14.3f}  "
+                f"{result.over_boards:11.3f}  {result.by_percentile:10.3f}  "
+                f"{result.median_ratio_mm:16.2f}  {result.median_boards_mm:11.2f}  "
                 f"{result.median_effect:6.2f}",
                 flush=True,
             )

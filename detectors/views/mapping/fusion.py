@@ -35,18 +35,15 @@ CELLS = 2000
 # distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median
 CLASSES = 12
 PER_CLASS = 100
-LENGTHS = (
-    24  # number of trial lengths, geometric from a pixel to the largest distance between views
-)
+# number of trial lengths, geometric from a pixel to the largest distance between views
+LENGTHS = 24
 EXPONENTS = (1.0, 1.5, 2.0)
 """A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2),
 not pointed (1)."""
 MEDIAN_SQUARE = 0.45494  # median of the square of a standard normal deviate
 MEDIAN_ERROR = 2.33  # relative standard error of the median of n such squares, times the root of n
-GATE_SIGMAS = (
-    # an observation this many deviations from the median of at least three views is an outlier
-    5.0
-)
+# an observation this many deviations from the median of at least three views is an outlier
+GATE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -212,9 +209,8 @@ BINS = 16
 PER_BIN = 40
 # number of pixels for the law: the median of a class is then known to 7 % from three frames
 SAMPLED = 16_384
-LEAST_M2 = (
-    1e-14  # least variance, so that no weight is infinite: no point is known better than to 0.1 um
-)
+# least variance, so that no weight is infinite: no point is known better than to 0.1 um
+LEAST_M2 = 1e-14
 
 
 def fuse(
@@ -298,7 +294,8 @@ def fuse(
 
 
 def _roughness(view: placing.PlacedView) -> np.ndarray:
-    """Return z minus the view's own smooth surface (h, w); computed only if frames do not repeat."""
+    """Return z minus the view's own smooth surface (h, w); computed only if frames do not
+    repeat."""
     inside = view.chosen.inside
     rough = np.full(inside.shape, np.nan)
     if not (view.chosen.cloud.count[inside] > 1).any():
@@ -352,7 +349,8 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
     ]
     if len(views) > 1:
         notes = [
-            f"fixed pattern {1e3 * np.sqrt(between.pattern_m2):.3f} mm over {between.length_px:.1f} px of the sensor,"
+            f"fixed pattern {1e3 * np.sqrt(between.pattern_m2):.3f} mm over "
+            f"{between.length_px:.1f} px of the sensor,"
             f" other differences between views {1e3 * np.sqrt(between.own_m2):.3f} mm"
         ]
     without = [view.name for view in views if not view.known_covariance]
@@ -362,7 +360,8 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
         )
     if found.rejected:
         notes.append(
-            f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations were outliers"
+            f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations "
+            "were outliers"
         )
     return tuple(notes)
 

@@ -82,7 +82,10 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
     )
     note = f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
     return merged, (
-        f"{note} {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are left out",
+        (
+            f"{note} {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are "
+            "left out"
+        ),
     )
 
 
@@ -290,7 +293,10 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         corner = np.min([low for low, high in overlaps if (low <= high).all()], axis=0)
         boxes = np.floor((points[shared] - corner) / step_m)
         if boxes.max() >= MAX_BOXES:
-            what = f"{np.ptp(points[shared], axis=0).max():.3g} m hold too many boxes of {step_m * 1e3:.3g} mm"
+            what = (
+                f"{np.ptp(points[shared], axis=0).max():.3g} m hold too many boxes of "
+                f"{step_m * 1e3:.3g} mm"
+            )
             fix = "crop the views to the target, or raise merge.step_mm"
             raise UserError(what, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
         x, y, z = boxes.astype(np.int64).T

@@ -303,7 +303,10 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     last = np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
-        what = f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of {step * 1e3:.3g} mm"
+        what = (
+            f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of "
+            f"{step * 1e3:.3g} mm"
+        )
         fix = "crop the views to the target, or give a larger merge.cell_mm"
         raise UserError(
             f"{what} would have {columns * rows:.3g}", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix

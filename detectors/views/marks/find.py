@@ -270,9 +270,8 @@ UNLIKE_SHARE = 0.3
 UNLIKE_PIXELS = 1.5
 """A mark is unlike the others if its sizes differ from their median by more than this share and
 this many pixels."""
-LARGEST_SHARE = (
-    0.15  # share of the target; a larger spot is a part of the target with another colour
-)
+# share of the target; a larger spot is a part of the target with another colour
+LARGEST_SHARE = 0.15
 
 
 def find_marks(
@@ -301,7 +300,10 @@ def find_marks(
         limit = mean + config.deviations * spread
         coloured = np.zeros(inside.shape, dtype=bool)
         coloured[inside] = red > limit
-        missing = f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and {config.deviations:g} standard"
+        missing = (
+            f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and "
+            f"{config.deviations:g} standard"
+        )
         missing += f" deviations of {spread:.0f}"
         if not cloud.organised:
             return MarkSet(
@@ -428,5 +430,8 @@ def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
         unlike = np.abs(sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
         (length, breadth, _), (usual_length, usual_breadth, _) = sizes_m / MM, usual_m / MM
         if unlike.any():
-            doubt = f"unlike the others: {length:.0f} x {breadth:.0f} mm, not {usual_length:.0f} x {usual_breadth:.0f}"
+            doubt = (
+                f"unlike the others: {length:.0f} x {breadth:.0f} mm, not {usual_length:.0f} x "
+                f"{usual_breadth:.0f}"
+            )
     return Mark(spot.centre_m, spot.covariance_m2, spot.normal, pixels, spot.area_m2, doubt=doubt)

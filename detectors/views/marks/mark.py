@@ -111,4 +111,7 @@ def off_line_problem(marks: Sequence[Mark]) -> str:
     if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
         return ""
     off = f"{sizes[1] / MM:.1f} mm off it"
-    return f"the {len(marks)} marks lie on a line, {off}, so rotation about it is undetermined: add a mark beside it"
+    return (
+        f"the {len(marks)} marks lie on a line, {off}, so rotation about it is undetermined: "
+        "add a mark beside it"
+    )

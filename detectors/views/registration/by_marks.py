@@ -65,14 +65,23 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         not problem
         and gammaincc(freedom / 2, _placed(fixed, moved, SHARED_M).chi2 / 2) < REFUSE_BELOW
     ):
-        problem = f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, more than noise and"
-        problem += f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or a mark moved"
+        problem = (
+            f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, more "
+            "than noise and"
+        )
+        problem += (
+            f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or "
+            "a mark moved"
+        )
     covariance = placement.covariance
     if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
         ratio = float(np.sqrt(placement.chi2 / freedom))
         covariance = covariance * ratio**2
         notes += (
-            f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",
+            (
+                f"the marks disagree by {ratio:.1f} times their noise; the covariance is "
+                "widened to match"
+            ),
         )
     where = placement.T_to_from, covariance, placement.centre_m
     found = registered.Registration(
@@ -210,9 +219,7 @@ class JointState:
         by_x = (self.basis(x + dx, y) - self.basis(x - dx, y)) @ self.surface / (2 * dx)
         by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
         normals = np.stack([-by_x, -by_y, np.ones(len(x))], axis=1)
-        by_pose = np.einsum(
-            "ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3))
-        )
+        by_pose = np.einsum("ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3)))
         scale = max(data.noise_m, sigma_of(residual))
         tukey = np.clip(1 - (residual / scale / BISQUARE_TUNING) ** 2, 0.0, None) ** 2
         return residual, basis, by_pose, tukey / data.sigma_m**2
@@ -269,7 +276,8 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
 def _adjust(
     views: Sequence[PreparedView], marked: Sequence[registered.Registration]
 ) -> list[registered.Registration]:
-    """Return registrations of views 1.., adjusted from those by their marks, none of which failed."""
+    """Return registrations of views 1.., adjusted from those by their marks, none of which
+    failed."""
     T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera
@@ -312,7 +320,10 @@ def _adjust(
     covariance = np.linalg.inv(state.equations(data)[0])
     T_reference_surface = invert(T_surface_reference)
     both = np.kron(np.eye(2), T_reference_surface[:3, :3])
-    note = f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the covariance includes it"
+    note = (
+        f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the "
+        "covariance includes it"
+    )
     lost = "" if converged else f"did not converge in {steps} steps of the joint adjustment"
     adjusted = []
     for v, found in enumerate(marked, start=1):

@@ -64,7 +64,10 @@ def register_by_icp(
             moved = transform_points(T, moving)
             apart, paired = _pairs(tree, moved, limit_m)
             if paired.sum() < 3:
-                failure = f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the reference's"
+                failure = (
+                    f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the "
+                    "reference's"
+                )
                 return registered.failed(view, "icp", start, failure, *notes)
             change = kabsch(moved[paired], (moved - apart)[paired], np.ones(paired.sum()))
             T = change @ T
@@ -359,7 +362,10 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
                     int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before)
                 )
                 if pairs < registered.MIN_OVERLAP * pixels:
-                    lost = f"odometry failed at {view.view.name}: only {pairs} pixels match the view before it"
+                    lost = (
+                        f"odometry failed at {view.view.name}: only {pairs} pixels match the "
+                        "view before it"
+                    )
             if lost:
                 found.append(registered.failed(view, "odometry", None, lost))
                 continue

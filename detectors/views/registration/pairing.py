@@ -150,7 +150,10 @@ def pair_marks(
     problem = f"the marks lie symmetrically: two placements bring {both} of them together, and "
     if T_reference_view_guess is None:
         return Pairing(pairs, problem + "there is no guess to choose by")
-    between = f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} mm from the other"
+    between = (
+        f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} "
+        "mm from the other"
+    )
     return Pairing(pairs, problem + between)
 
 
@@ -163,7 +166,10 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     ).reshape(-1, 2)
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
-    few = f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, the view {shown[1]}"
+    few = (
+        f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
+        f"the view {shown[1]}"
+    )
     return Pairing(pairs, few if len(common) < LEAST_MARKS else "", notes)
 
 

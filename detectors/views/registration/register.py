@@ -157,8 +157,14 @@ def judge(
     undetermined = ""
     apart = _apart(agreement)
     if error_m > limit_m:
-        undetermined = "not determined: the points let the target slide or rotate (they lie on a line, or the surface"
-        undetermined += f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur"
+        undetermined = (
+            "not determined: the points let the target slide or rotate (they lie on a line, or "
+            "the surface"
+        )
+        undetermined += (
+            f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which "
+            "would blur"
+        )
         undetermined += f" the map (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(
@@ -203,7 +209,10 @@ def _apart(agreement: Agreement) -> str:
     if agreement.apart_m > limit:
         text = f"the surfaces lie {agreement.apart_m / MM:.1f} mm apart where the views overlap"
     elif agreement.marks_m > marks_limit:
-        text = f"the marks of the views do not coincide: their points lie {agreement.marks_m / MM:.1f} mm apart"
+        text = (
+            "the marks of the views do not coincide: their points lie "
+            f"{agreement.marks_m / MM:.1f} mm apart"
+        )
         limit = marks_limit
     else:
         return ""
@@ -248,7 +257,10 @@ def _widened(
         for m, way in ((more_across, "across"), (more_within, "along"))
         if m
     ]
-    note = f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: each view's own"
+    note = (
+        f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: "
+        "each view's own"
+    )
     note += " error (offset, wiggling, lens); the covariance is widened by it"
     return replace(registration, covariance=covariance, notes=(*registration.notes, note))
 

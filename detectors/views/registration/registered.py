@@ -16,7 +16,10 @@ from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 # side of the cubes within which errors count as common: the window of the widest depth filter
 CLUSTER_PITCHES = 5.0
 UNKNOWN_COVARIANCE = np.full((6, 6), np.nan)
-SLIDES = "not determined: the points can slide or rotate without matching worse, as on a flat or smooth surface"
+SLIDES = (
+    "not determined: the points can slide or rotate without matching worse, as on a flat or "
+    "smooth surface"
+)
 
 
 @dataclass(frozen=True)
@@ -112,16 +115,14 @@ def clustered_sandwich(
 NOISE_LAG = 6
 """Pixels between the points of a second difference: beyond the widest depth filter, errors are
 independent."""
-MIN_OVERLAP = (
-    0.1  # least share of the view beside the reference's target: with less, nothing can be judged
-)
+# least share of the view beside the reference's target: with less, nothing can be judged
+MIN_OVERLAP = 0.1
 MOVING_PITCHES = 0.5  # an iteration whose last step moves the target by more has not converged
 MAX_POINTS = 10_000
 """Most points of a cloud to register: the time of coherent point drift grows with the product of
 both numbers."""
-THINNED_POINTS = (
-    2000  # points on which overlap and agreement are judged: a share is then known to 1 %
-)
+# points on which overlap and agreement are judged: a share is then known to 1 %
+THINNED_POINTS = 2000
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,10 @@ def clouds_of(
     )
     few = ""
     if min(len(fixed), len(moving)) < 3:
-        few = f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: {len(fixed)} in the"
+        few = (
+            f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: "
+            f"{len(fixed)} in the"
+        )
         few += f" reference and {len(moving)} in the view, 3 needed in each"
     return fixed, moving, guess, notes, few
 

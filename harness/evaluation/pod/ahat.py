@@ -44,7 +44,7 @@ class AhatFit:
     """Covariance (3, 3) of (b0, b1, tau) for independent targets; divided by ``per_target`` it is
     that for independent rows."""
     log_likelihood: float
-    """Of signals in their own unit."""
+    """Log-likelihood of signals in their own unit."""
     deviance: float
     """-2 times the log-likelihood."""
     x: np.ndarray
@@ -62,9 +62,9 @@ class AhatFit:
     per_target: float
     """Mean number of signals of a target, over rows."""
     log_size: bool
-    """Whether x is ln size."""
+    """True if x is ln size."""
     log_signal: bool
-    """Whether y is ln signal."""
+    """True if y is ln signal."""
     decision: float
     """Threshold of signals, in their own unit."""
     left: float | None
@@ -159,7 +159,11 @@ def fit_ahat(
     )
 
 
-def _check_limits(low: float, decision: float, high: float) -> None:
+def _check_limits(
+    low: float,
+    decision: float,
+    high: float,
+) -> None:
     """Refuse limits that are not in order, and a decision beyond them."""
     if not low < high:
         raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
@@ -180,7 +184,12 @@ def _check_that_signals_vary(between: np.ndarray) -> None:
         )
 
 
-def _notes(targets: int, per_target: float, a90: float, sizes: np.ndarray) -> tuple[str, ...]:
+def _notes(
+    targets: int,
+    per_target: float,
+    a90: float,
+    sizes: np.ndarray,
+) -> tuple[str, ...]:
     notes = []
     if targets < LEAST_TARGETS:
         notes.append(
@@ -229,7 +238,11 @@ def choose_axes(
     return tuple(sorted(fits, key=lambda fit: fit.deviance))
 
 
-def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Bound:
+def ahat_bound(
+    fit: AhatFit,
+    pod: float = 0.9,
+    confidence: float = 0.95,
+) -> Bound:
     """Return the one-sided upper bound on the size found with probability ``pod``, by the delta
     method on x: mu + z sigma + z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). It is
     infinite if sigma may be 0."""
@@ -249,7 +262,9 @@ def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Boun
 
 
 def ahat_band(
-    fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95
+    fit: AhatFit,
+    sizes: ArrayLike,
+    confidence: float = 0.95,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (lower, upper) POD at ``sizes`` (any shape), each one-sided, through the bounds of
     all sizes a_p: (x - mu - z sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22), solved for z; 0
@@ -280,7 +295,11 @@ def _finite(name: str, values: ArrayLike) -> np.ndarray:
     return array
 
 
-def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
+def _axis(
+    name: str,
+    values: np.ndarray,
+    log: bool,
+) -> np.ndarray:
     if log and np.any(values <= 0):
         raise UserError(
             f"{name} <= 0 have no logarithm (smallest {values.min():.6g})", legal="values above 0"
@@ -298,11 +317,14 @@ class CensoredFit(NamedTuple):
     covariance: np.ndarray
     """Inverse observed information (p + 1, p + 1) of (coefficients, tau)."""
     log_likelihood: float
-    """Of the values and the censored rows."""
+    """Log-likelihood of the values and the censored rows."""
 
 
 def fit_censored(
-    design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray
+    design: np.ndarray,
+    y: np.ndarray,
+    below: np.ndarray,
+    above: np.ndarray,
 ) -> CensoredFit:
     """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958).
 
@@ -357,7 +379,9 @@ def fit_censored(
 
 
 def _olsen_likelihood(
-    rows: np.ndarray, exact: np.ndarray, parameters: np.ndarray
+    rows: np.ndarray,
+    exact: np.ndarray,
+    parameters: np.ndarray,
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the log-likelihood, its gradient and its negative Hessian at Olsen's parameters.
 
@@ -397,7 +421,7 @@ class Diagnostic(NamedTuple):
     """A test of one assumption."""
 
     assumption: str
-    """What is assumed."""
+    """The assumption that is tested."""
     test: str
     """Name of the test."""
     statistic: float

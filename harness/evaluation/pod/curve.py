@@ -99,7 +99,7 @@ class PodCurve:
     link: str
     """Name of F, one of `LINKS`."""
     log_size: bool
-    """Whether x is the logarithm of the size."""
+    """True if x is the logarithm of the size."""
     mu: float
     """Middle of the curve, in the unit of x."""
     sigma: float
@@ -127,11 +127,11 @@ class Bound:
     confidence: float
     """One-sided confidence."""
     method: str
-    """How the bound was computed, in words."""
+    """Method by which the bound was computed, in words."""
     value: float
     """The bound, in the unit of sizes; infinite if there is none."""
     why: str = ""
-    """Why there is none; else empty."""
+    """Reason why there is none; else empty."""
 
     @property
     def demonstrated(self) -> bool:
@@ -285,7 +285,11 @@ def ascend(
     return b, best
 
 
-def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+def maxima(
+    data: HitsAndMisses,
+    start: np.ndarray,
+    tolerance: float = TOLERANCE,
+) -> np.ndarray:
     """Return the coefficients (d, p) with the largest likelihood of several studies, from
     ``start`` (p,); without a penalty. If hits and misses of a study do not overlap, its
     coefficients are those of the last step.
@@ -353,7 +357,10 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
 
 
 def profile(
-    data: HitsAndMisses, z0: float, level: float, slope: float = 1.0
+    data: HitsAndMisses,
+    z0: float,
+    level: float,
+    slope: float = 1.0,
 ) -> tuple[float, float]:
     """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0)
     whose predictor is ``level`` at ``z0``, and the slope there. ``slope``: start of the search,
@@ -382,7 +389,11 @@ def _hit_rate(data: HitsAndMisses) -> np.ndarray:
     return np.asarray(data.hits.sum() / (data.hits + data.misses).sum())
 
 
-def _penalised_profile(data: HitsAndMisses, z0: float, level: float) -> float:
+def _penalised_profile(
+    data: HitsAndMisses,
+    z0: float,
+    level: float,
+) -> float:
     """Return the profile of a penalised likelihood; concavity is not proved, so the search begins
     with a grid."""
 

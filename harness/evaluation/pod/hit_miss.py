@@ -100,9 +100,9 @@ class FloorCeilingTest:
     """A test whether POD = floor + (ceiling - floor) F fits better."""
 
     beyond: Beyond
-    """Which of both are free."""
+    """The free parameters: floor, ceiling or both."""
     p_value: float
-    """From the mixture of chi-squares for a parameter on its boundary."""
+    """P-value from the mixture of chi-squares for a parameter on its boundary."""
     floor: float
     """Maximum likelihood estimate: POD of the smallest damage."""
     ceiling: float
@@ -110,7 +110,7 @@ class FloorCeilingTest:
 
     @property
     def needed(self) -> bool:
-        """Return whether the model with two parameters is rejected at the 5 % level."""
+        """True if the model with two parameters is rejected at the 5 % level."""
         return self.p_value < 0.05
 
 
@@ -205,7 +205,11 @@ def _maximum(data: HitsAndMisses, hit_rate: float) -> np.ndarray:
     return np.asarray(maxima(studies, start, EXACT)[0])
 
 
-def _notes(rows_each: np.ndarray, targets: int, separated: bool) -> tuple[str, ...]:
+def _notes(
+    rows_each: np.ndarray,
+    targets: int,
+    separated: bool,
+) -> tuple[str, ...]:
     notes = []
     n = len(rows_each)
     if separated:
@@ -222,7 +226,10 @@ def _notes(rows_each: np.ndarray, targets: int, separated: bool) -> tuple[str, .
 
 
 def choose_model(
-    size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | None = None
+    size: ArrayLike,
+    hit: ArrayLike,
+    *,
+    inspections: ArrayLike | None = None,
 ) -> tuple[HitMissFit, ...]:
     """Fit every link with a and, if all sizes are positive, with ln a; least deviance first. The
     order does not depend on the limits: a model chosen because its limit is small has no coverage.
@@ -256,7 +263,12 @@ def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     )
 
 
-def _tested(fit: HitMissFit, beyond: Beyond, floor: Range, ceiling: Range) -> FloorCeilingTest:
+def _tested(
+    fit: HitMissFit,
+    beyond: Beyond,
+    floor: Range,
+    ceiling: Range,
+) -> FloorCeilingTest:
     """Test the likeliest curve with floor and ceiling in these ranges."""
     plain = np.append(fit.maximum, [0.0, 1.0])
     likeliest, value = _search(fit.data, plain, floor, ceiling)
@@ -283,7 +295,10 @@ def value_and_gradient(data: HitsAndMisses, curve: np.ndarray) -> tuple[float, n
 
 
 def _probabilities(
-    share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float
+    share: np.ndarray,
+    miss: np.ndarray,
+    floor: float,
+    ceiling: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the probabilities of hit and miss from ``share`` = F and ``miss`` = 1 - F."""
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
@@ -292,7 +307,11 @@ def _probabilities(
 
 
 def _of_shares(
-    data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float
+    data: HitsAndMisses,
+    share: np.ndarray,
+    miss: np.ndarray,
+    floor: float,
+    ceiling: float,
 ) -> np.ndarray:
     """Return the log-likelihoods (m,) of curves with floor and ceiling, from their shares (m, n)
     of hits and misses."""
@@ -301,7 +320,10 @@ def _of_shares(
 
 
 def _search(
-    data: HitsAndMisses, plain: np.ndarray, floor: Range, ceiling: Range
+    data: HitsAndMisses,
+    plain: np.ndarray,
+    floor: Range,
+    ceiling: Range,
 ) -> tuple[np.ndarray, float]:
     """Return the likeliest curve (4,) with floor and ceiling in these ranges, and its
     log-likelihood, from the best points of a coarse grid. ``plain`` (4,): the likeliest curve
@@ -350,7 +372,10 @@ def _rising_curves(z: np.ndarray, plain: np.ndarray) -> np.ndarray:
 
 
 def _checked(
-    size: ArrayLike, hit: ArrayLike, link: str, log_size: bool
+    size: ArrayLike,
+    hit: ArrayLike,
+    link: str,
+    log_size: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return x (n,) and hits (n,) as booleans. Raises UserError for the user's mistake."""
     sizes = np.asarray(size, float)
@@ -407,7 +432,11 @@ REACH = 10  # most doublings of a distance, from 2 to 2000 standard errors
 
 
 def bound(
-    fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0
+    fit: HitMissFit,
+    pod: float = 0.9,
+    confidence: float = 0.95,
+    *,
+    design_effect: float = 1.0,
 ) -> Bound:
     """Return the upper bound on the size with this POD; infinite, with the reason, if there is
     none. ``design_effect``: factor of variance and criterion for targets in clusters (Rao and
@@ -424,7 +453,9 @@ def bound(
 
 
 def band(
-    fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95
+    fit: HitMissFit,
+    sizes: np.ndarray,
+    confidence: float = 0.95,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower
     crosses 90 % at a90/95."""
@@ -453,7 +484,11 @@ def criterion(confidence: float) -> float:
     return float(stats.chi2.ppf(confidence, 1))
 
 
-def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
+def _likelihood_bound(
+    fit: HitMissFit,
+    pod: float,
+    allowed: float,
+) -> tuple[float, str]:
     """Return the largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and
     the reason."""
     data = fit.data

@@ -68,7 +68,12 @@ class Inspections:
 
 
 def read_inspections(
-    path: Path, size: str, responses: Sequence[str], target: str | None = None, *, hits: bool = True
+    path: Path,
+    size: str,
+    responses: Sequence[str],
+    target: str | None = None,
+    *,
+    hits: bool = True,
 ) -> Inspections:
     """Read the named columns. ``responses``: one column, or one per inspector. ``hits``: whether
     responses are words or 0/1 rather than signals. Raises UserError, with the line, for cells that
@@ -129,7 +134,12 @@ def read_inspections(
     return read
 
 
-def _require_names(path: Path, column: str, lines: np.ndarray, names: np.ndarray) -> None:
+def _require_names(
+    path: Path,
+    column: str,
+    lines: np.ndarray,
+    names: np.ndarray,
+) -> None:
     """Refuse a row whose target has no name."""
     for line, name in zip(lines, names, strict=True):
         if not name:
@@ -137,7 +147,12 @@ def _require_names(path: Path, column: str, lines: np.ndarray, names: np.ndarray
             raise UserError(f"{path}, line {line}: {column} is empty", fix=fix)
 
 
-def _require_no_negative(path: Path, column: str, lines: np.ndarray, sizes: np.ndarray) -> None:
+def _require_no_negative(
+    path: Path,
+    column: str,
+    lines: np.ndarray,
+    sizes: np.ndarray,
+) -> None:
     """Refuse a size below 0."""
     below = sizes < 0
     if below.any():
@@ -185,7 +200,11 @@ def _require_one_size(read: Inspections, names: np.ndarray) -> None:
             raise UserError(f"{read.path}: target {name!r} has {before} and {after}", fix=fix)
 
 
-def require_positive(read: Inspections, response: bool, why: str) -> None:
+def require_positive(
+    read: Inspections,
+    response: bool,
+    why: str,
+) -> None:
     """Refuse a size (or a response) that has no logarithm; ``why`` names the option that asks for
     it."""
     values = read.response if response else read.size
@@ -200,7 +219,12 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
         )
 
 
-def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, ...]) -> int:
+def _column(
+    path: Path,
+    header: list[str],
+    name: str,
+    chosen: tuple[str | None, ...],
+) -> int:
     """Return the index of a column. Raises UserError if there is none, or more than one, of this
     name."""
     if chosen.count(name) > 1:
@@ -222,7 +246,11 @@ def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, 
 
 
 def _hits(
-    path: Path, name: str, lines: np.ndarray, texts: list[str], notes: list[str]
+    path: Path,
+    name: str,
+    lines: np.ndarray,
+    texts: list[str],
+    notes: list[str],
 ) -> np.ndarray:
     """Return (n,): 1 for a hit, 0 for a miss, NaN where nothing is stated."""
     hits = np.full(len(texts), np.nan)
@@ -244,7 +272,11 @@ def _hits(
 
 
 def _numbers(
-    path: Path, name: str, lines: np.ndarray, texts: list[str], notes: list[str]
+    path: Path,
+    name: str,
+    lines: np.ndarray,
+    texts: list[str],
+    notes: list[str],
 ) -> np.ndarray:
     """Return the numbers (n,), NaN where nothing is stated."""
     thousands, unclear = _thousands(path, name, texts)
@@ -277,7 +309,11 @@ def _plain(text: str, thousands: set[str]) -> str:
     return plain
 
 
-def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
+def _thousands(
+    path: Path,
+    name: str,
+    texts: list[str],
+) -> tuple[set[str], str]:
     """Return the thousands separators of a column, and an ambiguous number ("" if there is none).
     The last of two marks in a number is the decimal mark. A mark that occurs twice in a number is
     a thousands separator, and so is a mark that occurs only before three digits if another mark is
@@ -329,7 +365,11 @@ def _rows(path: Path, column: str) -> Rows:
     return rows
 
 
-def _text_rows(path: Path, content: bytes, column: str) -> Rows:
+def _text_rows(
+    path: Path,
+    content: bytes,
+    column: str,
+) -> Rows:
     """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1, separated as ``sep=`` says or to
     fit the header."""
     utf_16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")

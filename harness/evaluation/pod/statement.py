@@ -60,9 +60,9 @@ class ModelRow:
     bound: Bound
     """Its a90/95."""
     chosen: bool
-    """Whether it is the curve that is stated."""
+    """True if it is the curve that is stated."""
     in_bound: bool
-    """Whether its bound is among those of which the statement's bound is the largest."""
+    """True if its bound is among those of which the statement's bound is the largest."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class PodStatement:
     unit: str
     """Unit of sizes; may be empty."""
     fits: tuple[HitMissFit, ...]
-    """For hits, the models whose largest bound and widest band are stated, that of the curve
-    first."""
+    """Models of hits whose largest bound and widest band are stated, that of the curve first;
+    empty for signals."""
     signal: AhatFit | None
     """The regression of signals; None for hits."""
     models: tuple[ModelRow, ...]
@@ -358,7 +358,9 @@ Fit = TypeVar("Fit", HitMissFit, AhatFit)
 
 
 def _models(
-    tried: Sequence[Fit], bounds: Sequence[Bound], close_fits: Sequence[Fit]
+    tried: Sequence[Fit],
+    bounds: Sequence[Bound],
+    close_fits: Sequence[Fit],
 ) -> tuple[ModelRow, ...]:
     """Return rows of fits with their ``bounds``; the first of the ``near`` fits is that of the
     curve."""
@@ -426,7 +428,11 @@ def _false_positives_by_noise(sites: np.ndarray, fit: AhatFit) -> float | None:
     return float(stats.norm(mean, std).sf(on_axis(fit.decision)))
 
 
-def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> np.ndarray:
+def drawn_sizes(
+    size: np.ndarray,
+    log_size: bool,
+    marks: tuple[float, ...],
+) -> np.ndarray:
     """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond
     those ``marks`` that are at most twice the largest size; in equal steps, or in equal ratios if
     ``log_size``."""

@@ -40,7 +40,10 @@ class Targets:
 
 
 def targets_of(
-    board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray
+    board: np.ndarray,
+    hole: np.ndarray,
+    size_mm: np.ndarray,
+    hit: np.ndarray,
 ) -> Targets:
     """Combine rows (n,) of inspections into targets: repeats of one damage of one board are one
     target."""
@@ -82,7 +85,11 @@ def weights_in_blocks(
         yield tuple(weights)
 
 
-def _times_drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
+def _times_drawn(
+    stream: np.random.Generator,
+    boards: int,
+    draws: int,
+) -> np.ndarray:
     """Return how often each draw has each board, (draws, boards)."""
     if not boards:
         return np.zeros((draws, 0))
@@ -90,7 +97,10 @@ def _times_drawn(stream: np.random.Generator, boards: int, draws: int) -> np.nda
 
 
 def refitted_sizes(
-    targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS
+    targets: Targets,
+    curve: PodCurve,
+    pods: tuple[float, ...],
+    draws: int = DRAWS,
 ) -> np.ndarray:
     """Refit ``curve``'s link and axis to resampled boards (and units, if targets have one).
 
@@ -106,7 +116,10 @@ def refitted_sizes(
 
 
 def _refitted(
-    targets: Targets, curve: PodCurve, pods: tuple[float, ...], weights: np.ndarray
+    targets: Targets,
+    curve: PodCurve,
+    pods: tuple[float, ...],
+    weights: np.ndarray,
 ) -> np.ndarray:
     """Refit the curve to targets with ``weights`` (draws, n)."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
@@ -147,7 +160,11 @@ def _refitted(
         return np.asarray(np.exp(x_at_pods))
 
 
-def crossings(b: np.ndarray, link: str, pods: tuple[float, ...]) -> np.ndarray:
+def crossings(
+    b: np.ndarray,
+    link: str,
+    pods: tuple[float, ...],
+) -> np.ndarray:
     """Return the sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs;
     infinite if none."""
     levels = link_ppf(link, np.array(pods))[:, None]
@@ -155,7 +172,11 @@ def crossings(b: np.ndarray, link: str, pods: tuple[float, ...]) -> np.ndarray:
         return np.where(b[:, 1] > 0, (levels - b[:, 0]) / b[:, 1], np.inf)
 
 
-def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
+def design_effect(
+    targets: Targets,
+    curve: PodCurve,
+    pod: float,
+) -> float:
     """Return the variance of the size with this POD with boards as units over that with damages as
     units: 1 if damages of one board are no more alike than those of two; NaN below two boards.
 

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChanceHits:
-    """How often a damage would be hit by a finding that has nothing to do with it."""
+    """Probability that a finding which has nothing to do with a damage hits it."""
 
     probability: float
-    """By shuffling: share of ``laid`` pairs with an unmatched finding near the damage."""
+    """Share of ``laid`` pairs with an unmatched finding near the damage, by shuffling."""
     laid: int
     """Number of pairs of a damage and another board's run."""
     expected: float
@@ -74,7 +74,10 @@ def chance_hits(
 
 
 def _shuffled(
-    damages: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float
+    damages: pd.DataFrame,
+    runs: pd.DataFrame,
+    findings: pd.DataFrame,
+    radius_mm: float,
 ) -> tuple[float, int]:
     """Return the share of damages, moved to runs of other boards, that have an unmatched finding
     within the radius, and the number of these pairs."""
@@ -150,10 +153,14 @@ class PixelCurves:
     """Area under the curve up to `PRO_LIMIT`, divided by that. NaN if the counted thresholds do
     not reach so far and pixels of damage remain below them."""
     why: str
-    """Why ``pro`` is NaN; else empty."""
+    """Reason why ``pro`` is NaN; else empty."""
 
 
-def roc_curve(holes: pd.DataFrame, sites: pd.DataFrame, threshold: float) -> Roc | None:
+def roc_curve(
+    holes: pd.DataFrame,
+    sites: pd.DataFrame,
+    threshold: float,
+) -> Roc | None:
     """Return the ROC of all damages; None without damages or places. Damage without judged pixels
     cannot be found."""
     if holes.empty or sites.empty:
@@ -180,7 +187,10 @@ def _share_from(signals: np.ndarray, levels: np.ndarray) -> np.ndarray:
 
 
 def free_response(
-    operating: pd.DataFrame, runs: pd.DataFrame, holes: pd.DataFrame, draws: int = DRAWS
+    operating: pd.DataFrame,
+    runs: pd.DataFrame,
+    holes: pd.DataFrame,
+    draws: int = DRAWS,
 ) -> FreeResponse | None:
     """Return the free-response curve of one set-up; None if no damage or no hole-free board was
     inspected, or no other threshold was counted. Thresholds with fewer false calls than a higher

@@ -45,7 +45,7 @@ WIDER = 1.1  # boards matter if the limit over boards exceeds a90/95 by more tha
 
 @dataclass(frozen=True, eq=False)
 class SetUpLimit:
-    """What the inspections of one set-up say about sizes, and the counts behind it.
+    """The detection limit of one set-up, and the counts behind it.
 
     If everything is found, the estimates are upper bounds: the smallest size inspected. If nothing
     is, or POD does not grow with size, they are NaN and their draws infinite."""
@@ -55,7 +55,7 @@ class SetUpLimit:
     statement: PodStatement | None
     """Curve, band and bounds from hits; None if no curve can be fitted."""
     why: str
-    """Why there is no curve; empty if there is one."""
+    """Reason why there is no curve; empty if there is one."""
     a90_95: Bound
     """The limit to quote, of diameters or depths in mm (`Inspected.limit_of`); infinite if not
     demonstrated."""
@@ -101,7 +101,7 @@ class SetUpLimit:
 
     @property
     def is_at_most(self) -> bool:
-        """Return whether everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
+        """True if everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
         return self.statement is None and bool(np.isfinite(self.a90_mm))
 
     def beyond(self, size_mm: float) -> bool:
@@ -132,7 +132,12 @@ class _Sizes:
     over_units: OverUnits | None = None
 
 
-def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -> SetUpLimit:
+def limit_of(
+    record: SetUpRecord,
+    *,
+    draws: int = DRAWS,
+    tested: bool = False,
+) -> SetUpLimit:
     """Return the limit of ``record``. ``tested``: whether to test for a floor and a ceiling, with
     a note. Deterministic. Data without a curve are not an error: ``why`` gives the reason."""
     inspected = record.inspected
@@ -209,7 +214,10 @@ def target_names(inspected: Inspected) -> np.ndarray:
 
 
 def _sizes_of_curve(
-    record: SetUpRecord, targets: Targets, statement: PodStatement, draws: int
+    record: SetUpRecord,
+    targets: Targets,
+    statement: PodStatement,
+    draws: int,
 ) -> _Sizes:
     """Return the sizes of a curve, with percentiles over resampled boards (and units)."""
     inspected = record.inspected
@@ -306,7 +314,9 @@ def _no_sizes(why: str, draws: int) -> _Sizes:
 
 
 def _false_calls(
-    runs: Unflawed | None, draws: int, population: str
+    runs: Unflawed | None,
+    draws: int,
+    population: str,
 ) -> tuple[FalseCallRate | None, Interval]:
     """Return the rate of false calls in runs, and its interval over boards; unknown without runs
     or calls."""

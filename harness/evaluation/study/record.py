@@ -128,7 +128,7 @@ class Inspected:
     y_mm: Numbers
     """True centre (n,) on the board, upwards."""
     hit: Truths
-    """Whether the damage was found (n,)."""
+    """True if the damage was found (n,)."""
     signal: NumbersOrNull
     """Highest score (n,) within the hit radius; NaN if no pixel there was judged."""
     by_depth: Truths | None = None
@@ -136,7 +136,7 @@ class Inspected:
     by_no_return: Truths | None = None
     """Hits (n,) by a finding of missing returns; None likewise."""
     size_of: Name = "diameter"
-    """What ``diameter_mm`` holds: diameter, width or length."""
+    """Name of what ``diameter_mm`` holds: diameter, width or length."""
 
     @property
     def limit_of(self) -> str:

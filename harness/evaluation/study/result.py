@@ -45,9 +45,9 @@ class Difference:
     interval: Interval
     """95 % interval over boards, without draws that are infinite for both."""
     paired: bool
-    """Whether both were judged on the same boards."""
+    """True if both were judged on the same boards."""
     beyond_chance: bool
-    """Whether the interval excludes 1."""
+    """True if the interval excludes 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class AxisLine:
     steps: tuple[Difference, ...]
     """The change from each value to the next."""
     numeric: bool
-    """Whether the values can be drawn to scale."""
+    """True if the values can be drawn to scale."""
 
 
 def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
@@ -97,7 +97,9 @@ def _without(setting: Mapping[str, Any], axis: str) -> dict[str, Any]:
 
 
 def _axis_line(
-    axis: str, settings: Sequence[Mapping[str, Any]], limits: Sequence[SetUpLimit]
+    axis: str,
+    settings: Sequence[Mapping[str, Any]],
+    limits: Sequence[SetUpLimit],
 ) -> AxisLine:
     """Return the line of these set-ups, with numbers in ascending order."""
     numeric = all(_is_number(setting[axis]) for setting in settings)
@@ -237,7 +239,9 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
 
 
 def _departures(
-    limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
+    limits: Sequence[SetUpLimit],
+    chances: Sequence[ChanceHits | None],
+    facts: Mapping[str, Any],
 ) -> tuple[str, ...]:
     per_board = max((limit.targets / limit.boards for limit in limits if limit.boards), default=1.0)
     # Unflawed sites are those of drawn damage on hole-free boards.
@@ -253,7 +257,10 @@ def _departures(
     rules = [
         (
             facts.get("source", {}).get("kind") == "simulated",
-            "Boards and camera are simulated. The handbook demands real flaws and the real system.",
+            (
+                "Boards and camera are simulated. The handbook demands real flaws and the real "
+                "system."
+            ),
         ),
         (
             per_board > 1,
@@ -460,7 +467,7 @@ class SetUpResult:
     surface: PodSurface | None
     """POD over diameter and depth; None if there is none."""
     surface_why: str
-    """Why there is no surface; else empty."""
+    """Reason why there is no surface; else empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,7 +483,7 @@ class StudyResult:
     axes: tuple[AxisLine, ...]
     """Lines along swept axes."""
     validity: tuple[Section, ...]
-    """What the limits hold for, in words."""
+    """Headings and sentences on what the limits hold for."""
     facts: Mapping[str, Any]
     """The resolved experiment as plain data."""
 
@@ -516,7 +523,12 @@ def evaluate_study(
     )
 
 
-def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: int) -> SetUpResult:
+def _set_up(
+    record: SetUpRecord,
+    tables: ResultTables,
+    radius_mm: float,
+    draws: int,
+) -> SetUpResult:
     """Evaluate a set-up from its own ``tables``."""
     holes = tables.holes
     sites = tables.sites
@@ -540,7 +552,11 @@ def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: 
     )
 
 
-def _with_measures(limit: SetUpLimit, holes: pd.DataFrame, runs: pd.DataFrame) -> SetUpLimit:
+def _with_measures(
+    limit: SetUpLimit,
+    holes: pd.DataFrame,
+    runs: pd.DataFrame,
+) -> SetUpLimit:
     """Add the typical error of measured sizes, and the time of a cloud."""
     size_of = limit.record.inspected.size_of
     column = "model_diameter_mm" if size_of == "diameter" else f"{size_of}_mm"

@@ -147,14 +147,23 @@ def _rises(b: np.ndarray, log_depth: np.ndarray) -> bool:
     return bool(slopes.min() > 0)
 
 
-def _fit(link: str, design: np.ndarray, hit: np.ndarray) -> _Fit:
+def _fit(
+    link: str,
+    design: np.ndarray,
+    hit: np.ndarray,
+) -> _Fit:
     hits = hit.astype(float)
     b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
     deviance = float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b))
     return _Fit(deviance, np.pad(b, (0, COEFFICIENTS - len(b))), link)
 
 
-def _refitted(design: np.ndarray, inspected: Inspected, fit: _Fit, draws: int) -> np.ndarray:
+def _refitted(
+    design: np.ndarray,
+    inspected: Inspected,
+    fit: _Fit,
+    draws: int,
+) -> np.ndarray:
     """Return the coefficients (draws, 4) of resampled boards."""
     terms = design.shape[1]
     parts = []
@@ -165,7 +174,11 @@ def _refitted(design: np.ndarray, inspected: Inspected, fit: _Fit, draws: int) -
     return np.pad(np.concatenate(parts), ((0, 0), (0, COEFFICIENTS - terms)))
 
 
-def _depth_at_pod(b: np.ndarray, link: str, diameter_mm: np.ndarray) -> np.ndarray:
+def _depth_at_pod(
+    b: np.ndarray,
+    link: str,
+    diameter_mm: np.ndarray,
+) -> np.ndarray:
     """Return the depths (draws, k) in mm found 90 % of the time by surfaces ``b`` (draws, 4)."""
     level = float(link_ppf(link, np.array(POD)))
     log_diameter = np.log(diameter_mm)

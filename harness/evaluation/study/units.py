@@ -87,7 +87,12 @@ def over_units(
     )
 
 
-def _new_unit(units: int, spread: float, a90: float, limit: Bound) -> Bound:
+def _new_unit(
+    units: int,
+    spread: float,
+    a90: float,
+    limit: Bound,
+) -> Bound:
     """Return the bound on the a90 of a new unit: ln a90 plus the root of the sum of squares of the
     margin of boards, ln(limit / a90), and that of units."""
     if not np.isfinite(spread):

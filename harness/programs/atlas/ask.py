@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -18,10 +19,19 @@ from harness.vocabulary.program import length_m, program
 
 if TYPE_CHECKING:
     from harness.programs.atlas.limits import LimitSurface
+    from harness.programs.atlas.tables import Row
 
 STORED = "atlas.parquet"
-KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind", "crack": "slot"}
+"""The table of limits that comes with tofpod, in baselines."""
+KINDS = {
+    "hole": "through",
+    "through-hole": "through",
+    "blind-hole": "blind",
+    "crack": "slot",
+}
+"""Kinds of damage by words that users may say instead."""
 BEST = "matched"
+"""The detector that is asked for if the atlas has it."""
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -69,43 +79,52 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "State which cameras find damage of a given size nine times out of ten at a given distance, with how many frames, "
-    "from a stored table of limits of simulated set-ups (experiments/atlas.yaml), with intervals. Nothing is "
-    "extrapolated.",
+    "State which cameras find damage of a given size nine times out of ten at a given distance,"
+    " with how many frames, from a stored table of limits of simulated set-ups"
+    " (experiments/atlas.yaml), with intervals. Nothing is extrapolated.",
     epilog="example: tofpod ask --damage hole --size 5mm --distance 1m",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 for any answer, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.programs.atlas.limits import surfaces_of
-    from harness.programs.atlas.tables import ATLAS, curves
-    from harness.records.schema import write_table
     from scenes.sensor.camera import load_camera
 
-    ends = sum(given is not None for given in (options.size, options.distance))
-    if ends == 1 or (not ends and options.out is None):
-        legal = "--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas"
-        raise UserError("--size and --distance are needed", legal=legal)
+    has_question = options.size is not None and options.distance is not None
+    is_partial = (options.size is None) != (options.distance is None)
+    if is_partial or (not has_question and options.out is None):
+        raise UserError(
+            "--size and --distance are needed",
+            legal="--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas",
+        )
     limits, about = _read(options.atlas or shipped("baselines") / STORED)
     surfaces = surfaces_of(limits)
-    titles = {
-        name: load_camera(name).title
-        for name in dict.fromkeys(surface.camera for surface in surfaces)
-    }
-    if ends:
+    cameras = dict.fromkeys(surface.camera for surface in surfaces)
+    titles = {camera: load_camera(camera).title for camera in cameras}
+    if has_question:
         _answer(options, surfaces, titles, about)
     if options.out is not None:
-        from harness.programs.atlas.page import atlas_html, save_atlas_png
-
-        rows = curves(surfaces, titles)
-        write_table(options.out, ATLAS, ATLAS.frame(rows), about)
-        write_text(
-            options.out / ATLAS_PAGE.name, atlas_html(rows, _warnings(titles), about, command)
-        )
-        save_atlas_png(options.out / ATLAS_PICTURE.name, rows)
-        print(
-            f"wrote {options.out / ATLAS_PAGE.name}, {ATLAS_PICTURE.name}, {', '.join(ATLAS.files)}"
-        )
+        _write_atlas(options.out, surfaces, titles, about, command)
     return 0
+
+
+def _write_atlas(
+    out: Path,
+    surfaces: Sequence[LimitSurface],
+    titles: Mapping[str, str],
+    about: Mapping[str, Any],
+    command: str,
+) -> None:
+    """Write the page, the picture and the table of the whole atlas."""
+    from harness.programs.atlas.page import atlas_html, save_atlas_png
+    from harness.programs.atlas.tables import ATLAS, curves
+    from harness.records.schema import write_table
+
+    rows = curves(surfaces, titles)
+    write_table(out, ATLAS, ATLAS.frame(rows), about)
+    page = atlas_html(rows, _warnings(titles), about, command)
+    write_text(out / ATLAS_PAGE.name, page)
+    save_atlas_png(out / ATLAS_PICTURE.name, rows)
+    print(f"wrote {out / ATLAS_PAGE.name}, {ATLAS_PICTURE.name}, {', '.join(ATLAS.files)}")
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
@@ -114,7 +133,7 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    from harness.programs.atlas import limits as atlas
+    from harness.programs.atlas.limits import AXES, CAMERA, DAMAGE
 
     file = path / "limits.parquet" if path.is_dir() else path
     legal = (
@@ -131,17 +150,19 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
             f"{file}: cannot be read as a table of limits: {error}", legal=legal
         ) from error
     needed = (
-        atlas.CAMERA,
-        atlas.DAMAGE,
-        atlas.AXES["distance_m"],
+        CAMERA,
+        DAMAGE,
+        AXES["distance_m"],
         "frames",
         "a90_mm",
         "a90_low_mm",
         "largest_mm",
     )
-    if missing := [name for name in needed if name not in table.column_names]:
+    missing = [name for name in needed if name not in table.column_names]
+    if missing:
         raise UserError(f"{file}: lacks the columns {', '.join(missing)}", legal=legal)
-    return table.to_pandas(), json.loads((table.schema.metadata or {}).get(b"tofpod", b"{}"))
+    metadata = table.schema.metadata or {}
+    return table.to_pandas(), json.loads(metadata.get(b"tofpod", b"{}"))
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:
@@ -149,147 +170,209 @@ def _warnings(cameras: Iterable[str]) -> list[str]:
     guesses."""
     from scenes.sensor.camera import guessed_precision, load_camera
 
-    alike: dict[str, list[str]] = {}
+    titles_by_form: dict[str, list[str]] = {}
     for camera in map(load_camera, dict.fromkeys(cameras)):
-        if text := guessed_precision(camera):
-            alike.setdefault(text.replace(camera.title, "{}"), []).append(camera.title)
-    form = {
-        text: text if len(who) == 1 else text.replace("its noise", "their noise")
-        for text, who in alike.items()
-    }
-    return [form[text].format("; ".join(who)) for text, who in alike.items()]
+        text = guessed_precision(camera)
+        if text:
+            form = text.replace(camera.title, "{}")
+            titles_by_form.setdefault(form, []).append(camera.title)
+    warnings = []
+    for form, titles in titles_by_form.items():
+        if len(titles) > 1:
+            form = form.replace("its noise", "their noise")
+        warnings.append(form.format("; ".join(titles)))
+    return warnings
 
 
 def _answer(
     options: argparse.Namespace,
     surfaces: Sequence[LimitSurface],
-    titles: dict[str, str],
-    about: Any,
+    titles: Mapping[str, str],
+    about: Mapping[str, Any],
 ) -> None:
-    import numpy as np
-
+    """Print the answer to a question: a sentence, the table of set-ups, and notes."""
     from harness.programs.atlas.tables import ATLAS, damage_words, rows_at
-    from harness.vocabulary.text import many, show
+    from harness.vocabulary.text import show
 
     size_mm = 1e3 * length_m("--size", options.size)
     distance_m = length_m("--distance", options.distance)
     kind = KINDS.get(options.damage, options.damage)
     chosen = _chosen(options, surfaces, kind)
-    given = {
-        "distance_m": [distance_m],
-        "frames": [options.frames],
-        "albedo": [options.albedo],
-        "depth_mm": [None],
-    }
-    if options.depth is not None:
-        given["depth_mm"] = [1e3 * length_m("--depth", options.depth)]
-    for axis, values in given.items():
-        computed = sorted({value for surface in chosen for value in surface.grid.get(axis, ())})
-        option = f"--{axis.partition('_')[0]}"
-        if values == [None]:
-            if axis == "depth_mm" and len(computed) > 1:
-                raise UserError(
-                    f"{option} is missing",
-                    legal=f"{computed[0]:g} to {computed[-1]:g} in this atlas",
-                )
-            given[axis] = sorted({computed[0], computed[-1]}) if computed else []
-        elif not computed:
-            raise UserError(
-                f"{option}: the atlas has no values for {damage_words(kind)}s",
-                fix=f"leave {option} out",
-            )
-    places = [
-        dict(zip(filter(given.get, given), each, strict=True))
-        for each in product(*filter(None, given.values()))
-    ]
-    rows = []
-    whose = dict[str, set[str]]()
-    for position in places:
-        found, why = rows_at(chosen, titles, position, size_mm)
-        rows += found
-        for reason, title in why:
-            whose.setdefault(reason, set()).add(title)
+    values = _values(options, chosen, kind, distance_m)
+    positions = _positions(values)
+    rows: list[Row] = []
+    cameras_by_reason: dict[str, set[str]] = {}
+    for position in positions:
+        answered, refused = rows_at(chosen, titles, position, size_mm)
+        rows += answered
+        for reason, title in refused:
+            cameras_by_reason.setdefault(reason, set()).add(title)
     all_chosen = {titles[surface.camera] for surface in chosen}
-    refused = [
-        reason if who == all_chosen else f"{', '.join(sorted(who))}: {reason}"
-        for reason, who in whose.items()
+    reasons = [
+        reason if cameras == all_chosen else f"{', '.join(sorted(cameras))}: {reason}"
+        for reason, cameras in cameras_by_reason.items()
     ]
     if not rows:
-        fix = f"compute it: {_exactly(chosen[0], places[0], about)}"
-        raise UserError("the atlas does not cover this: " + "; ".join(refused), fix=fix)
+        raise UserError(
+            f"the atlas does not cover this: {'; '.join(reasons)}",
+            fix=f"compute it: {_exactly(chosen[0], positions[0], about)}",
+        )
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
-    verdicts = [row.answer.verdict(size_mm) for row in rows]
-    counts = ", ".join(
-        f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts
+    asked = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
+    answer = f"{asked} are found nine times out of ten in {_counts(rows)}."
+    exact = _exactly(rows[0].surface, rows[0].position, about)
+    heads = {} if len(values["albedo"]) > 1 else {"albedo": ""}
+    show(
+        [
+            answer,
+            ATLAS.grid(rows, heads=heads, terminal=True),
+            _basis(rows, about),
+            *(f"not answered: {reason}" for reason in reasons),
+            f"to compute the first row exactly: {exact}",
+        ]
     )
-    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (
-        f" ({counts})." if counts else "."
-    )
-    asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
-    answer = f"{asked_for} are found nine times out of ten in {of_all}"
-    errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
-    left_out = f"the error of a90 at set-ups left out of the fit is {100 * max(errors, default=0):.0f} % (rms) at most"
-    missed = f"; {left_out}" if errors else ""
+
+
+def _values(
+    options: argparse.Namespace, chosen: Sequence[LimitSurface], kind: str, distance_m: float
+) -> dict[str, list[float]]:
+    """Return the values on each axis that the question asks for; without an option, the ends of
+    the atlas. An axis that the atlas lacks has none. Raises UserError if a value is needed or
+    cannot be."""
+    from harness.programs.atlas.tables import damage_words
+
+    depth_mm = None
+    if options.depth is not None:
+        depth_mm = 1e3 * length_m("--depth", options.depth)
+    asked = {
+        "distance_m": distance_m,
+        "frames": options.frames,
+        "albedo": options.albedo,
+        "depth_mm": depth_mm,
+    }
+    values: dict[str, list[float]] = {}
+    for axis, value in asked.items():
+        computed = sorted({node for surface in chosen for node in surface.grid.get(axis, ())})
+        option = f"--{axis.partition('_')[0]}"
+        if value is not None:
+            if not computed:
+                raise UserError(
+                    f"{option}: the atlas has no values for {damage_words(kind)}s",
+                    fix=f"leave {option} out",
+                )
+            values[axis] = [value]
+        elif axis == "depth_mm" and len(computed) > 1:
+            raise UserError(
+                f"{option} is missing",
+                legal=f"{computed[0]:g} to {computed[-1]:g} in this atlas",
+            )
+        else:
+            values[axis] = sorted({*computed[:1], *computed[-1:]})
+    return values
+
+
+def _positions(values: Mapping[str, Sequence[float]]) -> list[dict[str, float]]:
+    """Return every combination of the values, without the axes that have none."""
+    axes = [axis for axis in values if values[axis]]
+    combinations = product(*(values[axis] for axis in axes))
+    return [dict(zip(axes, combination, strict=True)) for combination in combinations]
+
+
+def _counts(rows: Sequence[Row]) -> str:
+    """Return ``3 of 8 set-ups (no for 4, undecided for 1)``."""
+    from harness.vocabulary.text import many
+
+    verdicts = [row.verdict for row in rows]
+    unfavourable = [
+        f"{verdict} for {verdicts.count(verdict)}"
+        for verdict in ("no", "undecided")
+        if verdict in verdicts
+    ]
+    text = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}"
+    return f"{text} ({', '.join(unfavourable)})" if unfavourable else text
+
+
+def _basis(rows: Sequence[Row], about: Mapping[str, Any]) -> str:
+    """Say under what conditions the limits hold, and how well the surfaces predict set-ups."""
     study = about.get("experiment", "the study")
-    heads = {} if len(given["albedo"]) > 1 else {"albedo": ""}
-    notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
-    notes += [f"not answered: {reason}" for reason in refused]
-    notes.append(
-        f"to compute the first row exactly: {_exactly(rows[0].surface, rows[0].place, about)}"
-    )
-    show([answer, ATLAS.grid(rows, heads=heads, terminal=True), *notes])
+    text = f"Simulated: one unit of each camera, under the conditions of {study}.yaml"
+    errors = [row.surface.error for row in rows if math.isfinite(row.surface.error)]
+    if errors:
+        text += (
+            "; the error of a90 at set-ups left out of the fit is"
+            f" {100 * max(errors):.0f} % (rms) at most"
+        )
+    return f"{text}."
 
 
 def _chosen(
     options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str
 ) -> list[LimitSurface]:
     """Return the surfaces for a question. Raises UserError if a name is not in the atlas."""
-    from harness.vocabulary.words import nearest
-
-    detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
-    detector = options.detector or (BEST if BEST in detectors else detectors[0])
-    for name, wanted in (
-        ("camera", options.camera or ()),
-        ("kind", [kind]),
-        ("detector", [detector]),
-    ):
-        in_atlas = dict.fromkeys(getattr(surface, name) for surface in surfaces)
-        if unknown := [value for value in wanted if value not in in_atlas]:
-            option = "--damage" if name == "kind" else f"--{name}"
-            legal = [
-                *(word for word, kind in KINDS.items() if name == "kind" and kind in in_atlas),
-                *in_atlas,
-            ]
-            near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
-            meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
-            what = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"
-            fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
-            raise UserError(what, legal=", ".join(legal), fix=fix if name == "kind" else None)
-    cameras = options.camera or [surface.camera for surface in surfaces]
+    in_atlas = dict.fromkeys(surface.camera for surface in surfaces)
+    cameras = options.camera or list(in_atlas)
+    _refuse_unknown("--camera", [camera for camera in cameras if camera not in in_atlas], in_atlas)
+    kinds = dict.fromkeys(surface.kind for surface in surfaces)
+    if kind not in kinds:
+        _refuse_kind(options.damage, kind, list(kinds))
+    detectors = dict.fromkeys(surface.detector for surface in surfaces)
+    best = BEST if BEST in detectors else next(iter(detectors))
+    detector = options.detector or best
+    if detector not in detectors:
+        _refuse_unknown("--detector", [detector], detectors)
     return [
-        s for s in surfaces if s.kind == kind and s.detector == detector and s.camera in cameras
+        surface
+        for surface in surfaces
+        if surface.kind == kind and surface.detector == detector and surface.camera in cameras
     ]
 
 
-def _exactly(surface: LimitSurface, place: Mapping[str, float], about: dict[str, Any]) -> str:
-    """Return the command of a study that computes the set-up itself."""
-    from harness.programs.atlas import limits as atlas
+def _refuse_unknown(option: str, unknown: Sequence[str], in_atlas: Iterable[str]) -> None:
+    """Raise UserError if a name is ``unknown``."""
+    legal = list(in_atlas)
+    if unknown:
+        text = f"{option} {', '.join(unknown)}: not in the atlas{_meant(unknown[0], legal)}"
+        raise UserError(text, legal=", ".join(legal))
 
-    axes: dict[str, Any] = {atlas.CAMERA: surface.camera, "capture.frames": int(place["frames"])}
-    axes[atlas.AXES["distance_m"]] = place["distance_m"]
-    parts = [f"tofpod sweep {about.get('experiment', 'atlas')}"]
-    depth = place.get("depth_mm")
-    if depth is not None or surface.kind != "through":
-        axes[atlas.DAMAGE] = json.loads(surface.damage) | (
-            {} if depth is None else {"depth_mm": [depth, depth]}
-        )
-    if "albedo" in place:
-        axes[atlas.AXES["albedo"]] = place["albedo"]
-    swept = {path: [value] for path, value in axes.items()}
-    return " ".join(
-        [*parts, "--set study.boards=36 --set", shlex.quote(f"sweep={json.dumps(swept)}")]
+
+def _refuse_kind(damage: str, kind: str, in_atlas: Sequence[str]) -> None:
+    """Raise UserError: the ``damage`` that the user named is of a ``kind`` not in the atlas."""
+    legal = [*(word for word, meant_kind in KINDS.items() if meant_kind in in_atlas), *in_atlas]
+    raise UserError(
+        f"--damage {damage}: not in the atlas{_meant(kind, [*legal, *KINDS])}",
+        legal=", ".join(legal),
+        fix="run a study of damage that is not in the atlas, such as tofpod sweep crack",
     )
+
+
+def _meant(name: str, candidates: Sequence[str]) -> str:
+    from harness.vocabulary.words import nearest
+
+    word = nearest(name, candidates)
+    return f"; did you mean {word!r}?" if word and word != name else ""
+
+
+def _exactly(surface: LimitSurface, position: Mapping[str, float], about: Mapping[str, Any]) -> str:
+    """Return the command of a study that computes the set-up itself."""
+    from harness.programs.atlas.limits import AXES, CAMERA, DAMAGE
+
+    axes: dict[str, Any] = {
+        CAMERA: [surface.camera],
+        "capture.frames": [int(position["frames"])],
+        AXES["distance_m"]: [position["distance_m"]],
+    }
+    depth_mm = position.get("depth_mm")
+    if depth_mm is not None or surface.kind != "through":
+        damage = json.loads(surface.damage)
+        if depth_mm is not None:
+            damage["depth_mm"] = [depth_mm, depth_mm]
+        axes[DAMAGE] = [damage]
+    if "albedo" in position:
+        axes[AXES["albedo"]] = [position["albedo"]]
+    swept = shlex.quote(f"sweep={json.dumps(axes)}")
+    experiment = about.get("experiment", "atlas")
+    return f"tofpod sweep {experiment} --set study.boards=36 --set {swept}"
 
 
 if __name__ == "__main__":

@@ -37,15 +37,12 @@ BUNDLE_S = 0.25  # work in a bundle for each process of a node; a call of a node
 MOST_IN_BUNDLE = 32  # most jobs in a bundle for each process of a node
 WITH_NODE = 2  # bundles at a node: its processes work on one while the other waits
 LOOKS_S = 1.0  # interval at which the driver checks which nodes are connected
-WAIT_FOR_NODES_S = (
-    60.0  # wait for workers that are started by hand; a batch system's queue may take hours
-)
+# wait for workers that are started by hand; a batch system's queue may take hours
+WAIT_FOR_NODES_S = 60.0
 TRIES = 5
 ANSWERS_S = 5  # time for a scheduler to answer a connection, which takes milliseconds
-EXAMINED_S = (
-    # time for a node to describe itself: it reads the sources, possibly from a network's disk
-    60.0
-)
+# time for a node to describe itself: it reads the sources, possibly from a network's disk
+EXAMINED_S = 60.0
 CLOSES_S = 1.0
 KINDS = {
     name.lower(): f"{name}Cluster"
@@ -105,7 +102,7 @@ class ClusterEngine:
         self._limits = limits
         self._wanted = workers_wanted
         self._code = dict(code)
-        self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
+        self._digests = {stage: source_digest(*sources) for stage, sources in self._code.items()}
         self._client: Any = None
         self._nodes: dict[str, _Node] = {}
         self._refused: dict[
@@ -120,9 +117,8 @@ class ClusterEngine:
         # node
         self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
         self._number = 0
-        self._mean_s = (
-            BUNDLE_S  # mean duration of a trial; at first, each trial counts as a whole bundle
-        )
+        # mean duration of a trial; at first, each trial counts as a whole bundle
+        self._mean_s = BUNDLE_S
         self._looked = float("-inf")
         self._lacking, self._lacking_since = (
             "",
@@ -198,7 +194,7 @@ class ClusterEngine:
         some_offer = any(
             node.facts.offers_render and node.can_render for node in self._nodes.values()
         )
-        for most, to in product(range(WITH_NODE), list(self._nodes.values())):
+        for allowed_jobs, to in product(range(WITH_NODE), list(self._nodes.values())):
             processes = to.facts.processes
             offers = to.facts.offers_render
             # A node with one process does one thing at a time: trials first, because renders only
@@ -209,7 +205,7 @@ class ClusterEngine:
                 self._send(to, (renders.popleft(),))
             elif (
                 trials
-                and len(to.bundles) - to.renders <= most
+                and len(to.bundles) - to.renders <= allowed_jobs
                 and not (processes == 1 and to.renders)
             ):
                 share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
@@ -231,8 +227,12 @@ class ClusterEngine:
             for pause_s in (0.0,) if number is not None else (0.0, 0.2, 1.0, 3.0):
                 await asyncio.sleep(pause_s)
                 try:
-                    given = {"workers": [address], "on_error": "return", "asynchronous": True}
-                    calling = self._client.run(function, *arguments, **given)
+                    call_options = {
+                        "workers": [address],
+                        "on_error": "return",
+                        "asynchronous": True,
+                    }
+                    calling = self._client.run(function, *arguments, **call_options)
                     answers = await (
                         calling if number is not None else asyncio.wait_for(calling, EXAMINED_S)
                     )
@@ -318,7 +318,8 @@ class ClusterEngine:
             # it died in the meantime, or the network failed; this says nothing about its
             # installation
             self._print_once(
-                f"{where} did not state its version ({type(answer).__name__}: {answer}); it is not used"
+                f"{where} did not state its version ({type(answer).__name__}: {answer}); it "
+                "is not used"
             )
         elif answer.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
             message = (
@@ -326,8 +327,14 @@ class ClusterEngine:
             )
             self._refuse(address, UserError(message, fix="use the same Python on all"))
         elif answer.digests.get("trials") != self._digests.get("trials"):
-            message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
-            fix = "install the same there, and start its workers again: they keep the code that they loaded"
+            message = (
+                f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, "
+                "numba or OpenCV"
+            )
+            fix = (
+                "install the same there, and start its workers again: they keep the code that "
+                "they loaded"
+            )
             self._refuse(address, UserError(f"{message} than this machine", fix=fix))
         elif answer.sees != self._nonce:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
@@ -443,7 +450,10 @@ def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
                 ) from error
             except (ValueError, TypeError, OSError, RuntimeError) as error:
                 message = f"dask-jobqueue could not start a cluster of kind {kind}: {error}"
-                fix = f"describe it in ~/.config/dask/jobqueue.yaml under jobqueue.{kind}: cores, processes: 1, memory"
+                fix = (
+                    f"describe it in ~/.config/dask/jobqueue.yaml under jobqueue.{kind}: cores, "
+                    "processes: 1, memory"
+                )
                 raise UserError(message, fix=fix) from error
         try:
             client = distributed.Client(
@@ -451,15 +461,18 @@ def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
             )
         except (OSError, ValueError) as error:
             message = f"the scheduler at {scheduler} does not answer within {ANSWERS_S} s: {error}"
-            fix = "start one with `dask scheduler`, and workers with `dask worker`; docs/scale.md says how"
+            fix = (
+                "start one with `dask scheduler`, and workers with `dask worker`; docs/scale.md "
+                "says how"
+            )
             raise UserError(message, fix=fix) from error
         stack.callback(_close, client)
         yield client
 
 
-def _close(what: Any) -> None:
+def _close(resource: Any) -> None:
     with contextlib.suppress(Exception):
-        what.close(timeout=CLOSES_S)
+        resource.close(timeout=CLOSES_S)
 
 
 def _bare(address: str) -> str:
@@ -477,9 +490,9 @@ def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFac
     """Describe this node. Each process computes digests once: files that change later are not what
     it runs."""
     digests: dict[Stage, str] = {}
-    for stage, which in code.items():
+    for stage, sources in code.items():
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            digests[stage] = source_digest(*which)
+            digests[stage] = source_digest(*sources)
     state = dask_worker.state
     offers_render = state.total_resources.get("render", 0) > 0
     sees = None

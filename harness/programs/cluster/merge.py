@@ -25,10 +25,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Copy the trials of results folders (such as those of `tofpod sweep --shard`) to another folder. "
+    "Copy the trials of results folders (such as those of `tofpod sweep --shard`) to "
+    "another folder. "
     "Nothing is run; if several folders hold a trial, a finished record is used.",
-    epilog="example: tofpod merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
-    "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
+    epilog="example: tofpod merge shard1/averaging/0123456789abcdef "
+    "shard2/averaging/0123456789abcdef "
+    "--into results/averaging/0123456789abcdef; then the sweep's own command, without "
+    "--shard, writes the report",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if two journals give different results for a trial, 2 for a
@@ -61,36 +64,40 @@ def main(options: argparse.Namespace, command: str) -> int:
         note = f"{len(damaged)} damaged or older records were left out and must be run again"
         print(f"{note}: {', '.join(damaged[:3])}", file=sys.stderr)
     if counts["alike"]:
-        alike = (
+        alike_text = (
             f"{counts['alike']} trials differ in the last digits, as between different processors"
         )
-        print(f"{alike}; the record that was copied first was kept")
+        print(f"{alike_text}; the record that was copied first was kept")
     if different:
-        note = f"{len(different)} trials have different results in different folders; the first record was kept"
+        note = (
+            f"{len(different)} trials have different results in different folders; the first "
+            "record was kept"
+        )
         why = "The machines may have different processors or versions"
         print(f"{note}: {', '.join(different[:3])}. {why}", file=sys.stderr)
         return 1
     out = into.parent.parent
     print(
-        f"next: run the sweep without --shard, with --out {out}, to run missing trials and write the report"
+        f"next: run the sweep without --shard, with --out {out}, to run missing trials and "
+        "write the report"
     )
     return 0
 
 
-def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
+def merge_into(into: Journal, source: Journal, counts: Counter[str]) -> list[str]:
     """Copy trials that ``into`` lacks or has not finished; count copied, known and alike trials
     (equal but for the last digits). Return the keys of trials that differ. Raises UserError if a
     newer tofpod wrote either journal."""
     different = []
-    for key, entry in other.entries():
-        known = into.read(key)
-        if known is None or (known.state != "done" and entry.state == "done"):
+    for key, entry in source.entries():
+        stored = into.read(key)
+        if stored is None or (stored.state != "done" and entry.state == "done"):
             into.write(key, entry)
             counts["copied"] += not key.startswith(THRESHOLDS)
             continue
         counts["known"] += not key.startswith(THRESHOLDS)
-        if known.state == entry.state == "done" and known.value != entry.value:
-            first = _without_seconds(known.record)
+        if stored.state == entry.state == "done" and stored.value != entry.value:
+            first = _without_seconds(stored.record)
             second = _without_seconds(entry.record)
             if not _alike(first, second):
                 different.append(key)
@@ -145,8 +152,8 @@ def _refuse_others(folders: list[Path], into: Path) -> None:
             )
     names = {"/".join(folder.resolve().parts[-2:]) for folder in folders}
     if len(names) > 1:
-        what = f"these are results of different experiments: {', '.join(sorted(names))}"
-        raise UserError(what, fix="merge the folders of each experiment separately")
+        message = f"these are results of different experiments: {', '.join(sorted(names))}"
+        raise UserError(message, fix="merge the folders of each experiment separately")
     (name,) = names
     if "/".join(into.resolve().parts[-2:]) != name:
         fix = f"--into {into}/{name}, and --out {into} for the sweep"

@@ -36,7 +36,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
-    pose = "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; may be repeated"
+    pose = (
+        "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; "
+        "may be repeated"
+    )
     add(
         "--pose",
         action="append",
@@ -51,7 +54,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     best = "add the N best poses, one by one, with tilts from -40 to 40° about x and about y"
     add("--suggest", type=whole_number(20), default=0, metavar="N", help=best)
-    goal = "find the quickest capture that finds this size on the share, over all set-ups, distances and tilts"
+    goal = (
+        "find the quickest capture that finds this size on the share, over all set-ups, "
+        "distances and tilts"
+    )
     add("--goal", metavar="LENGTH", help=goal)
     add("--share", type=float, default=0.9, help="share of the face for --goal (default: 0.9)")
     add(
@@ -60,7 +66,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="default: results/coverage/ and the experiment's name",
     )
-    results = "results folder of experiments, whose stored renders are used and extended (default: results)"
+    results = (
+        "results folder of experiments, whose stored renders are used and extended (default: "
+        "results)"
+    )
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     add("--jobs", type=whole_number(256), default=2, metavar="N", help="processes (default: 2)")
     add("--serial", action="store_true", help="run everything in this process, for a debugger")
@@ -82,8 +91,10 @@ def _pose(text: str) -> Pose:
 
 @program(
     _options,
-    "State the smallest damage that is found nine times out of ten at each place of a part, given the noise, angle, "
-    "distance and missing returns there, and the share of the part on which a wanted size is found. Write tables and a "
+    "State the smallest damage that is found nine times out of ten at each place of a part, "
+    "given the noise, angle, "
+    "distance and missing returns there, and the share of the part on which a wanted size "
+    "is found. Write tables and a "
     "page on which the part can be turned.",
     epilog="example: tofpod coverage pipe --size 3mm --suggest 3",
 )
@@ -114,15 +125,17 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not 0 < options.share <= 1:
         raise UserError(f"--share {options.share:g}", legal="a share above 0, up to 1")
     if len(experiment.points) > 1 and not options.goal:
-        what = f"{name}: has {len(experiment.points)} set-ups, but only --goal can compare several"
+        message = (
+            f"{name}: has {len(experiment.points)} set-ups, but only --goal can compare several"
+        )
         raise UserError(
-            what, fix="choose one set-up with --set, such as sweep={} and the values of its axes"
+            message, fix="choose one set-up with --set, such as sweep={} and the values of its axes"
         )
     size = options.goal or options.size
     size_mm = length_m("--goal" if options.goal else "--size", size) / MM if size else None
     for point in experiment.points:
         refuse_size(point.config, size_mm)
-    given, further = _poses(options, declared(experiment.config)[1].distance_m)
+    given_poses, further_poses = _poses(options, declared(experiment.config)[1].distance_m)
     folder = options.out or options.results / "coverage" / name
     cache = options.results / ".cache" / "renders"
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
@@ -130,24 +143,24 @@ def main(options: argparse.Namespace, command: str) -> int:
         EngineOptions(jobs=options.jobs, serial=options.serial), {experiment.config.detector.name}
     )
     with in_use(cache), locked(folder), engine:
-        surveys = survey(experiment, [*given, *further], cache, folder, engine)
+        surveys = survey(experiment, [*given_poses, *further_poses], cache, folder, engine)
     chosen = surveys[0]
     goals = []
     if options.goal:
         ways = (
-            way
+            row
             for survey in surveys
-            for way in _ways(survey, size_mm or survey.found.sizes_mm[1], options.share)
+            for row in _ways(survey, size_mm or survey.found.sizes_mm[1], options.share)
         )
         order = {True: "capture_s", False: "missing_share"}
-        goals = sorted(ways, key=lambda way: (not way["reached"], way[order[way["reached"]]]))
+        goals = sorted(ways, key=lambda row: (not row["reached"], row[order[row["reached"]]]))
         chosen = goals[0]["survey"]
     wanted = size_mm or chosen.found.sizes_mm[1]
-    found = chosen.found
+    findable = chosen.found
     poses = (
         goals[0]["rows"]
         if goals
-        else _rows(chosen, list(chosen.seen), wanted, len(given), options.suggest)
+        else _rows(chosen, list(chosen.seen), wanted, len(given_poses), options.suggest)
     )
     if not poses:
         raise UserError(
@@ -157,8 +170,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     patches = chosen.patches
     best = np.nan_to_num(each_mm, nan=np.inf).argmin(axis=0)
     limits_mm = np.fmin.reduce(each_mm)
-    seen = [chosen.seen[row["pose"]] for row in poses]
-    facts = np.stack([[each.deviation_m, each.cosine, each.range_m] for each in seen])
+    seen_at_poses = [chosen.seen[row["pose"]] for row in poses]
+    facts = np.stack(
+        [
+            [seen_at_pose.deviation_m, seen_at_pose.cosine, seen_at_pose.range_m]
+            for seen_at_pose in seen_at_poses
+        ]
+    )
     columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm, best + 1]
     noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
     columns += [noise_m / MM, np.degrees(np.arccos(cosine)), range_m]
@@ -168,11 +186,14 @@ def main(options: argparse.Namespace, command: str) -> int:
     provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
     write_tables(folder, {table: table.frame(row) for table, row in rows.items()}, provenance)
-    warnings = warnings_of(found, chosen.seen)
-    sentence = answer(found, patches, limits_mm, wanted, len(poses))
-    if (added := len(poses) - len(given)) < options.suggest:
-        few = f"{added} of {many(options.suggest, 'pose')} suggested: no other pose increases the coverage"
-        warnings.insert(0, few)
+    warnings = warnings_of(findable, chosen.seen)
+    sentence = answer(findable, patches, limits_mm, wanted, len(poses))
+    if (added := len(poses) - len(given_poses)) < options.suggest:
+        note_text = (
+            f"{added} of {many(options.suggest, 'pose')} suggested: no other pose increases the "
+            "coverage"
+        )
+        warnings.insert(0, note_text)
     if goals:
         lead = f"Quickest capture ({goals[0]['capture_s']:.0f} s)"
         if not goals[0]["reached"]:
@@ -182,11 +203,17 @@ def main(options: argparse.Namespace, command: str) -> int:
             f"{lead}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {sentence}"
         )
     config = chosen.point.config
-    scene = scene_of(patches, limits_mm, found)
+    scene = scene_of(patches, limits_mm, findable)
     camera = config.simulated.camera
-    detector = f"the detector {config.detector.name} at a threshold of {chosen.task.criteria.threshold:.3g}"
-    unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
-    first = f"Simulated, for {unit}, {detector}. {found.statement}"
+    detector = (
+        f"the detector {config.detector.name} at a threshold of "
+        f"{chosen.task.criteria.threshold:.3g}"
+    )
+    unit = (
+        f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, "
+        f"{many(config.capture.frames, 'frame')}"
+    )
+    first = f"Simulated, for {unit}, {detector}. {findable.statement}"
     html = coverage_html(name, sentence, first, scene, poses, goals, warnings, command)
     write_text(folder / COVERAGE_PAGE.name, html)
     grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]
@@ -201,45 +228,58 @@ def _poses(options: argparse.Namespace, own_m: float) -> tuple[list[Pose], list[
         distances = [round(own_m * part, 4) for part in GOAL_DISTANCES]
         tilts = GOAL_TILTS_DEG
         return [], list(product(distances, tilts, tilts))
-    given = list(dict.fromkeys(options.pose or [(own_m, 0.0, 0.0)]))
+    given_poses = list(dict.fromkeys(options.pose or [(own_m, 0.0, 0.0)]))
     grid = [
         pose
-        for pose in product([given[0][0]], TILTS_DEG, TILTS_DEG)
+        for pose in product([given_poses[0][0]], TILTS_DEG, TILTS_DEG)
         if min(abs(pose[1]), abs(pose[2])) < 40
     ]
-    return given, [pose for pose in grid if pose not in given] if options.suggest else []
+    return given_poses, [
+        pose for pose in grid if pose not in given_poses
+    ] if options.suggest else []
 
 
 def _rows(
-    seen: Survey, poses: list[Pose], size_mm: float, given: int, further: int
+    surveyed: Survey, poses: list[Pose], size_mm: float, given_count: int, further_count: int
 ) -> list[dict[str, Any]]:
     """Return a row for each given pose and for each pose that is added, in order."""
     from harness.programs.coverage.statistics import in_turn
 
-    limits_mm = [seen.found.limits_mm(seen.seen[pose]) for pose in poses]
+    limits_mm = [surveyed.found.limits_mm(surveyed.seen[pose]) for pose in poses]
     rows = list[dict[str, Any]]()
-    for which, gain, total in in_turn(
-        seen.patches, [limit_mm <= size_mm for limit_mm in limits_mm], given, further
+    for pose_index, gain, total in in_turn(
+        surveyed.patches,
+        [limit_mm <= size_mm for limit_mm in limits_mm],
+        given_count,
+        further_count,
     ):
-        row = {"number": len(rows) + 1, "pose": poses[which], "limits_mm": limits_mm[which]}
-        row |= dict(zip(("distance_m", "tilt_x_deg", "tilt_y_deg"), poses[which], strict=True))
-        row |= {"alone_share": seen.patches.share(limits_mm[which] <= size_mm)}
+        row = {
+            "number": len(rows) + 1,
+            "pose": poses[pose_index],
+            "limits_mm": limits_mm[pose_index],
+        }
+        row |= dict(zip(("distance_m", "tilt_x_deg", "tilt_y_deg"), poses[pose_index], strict=True))
+        row |= {"alone_share": surveyed.patches.share(limits_mm[pose_index] <= size_mm)}
         rows.append(row | {"gain_share": gain, "total_share": total})
     return rows
 
 
-def _ways(seen: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
+def _ways(surveyed: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
     """Return, for each distance, few poses of a set-up that reach the share, chosen greedily, or
     `MOST_POSES` poses."""
     from scenes.sensor.camera import camera_of
 
     ways = []
-    config = seen.point.config
+    config = surveyed.point.config
     camera = camera_of(config.simulated.camera)
     frames = config.capture.frames
-    for distance_m in dict.fromkeys(pose[0] for pose in seen.seen):
+    for distance_m in dict.fromkeys(pose[0] for pose in surveyed.seen):
         rows = _rows(
-            seen, [pose for pose in seen.seen if pose[0] == distance_m], size_mm, 0, MOST_POSES
+            surveyed,
+            [pose for pose in surveyed.seen if pose[0] == distance_m],
+            size_mm,
+            0,
+            MOST_POSES,
         )
         rows = rows[
             : next((row["number"] for row in rows if row["total_share"] >= share), len(rows))
@@ -251,7 +291,7 @@ def _ways(seen: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
         )
         tilts = "; ".join(f"{row['tilt_x_deg']:g}, {row['tilt_y_deg']:g}" for row in rows)
         way = {
-            "set_up": in_words(seen.point.variant),
+            "set_up": in_words(surveyed.point.variant),
             "camera": camera_title(camera.name),
             "frames": frames,
         }
@@ -263,7 +303,7 @@ def _ways(seen: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
                 "reached": covered >= share,
                 "missing_share": 1 - covered,
                 "rows": rows,
-                "survey": seen,
+                "survey": surveyed,
             }
         )
     return ways

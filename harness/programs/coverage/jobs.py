@@ -80,9 +80,9 @@ def survey(
         outcome = run_plan(plan, journal, engine, report)
     for entry in map(journal.read, outcome.finished):
         for row in (entry.record or {}).get("holes", ()) if entry else ():
-            place = (row["variant"], row["frames"], row["board"], row["hole"])
+            damage_key = (row["variant"], row["frames"], row["board"], row["hole"])
             missed = np.inf if row["no_return"] else np.nan
-            scores.setdefault(place, []).append(row["score"] if row["detected"] else missed)
+            scores.setdefault(damage_key, []).append(row["score"] if row["detected"] else missed)
     surveys = []
     for group in plan.groups:
         source, family = declared(group.points[0].config)
@@ -110,17 +110,29 @@ def survey(
             )
             pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
             boards = values_of(_board_seen, pairs, engine)
-            inspections = _inspections([board for board in boards if board is not None], point, scores)
-            found = findable(inspections, outcome.thresholds[point.digest])
+            inspections = _inspections(
+                [board for board in boards if board is not None], point, scores
+            )
+            findable_sizes = findable(inspections, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
-            seen = values_of(
+            seen_of_views = values_of(
                 _part_seen, [(view, task, group.seed, patches) for view in views], engine
             )
-            seen = [
-                Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each
-                for each in seen
+            seen_of_views = [
+                Seen(blind, np.ones(len(blind)), np.ones(len(blind)))
+                if seen_of_view is None
+                else seen_of_view
+                for seen_of_view in seen_of_views
             ]
-            surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
+            surveys.append(
+                Survey(
+                    point,
+                    task,
+                    patches,
+                    findable_sizes,
+                    dict(zip(poses, seen_of_views, strict=True)),
+                )
+            )
     return surveys
 
 
@@ -150,7 +162,10 @@ def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConf
         and source.views is None
     ):
         return source, source.target
-    fix = "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as experiments/pipe.yaml does"
+    fix = (
+        "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as "
+        "experiments/pipe.yaml does"
+    )
     raise UserError(f"{config.name}: is not a study of drawn damage in single views", fix=fix)
 
 
@@ -163,9 +178,12 @@ def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
     if high - low < SAME_MM and damage.depths_mm:
         word, (low, high) = "depth", damage.depths_mm
     if size_mm is not None and not low <= size_mm <= high:
-        fix = "change the damage's range in the experiment: sizes that are not inspected have no limit"
-        what = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
-        raise UserError(what, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
+        fix = (
+            "change the damage's range in the experiment: sizes that are not inspected have no "
+            "limit"
+        )
+        message = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
+        raise UserError(message, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
 
 
 def _widened(group: Group, poses: Sequence[Pose]) -> Group:
@@ -210,22 +228,24 @@ def _inspections(
     """Return all inspections of the damages of boards (`_board_seen`)."""
     facts = list[tuple[float, ...]]()
     for number, damages in boards:
-        for damage, seen in damages:
-            place = (point.variant, point.config.capture.frames, number, str(damage.id))
-            own = len(facts)
+        for damage, seen_damage in damages:
+            damage_key = (point.variant, point.config.capture.frames, number, str(damage.id))
+            own_index = len(facts)
             sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
-            facts += [(own, *sizes_mm, *seen, score) for score in scores.get(place, ())]
+            facts += [
+                (own_index, *sizes_mm, *seen_damage, score) for score in scores.get(damage_key, ())
+            ]
     if not facts:
         raise UserError(
             f"{point.label or point.variant}: no damaged board was judged",
             fix="check the detector's crop",
         )
-    numbers, plan_mm, depth_mm, *seen, score = np.array(facts).T
+    numbers, plan_mm, depth_mm, *seen_damage, score = np.array(facts).T
     size_of = boards[0][1][0][0].size_of
     word, size_mm = (
         ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
     )
-    return ScoredDamage(word, numbers, size_mm, Seen(*seen), score)
+    return ScoredDamage(word, numbers, size_mm, Seen(*seen_damage), score)
 
 
 def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
@@ -245,39 +265,39 @@ def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
         criteria = point.criteria
         detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
         evidence = detector.analyse(cloud_of(task, point))
-        known = np.isfinite(evidence.score)
+        is_known = np.isfinite(evidence.score)
         fields.append(
             [
-                known,
+                is_known,
                 *(
-                    np.where(known, image**2, 0.0)
+                    np.where(is_known, image**2, 0.0)
                     for image in (evidence.residual_m, evidence.score)
                 ),
             ]
         )
-    known, *squares = np.mean(fields, axis=0)
+    is_known, *squares = np.mean(fields, axis=0)
     square, of_score = (ndimage.uniform_filter(image, AROUND_PX) for image in squares)
-    judged = (known >= 0.5) & (square > 0) & (of_score > 0)
+    judged = (is_known >= 0.5) & (square > 0) & (of_score > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(
-            judged, np.sqrt(square / of_score / ndimage.uniform_filter(known, NEAR_PX)), np.inf
+            judged, np.sqrt(square / of_score / ndimage.uniform_filter(is_known, NEAR_PX)), np.inf
         )
 
 
 def _board_seen(
-    batch: Batch, whole: Batch, point: TrialPoint, seed: int
+    batch: Batch, whole_batch: Batch, point: TrialPoint, seed: int
 ) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
     """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board
     without damage."""
     set_up = load_board(batch.views[0])
-    unit_m = _unit_m(whole, point, seed)
-    found = []
+    unit_m = _unit_m(whole_batch, point, seed)
+    seen_damages = []
     for damage in set_up.truth:
         range_m = float(np.linalg.norm(damage.centre_camera_m))
         cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
         about_m = float(np.median(unit_m.ravel()[set_up.outlines[damage.id]]))
-        found.append((damage, (about_m, cosine, range_m)))
-    return batch.board or 0, found
+        seen_damages.append((damage, (about_m, cosine, range_m)))
+    return batch.board or 0, seen_damages
 
 
 def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> Seen:
@@ -293,7 +313,7 @@ def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> S
     camera = set_up.unit.camera
     lens = camera.nominal_lens
     u, v = np.rint(lens.project(points_m)).astype(int).T - [[region.col0], [region.row0]]
-    seen = (
+    is_seen = (
         camera.images(points_m)
         & (cosine > 0)
         & (u >= 0)
@@ -301,10 +321,10 @@ def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> S
         & (u < region.shape[1])
         & (v < region.shape[0])
     )
-    u = np.where(seen, u, 0)
-    v = np.where(seen, v, 0)
+    u = np.where(is_seen, u, 0)
+    v = np.where(is_seen, v, 0)
     # an object in front of a patch has another z
     slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
     reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
-    seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
-    return Seen(np.where(seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)
+    is_seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
+    return Seen(np.where(is_seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)

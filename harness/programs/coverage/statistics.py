@@ -88,9 +88,12 @@ class Findable:
     def statement(self) -> str:
         """The law in a sentence."""
         return (
-            f"Learnt from {self.damages} damages: the detector's signal is proportional to the {self.size_of} to the "
-            f"power {self.coefficients[1]:.2g}, and scatters by {100 * self.scatter:.0f} % where the face is seen "
-            f"frontally, by {100 * self.scatter * 2**self.growth:.0f} % at 60°. In a test at ten places of a pipe "
+            f"Learnt from {self.damages} damages: the detector's signal is proportional to "
+            f"the {self.size_of} to the "
+            f"power {self.coefficients[1]:.2g}, and scatters by {100 * self.scatter:.0f} % "
+            "where the face is seen "
+            f"frontally, by {100 * self.scatter * 2**self.growth:.0f} % at 60°. In a test "
+            "at ten places of a pipe "
             "limits were a tenth too small on average, and wrong by up to 40 % at a single place."
         )
 
@@ -101,24 +104,27 @@ class Findable:
         doubts = []
         if self.growth == GROWTHS[-1]:
             doubts.append(
-                "the signal scatters more with the angle than the law can describe: limits may be too small where the "
+                "the signal scatters more with the angle than the law can describe: limits "
+                "may be too small where the "
                 "face is tilted, and too large where it is seen frontally"
             )
         if self.ratio > LOOSE:
             doubts.append(
-                "what is found depends on more than size, angle and distance: the size found nine times in ten is "
-                f"{self.ratio:.2g} times that found half of the time. Limits are rough and may be far too large: run a "
+                "what is found depends on more than size, angle and distance: the size "
+                "found nine times in ten is "
+                f"{self.ratio:.2g} times that found half of the time. Limits are rough and "
+                "may be far too large: run a "
                 "study in these poses before you rely on them"
             )
         return ". Also, ".join(doubts)
 
-    def limits_mm(self, seen: Seen) -> np.ndarray:
+    def limits_mm(self, view: Seen) -> np.ndarray:
         """Return a90 (n,) of places: at least the smallest size inspected, infinite above the
         largest; NaN where nothing is judged or the angle is steeper than all inspected angles."""
-        cosine = np.maximum(seen.cosine, self.steepest)
-        without_size = _design(np.ones(len(cosine)), cosine, seen.range_m) @ self.coefficients
+        cosine = np.maximum(view.cosine, self.steepest)
+        without_size = _design(np.ones(len(cosine)), cosine, view.range_m) @ self.coefficients
         needed = (
-            np.log(self.threshold * seen.deviation_m)
+            np.log(self.threshold * view.deviation_m)
             + special.ndtri(POD) * self.scatter / cosine**self.growth
         )
         limits_mm = np.maximum(
@@ -126,7 +132,7 @@ class Findable:
         )
         limits_mm = np.where(limits_mm > self.sizes_mm[1], np.inf, limits_mm)
         beyond = np.cos(min(np.arccos(self.steepest) + np.deg2rad(BEYOND_DEG), np.pi / 2))
-        return np.where(np.isfinite(seen.deviation_m) & (seen.cosine >= beyond), limits_mm, np.nan)
+        return np.where(np.isfinite(view.deviation_m) & (view.cosine >= beyond), limits_mm, np.nan)
 
 
 def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:
@@ -152,8 +158,8 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
     score = scored.score[judged]
     design = _design(size_mm, cosine, scored.seen.range_m[judged])
     below = np.isnan(score)
-    found = np.sort(score[score > threshold])
-    far = max(FAR * threshold, *found[np.isfinite(found)][:FEWEST])
+    found_scores = np.sort(score[score > threshold])
+    far = max(FAR * threshold, *found_scores[np.isfinite(found_scores)][:FEWEST])
     above = score > far
     signal = np.log(
         np.minimum(np.where(below, threshold, score), far) * scored.seen.deviation_m[judged]
@@ -170,9 +176,12 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
     best = int(np.nanargmax([value for value, _ in fits]))
     growth, (coefficients, scatter, _, _) = float(GROWTHS[best]), fits[best][1]
     if coefficients[1] <= 0:
-        what = f"what is found does not follow the {scored.size_of} of the damage: no limit can be learnt"
+        message = (
+            f"what is found does not follow the {scored.size_of} of the damage: no limit can be "
+            "learnt"
+        )
         raise UserError(
-            what, fix="ask for fewer or less tilted poses, or run a study in the pose wanted"
+            message, fix="ask for fewer or less tilted poses, or run a study in the pose wanted"
         )
     ratio = np.exp(special.ndtri(POD) * scatter / np.median(cosine) ** growth / coefficients[1])
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
@@ -181,18 +190,18 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
 
 
 def in_turn(
-    patches: Patches, found: Sequence[np.ndarray], given: int, further: int
+    patches: Patches, found_patches: Sequence[np.ndarray], given_count: int, further_count: int
 ) -> list[tuple[int, float, float]]:
     """Return the first ``given`` poses, then up to ``further`` others, always the one that adds
     most. ``found``: by pose, the patches (n,) bool on which damage is found. A row has the pose's
     index, the share of the area that it adds, and the share that all poses so far cover."""
     covered = np.zeros(len(patches.areas_m2), bool)
     rows = list[tuple[int, float, float]]()
-    for turn in range(given + further):
-        gains = [patches.share(each & ~covered) for each in found]
-        best = turn if turn < given else int(np.argmax(gains))
-        if turn >= given and gains[best] <= 0:
+    for turn in range(given_count + further_count):
+        gains = [patches.share(patch_mask & ~covered) for patch_mask in found_patches]
+        best = turn if turn < given_count else int(np.argmax(gains))
+        if turn >= given_count and gains[best] <= 0:
             break
-        covered = covered | found[best]
+        covered = covered | found_patches[best]
         rows.append((best, gains[best], patches.share(covered)))
     return rows

@@ -19,7 +19,9 @@ COVERAGE = Table(
         Column("area_m2", note="area of the patch"),
         Column(
             "a90_mm",
-            note="size found 90 % of the time in the best pose; inf: no size is; empty: not judged",
+            note=(
+                "size found 90 % of the time in the best pose; inf: no size is; empty: not judged"
+            ),
         ),
         Column("pose", note="number of the best pose, in which the smallest damage is found"),
         Column("noise_mm", note="the detector's unit of score in the best pose; inf: not judged"),

@@ -19,11 +19,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Compare the detectors of a simulated study with the ideal observer, which knows each damage's exact signature "
-    "and the covariance of the noise over units of the camera, but not the place of the damage. State its a50 and a90 "
-    f"at the study's rate of false calls, and every detector's efficiency. Write {EFFICIENCY_PAGE.name} and tables to "
+    "Compare the detectors of a simulated study with the ideal observer, which knows each "
+    "damage's exact signature "
+    "and the covariance of the noise over units of the camera, but not the place of the "
+    "damage. State its a50 and a90 "
+    "at the study's rate of false calls, and every detector's efficiency. Write "
+    f"{EFFICIENCY_PAGE.name} and tables to "
     "the study's folder.",
-    epilog="The program takes some seconds per damaged board. Views without a stored render are rendered again.",
+    epilog=(
+        "The program takes some seconds per damaged board. Views without a stored render are "
+        "rendered again."
+    ),
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -73,8 +79,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         if unknown := [
             set_up.label for set_up in study.set_ups if (set_up.variant, set_up.frames) not in ideal
         ]:
-            what = f"{folder}: {EXPERIMENT.name} lacks the set-up {unknown[0]} of {STUDY.name}"
-            raise UserError(what, fix="name an unchanged results folder, or run the study again")
+            message = f"{folder}: {EXPERIMENT.name} lacks the set-up {unknown[0]} of {STUDY.name}"
+            raise UserError(message, fix="name an unchanged results folder, or run the study again")
         rows = [
             efficiency_of(limit_of(set_up), ideal[set_up.variant, set_up.frames])
             for set_up in study.set_ups
@@ -84,12 +90,18 @@ def main(options: argparse.Namespace, command: str) -> int:
         names = ", ".join(dict.fromkeys(camera.name for camera in cameras))
         seeds = ", ".join(dict.fromkeys(str(camera.unit_seed) for camera in cameras))
         first = (
-            f"The ideal observer judges a new unit of {names} by the noise of {rows[0].ideal.units} units, at "
-            f"{rate:g} false call{'' if rate == 1 else 's'} per m², with known size and depth; the detectors' hits are "
-            f"on unit {seeds}. Not modelled: missing returns, non-Gaussian tails, noise that differs within damage."
+            f"The ideal observer judges a new unit of {names} by the noise of "
+            f"{rows[0].ideal.units} units, at "
+            f"{rate:g} false call{'' if rate == 1 else 's'} per m², with known size and "
+            "depth; the detectors' hits are "
+            f"on unit {seeds}. Not modelled: missing returns, non-Gaussian tails, noise "
+            "that differs within damage."
         )
         if study.digest != experiment.digest:
-            changed = "the hits come from another version of the camera or of a detector than the installed version"
+            changed = (
+                "the hits come from another version of the camera or of a detector than the "
+                "installed version"
+            )
             warnings.insert(0, f"{changed}: run the study again")
         provenance = {
             **record(command),

@@ -42,9 +42,8 @@ it."""
 # 0.01
 NORMALS = 4096
 AROUND = 3  # half of the lattice of places around a damage at which it may be found, in strides
-NEAR_CORRELATION = (
-    0.2  # places with a smaller correlation to the damage's own place do not add to its detection
-)
+# places with a smaller correlation to the damage's own place do not add to its detection
+NEAR_CORRELATION = 0.2
 SHARES = (0.5, 0.9)  # shares of damages found for the comparison of observers
 RANGE = (1.0, 12.0)  # range of thresholds, in deviations, in which the wanted one is sought
 LAGS = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
@@ -71,16 +70,16 @@ class NoiseSums:
     fourth: float
     pixels: float
 
-    def __add__(self, other: NoiseSums) -> NoiseSums:
+    def __add__(self, added: NoiseSums) -> NoiseSums:
         """Add the sums over other fields."""
         return NoiseSums(
-            *(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__)
+            *(getattr(self, name) + getattr(added, name) for name in self.__dataclass_fields__)
         )
 
-    def __sub__(self, other: NoiseSums) -> NoiseSums:
+    def __sub__(self, subtracted: NoiseSums) -> NoiseSums:
         """Remove the sums over some fields."""
         return NoiseSums(
-            *(getattr(self, name) - getattr(other, name) for name in self.__dataclass_fields__)
+            *(getattr(self, name) - getattr(subtracted, name) for name in self.__dataclass_fields__)
         )
 
     @cached_property
@@ -108,7 +107,7 @@ class NoiseSums:
         return np.asarray(np.maximum(power, LEAST_POWER * power.mean()))
 
 
-def noise_sums(noise: np.ndarray, known: np.ndarray) -> NoiseSums:
+def noise_sums(noise: np.ndarray, is_known: np.ndarray) -> NoiseSums:
     """Return the sums over fields ``noise`` (k, h, w), in deviations, at the ``known`` (k, h, w)
     pixels."""
     shape = _padded(*noise.shape[1:])
@@ -117,51 +116,54 @@ def noise_sums(noise: np.ndarray, known: np.ndarray) -> NoiseSums:
         power = sum(np.abs(scipy.fft.rfft2(image, shape)) ** 2 for image in images)
         return np.asarray(scipy.fft.irfft2(power, shape)[np.ix_(LAGS, LAGS)])
 
-    filled = np.where(known, noise, 0.0)
+    filled = np.where(is_known, noise, 0.0)
     return NoiseSums(
-        by_lag(filled), by_lag(known.astype(float)), float((filled**4).sum()), float(known.sum())
+        by_lag(filled),
+        by_lag(is_known.astype(float)),
+        float((filled**4).sum()),
+        float(is_known.sum()),
     )
 
 
-def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.ndarray:
+def inverse_times(images: np.ndarray, is_known: np.ndarray, sums: NoiseSums) -> np.ndarray:
     """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``known`` (h, w) pixels, 0 elsewhere,
     by conjugate gradients that start from the inverse on a periodic grid; exact for any outline.
     """
-    h, w = known.shape
+    h, w = is_known.shape
     shape = _padded(h, w)
     power = sums.power(shape)
 
-    def filtered(image: np.ndarray, by: np.ndarray) -> np.ndarray:
+    def filtered(image: np.ndarray, response: np.ndarray) -> np.ndarray:
         return np.asarray(
-            known * scipy.fft.irfft2(by * scipy.fft.rfft2(image, shape), shape)[:h, :w]
+            is_known * scipy.fft.irfft2(response * scipy.fft.rfft2(image, shape), shape)[:h, :w]
         )
 
     found = np.zeros(images.shape)
     for image, solution in zip(images, found, strict=True):
-        rest = known * image
-        enough = CONVERGED**2 * float((rest**2).sum())
-        direction = np.zeros(rest.shape)
+        residual = is_known * image
+        enough = CONVERGED**2 * float((residual**2).sum())
+        direction = np.zeros(residual.shape)
         product = 1.0
         for _ in range(MOST_ITERATIONS):
-            if float((rest**2).sum()) <= enough:
+            if float((residual**2).sum()) <= enough:
                 break
-            towards = filtered(rest, 1.0 / power)
+            towards = filtered(residual, 1.0 / power)
             before = product
-            product = float((rest * towards).sum())
+            product = float((residual * towards).sum())
             direction = towards + product / before * direction
             onward = filtered(direction, power)
             step = product / float((direction * onward).sum())
             solution += step * direction
-            rest = rest - step * onward
+            residual = residual - step * onward
     return found
 
 
 def detectability(
-    signals: np.ndarray, surface: np.ndarray, known: np.ndarray, sums: NoiseSums
+    signals: np.ndarray, surface: np.ndarray, is_known: np.ndarray, sums: NoiseSums
 ) -> np.ndarray:
     """Return d' (n,) of signals (n, h, w) on an unknown sum of images ``surface`` (p, h, w), both
     in deviations."""
-    whitened = inverse_times(np.concatenate([surface, signals]), known, sums)
+    whitened = inverse_times(np.concatenate([surface, signals]), is_known, sums)
     flat = whitened.reshape(len(whitened), -1)
     gram = flat @ np.concatenate([surface, signals]).reshape(len(flat), -1).T
     p = len(surface)
@@ -184,10 +186,10 @@ def responses(signal: np.ndarray, sums: NoiseSums) -> np.ndarray:
 # detection
 
 
-def _covariance(correlated: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _covariance(correlated: np.ndarray, lags: np.ndarray) -> np.ndarray:
     """Return the covariance (n, n) of the statistic at places (n, 2) in pixels."""
-    apart = places[:, None] - places[None] + len(correlated) // 2
-    return np.asarray(correlated[apart[..., 0], apart[..., 1]])
+    lag_index = lags[:, None] - lags[None] + len(correlated) // 2
+    return np.asarray(correlated[lag_index[..., 0], lag_index[..., 1]])
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
@@ -238,12 +240,14 @@ def needed_indices(correlated: np.ndarray, threshold: float) -> np.ndarray:
     half = int((correlated[middle, middle:] > 0.5).sum())
     stride = min(max(1, half // AROUND), middle // (2 * AROUND))
     steps = stride * np.arange(-AROUND, AROUND + 1)
-    places = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    rho = correlated[places[:, 0] + middle, places[:, 1] + middle]
-    places = places[rho > NEAR_CORRELATION]
+    offsets = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    rho = correlated[offsets[:, 0] + middle, offsets[:, 1] + middle]
+    offsets = offsets[rho > NEAR_CORRELATION]
     rho = rho[rho > NEAR_CORRELATION]
-    rest = _normals(len(rho)) @ _root(_covariance(correlated, places) - np.outer(rho, rho)).T
-    return np.asarray(((threshold - rest) / rho).min(axis=1))
+    conditional_noise = (
+        _normals(len(rho)) @ _root(_covariance(correlated, offsets) - np.outer(rho, rho)).T
+    )
+    return np.asarray(((threshold - conditional_noise) / rho).min(axis=1))
 
 
 def detection_probability(needed: np.ndarray, index: float) -> float:
@@ -306,9 +310,9 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
     for view in views:
         signals = view.signals_m / view.deviation_m * view.known
         surface = view.surface / view.deviation_m * view.known
-        seen = signals.any(axis=(1, 2))
+        is_seen = signals.any(axis=(1, 2))
         index = np.zeros(len(signals))
-        index[seen] = detectability(signals[seen], surface, view.known, sums)
+        index[is_seen] = detectability(signals[is_seen], surface, view.known, sums)
         for hole, signal, d in zip(view.holes, signals, index.tolist(), strict=True):
             if d == 0.0:
                 rows.append((view.board, hole, 0.0, np.nan, 0.0))

@@ -45,7 +45,7 @@ def ideal_of_set_ups(
     """Return the ideal observer for every set-up of a study, by variant and frames, at a rate of
     false calls. Views that are not stored are rendered. Raises UserError if a view or a board's
     noise is not available."""
-    found = {}
+    ideals = {}
     for group in plan.groups:
         batches = [batch for batch in group.then if batch.role == "damaged"]
         lost = render_missing(
@@ -73,8 +73,8 @@ def ideal_of_set_ups(
         }
         for point in group.points:
             frames = point.config.capture.frames
-            found[point.variant, frames] = by_frames[frames]
-    return found
+            ideals[point.variant, frames] = by_frames[frames]
+    return ideals
 
 
 def _undamaged(batch: Batch) -> RenderJob:
@@ -95,16 +95,17 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     cut = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
     if intact.sum() < FEWEST_PIXELS:
         raise UserError(
-            f"only {intact.sum()} pixels of the board are far from damage and rim: its noise is not known"
+            f"only {intact.sum()} pixels of the board are far from damage and rim: its "
+            "noise is not known"
         )
-    places = set_up.board_xy_m[set_up.on_board]
-    basis = Chebyshev.over(places, DEGREE).basis(places)
+    face_xy_m = set_up.board_xy_m[set_up.on_board]
+    basis = Chebyshev.over(face_xy_m, DEGREE).basis(face_xy_m)
     surface = np.zeros((len(basis), *set_up.on_board.shape))
     surface[:, set_up.on_board] = basis
     reach_m = REACH_PX * max(set_up.pitch_mm) * MM
     x, y = np.moveaxis(set_up.board_xy_m, -1, 0)
-    near = [damage.within(x, y, reach_m) for damage in set_up.truth]
-    signals_m = np.where(near, clear_z_m - noise_free_z_m(undamaged), 0.0)
+    within_reach = [damage.within(x, y, reach_m) for damage in set_up.truth]
+    signals_m = np.where(within_reach, clear_z_m - noise_free_z_m(undamaged), 0.0)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
     board = batch.board or 0
@@ -116,9 +117,9 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     shown = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut])
     views = {}
     for point in {point.config.capture.frames: point for point in points}.values():
-        noise_m, known = _noise_m(set_up, board, point, surface, intact)
-        deviation_m = _deviation_m(noise_m, known)
-        sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], known[:, *cut])
+        noise_m, is_known = _noise_m(set_up, board, point, surface, intact)
+        deviation_m = _deviation_m(noise_m, is_known)
+        sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], is_known[:, *cut])
         view = BoardView(
             board, names, seen[cut], deviation_m[cut], *shown, sums, UNITS_A_BOARD, *facts
         )
@@ -161,19 +162,19 @@ def _noise_m(
             capture.frames
         ]
         noise = np.where(intact, cloud.points_m[..., 2], np.nan)
-        known = np.isfinite(noise)
-        basis = surface[:, known].T
-        noise[known] -= basis @ np.linalg.lstsq(basis, noise[known], rcond=None)[0]
+        is_known = np.isfinite(noise)
+        basis = surface[:, is_known].T
+        noise[is_known] -= basis @ np.linalg.lstsq(basis, noise[is_known], rcond=None)[0]
         fields.append(noise)
     noise_m = np.array(fields)
     return np.nan_to_num(noise_m), np.isfinite(noise_m)
 
 
-def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _deviation_m(noise_m: np.ndarray, is_known: np.ndarray) -> np.ndarray:
     """Return the root mean square (h, w) of the noise over units and a square around each pixel,
     or the nearest one."""
     square = ndimage.uniform_filter((noise_m**2).sum(axis=0), SMOOTHED_PX)
-    count = ndimage.uniform_filter((known * 1.0).sum(axis=0), SMOOTHED_PX)
+    count = ndimage.uniform_filter((is_known * 1.0).sum(axis=0), SMOOTHED_PX)
     enough = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~enough, return_distances=False, return_indices=True)
     return np.asarray(np.sqrt(square[tuple(nearest)] / count[tuple(nearest)]))

@@ -31,31 +31,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STYLES = ("-", "--", "-.", ":")
-CLASSES = (
-    8  # number of classes of d', with equal numbers of damages, whose shares of hits are drawn
-)
+# number of classes of d', with equal numbers of damages, whose shares of hits are drawn
+CLASSES = 8
 LEFT = 0.5  # left end of the axis of d'; damage with a lower d' is found only by chance
 READ = (
-    "Efficiency: the squared ratio of two d', that at which the ideal observer finds the share and that at which the "
-    "detector finds it by depth alone. d' is the ideal observer's signal at a damage divided by the standard deviation "
-    "of its statistic. The ideal observer knows the damage's exact signature and the noise's covariance over units, "
+    "Efficiency: the squared ratio of two d', that at which the ideal observer finds the "
+    "share and that at which the "
+    "detector finds it by depth alone. d' is the ideal observer's signal at a damage "
+    "divided by the standard deviation "
+    "of its statistic. The ideal observer knows the damage's exact signature and the "
+    "noise's covariance over units, "
     "but neither the place nor the surface. Intervals are over boards."
 )
 
 
 def answer(rows: Sequence[Efficiency]) -> str:
     """State the best and the worst detector in one sentence."""
-    known = sorted(
+    ranked_rows = sorted(
         (row for row in rows if np.isfinite(row.most.efficiency)),
         key=lambda row: row.most.efficiency,
     )
-    if not known:
+    if not ranked_rows:
         return "No detector has a curve against the ideal observer's d', so there is no efficiency."
     sentences = []
-    for row in (known[-1], known[0])[: len(known)]:
+    for row in (ranked_rows[-1], ranked_rows[0])[: len(ranked_rows)]:
         sentences.append(
-            f"{row.limit.record.detector} ({row.limit.record.label}) has {percent(row.most.efficiency)} % at a90: "
-            f"{size(row.limit.a90_mm, row.limit.largest_mm)} mm, and the ideal observer {size(row.most.ideal_mm)} mm"
+            f"{row.limit.record.detector} ({row.limit.record.label}) has "
+            f"{percent(row.most.efficiency)} % at a90: "
+            f"{size(row.limit.a90_mm, row.limit.largest_mm)} mm, and the ideal observer "
+            f"{size(row.most.ideal_mm)} mm"
         )
     return f"Highest efficiency: {sentences[0]}." + (
         f" Lowest: {sentences[1]}." if len(sentences) > 1 else ""
@@ -78,9 +82,9 @@ def efficiency_figure(rows: Sequence[Efficiency]) -> str:
         for row in rows:
             colour = COLOURS[detectors.index(row.limit.record.detector) % len(COLOURS)]
             style = conditions.index((row.limit.record.frames, row.limit.largest_mm))
-            seen = np.sort(row.index[row.index > 0])
-            if row.curve is not None and len(seen):
-                x = np.geomspace(LEFT, max(seen[-1], 2 * LEFT), 200)
+            index_found = np.sort(row.index[row.index > 0])
+            if row.curve is not None and len(index_found):
+                x = np.geomspace(LEFT, max(index_found[-1], 2 * LEFT), 200)
                 name = plain(fill(f"{row.limit.record.detector}: {name_of(row.limit)}", 100))
                 axes.plot(
                     x,
@@ -135,8 +139,10 @@ def efficiency_html(
 ) -> str:
     """Return the page as text; it needs no network."""
     caption = (
-        "Share of damages found against d'. Lines are probit curves of ln d'; points are classes with equal numbers of "
-        "damages. A detector that loses the same share everywhere has the same curve for all sizes and kinds."
+        "Share of damages found against d'. Lines are probit curves of ln d'; points are "
+        "classes with equal numbers of "
+        "damages. A detector that loses the same share everywhere has the same curve for "
+        "all sizes and kinds."
     )
     drawn = figure({"against-d": efficiency_figure(rows)}, "against-d", caption)
     body = [

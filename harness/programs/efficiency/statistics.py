@@ -83,44 +83,51 @@ def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.nd
     design = np.column_stack([np.ones_like(log), (log - centre) / spread])
     hits = weights * pod
     misses = weights * (1.0 - pod)
-    found = np.full((2, len(weights)), np.inf)
-    known = (hits.sum(axis=1) > HARDLY) & (misses.sum(axis=1) > HARDLY)
-    fitted = maxima(HitsAndMisses(design, hits[known], misses[known], LINK), np.array([0.0, 1.0]))
-    found[:, known] = np.exp(centre + spread * crossings(fitted, LINK, SHARES))
-    found[:, misses.sum(axis=1) <= HARDLY] = x.min()
-    return found
+    sizes_mm = np.full((2, len(weights)), np.inf)
+    has_curve = (hits.sum(axis=1) > HARDLY) & (misses.sum(axis=1) > HARDLY)
+    fitted = maxima(
+        HitsAndMisses(design, hits[has_curve], misses[has_curve], LINK), np.array([0.0, 1.0])
+    )
+    sizes_mm[:, has_curve] = np.exp(centre + spread * crossings(fitted, LINK, SHARES))
+    sizes_mm[:, misses.sum(axis=1) <= HARDLY] = x.min()
+    return sizes_mm
 
 
 def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     """Compare a detector's hits with the ideal observer on the damages that both judged."""
-    seen = limit.record.inspected
-    hit = seen.hit if seen.by_depth is None else seen.by_depth
-    place = {
+    inspected = limit.record.inspected
+    hit = inspected.hit if inspected.by_depth is None else inspected.by_depth
+    row_of_damage = {
         key: number
         for number, key in enumerate(zip(ideal.board.tolist(), ideal.hole.tolist(), strict=True))
     }
     rows = np.array(
-        [place[key] for key in zip(seen.board.tolist(), seen.hole.tolist(), strict=True)]
+        [
+            row_of_damage[key]
+            for key in zip(inspected.board.tolist(), inspected.hole.tolist(), strict=True)
+        ]
     )
-    kept, first, which = np.unique(rows, return_index=True, return_inverse=True)
-    size_mm = seen.diameter_mm[first]
+    kept, first, damage_index = np.unique(rows, return_index=True, return_inverse=True)
+    size_mm = inspected.diameter_mm[first]
     pod = ideal.pod[kept]
     index = np.maximum(ideal.index[kept], LEAST_INDEX)
-    hits = np.bincount(which, hit)
-    inspections = np.bincount(which).astype(float)
+    hits = np.bincount(damage_index, hit)
+    inspections = np.bincount(damage_index).astype(float)
     again = weights_in_blocks(DRAWS, (ideal.board[kept], "damaged"))
     weights = np.vstack([np.ones(len(kept)), *(weights for (weights,) in again)])
     ideal_mm = expected_sizes(size_mm, pod, weights)
-    known = np.isfinite(ideal.needed[:, kept])
+    is_known = np.isfinite(ideal.needed[:, kept])
     with np.errstate(invalid="ignore"):
-        ideal_index = (np.where(known, ideal.needed[:, kept], 0.0) @ weights.T) / (
-            known @ weights.T
+        ideal_index = (np.where(is_known, ideal.needed[:, kept], 0.0) @ weights.T) / (
+            is_known @ weights.T
         )
     curve = None
     why = ""
     needed = np.full((2, 1 + DRAWS), np.nan)
     try:
-        curve = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which).curve
+        curve = fit_hit_miss(
+            index[damage_index], hit, link=LINK, log_size=True, inspections=damage_index
+        ).curve
         targets = Targets(ideal.board[kept], index, hits, inspections)
         needed[:, 0] = [curve.size_at(share) for share in SHARES]
         needed[:, 1:] = refitted_sizes(targets, curve, SHARES)
@@ -128,12 +135,16 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
         needed[~inside] = np.nan
         if not inside.all():
             wanted = " and ".join(f"{100 * share:.0f} %" for share in np.array(SHARES)[~inside])
-            why = f"the d' at which {wanted} are found was not inspected ({index.min():.2g} to {index.max():.3g})"
+            why = (
+                f"the d' at which {wanted} are found was not inspected ({index.min():.2g} to "
+                f"{index.max():.3g})"
+            )
     except UserError as error:
         why = error.message
     all_found = bool((1.0 - pod).sum() <= HARDLY)
     half, most = (
-        _level(*each, all_found) for each in zip(ideal_mm, ideal_index, needed, strict=True)
+        _level(*level_parts, all_found)
+        for level_parts in zip(ideal_mm, ideal_index, needed, strict=True)
     )
     board = ideal.board[kept]
     hole = ideal.hole[kept]
@@ -170,12 +181,15 @@ def warnings_of(rows: list[Efficiency]) -> list[str]:
         ideal = row.ideal
         if ideal.kurtosis > HEAVY:
             warnings.append(
-                f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis {ideal.kurtosis:.2g}): the ideal"
-                " observer for Gaussian noise is not the best detector there, and its rate of false calls differs"
+                f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis "
+                f"{ideal.kurtosis:.2g}): the ideal"
+                " observer for Gaussian noise is not the best detector there, and its rate "
+                "of false calls differs"
             )
         if ideal.lost > MOST_LOST:
             warnings.append(
-                f"{name}: up to {100 * ideal.lost:.2g} % of the pixels within a board's damage return nothing, which"
+                f"{name}: up to {100 * ideal.lost:.2g} % of the pixels within a board's "
+                "damage return nothing, which"
                 " the ideal observer does not use: with missing returns more can be found"
             )
         if row.why:

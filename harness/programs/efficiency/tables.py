@@ -24,7 +24,10 @@ def _ideal_size(level: Level) -> Estimate:
 
 EFFICIENCY = Table(
     "efficiency",
-    "one row per set-up and number of frames of a study: its detector compared with the ideal observer",
+    (
+        "one row per set-up and number of frames of a study: its detector compared with the "
+        "ideal observer"
+    ),
     (
         Column("set_up", "set-up", "limit.record.label", SET_UP.note, unbroken),
         Column("variant", "", "limit.record.variant", "name of the set-up"),
@@ -35,7 +38,10 @@ EFFICIENCY = Table(
             "ideal_a50_mm",
             "ideal a50 (mm)",
             lambda row: _ideal_size(row.half),
-            "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
+            (
+                "diameter that the ideal observer finds 50 % of the time, with its 95 % "
+                "interval over boards"
+            ),
             interval=True,
         ),
         Column(
@@ -99,7 +105,10 @@ class EfficiencyRow:
 
 DAMAGES = Table(
     "ideal",
-    "one row per damage, set-up and number of frames: the ideal observer's probability, and the detector's hits",
+    (
+        "one row per damage, set-up and number of frames: the ideal observer's probability, and "
+        "the detector's hits"
+    ),
     (
         Column("set_up", "", "of.limit.record.label", SET_UP.note),
         Column("board", "", "board", "number of the damaged board"),

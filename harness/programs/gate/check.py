@@ -64,8 +64,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Run a study of detection limits and compare it with its baseline. The check fails (exit code 1) if a "
-    "limit or the rate of false calls has grown by more than 10 % and a paired test shows that this is not by "
+    "Run a study of detection limits and compare it with its baseline. The check fails "
+    "(exit code 1) if a "
+    "limit or the rate of false calls has grown by more than 10 % and a paired test shows "
+    "that this is not by "
     "chance, if a set-up no longer has a limit, or if more trials fail.",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
@@ -91,10 +93,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     if (
         study.boards < needed
     ):  # no loss could ever be significant, so the gate would pass everything
-        what = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
+        message = (
+            f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check "
+            "cannot fail"
+        )
         fix = "raise study.boards: 24 are needed to detect a threshold that is 1.2 times as high"
         raise UserError(
-            what, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix
+            message, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix
         )
     engine = engine_options(options)
     if not engine.shard.is_whole:
@@ -110,8 +115,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if code not in (0, 1):
         return code
     folder = experiment.folder(options.out)
-    found = read_record(folder)
-    comparison = None if baseline is None else compare_studies(baseline, found)
+    record = read_record(folder)
+    comparison = None if baseline is None else compare_studies(baseline, record)
     if comparison is not None:
         print()
         show(compare_parts(comparison))
@@ -123,7 +128,7 @@ def main(options: argparse.Namespace, command: str) -> int:
                 f"{path}: is unchanged, because trials failed",
                 fix="correct the cause of the failures",
             )
-        write_text(path, record_text(found))
+        write_text(path, record_text(record))
         print(f"wrote {path}")
         return 0
     missing = [row.label for row in comparison.marked("only in first")]
@@ -135,10 +140,10 @@ def main(options: argparse.Namespace, command: str) -> int:
             file=sys.stderr,
         )
         return 1
-    if apart := comparison.marked("not comparable"):
-        what = "; ".join(f"{row.label}: {row.why}" for row in apart)
+    if not_compared := comparison.marked("not comparable"):
+        message = "; ".join(f"{row.label}: {row.why}" for row in not_compared)
         fix = "run the check again with --update and commit the baseline"
-        raise UserError(f"{path}: cannot serve as a baseline: {what}", fix=fix)
+        raise UserError(f"{path}: cannot serve as a baseline: {message}", fix=fix)
     return 0
 
 

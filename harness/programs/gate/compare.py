@@ -38,10 +38,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Compare the detection limits of two studies: a90 and its change with an interval over boards, "
-    "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not significant, ! newly "
+    "Compare the detection limits of two studies: a90 and its change with an interval over "
+    "boards, "
+    "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not "
+    "significant, ! newly "
     "failing, x not comparable.",
-    epilog="Set-ups are paired by name and frames; if each study has a single set-up, the two are paired. Tests are "
+    epilog="Set-ups are paired by name and frames; if each study has a single set-up, the two are "
+    "paired. Tests are "
     "paired if both studies have the same boards. tofpod check fails if a detection limit grew.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -57,13 +60,19 @@ def main(options: argparse.Namespace, command: str) -> int:
     first = read_record(options.first)
     second = read_record(options.second)
     if not any(old is not None and new is not None for old, new in paired_set_ups(first, second)):
-        both = " / ".join(
+        names_of_both = " / ".join(
             "; ".join(set_up.label for set_up in study.set_ups) for study in (first, second)
         )
-        what = f"no set-ups can be paired, since none has the same name and frames in both studies: {both}"
-        legal = "set-ups with the same frames and the same name or values on the axes; or a single set-up in each"
+        message = (
+            "no set-ups can be paired, since none has the same name and frames in both "
+            f"studies: {names_of_both}"
+        )
+        legal = (
+            "set-ups with the same frames and the same name or values on the axes; or a single "
+            "set-up in each"
+        )
         raise UserError(
-            what,
+            message,
             legal=legal,
             fix="run both studies with the same `sweep`, or each with a single set-up",
         )

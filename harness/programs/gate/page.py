@@ -84,13 +84,20 @@ COMPARED = Table(
     kind="limits compared",
 )
 TESTS = (
-    "Lost, won: inspections with a hit in the first study only, and in the second only. The p beside them is twice the "
-    "smaller of two p-values: that of a sign-flip test of hits with boards (not damages) as units, and that of "
-    "Student's t of the change of a90 over 500 draws of boards. If the studies have different boards, it is the share "
-    "of draws of a90. The p of false calls is that of a sign-flip test if frames and threshold are the same; otherwise "
-    "it allows for the error of each calibration. Signal: median change of the damages' signals relative to the signal "
-    "at which damage is found; its p is that of a normal test with the scatter over boards and of both calibrations. "
-    "All p are one-sided (for being worse) and adjusted. 95 %: interval of the change of a90 over draws of boards."
+    "Lost, won: inspections with a hit in the first study only, and in the second only. The "
+    "p beside them is twice the "
+    "smaller of two p-values: that of a sign-flip test of hits with boards (not damages) as "
+    "units, and that of "
+    "Student's t of the change of a90 over 500 draws of boards. If the studies have "
+    "different boards, it is the share "
+    "of draws of a90. The p of false calls is that of a sign-flip test if frames and "
+    "threshold are the same; otherwise "
+    "it allows for the error of each calibration. Signal: median change of the damages' "
+    "signals relative to the signal "
+    "at which damage is found; its p is that of a normal test with the scatter over boards "
+    "and of both calibrations. "
+    "All p are one-sided (for being worse) and adjusted. 95 %: interval of the change of "
+    "a90 over draws of boards."
 )
 
 
@@ -118,10 +125,14 @@ def compare_parts(comparison: Comparison) -> list[str | Grid]:
 def rule(comparison: Comparison) -> str:
     """Explain the marks."""
     return (
-        f"Worse (+): a90, the rate of false calls, or the threshold over the signals has grown by more than "
-        f"{100 * (MARGIN - 1):.0f} %, and a test shows that this is not by chance (p < {comparison.alpha:g}, adjusted "
-        "by Holm's method over all set-ups). Better (-): the opposite for a90. ~: the change exceeds that margin, but "
-        "may be due to chance. !: the limit is lost, or more trials failed. *: a limit for the first time. x: not "
+        "Worse (+): a90, the rate of false calls, or the threshold over the signals has "
+        "grown by more than "
+        f"{100 * (MARGIN - 1):.0f} %, and a test shows that this is not by chance (p < "
+        f"{comparison.alpha:g}, adjusted "
+        "by Holm's method over all set-ups). Better (-): the opposite for a90. ~: the "
+        "change exceeds that margin, but "
+        "may be due to chance. !: the limit is lost, or more trials failed. *: a limit for "
+        "the first time. x: not "
         "comparable. <: only in the first study. >: only in the second study."
     )
 
@@ -133,9 +144,15 @@ def answer(comparison: Comparison) -> str:
     if worse:
         reasons = "; ".join(f"{row.label}: {row.why}" for row in worse[:3])
         verb = "is" if len(worse) == 1 else "are"
-        return f"{len(worse)} of {len(rows)} set-ups {verb} worse. {reasons}{'; ...' if len(worse) > 3 else '.'}"
+        return (
+            f"{len(worse)} of {len(rows)} set-ups {verb} worse. "
+            f"{reasons}{'; ...' if len(worse) > 3 else '.'}"
+        )
     counts = {mark: len(comparison.marked(mark)) for mark in SIGNS}
-    return f"No set-up is worse: {', '.join(f'{n} {mark}' for mark, n in counts.items() if n) or 'there is none'}."
+    return (
+        "No set-up is worse: "
+        f"{', '.join(f'{n} {mark}' for mark, n in counts.items() if n) or 'there is none'}."
+    )
 
 
 def remarks(comparison: Comparison) -> list[str]:
@@ -151,8 +168,8 @@ def remarks(comparison: Comparison) -> list[str]:
         for change in row.changed:
             by_change.setdefault(change, []).append(row.label)
     differs = [
-        what + ("" if len(at) == len(pairs) else f" ({'; '.join(at)})")
-        for what, at in by_change.items()
+        change + ("" if len(labels) == len(pairs) else f" ({'; '.join(labels)})")
+        for change, labels in by_change.items()
     ]
     return [*reasons, *([f"what differs: {'; '.join(differs)}"] if differs else [])]
 

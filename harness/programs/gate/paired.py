@@ -39,12 +39,12 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     rows_1, rows_2 = shared_rows(first, second)
     if not len(rows_1):
         return None
-    found = first.hit[rows_1]
+    first_hits = first.hit[rows_1]
     now = second.hit[rows_2]
-    only_first = int((found & ~now).sum())
-    only_second = int((now & ~found).sum())
+    only_first = int((first_hits & ~now).sum())
+    only_second = int((now & ~first_hits).sum())
     names, board = np.unique(first.board[rows_1], return_inverse=True)
-    gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
+    gained = np.bincount(board, now.astype(float) - first_hits.astype(float)).round().astype(int)
     return HitsChange(len(names), len(rows_1), only_first, only_second, *sign_flip(gained))
 
 
@@ -117,9 +117,11 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     with np.errstate(all="ignore"):
         change = float(np.log(now / before))
         logs = np.log(draws_2 / draws_1) if paired else np.empty(0)
-    known = logs[np.isfinite(logs)]
-    if len(known) > KNOWN * len(logs) and known.std() > 0 and np.isfinite(change):
-        grown, shrunk = t.sf([change, -change], len(boards[0]) - 1, scale=known.std()).tolist()
+    finite_logs = logs[np.isfinite(logs)]
+    if len(finite_logs) > KNOWN * len(logs) and finite_logs.std() > 0 and np.isfinite(change):
+        grown, shrunk = t.sf(
+            [change, -change], len(boards[0]) - 1, scale=finite_logs.std()
+        ).tolist()
     return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
 
 
@@ -152,16 +154,18 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     needed = found_from(first), found_from(second)
     with np.errstate(divide="ignore", invalid="ignore"):
         before, now = (
-            np.log(record.inspected.signal[rows] / at)
-            for record, rows, (at, _) in zip((first, second), (rows_1, rows_2), needed, strict=True)
+            np.log(record.inspected.signal[rows] / needed_signal)
+            for record, rows, (needed_signal, _) in zip(
+                (first, second), (rows_1, rows_2), needed, strict=True
+            )
         )
         clear = np.isfinite(before + now) & (before + now > 0)
     change = (now - before)[clear]
     board = first.inspected.board[rows_1][clear]
-    names, which = np.unique(board, return_inverse=True)
+    names, board_index = np.unique(board, return_inverse=True)
     if len(names) < 2:
         return None
-    of_boards = np.bincount(which, change) / np.bincount(which)
+    of_boards = np.bincount(board_index, change) / np.bincount(board_index)
     parts = [(of_boards.var(ddof=1) / len(names), len(names) - 1.0)]
     if not np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
         parts += [_threshold_variance(first), _threshold_variance(second)]
@@ -182,10 +186,10 @@ def found_from(record: SetUpRecord) -> tuple[float, float]:
     strongest miss and the weakest hit, if they do not overlap; else the signal at which half is
     found, by logistic regression. Hits by missing returns alone do not count; NaN without signals,
     or if hits do not grow with them."""
-    seen = record.inspected
-    known = seen.signal > 0
-    signal = seen.signal[known]
-    hit = (seen.hit if seen.by_depth is None else seen.by_depth)[known]
+    inspected = record.inspected
+    has_signal = inspected.signal > 0
+    signal = inspected.signal[has_signal]
+    hit = (inspected.hit if inspected.by_depth is None else inspected.by_depth)[has_signal]
     if not len(signal):
         return np.nan, np.nan
     if (hit == (signal > record.threshold)).all():
@@ -241,7 +245,8 @@ class CallsChange:
 
     @property
     def ratio(self) -> float:
-        """The second rate over the first: infinite if only the second has calls, 1 if neither has."""
+        """The second rate over the first: infinite if only the second has calls, 1 if neither
+        has."""
         before, now = self.rates_per_m2
         return now / before if before else (np.inf if now else 1.0)
 
@@ -265,14 +270,14 @@ def calls_change(
     (boards_1, calling_1), (boards_2, calling_2) = _calling(unflawed_1), _calling(unflawed_2)
     # on identical frames, an equal calibrated threshold means equal scores: two scorings give the
     # same number by chance only if scores are few whole numbers; a given threshold has no scatter
-    given = not (first.calibration_runs or second.calibration_runs)
-    way: Literal["signs", "calibrations", "both"] = "both"
+    is_given = not (first.calibration_runs or second.calibration_runs)
+    method: Literal["signs", "calibrations", "both"] = "both"
     if first.frames_digest != second.frames_digest:
-        way = "calibrations"
-    elif given or np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
-        way = "signs"
+        method = "calibrations"
+    elif is_given or np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
+        method = "signs"
     by_signs = by_draws = (0.0, 0.0)
-    if way != "calibrations":
+    if method != "calibrations":
         _, row_1, row_2 = np.intersect1d(
             np.unique(unflawed_1.board), np.unique(unflawed_2.board), return_indices=True
         )
@@ -281,7 +286,7 @@ def calls_change(
             for t in (unflawed_1, unflawed_2)
         ]
         by_signs = sign_flip((sums[1][row_2] - sums[0][row_1]).round().astype(int))
-    if way != "signs":
+    if method != "signs":
         total = calling_1 + calling_2
         ranks = _rank(first, wanted_per_m2), _rank(second, wanted_per_m2)
         of_second = np.arange(total + 1)  # number of the second's boards among all that called
@@ -294,7 +299,9 @@ def calls_change(
             chance = chance / chance.sum()
         by_draws = _tails(chance, calling_2) if total else (1.0, 1.0)
     fewer, more = (max(pair) for pair in zip(by_signs, by_draws, strict=True))
-    return CallsChange(calls, areas, (boards_1, boards_2), (calling_1, calling_2), more, fewer, way)
+    return CallsChange(
+        calls, areas, (boards_1, boards_2), (calling_1, calling_2), more, fewer, method
+    )
 
 
 def _calling(table: Unflawed) -> tuple[int, int]:

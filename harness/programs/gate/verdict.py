@@ -155,17 +155,19 @@ def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
             for o in (*first.set_ups, *free)
         ]
         of_free = keys[len(first.set_ups) :]
-        for place, key in enumerate(keys[: len(first.set_ups)]):
-            if place not in partner and of_free.count(key) == 1:
-                at = of_free.index(key)
-                partner[place] = free.pop(at)
-                of_free.pop(at)
-    pairs: list[Pair] = [(record, partner.get(place)) for place, record in enumerate(first.set_ups)]
+        for first_index, key in enumerate(keys[: len(first.set_ups)]):
+            if first_index not in partner and of_free.count(key) == 1:
+                free_index = of_free.index(key)
+                partner[first_index] = free.pop(free_index)
+                of_free.pop(free_index)
+    pairs: list[Pair] = [
+        (record, partner.get(first_index)) for first_index, record in enumerate(first.set_ups)
+    ]
     return (*pairs, *((None, record) for record in free))
 
 
 def not_comparable(
-    first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord
+    first: StudyRecord, second: StudyRecord, first_set_up: SetUpRecord, second_set_up: SetUpRecord
 ) -> str:
     """Return why the two were not measured in the same way (hit radius, wanted false calls,
     damage), empty if they were. Damage of other boards is compared by Kolmogorov and Smirnov's
@@ -182,38 +184,38 @@ def not_comparable(
             "no stated rate" if rate is None else f"{rate:g} false calls per m²" for rate in rates
         )
         return f"thresholds for {before} there, for {now} here"
-    if bool(one.calibration_runs) != bool(other.calibration_runs):
+    if bool(first_set_up.calibration_runs) != bool(second_set_up.calibration_runs):
         return "one threshold is calibrated, the other is given"
-    boards = [len(np.unique(record.inspected.board)) for record in (one, other)]
-    if one.targets_digest == other.targets_digest or not min(boards):
+    boards = [len(np.unique(record.inspected.board)) for record in (first_set_up, second_set_up)]
+    if first_set_up.targets_digest == second_set_up.targets_digest or not min(boards):
         return ""
-    for column, what in (("diameter_mm", "sizes"), ("depth_mm", "depths")):
-        values = (getattr(record.inspected, column) for record in (one, other))
+    for column, noun in (("diameter_mm", "sizes"), ("depth_mm", "depths")):
+        values = (getattr(record.inspected, column) for record in (first_set_up, second_set_up))
         distance = float(ks_2samp(*values, method="asymp").statistic)
         if kstwobign.sf(distance / np.sqrt(1 / boards[0] + 1 / boards[1])) < OTHER_DAMAGE_P:
-            return f"the damage is of other {what}"
+            return f"the damage is of other {noun}"
     return ""
 
 
-def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
+def differences(first_set_up: SetUpRecord, second_set_up: SetUpRecord) -> tuple[str, ...]:
     """Return differences that may be the cause."""
     facts = [
         (f"{record.detector} {record.detector_version}", f"frames {record.frames}")
-        for record in (one, other)
+        for record in (first_set_up, second_set_up)
     ]
     changes = [
         f"{before} → {now.removeprefix('frames ')}"
         for before, now in zip(*facts, strict=True)
         if before != now
     ]
-    for axis in sorted({*one.axes, *other.axes}):
-        before = one.axes.get(axis, "default")
-        now = other.axes.get(axis, "default")
+    for axis in sorted({*first_set_up.axes, *second_set_up.axes}):
+        before = first_set_up.axes.get(axis, "default")
+        now = second_set_up.axes.get(axis, "default")
         if before != now:
             changes.append(f"{axis} {before} → {now}")
-    if one.targets_digest != other.targets_digest:
+    if first_set_up.targets_digest != second_set_up.targets_digest:
         changes.append("other boards")
-    elif one.frames_digest != other.frames_digest:
+    elif first_set_up.frames_digest != second_set_up.frames_digest:
         changes.append("other frames of the same boards")
     return tuple(changes)
 

@@ -25,8 +25,10 @@ DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusi
 MOST_AT_ONCE = 8
 FILLED = 0.25
 COMPARED = (
-    "virtual damage may be harder to find than real damage: on the only drilled plate where both were compared, 7 of 23"
-    " virtual holes and 50 of 56 real holes of the same apparent width were found; check the limit with a gauge board"
+    "virtual damage may be harder to find than real damage: on the only drilled plate where "
+    "both were compared, 7 of 23"
+    " virtual holes and 50 of 56 real holes of the same apparent width were found; check "
+    "the limit with a gauge board"
 )
 
 
@@ -108,7 +110,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="least distance of damages (default: 2 hit radii plus 10)",
     )
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
-    calls = f"expected number, which sets the threshold as in tofpod detect (default: {cli.DEFAULT_FALSE_CALLS:g})"
+    calls = (
+        "expected number, which sets the threshold as in tofpod detect (default: "
+        f"{cli.DEFAULT_FALSE_CALLS:g})"
+    )
     add("--false-calls", type=float, metavar="N", help=calls)
     add(
         "--threshold",
@@ -141,9 +146,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Put virtual damage at random places of recorded frames of an undamaged part, as the camera would "
-    "have measured it, and state which size is found: a50, a90, a90/95 and false calls per square metre. Each PATH "
-    "is one static capture. The frames keep their own noise, fixed pattern and surface; only the damage is "
+    "Put virtual damage at random places of recorded frames of an undamaged part, as the "
+    "camera would "
+    "have measured it, and state which size is found: a50, a90, a90/95 and false calls per "
+    "square metre. Each PATH "
+    "is one static capture. The frames keep their own noise, fixed pattern and surface; "
+    "only the damage is "
     "simulated.",
     epilog="example: tofpod implant captures/wall --camera azure_kinect_nfov --damage through "
     "--diameters 2:10 --out implanted",
@@ -173,7 +181,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     )
     refuse_thresholds(options)
     numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
-    for name, number in [*numbers, *(("frames", each) for each in options.frames or ())]:
+    for name, number in [
+        *numbers,
+        *(("frames", frame_count) for frame_count in options.frames or ()),
+    ]:
         if not 0 < number < math.inf:
             raise UserError(f"--{name} {number:g}", legal="above 0")
     detector, settings = cli.detector_of(options, options.crop, options.set)
@@ -184,8 +195,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
         return value, evidence.warnings
 
-    how = (options.hit_radius * MM, options.threshold, own_threshold)
-    judging = Judging(options.detector, canonical_json(settings), *how)
+    judging_options = (options.hit_radius * MM, options.threshold, own_threshold)
+    judging = Judging(options.detector, canonical_json(settings), *judging_options)
     cli.refuse_repeats(options.paths)
     reading = cli.reading_of(options)
     opened = [
@@ -209,7 +220,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     warnings = (*(doubt for scan in scans for doubt in scan.recording.warnings), *warnings)
 
     area_m2 = sum(scan.area_m2 for scan in scans)
-    recordings = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
+    recordings = (
+        f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² "
+        "judged"
+    )
     facts = {
         "implanted": [
             *_shares(
@@ -237,15 +251,20 @@ def main(options: argparse.Namespace, command: str) -> int:
     title = f"Virtual damage in {recordings}"
     expected = options.false_calls or cli.DEFAULT_FALSE_CALLS
     calls = f"{expected:g} false calls a capture: the median over groups of frames."
-    own = f"Set by the undamaged frames, as in tofpod detect, by noise towards the camera, for {calls}"
-    thresholds = f"Given as {options.threshold:g}." if options.threshold else own
-    known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
+    own_text = (
+        "Set by the undamaged frames, as in tofpod detect, by noise towards the camera, for "
+        f"{calls}"
+    )
+    thresholds = f"Given as {options.threshold:g}." if options.threshold else own_text
+    recorded_origin = {
+        key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")
+    }
     study = StudyRecord(
         name="implant",
         digest=digest(facts),
         hit_radius_mm=options.hit_radius,
         false_calls_per_m2=None,
-        provenance={**known, "thresholds": thresholds},
+        provenance={**recorded_origin, "thresholds": thresholds},
         set_ups=set_ups,
     )
     provenance = {
@@ -313,17 +332,28 @@ def _shares(options: argparse.Namespace, recordings: str, peaks_mm: list[float])
     ``peaks_mm``: visible depths."""
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [
-        f"Measured: {recordings}, with their surface, noise, fixed pattern, texture and missing returns.",
-        f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
-        f"of {options.albedo:g}; noise is added where the damage weakens the light, but never removed.",
-        f"Virtual damage shows a median depth of {middle:.2g} mm ({low:.2g} to {high:.2g} mm for eight in ten). If "
-        "real damage of such sizes shows more or less depth in recordings of this camera, the limit is wrong "
+        (
+            f"Measured: {recordings}, with their surface, noise, fixed pattern, texture and "
+            "missing returns."
+        ),
+        f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at "
+        "its place, with an albedo "
+        f"of {options.albedo:g}; noise is added where the damage weakens the light, but "
+        "never removed.",
+        f"Virtual damage shows a median depth of {middle:.2g} mm ({low:.2g} to {high:.2g} "
+        "mm for eight in ten). If "
+        "real damage of such sizes shows more or less depth in recordings of this camera, "
+        "the limit is wrong "
         "accordingly: check it with a gauge board.",
-        "Here, a board is a placement of damage in a group of recorded frames. Placements share the recording's "
-        "surface and fixed pattern, and also its noise if it has few frames: intervals are over places and sizes in "
+        "Here, a board is a placement of damage in a group of recorded frames. Placements "
+        "share the recording's "
+        "surface and fixed pattern, and also its noise if it has few frames: intervals are "
+        "over places and sizes in "
         "this recording, not over other parts, units or days.",
-        "No damage was placed within the hit radius of a finding in the average of all undamaged frames. The undamaged "
-        "recording is the hole-free board; a warning is given if the same frames set the threshold.",
+        "No damage was placed within the hit radius of a finding in the average of all "
+        "undamaged frames. The undamaged "
+        "recording is the hole-free board; a warning is given if the same frames set the "
+        "threshold.",
     ]
 
 

@@ -41,9 +41,8 @@ MOST_HOLE_FREE = 20
 MOST_SETTING = 5
 MOST_EMPTY = 200  # give up after this many placements in a row without a place for any damage
 NORMAL_PX = 4  # half the side of the square of surface that determines the tangent plane
-TELLING_DEG = (
-    5.0  # a warning follows if the judged rim is steeper than the places of damage by this angle
-)
+# a warning follows if the judged rim is steeper than the places of damage by this angle
+TELLING_DEG = 5.0
 VARIANT = "main"
 
 
@@ -86,17 +85,17 @@ class Scan:
         along /= np.linalg.norm(along)
         self.T_camera_board = np.eye(4)
         self.T_camera_board[:3] = np.column_stack([along, np.cross(normal, along), normal, centre])
-        places = transform_points(invert(self.T_camera_board), points_m)[:, :2]
-        middle = places.min(axis=0) / 2 + places.max(axis=0) / 2
+        face_places = transform_points(invert(self.T_camera_board), points_m)[:, :2]
+        middle = face_places.min(axis=0) / 2 + face_places.max(axis=0) / 2
         self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
-        self.size_m: np.ndarray = np.ptp(places, axis=0)
+        self.size_m: np.ndarray = np.ptp(face_places, axis=0)
         # no damage is placed where the undamaged recording has findings, which would count as hits
         detector = judge.detector_of(judging.detector, judging.settings_json)
         threshold = judging.threshold
-        found = detector.find(
+        detections = detector.find(
             self.whole, evidence, threshold or judging.threshold_of(self.whole)[0]
         )
-        rays = np.array([each.centre_m for each in found]).reshape(-1, 3)
+        rays = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
         met = rays * ((self.T_camera_board[:3, 3] @ normal) / (rays @ normal))[:, None]
         self.taken_m = transform_points(invert(self.T_camera_board), met)[:, :2]
         self.free_m = judging.radius_m
@@ -154,17 +153,27 @@ class Scan:
         """Return a sentence on the rim where no damage is placed; empty if it is not steeper than
         the rest."""
         inner = self.depth_px >= self.rim_px(family)
-        known = np.isfinite(self.angle_deg)
-        if not (inner & known).any():
+        has_angle = np.isfinite(self.angle_deg)
+        if not (inner & has_angle).any():
             return ""
         steep = [
-            float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)
+            float(np.quantile(self.angle_deg[part & has_angle], 0.99))
+            for part in (inner, self.judged)
         ]
         if steep[1] - steep[0] < TELLING_DEG:
             return ""
-        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of the judged area"
-        rim = f"the limit says nothing about the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
-        return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
+        inside = (
+            f"the inner {100 * (inner & has_angle).sum() / has_angle.sum():.0f} % of the judged "
+            "area"
+        )
+        rim = (
+            f"the limit says nothing about the rim, seen at up to {steep[1]:.0f} degrees, where "
+            "more is missed"
+        )
+        return (
+            f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} "
+            f"degrees; {rim}"
+        )
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
         """Return the average of some frames, computed as in `tofpod detect`."""
@@ -246,8 +255,8 @@ def placements(
     """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError if
     none fits."""
     units = [unit_config(camera, scan.lens) for scan in scans]
-    found = number = empty = 0
-    while found < targets:
+    placed_count = number = empty = 0
+    while placed_count < targets:
         scan, (config, same) = scans[number % len(scans)], units[number % len(scans)]
         placed = damages_placed(scan, family, camera, "damaged", number)
         empty = 0 if placed.damages else empty + 1
@@ -266,7 +275,7 @@ def placements(
                 implant_of(config, same, scan.lens, board, len(scan.frames), draw, cache)
             )
         if implants:
-            found += len(implants)
+            placed_count += len(implants)
             yield Implanted(number, scan, placed, tuple(implants))
         number += 1
 
@@ -278,15 +287,24 @@ def damages_placed(
     them."""
     drawn = family.drawn(purpose, number)
     rim_px = scan.rim_px(family)
-    kept = {damage.id for damage in drawn.damages if scan.place(*damage.centre_m, rim_px) is not None}
-    left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
-    return drawn.model_copy(update=left)
+    kept = {
+        damage.id for damage in drawn.damages if scan.place(*damage.centre_m, rim_px) is not None
+    }
+    kept_damages = {
+        name: tuple(damage for damage in getattr(drawn, name) if damage.id in kept)
+        for name in KINDS
+    }
+    return drawn.model_copy(update=kept_damages)
 
 
 def judge_scans(
-    scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
+    scans: Sequence[Scan],
+    implanted: Sequence[Implanted],
+    family: DrawnTargetConfig,
+    camera: str,
+    judging: Judging,
     frames: Sequence[int],
-) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
+) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:
     """Set a threshold for each number of frames, count false calls on undamaged frames, and judge
     all placements. Return tables, a set-up for each number of frames, and warnings. If a recording
     has two groups of that many frames or more, every second group sets the threshold; otherwise
@@ -307,27 +325,35 @@ def judge_scans(
         setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
         if len(groups) == 1:
             warnings.append(
-                f"{count} frames: one average sets the threshold, shows the false calls and is damaged too"
+                f"{count} frames: one average sets the threshold, shows the false calls and "
+                "is damaged too"
             )
         setting = setting[:MOST_SETTING] if judging.threshold is None else []
         quiet = judged[:MOST_HOLE_FREE]
-        own = [judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting]
-        warnings += dict.fromkeys(f"{count} frames: {text}" for _, doubts in own for text in doubts)
-        calibrated[count] = len(own)
-        threshold = judging.threshold or float(np.median([value for value, _ in own]))
+        own_thresholds = [
+            judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting
+        ]
+        warnings += dict.fromkeys(
+            f"{count} frames: {text}" for _, doubts in own_thresholds for text in doubts
+        )
+        calibrated[count] = len(own_thresholds)
+        threshold = judging.threshold or float(np.median([value for value, _ in own_thresholds]))
 
         for number, (scan, group) in enumerate(quiet):
             sites = damages_placed(scan, family, camera, "hole_free", number)
             cloud = scan.averaged(scan.frames[group])
-            known = scan.known(cloud, sites, damaged=False)
-            _add(record, judging, known, threshold, frames=count, board=number)
-        for at, placement in enumerate(made):
+            labelled = scan.known(cloud, sites, damaged=False)
+            _add(record, judging, labelled, threshold, frames=count, board=number)
+        for placement_index, placement in enumerate(implanted):
             slices = [group for scan, group in judged if scan is placement.scan]
             slices = slices or [group for scan, group in groups if scan is placement.scan]
-            cloud = placement.cloud(slices[at % len(slices)])
-            known = placement.scan.known(cloud, placement.target, damaged=True)
-            _add(record, judging, known, threshold, frames=count, board=placement.number)
-            print(f"frames averaged {count}: placement {at + 1} of {len(made)}", file=sys.stderr)
+            cloud = placement.cloud(slices[placement_index % len(slices)])
+            labelled = placement.scan.known(cloud, placement.target, damaged=True)
+            _add(record, judging, labelled, threshold, frames=count, board=placement.number)
+            print(
+                f"frames averaged {count}: placement {placement_index + 1} of {len(implanted)}",
+                file=sys.stderr,
+            )
     tables = ResultTables(
         **{
             name: pd.DataFrame(columns_of(rows, {}) if rows else {})
@@ -352,7 +378,7 @@ def judge_scans(
                 detector=detector.name,
                 detector_version=detector.version,
                 calibration_runs=calibrated[count],
-                targets_digest=digest([placement.target.to_data() for placement in made]),
+                targets_digest=digest([placement.target.to_data() for placement in implanted]),
                 frames_digest=digest([camera_data, count, *files]),
             )
         )
@@ -362,7 +388,7 @@ def judge_scans(
 def _add(
     record: TrialRecord,
     judging: Judging,
-    known: LabelledCloud,
+    labelled: LabelledCloud,
     threshold: float,
     *,
     frames: int,
@@ -370,7 +396,7 @@ def _add(
 ) -> None:
     """Judge one cloud and add its rows."""
     judgement = judge.judge(
-        known,
+        labelled,
         judge.Criteria(
             detector=judging.detector,
             settings_json=judging.settings_json,
@@ -383,6 +409,6 @@ def _add(
         judgement,
         point="",
         origin=Origin(variant=VARIANT, frames=frames, repeat=0, board=board),
-        role="damaged" if known.damaged else "hole_free",
+        role="damaged" if labelled.damaged else "hole_free",
         seconds_frames=0.0,
     )

@@ -28,10 +28,8 @@ SEED = 1
 CLEAR_MM = 6.0
 EDGE_MM = 18.0
 LARGEST_MM = 5e3  # the largest size that the truth file allows
-HIT_SHARE = (
-    # Hit radius as a share of the distance between holes, so that no finding can hit two holes
-    0.4
-)
+# Hit radius as a share of the distance between holes, so that no finding can hit two holes
+HIT_SHARE = 0.4
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -84,7 +84,8 @@ def notes(mapod: Mapod) -> list[str]:
         "over the models that fit the simulated hits about equally well. If the simulation is "
         "contradicted, the larger of combined and measured limit counts.",
         "If the simulated curve were right, hits and misses at least as far from it would occur "
-        f"with probability {mapod.agrees:.2g}; a probability below 0.05 counts as a contradiction.",
+        f"with probability {mapod.agrees:.2g}; a probability below 0.05 counts as a "
+        "contradiction.",
         f"Stopping rule: stop when a90/95 is at most {ENOUGH:g} times a90. The rule was fixed "
         "before any board.",
     ]

@@ -12,12 +12,12 @@ from harness.vocabulary.program import program
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    what = (
+    what_help = (
         "cache: stored renders, which are made again when they are needed; results: results folders"
     )
-    add("what", choices=("cache", "results"), help=what)
-    which = "name of the results, as listed by tofpod ls results"
-    add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=which)
+    add("what", choices=("cache", "results"), help=what_help)
+    name_help = "name of the results, as listed by tofpod ls results"
+    add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=name_help)
     add(
         "--limit",
         metavar="SIZE",
@@ -37,7 +37,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Remove stored renders or results. Only files that tofpod wrote below --out are removed, links are never "
+    "Remove stored renders or results. Only files that tofpod wrote below --out are "
+    "removed, links are never "
     "followed, and files of a running sweep are kept.",
     epilog="examples: tofpod clean cache --limit 5GB; "
     "tofpod clean results averaging/69346a82f4194e03 --dry-run",
@@ -85,9 +86,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         for file in (removable(path) if of_results else cache_removal(path, limit))
     ]
     in_folders = f"{len(wanted)} files in {many(len(folders), 'folder')}"
-    what = in_folders if of_results else many(len(wanted), "stored render")
+    subject = in_folders if of_results else many(len(wanted), "stored render")
     if not _agreed(
-        options, f"{what}, {size_text(sum(file.size_bytes for file in wanted))}", len(wanted)
+        options, f"{subject}, {size_text(sum(file.size_bytes for file in wanted))}", len(wanted)
     ):
         return 0 if options.dry_run or not wanted else 1
     with _held(folders, of_results):  # not held during the question, which would block every sweep
@@ -110,30 +111,31 @@ def _held(folders: list[Path], of_results: bool) -> ExitStack:
     from harness.runs.shards import locked
     from scenes.render.cache import alone
 
-    with ExitStack() as held:
+    with ExitStack() as locks:
         for folder in folders:
             try:
-                held.enter_context(locked(folder) if of_results else alone(folder))
+                locks.enter_context(locked(folder) if of_results else alone(folder))
             except OSError as error:
                 raise UserError(
                     f"{folder}: cannot be written ({error.strerror})", fix="ask its owner"
                 ) from error
-        return held.pop_all()
+        return locks.pop_all()
 
 
-def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
+def _agreed(options: argparse.Namespace, subject: str, count: int) -> bool:
     """Ask for confirmation. Raises UserError if nobody can be asked."""
     if options.dry_run or not count:
-        print(f"would remove {what}" if count else "nothing to remove")
+        print(f"would remove {subject}" if count else "nothing to remove")
         return False
     if options.yes:
         return True
     if not sys.stdin.isatty():
         raise UserError(
-            f"cannot ask whether to remove {what}", fix="add --yes to confirm, or --dry-run to look"
+            f"cannot ask whether to remove {subject}",
+            fix="add --yes to confirm, or --dry-run to look",
         )
     try:
-        return input(f"remove {what}? [y/N] ").strip().lower() in ("y", "yes")
+        return input(f"remove {subject}? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:
         return False
 

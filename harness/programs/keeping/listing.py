@@ -45,11 +45,11 @@ BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks
 
 def bytes_of(text: str) -> int:
     """Read a size such as ``5GB`` or ``500 MB``. Raises UserError."""
-    found = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})", text.strip())
+    match = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})", text.strip())
     factors = {unit.lower(): factor for unit, factor in BYTES.items()}
-    if found is None or found[2].lower() not in factors:
+    if match is None or match[2].lower() not in factors:
         raise UserError(f"{text!r} is not a size", legal="such as 500MB, 5GB or 1.5TB")
-    return round(float(found[1]) * factors[found[2].lower()])
+    return round(float(match[1]) * factors[match[2].lower()])
 
 
 Row = Mapping[str, Any]
@@ -98,9 +98,9 @@ def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
     for row in rows:
         cells: tuple[Any, ...] = (row.get("version") or "-", row.get("about", ""))
         if "title" in row:
-            near = row["nearest_m"]
+            nearest_m = row["nearest_m"]
             far = row["farthest_m"]
-            reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
+            reach = f"from {nearest_m:.4g} m" if far is None else f"{nearest_m:.4g} to {far:.4g} m"
             cells = (
                 f"{row['columns']} x {row['rows']}",
                 reach,
@@ -202,9 +202,9 @@ def reference() -> str:
     ]
     for title, keys in sections.items():
         lines += ["", f"## {title}"]
-        places: dict[str, list[str]] = {}
+        rows_by_section: dict[str, list[str]] = {}
         for path, slot, model in keys:
-            place, _, key = path.rpartition(".")
+            section, _, key = path.rpartition(".")
             default = default_at(slot)
             note = (slot.field.description if slot.field else "") or ""
             legal = (
@@ -220,9 +220,9 @@ def reference() -> str:
                 "| key | legal | default | meaning |",
                 "|---|---|---|---|",
             )
-            places.setdefault(place, [*head]).append(row)
-        for place, rows in places.items():
-            lines += ["", *([f"### `{place}`", ""] if place else []), *rows]
+            rows_by_section.setdefault(section, [*head]).append(row)
+        for section, rows in rows_by_section.items():
+            lines += ["", *([f"### `{section}`", ""] if section else []), *rows]
     return "\n".join(lines)
 
 
@@ -235,39 +235,43 @@ SHOWN_SETTINGS = 6
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
     """Return `described` for every folder, with its ``limits``, the settings in which it
     ``differs``, ``is_latest``."""
-    found = []
+    described_runs = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
             continue
         runs = folders_in(parent, DIGEST_NAME)
         settings = {run: _settings(run) for run in runs} if len(runs) > 1 else {}
-        known = [setting for setting in settings.values() if setting]
-        paths = dict.fromkeys(path for own in known for path in own)
-        apart = [
-            path for path in paths if len({canonical_json(own.get(path)) for own in known}) > 1
+        known_settings = [setting for setting in settings.values() if setting]
+        paths = dict.fromkeys(path for setting in known_settings for path in setting)
+        differing_paths = [
+            path
+            for path in paths
+            if len({canonical_json(setting.get(path)) for setting in known_settings}) > 1
         ]
         newest = latest_run(parent)
         for run in runs:
-            own = settings.get(run)
-            differs = {path: own.get(path) for path in apart} if own else {}
-            found.append(
+            run_settings = settings.get(run)
+            differs = (
+                {path: run_settings.get(path) for path in differing_paths} if run_settings else {}
+            )
+            described_runs.append(
                 described(run)
                 | {"limits": _limits(run), "differs": differs, "is_latest": run.name == newest}
             )
-    return found
+    return described_runs
 
 
 def limit_text(limits: list[dict[str, Any]]) -> str:
     """Return the detection limit with its set-up, or the range of several limits; "" if there is
     no study."""
-    found = [
+    demonstrated = [
         row for row in limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"
     ]
-    if not found:
+    if not demonstrated:
         return "a90/95 not demonstrated" if limits else ""
-    found.sort(key=lambda row: row["a90_95_mm"])
-    ends = [found[0], *found[1:][-1:]]
-    missing = len(limits) - len(found)
+    demonstrated.sort(key=lambda row: row["a90_95_mm"])
+    ends = [demonstrated[0], *demonstrated[1:][-1:]]
+    missing = len(limits) - len(demonstrated)
     beside = f"; not demonstrated by {missing} of {len(limits)} set-ups" if missing else ""
     return (
         "a90/95 "
@@ -281,21 +285,23 @@ def differs_text(differs: dict[str, Any]) -> str:
     experiment."""
     names = names_of(differs)
     parts = [f"{names[path]}={value_text(path, value)}" for path, value in differs.items()]
-    more = len(parts) - SHOWN_SETTINGS
-    return ", ".join(parts[:SHOWN_SETTINGS]) + (f" and {more} more" if more > 0 else "")
+    hidden_count = len(parts) - SHOWN_SETTINGS
+    return ", ".join(parts[:SHOWN_SETTINGS]) + (
+        f" and {hidden_count} more" if hidden_count > 0 else ""
+    )
 
 
 def _settings(run: Path) -> dict[str, Any]:
     """Return every setting of a run's resolved experiment by its dotted path; empty if it cannot
     be read."""
     try:
-        found = {
+        settings = {
             ".".join(path): value for path, value in leaves(read_yaml(run / EXPERIMENT.name).data)
         }
-        canonical_json(found)
+        canonical_json(settings)
     except (UserError, ValueError, OSError, TypeError, AttributeError):
         return {}
-    return found
+    return settings
 
 
 def _limits(run: Path) -> list[dict[str, Any]]:
@@ -408,8 +414,8 @@ def chosen_results(out: Path, name: str) -> list[Path]:
         raise UserError(f"{name!r} is not the name of any results", legal=legal)
     parent = Path(out) / experiment
     refuse_links(parent, parent / digest)
-    found = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
-    for folder in found or [parent / digest]:
+    folders = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
+    for folder in folders or [parent / digest]:
         # every sweep first writes its declaration, whose first line identifies tofpod
         declared = folder / EXPERIMENT.name
         if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(
@@ -418,12 +424,12 @@ def chosen_results(out: Path, name: str) -> list[Path]:
             raise UserError(
                 f"{folder}: is not a results folder", fix="see the list of tofpod ls results"
             )
-    return found
+    return folders
 
 
 def removable(folder: Path) -> list[StoredFile]:
     """Return the files of a results folder that tofpod wrote, with locks last."""
-    found = []
+    files = []
     for path in sorted(
         files_below(folder), key=lambda path: LOCK_NAME.fullmatch(path.name) is not None
     ):
@@ -434,8 +440,8 @@ def removable(folder: Path) -> list[StoredFile]:
             Path(JOURNAL): SEGMENT_NAME.fullmatch(name),
         }.get(above, re.fullmatch(r"point-[0-9]{3,6}", str(above)) and is_output(name, "capture"))
         if own_files and not path.is_symlink():
-            found.append(StoredFile(path, path.lstat().st_size, path.lstat().st_mtime))
-    return found
+            files.append(StoredFile(path, path.lstat().st_size, path.lstat().st_mtime))
+    return files
 
 
 def remove_empty(folder: Path) -> None:

@@ -38,8 +38,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "List detectors and cameras: tofpod's own and those that installed packages offer through the entry point "
-    "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of renders, or all keys of an "
+    "List detectors and cameras: tofpod's own and those that installed packages offer "
+    "through the entry point "
+    "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of "
+    "renders, or all keys of an "
     "experiment.",
     epilog="examples: tofpod ls; tofpod ls thesis; tofpod ls cameras kinect_v2; "
     "tofpod ls --json; tofpod ls results; tofpod ls results averaging; "
@@ -69,41 +71,41 @@ def _list_offers(options: argparse.Namespace) -> int:
         rows = {kind: offered(kind) for kind in ([word] if word else SETTABLE)}
         if options.json:
             return _print_json(rows)
-        for kind, found in rows.items():
-            show([f"{kind} (entry points: {plug_ins(kind).group})", grid_of(kind, found), ""])
+        for kind, offers in rows.items():
+            show([f"{kind} (entry points: {plug_ins(kind).group})", grid_of(kind, offers), ""])
         return 0
-    named = (
+    kinds_with_name = (
         [word]
         if word in SETTABLE
         else [kind for kind in SETTABLE if word in plug_ins(kind).names()]
     )
-    if not named or (name is not None and word not in SETTABLE):
+    if not kinds_with_name or (name is not None and word not in SETTABLE):
         names = (
             []
             if name is not None
             else [name for kind in SETTABLE for name in plug_ins(kind).names()]
         )
         legal = [*SETTABLE, "results", "cache", "keys", *names]
-        near = nearest(word, legal)
-        meant = f"; did you mean {near!r}?" if near else ""
+        nearest_word = nearest(word, legal)
+        meant = f"; did you mean {nearest_word!r}?" if nearest_word else ""
         fix = "run tofpod ls for a list"
         raise UserError(
             f"there is nothing called {word!r} to list{meant}", legal=", ".join(legal), fix=fix
         )
-    details = {kind: shown(kind, name or word) for kind in named}
+    details = {kind: shown(kind, name or word) for kind in kinds_with_name}
     if options.json:
         return _print_json(details if name is None else details[word])
     for kind, row in details.items():
         settable = [
-            (each["path"], canonical_json(each["value"]), each["about"])
-            for each in row[SETTABLE[kind]]
+            (setting["path"], canonical_json(setting["value"]), setting["about"])
+            for setting in row[SETTABLE[kind]]
         ]
-        what = (
+        heads = (
             ("setting", "default", "legal")
             if kind == "detectors"
             else ("number", "value", "tag and source")
         )
-        show([grid_of(kind, [row]), "", Grid.of(what, settable, left=3)])
+        show([grid_of(kind, [row]), "", Grid.of(heads, settable, left=3)])
     return 0
 
 
@@ -144,7 +146,7 @@ def _list_cache(options: argparse.Namespace) -> int:
         raise UserError(f"the cache has no part called {options.name!r}", fix="tofpod ls cache")
     folder = options.out / ".cache" / "renders"
     renders = stored_renders(folder)
-    left = leftovers(folder)
+    leftover_files = leftovers(folder)
     size_bytes = sum(file.size_bytes for file in renders)
     unused_days = max(
         (max(time.time() - file.used_s, 0.0) / DAY_S for file in renders), default=0.0
@@ -154,14 +156,14 @@ def _list_cache(options: argparse.Namespace) -> int:
             "folder": str(folder),
             "renders": len(renders),
             "size_bytes": size_bytes,
-            "leftovers": len(left),
+            "leftovers": len(leftover_files),
         }
         return _print_json(facts | {"longest_unused_days": unused_days})
     print(f"cache {folder}\n  renders: {len(renders)}, {size_text(size_bytes)}")
     if renders:
         print(f"  longest time without use: {unused_days:.1f} days")
-    if left:
-        print(f"  left by killed processes: {len(left)} files")
+    if leftover_files:
+        print(f"  left by killed processes: {len(leftover_files)} files")
     return 0
 
 

@@ -74,7 +74,7 @@ def analyse() -> None:
         {"crop": {"kind": "auto"}},
         *({"crop": {"kind": "none"}, "surface": surface} for surface in surfaces),
     ]
-    for name, settings in (("matched", wanted[1]), *(("thesis", each) for each in wanted)):
+    for name, settings in (("matched", wanted[1]), *(("thesis", surface) for surface in wanted)):
         detector = load_detector(name, settings)
         with suppress(
             UserError

@@ -19,26 +19,30 @@ from harness.tables.study import STUDY_TABLES
 
 HEAD = f"""# Results
 
-`python -m harness.programs.keeping.readme` writes this file from the declarations in `harness/tables`; a test keeps it current.
+`python -m harness.programs.keeping.readme` writes this file from the declarations of tables;
+a test keeps it current.
 
-Sweeps write to `results/<experiment>/<digest>/`; the digest covers all settings that can change a result.
-`results/<experiment>/{LATEST}` is a link to the newest run that has a report (a text file with its name where the
-system has no links). `tofpod ls results` lists all runs, the settings in which they differ, and their
-detection limits; `tofpod clean results` removes them. `{JOURNAL}/` holds finished trials, so that the same
-command resumes an interrupted sweep. `tofpod check` compares with `baselines/`. Noise-free renders are kept in
-`results/.cache/renders/`. Everything but the baselines can be deleted at any time."""
+Sweeps write to `results/<experiment>/<digest>/`; the digest covers all settings that can change a
+result. `results/<experiment>/{LATEST}` is a link to the newest run that has a report (a text file
+with its name where the system has no links). `tofpod ls results` lists all runs, the settings in
+which they differ, and their detection limits; `tofpod clean results` removes them. `{JOURNAL}/`
+holds finished trials, so that the same command resumes an interrupted sweep. `tofpod check`
+compares with `baselines/`. Noise-free renders are kept in `results/.cache/renders/`. Everything
+but the baselines can be deleted at any time."""
 TABLES = """
 # Tables
 
-Parquet files hold all digits. Their schema holds each column's unit and description, and the origin (key `tofpod`:
-commit, versions, seed). CSV files hold six digits. The ending of a column's name is its unit. An empty cell means that
-the value is unknown or not demonstrated. `x_low` and `x_high` are the ends of the 95 % interval of `x`. Tables without
-rows are not written. An experiment with axes has another column for each axis, named by its dotted path."""
+Parquet files hold all digits. Their schema holds each column's unit and description, and the
+origin (key `tofpod`: commit, versions, seed). CSV files hold six digits. The ending of a column's
+name is its unit. An empty cell means that the value is unknown or not demonstrated. `x_low` and
+`x_high` are the ends of the 95 % interval of `x`. Tables without rows are not written. An
+experiment with axes has another column for each axis, named by its dotted path."""
 GROUPS = {
     "": "Every sweep",
     "study": "Additional files of a study of detection limits",
     "views": "Additional files of an experiment with several views",
-    "capture": "Files of an experiment on real captures (in `point-000/`, ..., except `summary.csv`)",
+    "capture": "Files of an experiment on real captures "
+    "(in `point-000/`, ..., except `summary.csv`)",
     "check": "Also written by `tofpod check`",
     "efficiency": "Also written by `tofpod efficiency`",
     "coverage": "Written by `tofpod coverage`",

@@ -27,6 +27,8 @@ def outputs() -> Iterator[Output]:
                 yield Output(name, table.note, of="study" if table in STUDY_ONLY else group)
 
 
-def is_output(name: str, place: FolderKind) -> bool:
+def is_output(name: str, folder_kind: FolderKind) -> bool:
     """Return whether a program writes a file with this name to this place."""
-    return any(output.place == place and fnmatchcase(name, output.name) for output in outputs())
+    return any(
+        output.place == folder_kind and fnmatchcase(name, output.name) for output in outputs()
+    )

@@ -1,5 +1,4 @@
-"""Rules for the claims on a single view (C1 to C6, C9) and on cameras (C11), the same for every
-run.
+"""Rules for the claims on a single view (C1 to C6 and C9), the same for every run.
 
 A verdict needs certainty in either direction: if an interval allows both, it is "undecided". No
 experiment can change a rule, and no rule was chosen to make a claim come out."""
@@ -11,7 +10,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,13 +25,46 @@ from harness.evaluation.summary import (
     summarise_holes,
     with_columns,
 )
+from harness.records.examples import ExampleCloud
 from harness.records.trials import ResultTables, hole_list
 from harness.report.claims import Answer, Verdict
 from harness.vocabulary.declaration.yaml_source import read_yaml
-from harness.vocabulary.path_names import value_text
+from harness.vocabulary.text import many
 
-# the smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger
 FEW = 1
+"""The smaller number of frames in the claims; `harness.evaluation.maps.MANY` is the larger."""
+THESIS_HOLES = tuple(str(number) for number in range(1, 12))
+FOUND_WITH_MANY = frozenset(THESIS_HOLES[3:])
+FOUND_WITH_FEW = frozenset(THESIS_HOLES[4:])
+NO_HOLES = frozenset[str]()
+RULER_MM = 25.4 / 16
+"""A graduation of the ruler (1/16 in) with which the thesis read its reference positions."""
+SLOPE_MARGIN = 0.05
+"""Exponents within this distance of -0.5 count as 1/sqrt(N); over 50 frames, it is a factor of
+1.22 in noise."""
+UNCHANGED = 0.9
+"""The systematic error is lowered if it falls below this share; white noise falls to 0.14."""
+FEWEST_UNITS = 3
+"""Fewest units of a camera, which must all agree, to decide a claim that depends on its fixed
+pattern."""
+FEWEST_PAIRS = 5
+"""Fewest pairs of views to compare registrations."""
+FEWEST_RANKED = 4
+"""Fewest holes to rank; of fewer, even a perfect order is above 1 in 20 by chance."""
+SIGNIFICANT = 0.05
+"""A permutation p below this decides a claim on ranks."""
+IN_CRITERIA = {
+    "MANY": MANY,
+    "RULER_MM": RULER_MM,
+    "SLOPE_MARGIN": SLOPE_MARGIN,
+    "UNCHANGED": UNCHANGED,
+    "FEWEST_UNITS": FEWEST_UNITS,
+    "FEWEST_PAIRS": FEWEST_PAIRS,
+    "FEWEST_RANKED": FEWEST_RANKED,
+}
+"""The constants that the criteria of claims.yaml name in braces."""
+
+# ---------------------------------------------------------------- claims and answers
 
 
 @lru_cache
@@ -47,8 +78,13 @@ def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
     """Return the verdict on a claim of claims.yaml, with this module's constants filled into its
     criterion."""
     declaration = declared()[claim]
+    criterion = declaration["criterion"].format_map(IN_CRITERIA)
     return Verdict(
-        claim, declaration["says"], answer, evidence, declaration["criterion"].format_map(globals())
+        claim=claim,
+        text=declaration["says"],
+        verdict=answer,
+        evidence=evidence,
+        rule=criterion,
     )
 
 
@@ -61,60 +97,110 @@ def decide(parts: Iterable[bool | None]) -> Answer:
     return "borne out" if values and all(value is True for value in values) else "undecided"
 
 
-THESIS_HOLES = tuple(str(number) for number in range(1, 12))
-FOUND_WITH_MANY = frozenset(THESIS_HOLES[3:])
-FOUND_WITH_FEW = frozenset(THESIS_HOLES[4:])
-RULER_MM = (
-    25.4 / 16
-)  # one graduation of the ruler (1/16 in) with which the thesis read its reference positions
-SLOPE_MARGIN = 0.05
-"""Exponents within this distance of -0.5 count as 1/sqrt(N); over 50 frames, it is a factor of
-1.22 in noise."""
-# the systematic error counts as lowered if it falls below this share, while white noise falls to
-# 0.14
-UNCHANGED = 0.9
-# fewest units of a camera, which must all agree, to decide a claim that depends on its fixed
-# pattern
-FEWEST_UNITS = 3
-FEWEST_PAIRS = 5  # fewest pairs of views to compare registrations
-# fewest holes to rank; with fewer, even a perfect order has a probability above 1 in 20 by chance
-FEWEST_RANKED = 4
+def certain(holds: bool, fails: bool) -> bool | None:
+    """Return True if a part of a claim certainly holds, False if it certainly fails, else None."""
+    if holds:
+        return True
+    return False if fails else None
 
 
 @dataclass(frozen=True)
 class Case:
-    """The tables of a variant that rules use, and its averaged clouds. ``units`` are the summary
-    rows of this variant and of the variations that change only the camera's unit."""
+    """The tables of the main set-up that rules use."""
 
-    variant: str
     summary: pd.DataFrame
+    """Its rows of `summarise_holes`."""
     units: pd.DataFrame
+    """The same rows, and those of variations that change only the camera's unit."""
     holes: pd.DataFrame
+    """Its rows per trial and hole."""
     runs: pd.DataFrame
+    """Its rows per trial."""
     probes: pd.DataFrame
-    examples: Sequence[Any] = ()
+    """Its rows of sample pixels."""
+    examples: Sequence[ExampleCloud]
+    """Its averaged clouds."""
 
     def found_with_many(self) -> pd.DataFrame:
         """Summary rows of the holes found with `MANY` frames."""
-        return self.summary[(self.summary["frames"] == MANY) & (self.summary["status"] == "found")]
+        with_many = self.summary["frames"] == MANY
+        return self.summary[with_many & (self.summary["status"] == "found")]
+
+    def thresholds_mm(self, frames: int) -> pd.Series:
+        """Thresholds on the damaged board with this number of frames."""
+        damaged = self.runs[self.runs["role"] == "damaged"]
+        thresholds_mm = damaged["threshold"] * damaged["scale_mm"]
+        return thresholds_mm[damaged["frames"] == frames].dropna()
+
+
+# ---------------------------------------------------------------- C1, C2: which holes are found
+
+
+def _c1(case: Case) -> tuple[Answer, str]:
+    return _found(case, MANY, expected=FOUND_WITH_MANY, unexpected=NO_HOLES)
+
+
+def _c1b(case: Case) -> tuple[Answer, str]:
+    small = frozenset(THESIS_HOLES) - FOUND_WITH_MANY
+    return _found(case, MANY, expected=NO_HOLES, unexpected=small)
 
 
 def _c2(case: Case) -> tuple[Answer, str]:
-    answer, evidence = _found(case, FEW, FOUND_WITH_FEW, frozenset(THESIS_HOLES) - FOUND_WITH_FEW)
-    set_agrees = {"borne out": True, "not borne out": False, "undecided": None}[answer]
-    damaged = case.runs[case.runs["role"] == "damaged"]
-    in_mm = damaged["threshold"] * damaged["scale_mm"]
-    few = in_mm[damaged["frames"] == FEW].dropna()
-    many = in_mm[damaged["frames"] == MANY].dropna()
-    interval = mean_difference(few, many)
-    if not interval.known:
-        return decide(
-            [set_agrees, None]
-        ), f"{evidence} There are too few runs to compare the thresholds."
-    threshold = f"Threshold {few.mean():.2f} mm with 1 frame, {many.mean():.2f} mm with 50"
-    return decide(
-        [set_agrees, interval.over(0)]
-    ), f"{evidence} {threshold} (difference {span(interval)} mm)."
+    small = frozenset(THESIS_HOLES) - FOUND_WITH_FEW
+    answer, evidence = _found(case, FEW, expected=FOUND_WITH_FEW, unexpected=small)
+    agrees = certain(holds=answer == "borne out", fails=answer == "not borne out")
+    few_mm = case.thresholds_mm(FEW)
+    many_mm = case.thresholds_mm(MANY)
+    fall_mm = mean_difference(few_mm, many_mm)
+    if not fall_mm.known:
+        evidence += " There are too few runs to compare the thresholds."
+        return decide([agrees, None]), evidence
+    evidence += (
+        f" Threshold {few_mm.mean():.2f} mm with 1 frame, {many_mm.mean():.2f} mm with 50"
+        f" (difference {span(fall_mm)} mm)."
+    )
+    return decide([agrees, fall_mm.over(0)]), evidence
+
+
+def _found(
+    case: Case, frames: int, expected: frozenset[str], unexpected: frozenset[str]
+) -> tuple[Answer, str]:
+    """Judge whether the expected holes are found and the unexpected holes missed; return also the
+    counts."""
+    status = found_holes(case.summary, MAIN, frames)
+    if not status:
+        return "undecided", f"Not judged: no trial has {frames} frames."
+    if set(status) != set(THESIS_HOLES):
+        return "undecided", "Not judged: the target is not the thesis' row of eleven holes."
+    detected = [hole for hole, state in status.items() if state == "found"]
+    missed = [hole for hole, state in status.items() if state == "missed"]
+    undecided = [hole for hole, state in status.items() if state == "undecided"]
+    too_many = [hole for hole in detected if hole in unexpected]
+    too_few = [hole for hole in missed if hole in expected]
+    open_holes = [hole for hole in undecided if hole in expected | unexpected]
+    sentences = [f"With {many(frames, 'frame')} found: {hole_list(detected)}."]
+    if too_many:
+        sentences.append(f"More than the thesis: {hole_list(too_many)}.")
+    if too_few:
+        sentences.append(f"Fewer than the thesis: {hole_list(too_few)}.")
+    if open_holes:
+        sentences.append(f"Undecided: {hole_list(open_holes)}.")
+    sentences.append(f"Detections of trials (holes): {_detections(case, frames)}.")
+    agrees = not (too_many or too_few)
+    return decide([agrees, None if open_holes else True]), " ".join(sentences)
+
+
+def _detections(case: Case, frames: int) -> str:
+    """Return the holes by their number of detections: ``0 of 50 (1-3), 50 of 50 (4-11)``."""
+    rows = case.summary[case.summary["frames"] == frames]
+    holes_by_count: dict[str, list[str]] = {}
+    for _, row in rows.sort_values("detected", kind="stable").iterrows():
+        count = f"{row['detected']} of {row['n']}"
+        holes_by_count.setdefault(count, []).append(row["hole"])
+    return ", ".join(f"{count} ({hole_list(holes)})" for count, holes in holes_by_count.items())
+
+
+# ---------------------------------------------------------------- C3, C4: sizes
 
 
 def _c3(case: Case) -> tuple[Answer, str]:
@@ -124,32 +210,32 @@ def _c3(case: Case) -> tuple[Answer, str]:
     parts: list[bool | None] = []
     ratios = []
     for _, row in rows.iterrows():
-        bias = float(row["extent_bias_mm"])
-        std = float(row["extent_diameter_std_mm"])
-        interval = standardised_bias(bias, std, int(row["extent_measured"]))
-        ratio = bias / std if std > 0 else interval.low
-        within = interval.within(-1, 1)
-        outside = interval.above(1) or interval.below(-1)
-        parts.append(True if within else False if outside else None)
-        ratios.append(
-            f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}"
-        )
-    return (
-        decide(parts),
-        f"(mean - true)/std by the thesis' measure: {', '.join(ratios)}. {_between_units(case, rows)}",
+        bias_mm = float(row["extent_bias_mm"])
+        std_mm = float(row["extent_diameter_std_mm"])
+        interval = standardised_bias(bias_mm, std_mm, int(row["extent_measured"]))
+        is_outside = interval.above(1) or interval.below(-1)
+        parts.append(certain(holds=interval.within(-1, 1), fails=is_outside))
+        ratio = bias_mm / std_mm if std_mm > 0 else interval.low
+        text = f"{ratio:+.1f} ({span(interval, 1)})" if interval.known else "–"
+        ratios.append(f"hole {row['hole']} {text}")
+    evidence = (
+        f"(mean - true)/std by the thesis' measure: {', '.join(ratios)}."
+        f" {_between_units(case, rows)}"
     )
+    return decide(parts), evidence
 
 
 def _between_units(case: Case, rows: pd.DataFrame) -> str:
     """Return the error of the mean size of the holes found (``rows``) in standard deviations
     between units."""
-    many = case.units[case.units["frames"] == MANY]
-    means = many.pivot(index="variant", columns="hole", values="extent_diameter_mean_mm")
-    if len(means) < FEWEST_UNITS:
+    with_many = case.units[case.units["frames"] == MANY]
+    means_mm = with_many.pivot(index="variant", columns="hole", values="extent_diameter_mean_mm")
+    if len(means_mm) < FEWEST_UNITS:
         return "Between units: not judged, because all repeats have the same unit's fixed pattern."
-    true = rows.set_index("hole")["true_diameter_mm"]
-    off = ((means.mean() - true) / means.std())[true.index]
-    return f"Between {len(means)} units: {', '.join(f'hole {hole} {ratio:+.1f}' for hole, ratio in off.items())}."
+    true_mm = rows.set_index("hole")["true_diameter_mm"]
+    ratios = ((means_mm.mean() - true_mm) / means_mm.std())[true_mm.index]
+    texts = [f"hole {hole} {ratio:+.1f}" for hole, ratio in ratios.items()]
+    return f"Between {len(means_mm)} units: {', '.join(texts)}."
 
 
 def _c4(case: Case) -> tuple[Answer, str]:
@@ -157,132 +243,29 @@ def _c4(case: Case) -> tuple[Answer, str]:
     rows = rows[rows["extent_bias_mm"].notna()]
     if len(rows) < FEWEST_RANKED:
         return "undecided", f"Only {len(rows)} holes are found with 50 frames."
-    diameter = rows["true_diameter_mm"].to_numpy(float)
-    error = rows["extent_bias_mm"].abs().to_numpy(float)
-    rho, p = falling_rank(diameter, error)
-    p_rises = falling_rank(diameter, -error)[1]
-    smallest = rows.iloc[diameter.argmin()]
-    largest = rows.iloc[diameter.argmax()]
-    errors = (
-        f"{abs(at['extent_bias_mm']):.2f} mm at {at['true_diameter_mm']:.2f} mm"
-        for at in (smallest, largest)
-    )
-    falls = "< 0.001" if p < 0.001 else f"= {p:.3f}"
-    rises = "< 0.001" if p_rises < 0.001 else f"= {p_rises:.3f}"
+    diameter_mm = rows["true_diameter_mm"].to_numpy(float)
+    error_mm = rows["extent_bias_mm"].abs().to_numpy(float)
+    rho, p_falls = falling_rank(diameter_mm, error_mm)
+    _, p_rises = falling_rank(diameter_mm, -error_mm)
+    smallest = rows.iloc[diameter_mm.argmin()]
+    largest = rows.iloc[diameter_mm.argmax()]
     evidence = (
-        f"Rank correlation {rho:+.2f} over {len(rows)} holes (one-sided p {falls} that it falls with the diameter, "
-        f"{rises} that it grows). Error {', '.join(errors)}."
+        f"Rank correlation {rho:+.2f} over {len(rows)} holes (one-sided p {p_text(p_falls)} that"
+        f" it falls with the diameter, {p_text(p_rises)} that it grows)."
+        f" Error {_size_error(smallest)}, {_size_error(largest)}."
     )
-    return (
-        "borne out" if p < 0.05 else "not borne out" if p_rises < 0.05 else "undecided"
-    ), evidence
+    if p_falls < SIGNIFICANT:
+        return "borne out", evidence
+    return "not borne out" if p_rises < SIGNIFICANT else "undecided", evidence
 
 
-def _c5(case: Case) -> tuple[Answer, str]:
-    rows = case.found_with_many()
-    rows = rows[(rows["true_offset_mm"] > 0) & rows["extent_offset_mean_mm"].notna()]
-    if rows.empty:
-        return "undecided", "With 50 frames, only the reference hole is found."
-    off = rows["extent_offset_bias_mm"].abs()
-    agrees = off <= np.maximum(rows["extent_offset_std_mm"].fillna(0.0), RULER_MM)
-    many = case.holes[(case.holes["frames"] == MANY) & case.holes["hole"].isin(rows["hole"])]
-    ratio, interval = scatter_ratio(many, "extent_offset_mm", "extent_diameter_mm")
-    larger = interval.over(1)
-    worst = rows.iloc[int(off.to_numpy().argmax())]
-    evidence = (
-        f"{int(agrees.sum())} of {len(rows)} mean positions agree"
-        f"{'' if agrees.all() else ' (except ' + hole_list(rows['hole'][~agrees]) + ')'}; the largest difference is "
-        f"{worst['extent_offset_bias_mm']:+.2f} mm, std {worst['extent_offset_std_mm']:.2f} mm (hole {worst['hole']}). "
-        f"Median ratio of the variances of position and size {ratio:.2f} ({span(interval)})."
-    )
-    return decide([bool(agrees.all()), larger]), evidence
+def p_text(p: float) -> str:
+    """Return ``= 0.042``, or ``< 0.001``."""
+    return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
-def _c6(case: Case) -> tuple[Answer, str]:
-    clouds = [cloud for cloud in case.examples if cloud.frames == MANY]
-    shapes = [shape for cloud in clouds for shape in hole_shapes(cloud)]
-    if not shapes:
-        why = (
-            "no hole has enough valid pixels inside its outline"
-            if clouds
-            else "no cloud of 50 frames was stored"
-        )
-        return "undecided", f"Not judged: {why}."
-    looks = {
-        look: [s.hole for s in shapes if s.looks == look]
-        for look in ("bowl", "cylinder", "neither")
-    }
-    bowls = len(looks["bowl"])
-    cylinders = len(looks["cylinder"])
-    most = len(shapes) / 2
-    bowl = bowls > most and not cylinders
-    cylinder = cylinders > most and not bowls
-    answer: Answer = "borne out" if bowl else "not borne out" if cylinder else "undecided"
-    ratio = float(np.median([shape.bowl_rms_mm / shape.cylinder_rms_mm for shape in shapes]))
-    control = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
-    evidence = (
-        f"Of {len(shapes)} holes judged, like a bowl: {hole_list(looks['bowl'])}; like a cylinder: "
-        f"{hole_list(looks['cylinder'])}; unclear: {hole_list(looks['neither'])}. Median misfit of the bowl relative "
-        f"to the cylinder {ratio:.2f}. Control: the true geometry at the same pixels is closer to a bowl in "
-        f"{control} of {len(shapes)} holes."
-    )
-    return answer, evidence
-
-
-def _c9(case: Case) -> tuple[Answer, str]:
-    law = noise_law(case.probes, case.variant)
-    if law is None:
-        return "undecided", "Not judged: too few sample pixels or numbers of frames."
-    low = -0.5 - SLOPE_MARGIN
-    high = -0.5 + SLOPE_MARGIN
-    slope = law.slope_interval
-    ratio = law.systematic_ratio_interval
-    falls = (
-        True
-        if slope.within(low, high)
-        else (False if slope.below(low) or slope.above(high) else None)
-    )
-    stays = ratio.over(UNCHANGED)
-    evidence = (
-        f"Temporal noise varies as N to the power {law.slope:.3f} ({span(slope, 3)}); the systematic error with "
-        f"{law.many_frames} frames is {law.systematic_ratio:.2f} times that with {law.few_frames} ({span(ratio)}); "
-        f"{law.pixels} pixels."
-    )
-    return decide([falls, stays]), evidence
-
-
-RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
-    "C1": lambda case: _found(case, MANY, FOUND_WITH_MANY, frozenset()),
-    "C1b": lambda case: _found(case, MANY, frozenset(), frozenset(THESIS_HOLES) - FOUND_WITH_MANY),
-    **{"C2": _c2, "C3": _c3, "C4": _c4, "C5": _c5, "C6": _c6, "C9": _c9},
-}
-
-
-def score_claims(
-    tables: ResultTables,
-    variant: str = MAIN,
-    examples: Sequence[Any] = (),
-    summary: pd.DataFrame | None = None,
-) -> list[Verdict]:
-    """Return a verdict for each of `RULES` on a variant. ``summary`` is the result of
-    `summarise_holes`, if known."""
-    summary = summarise_holes(tables.holes) if summary is None else summary
-    alone = tables.variants["settings"].map(
-        lambda text: list(json.loads(text or "{}")) == [CAMERA_UNIT]
-    )
-    units = summary[summary["variant"].isin({variant, *tables.variants["variant"][alone]})]
-    every = (summary, with_columns(tables.holes), tables.runs, tables.probes)
-    summary, holes, runs, probes = (table[table["variant"] == variant] for table in every)
-    case = Case(
-        variant,
-        summary,
-        units,
-        holes,
-        runs,
-        probes,
-        [shown for shown in examples if shown.variant == variant],
-    )
-    return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
+def _size_error(row: pd.Series) -> str:
+    return f"{abs(row['extent_bias_mm']):.2f} mm at {row['true_diameter_mm']:.2f} mm"
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
@@ -292,11 +275,13 @@ def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     y_ranks = rankdata(y)
     if np.ptp(x_ranks) == 0 or np.ptp(y_ranks) == 0:
         return 0.0, 1.0
-    a = x_ranks - x_ranks.mean()
-    b = y_ranks - y_ranks.mean()
-    norm = np.sqrt((a @ a) * (b @ b))
-    null = a[_orders(len(a))] @ b
-    return float(a @ b / norm), float((null <= a @ b + 1e-12 * norm).mean())
+    x_centred = x_ranks - x_ranks.mean()
+    y_centred = y_ranks - y_ranks.mean()
+    norm = np.sqrt((x_centred @ x_centred) * (y_centred @ y_centred))
+    product = x_centred @ y_centred
+    by_chance = x_centred[_orders(len(x_centred))] @ y_centred
+    p = (by_chance <= product + 1e-12 * norm).mean()
+    return float(product / norm), float(p)
 
 
 @lru_cache
@@ -305,145 +290,151 @@ def _orders(count: int) -> np.ndarray:
     given order."""
     if count <= 8:
         return np.array(list(permutations(range(count))))
-    random = np.random.default_rng(0).permuted(np.tile(np.arange(count), (20_000, 1)), axis=1)
-    return np.vstack([np.arange(count), random])
+    in_order = np.arange(count)
+    shuffled = np.random.default_rng(0).permuted(np.tile(in_order, (20_000, 1)), axis=1)
+    return np.vstack([in_order, shuffled])
 
 
-def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, Interval]:
-    """Return the median over holes of var(first) / var(second) over repeats with both values, and
-    its bootstrap interval over repeats; infinite if no hole's second column varies. ``holes`` has
-    a row per repeat and hole."""
-    top = holes.pivot(index="repeat", columns="hole", values=first).to_numpy(float)
-    bottom = holes.pivot(index="repeat", columns="hole", values=second).to_numpy(float)
-    both = np.isfinite(top) & np.isfinite(bottom)
+# ---------------------------------------------------------------- C5: positions
 
-    def ratio(chosen: np.ndarray) -> np.ndarray:
+
+def _c5(case: Case) -> tuple[Answer, str]:
+    rows = case.found_with_many()
+    rows = rows[(rows["true_offset_mm"] > 0) & rows["extent_offset_mean_mm"].notna()]
+    if rows.empty:
+        return "undecided", "With 50 frames, only the reference hole is found."
+    error_mm = rows["extent_offset_bias_mm"].abs()
+    tolerance_mm = np.maximum(rows["extent_offset_std_mm"].fillna(0.0), RULER_MM)
+    agrees = error_mm <= tolerance_mm
+    with_many = case.holes["frames"] == MANY
+    trials = case.holes[with_many & case.holes["hole"].isin(rows["hole"])]
+    ratio, interval = scatter_ratio(trials, "extent_offset_mm", "extent_diameter_mm")
+    exceptions = "" if agrees.all() else f" (except {hole_list(rows['hole'][~agrees])})"
+    worst = rows.iloc[int(error_mm.to_numpy().argmax())]
+    evidence = (
+        f"{int(agrees.sum())} of {len(rows)} mean positions agree{exceptions}; the largest"
+        f" difference is {worst['extent_offset_bias_mm']:+.2f} mm, std"
+        f" {worst['extent_offset_std_mm']:.2f} mm (hole {worst['hole']})."
+        f" Median ratio of the variances of position and size {ratio:.2f} ({span(interval)})."
+    )
+    return decide([bool(agrees.all()), interval.over(1)]), evidence
+
+
+def scatter_ratio(trials: pd.DataFrame, numerator: str, denominator: str) -> tuple[float, Interval]:
+    """Return the median over holes of var(numerator) / var(denominator) over repeats with both
+    values, and its bootstrap interval over repeats; infinite if no hole's denominator varies.
+    ``trials`` has a row per repeat and hole."""
+    upper = trials.pivot(index="repeat", columns="hole", values=numerator).to_numpy(float)
+    lower = trials.pivot(index="repeat", columns="hole", values=denominator).to_numpy(float)
+    is_complete = np.isfinite(upper) & np.isfinite(lower)
+    upper = np.where(is_complete, upper, np.nan)
+    lower = np.where(is_complete, lower, np.nan)
+
+    def median_ratio(repeats: np.ndarray) -> np.ndarray:
+        """Return the median ratio (b,) of each choice of ``repeats`` (b, n)."""
         with (
             np.errstate(invalid="ignore", divide="ignore"),
             warnings.catch_warnings(action="ignore"),
         ):
-            over = np.nanvar(np.where(both, top, np.nan)[chosen], axis=1, ddof=1)
-            under = np.nanvar(np.where(both, bottom, np.nan)[chosen], axis=1, ddof=1)
-            ratios = over / under
-        return np.nanmedian(
-            np.where(np.isnan(ratios).all(axis=1, keepdims=True), np.inf, ratios), axis=1
-        )
+            upper_variance = np.nanvar(upper[repeats], axis=1, ddof=1)
+            lower_variance = np.nanvar(lower[repeats], axis=1, ddof=1)
+            ratios = upper_variance / lower_variance
+        no_hole_varies = np.isnan(ratios).all(axis=1, keepdims=True)
+        return np.nanmedian(np.where(no_hole_varies, np.inf, ratios), axis=1)
 
-    return float(ratio(np.arange(len(top))[None])[0]), bootstrap(ratio, len(top))
-
-
-def _found(
-    case: Case, frames: int, expected: frozenset[str], unexpected: frozenset[str]
-) -> tuple[Answer, str]:
-    """Judge whether the expected holes are found and the unexpected holes missed; return also the
-    counts."""
-    status = found_holes(case.summary, case.variant, frames)
-    if set(status) != set(THESIS_HOLES):
-        why = (
-            f"no trial has {frames} frames"
-            if not status
-            else "the target is not the thesis' row of eleven holes"
-        )
-        return "undecided", f"Not judged: {why}."
-    by_state = {
-        k: [hole for hole, state in status.items() if state == k]
-        for k in ("found", "missed", "undecided")
-    }
-    more = [hole for hole in by_state["found"] if hole in unexpected]
-    fewer = [hole for hole in by_state["missed"] if hole in expected]
-    open_ = [hole for hole in by_state["undecided"] if hole in expected | unexpected]
-    rows = case.summary[case.summary["frames"] == frames]
-    alike: dict[str, list[str]] = {}
-    for _, row in rows.sort_values("detected", kind="stable").iterrows():
-        alike.setdefault(f"{row['detected']} of {row['n']}", []).append(row["hole"])
-    counts = ", ".join(f"{count} ({hole_list(names)})" for count, names in alike.items())
-    parts = [
-        f"With {frames} frame{'s' if frames > 1 else ''} found: {hole_list(by_state['found'])}."
-    ]
-    for what, holes in (
-        ("More than the thesis", more),
-        ("Fewer than the thesis", fewer),
-        ("Undecided", open_),
-    ):
-        parts += [f"{what}: {hole_list(holes)}."] if holes else []
-    answer = decide([not (more or fewer), None if open_ else True])
-    return answer, " ".join([*parts, f"Detections of trials (holes): {counts}."])
+    every_repeat = np.arange(len(upper))[None]
+    return float(median_ratio(every_repeat)[0]), bootstrap(median_ratio, len(upper))
 
 
-CAMERA = "source.camera.name"
-BEST = "azure_kinect_nfov"
-OTHERS = ("kinect_v2", "realsense_l515")
+# ---------------------------------------------------------------- C6, C9: shape and noise
 
 
-def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
-    """Return the verdict from summary rows of all set-ups and variations; None if none of the
-    ``axes`` holds the three cameras. At each place, a camera's range of counts covers all its
-    units and variations."""
-    if CAMERA not in axes or not {BEST, *OTHERS} <= set(summary[CAMERA]):
-        return None
-    rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]
-    if rows.empty:
-        return verdict_of("C11", "undecided", f"Not judged: no trial has {MANY} frames.")
-    varied = [path for path in axes if path not in (CAMERA, CAMERA_UNIT)]
-    found = {
-        " and ".join(map(value_text, varied, values)) or "its one place": {
-            camera: _bounds(each) for camera, each in part.groupby(CAMERA)
-        }
-        for values, part in (
-            rows.groupby(varied, sort=False, dropna=False) if varied else [((), rows)]
-        )
-    }
-    units = rows.groupby(CAMERA)[CAMERA_UNIT].nunique().min() if CAMERA_UNIT in axes else 1
-    counts = [
-        f"{place} {' / '.join(' to '.join(map(str, sorted(set(held.get(who, ()))))) or '–' for who in (BEST, *OTHERS))}"
-        for place, held in found.items()
-    ]
-    evidence = [
-        f"Holes found with {MANY} frames by {BEST} / {' / '.join(OTHERS)}: {'; '.join(counts)}."
-    ]
-    if units < FEWEST_UNITS:
-        evidence.insert(
-            0, f"Only {units} of each camera's units: too few for a verdict on other units."
-        )
-    answers: list[bool | None] = []
-    for camera in OTHERS:
-        standings: dict[str, list[str]] = {
-            word: [] for word in ("ahead", "level", "behind", "open")
-        }
-        for place, held in found.items():
-            if {BEST, camera} <= set(held):
-                (low, high), (other_low, other_high) = held[BEST], held[camera]
-                sure = low == high and other_low == other_high
-                word = (
-                    "ahead"
-                    if low > other_high
-                    else "behind"
-                    if high < other_low
-                    else "level"
-                    if sure
-                    else "open"
-                )
-                standings[word].append(place)
-        judged = any(standings.values())
-        answer = (
-            False
-            if standings["behind"]
-            else None
-            if standings["open"]
-            else bool(standings["ahead"])
-        )
-        answers.append(answer if judged else None)
-        text = "; ".join(
-            f"{word} at {', '.join(where)}" for word, where in standings.items() if where
-        )
-        evidence += [f"Against {camera}: {text}."] if judged else []
-    return verdict_of(
-        "C11", decide(answers) if units >= FEWEST_UNITS else "undecided", " ".join(evidence)
+def _c6(case: Case) -> tuple[Answer, str]:
+    clouds = [cloud for cloud in case.examples if cloud.frames == MANY]
+    if not clouds:
+        return "undecided", "Not judged: no cloud of 50 frames was stored."
+    shapes = [shape for cloud in clouds for shape in hole_shapes(cloud)]
+    if not shapes:
+        return "undecided", "Not judged: no hole has enough valid pixels inside its outline."
+    bowls = [shape.hole for shape in shapes if shape.looks == "bowl"]
+    cylinders = [shape.hole for shape in shapes if shape.looks == "cylinder"]
+    unclear = [shape.hole for shape in shapes if shape.looks == "neither"]
+    half = len(shapes) / 2
+    are_bowls = len(bowls) > half and not cylinders
+    are_cylinders = len(cylinders) > half and not bowls
+    ratio = float(np.median([shape.bowl_rms_mm / shape.cylinder_rms_mm for shape in shapes]))
+    truly_bowls = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
+    evidence = (
+        f"Of {len(shapes)} holes judged, like a bowl: {hole_list(bowls)}; like a cylinder:"
+        f" {hole_list(cylinders)}; unclear: {hole_list(unclear)}. Median misfit of the bowl"
+        f" relative to the cylinder {ratio:.2f}. Control: the true geometry at the same pixels is"
+        f" closer to a bowl in {truly_bowls} of {len(shapes)} holes."
+    )
+    return decide([certain(holds=are_bowls, fails=are_cylinders)]), evidence
+
+
+def _c9(case: Case) -> tuple[Answer, str]:
+    law = noise_law(case.probes, MAIN)
+    if law is None:
+        return "undecided", "Not judged: too few sample pixels or numbers of frames."
+    steepest = -0.5 - SLOPE_MARGIN
+    flattest = -0.5 + SLOPE_MARGIN
+    slope = law.slope_interval
+    ratio = law.systematic_ratio_interval
+    is_outside = slope.below(steepest) or slope.above(flattest)
+    falls = certain(holds=slope.within(steepest, flattest), fails=is_outside)
+    stays = ratio.over(UNCHANGED)
+    evidence = (
+        f"Temporal noise varies as N to the power {law.slope:.3f} ({span(slope, 3)}); the"
+        f" systematic error with {law.many_frames} frames is {law.systematic_ratio:.2f} times that"
+        f" with {law.few_frames} ({span(ratio)}); {law.pixels} pixels."
+    )
+    return decide([falls, stays]), evidence
+
+
+# ---------------------------------------------------------------- all claims on a single view
+
+RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
+    "C1": _c1,
+    "C1b": _c1b,
+    "C2": _c2,
+    "C3": _c3,
+    "C4": _c4,
+    "C5": _c5,
+    "C6": _c6,
+    "C9": _c9,
+}
+
+
+def score_claims(
+    tables: ResultTables,
+    examples: Sequence[ExampleCloud] = (),
+    summary: pd.DataFrame | None = None,
+) -> list[Verdict]:
+    """Return a verdict for each of `RULES` on the main set-up. ``summary`` is the result of
+    `summarise_holes`, if it exists."""
+    if summary is None:
+        summary = summarise_holes(tables.holes)
+    case = _case_of(tables, examples, summary)
+    verdicts = []
+    for claim, rule in RULES.items():
+        answer, evidence = rule(case)
+        verdicts.append(verdict_of(claim, answer, evidence))
+    return verdicts
+
+
+def _case_of(tables: ResultTables, examples: Sequence[ExampleCloud], summary: pd.DataFrame) -> Case:
+    holes = with_columns(tables.holes)
+    other_units = tables.variants["variant"][tables.variants["settings"].map(_changes_only_unit)]
+    return Case(
+        summary=summary[summary["variant"] == MAIN],
+        units=summary[summary["variant"].isin({MAIN, *other_units})],
+        holes=holes[holes["variant"] == MAIN],
+        runs=tables.runs[tables.runs["variant"] == MAIN],
+        probes=tables.probes[tables.probes["variant"] == MAIN],
+        examples=[example for example in examples if example.variant == MAIN],
     )
 
 
-def _bounds(rows: pd.DataFrame) -> tuple[int, int]:
-    """Return the fewest and most holes that any unit or variation of a camera finds at a place."""
-    sure = (rows["status"] == "found").groupby(rows["variant"]).sum()
-    possible = (rows["status"] != "missed").groupby(rows["variant"]).sum()
-    return int(sure.min()), int(possible.max())
+def _changes_only_unit(settings_json: str) -> bool:
+    return list(json.loads(settings_json or "{}")) == [CAMERA_UNIT]

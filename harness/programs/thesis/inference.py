@@ -7,13 +7,14 @@ neither prove nor exclude anything. Holes are assumed independent given the set-
 have the same prior probability."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from harness.evaluation.maps import MANY
+from harness.programs.thesis.cameras import CAMERA
 from harness.programs.thesis.claims import (
-    CAMERA,
     FEW,
     FOUND_WITH_FEW,
     FOUND_WITH_MANY,
@@ -21,12 +22,14 @@ from harness.programs.thesis.claims import (
 )
 from harness.vocabulary.path_names import in_words, names_of, value_text
 
-FEWEST_SET_UPS = 20  # fewest set-ups for which a posterior is computed
-# a value is doubted if its posterior probability is less than this share of its prior probability
+FEWEST_SET_UPS = 20
+"""Fewest set-ups for which a posterior is computed."""
 DOUBTED = 0.5
+"""A value is doubted if its posterior probability is less than this share of its prior one."""
 SET_UP = "set-up"
+"""Value of the column ``axis`` in the rows of whole set-ups."""
 KIND = "source.target.hole_kind"
-SPEAKS_OF = {
+KIND_WITH = {
     "source.target.blind_depth_mm": "blind",
     "source.target.backing_distance_mm": "through",
 }
@@ -40,72 +43,78 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     without both numbers of frames. The probability of a fact that only one kind of hole has is
     conditional on this kind."""
     rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
-    rows = rows[rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)]
+    rows_of_set_up = rows.groupby("variant")["hole"].transform("size")
+    rows = rows[rows_of_set_up == 2 * len(THESIS_HOLES)]
     if CAMERA in axes or rows["variant"].nunique() < FEWEST_SET_UPS:
         return None
+    log_likelihood = _log_likelihood(rows)
+    share = np.exp(log_likelihood - log_likelihood.max())
+    share = share / share.sum()
+    posterior: list[dict[str, Any]] = [
+        {
+            "axis": SET_UP,
+            "value": name,
+            "prior_share": 1 / len(share),
+            "likelihood": np.exp(log_likelihood[name]),
+            "posterior_share": probability,
+        }
+        for name, probability in share.sort_values(ascending=False, kind="stable").items()
+    ]
+    set_ups = rows.drop_duplicates("variant").set_index("variant")
+    for path, name in names_of(list(axes)).items():
+        possible = set_ups
+        kind = KIND_WITH.get(path)
+        if kind and KIND in axes:
+            possible = set_ups[set_ups[KIND] == kind]
+            name = f"{name} of {kind} holes"
+        for value, group in possible.groupby(path, dropna=False):
+            posterior.append(
+                {
+                    "axis": name,
+                    "value": value_text(path, value),
+                    "prior_share": len(group) / len(possible),
+                    "likelihood": float(np.exp(log_likelihood[group.index]).mean()),
+                    "posterior_share": float(
+                        share[group.index].sum() / share[possible.index].sum()
+                    ),
+                }
+            )
+    return pd.DataFrame(posterior)
+
+
+def _log_likelihood(rows: pd.DataFrame) -> pd.Series:
+    """Return the logarithm of the probability of the thesis' exact result by set-up, from rows of
+    both numbers of frames and all holes."""
     chance = (rows["detected"] + 0.5) / (rows["n"] + 1)
-    expected = np.where(
+    thesis_found = np.where(
         rows["frames"] == MANY,
         rows["hole"].isin(FOUND_WITH_MANY),
         rows["hole"].isin(FOUND_WITH_FEW),
     )
-    logs = (
-        pd.Series(np.log(np.where(expected, chance, 1 - chance)), rows.index)
-        .groupby(rows["variant"])
-        .sum()
-    )
-    share = np.exp(logs - logs.max())
-    share, prior = share / share.sum(), 1 / len(share)
-    found = [
-        {
-            "axis": SET_UP,
-            "value": name,
-            "prior_share": prior,
-            "likelihood": np.exp(logs[name]),
-            "posterior_share": post,
-        }
-        for name, post in share.sort_values(ascending=False, kind="stable").items()
-    ]
-    of_set_up = rows.drop_duplicates("variant").set_index("variant")
-    for path, name in names_of(list(axes)).items():
-        among = of_set_up
-        kind = SPEAKS_OF.get(path)
-        if kind and KIND in axes:
-            among = of_set_up[of_set_up[KIND] == kind]
-            name = f"{name} of {kind} holes"
-        for value, group in among.groupby(path, dropna=False):
-            own = {
-                "axis": name,
-                "value": value_text(path, value),
-                "prior_share": len(group) / len(among),
-            }
-            mean = float(np.exp(logs[group.index]).mean())
-            part = float(share[group.index].sum() / share[among.index].sum())
-            found.append({**own, "likelihood": mean, "posterior_share": part})
-    return pd.DataFrame(found)
+    agrees = pd.Series(np.log(np.where(thesis_found, chance, 1 - chance)), rows.index)
+    return agrees.groupby(rows["variant"]).sum()
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
     """Return a sentence on the facts that the thesis' result requires (the values of each axis
     that are not `DOUBTED`, without facts of a doubted kind of hole) and its probability in the
     likeliest set-up."""
-    best = posterior.iloc[0]
-    doubted = posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
+    likeliest = posterior.iloc[0]
+    is_set_up = posterior["axis"] == SET_UP
+    is_doubted = posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
+    doubted_values = posterior["value"][is_doubted]
     required = []
-    for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
-        kept = rows["value"][~doubted[rows.index]]
-        without = any(
-            str(name).endswith(f" of {kind} holes") for kind in posterior["value"][doubted]
-        )
-        required += (
-            [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
-        )
-    facts = (
-        "; ".join(required)
-        or "no particular fact holds (every value of every axis remains possible)"
-    )
+    for name, rows in posterior[~is_set_up].groupby("axis", sort=False):
+        possible = rows["value"][~is_doubted[rows.index]]
+        of_doubted_kind = any(str(name).endswith(f" of {value} holes") for value in doubted_values)
+        if len(possible) < len(rows) and not of_doubted_kind:
+            required.append(f"{name} is {' or '.join(possible)}")
+    if not required:
+        required.append("no particular fact holds (every value of every axis remains possible)")
     return (
-        f"The thesis' outcome is borne out if {facts} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
-        f"that the outcome makes less than half as probable are left out). In the likeliest set-up, "
-        f"{in_words(best['value'])}, the exact outcome has a probability of {best['likelihood']:.2g}."
+        f"The thesis' outcome is borne out if {'; '.join(required)} (of {int(is_set_up.sum())}"
+        " set-ups; values that the outcome makes less than half as probable are left out). In the"
+        f" likeliest set-up, {in_words(likeliest['value'])}, the exact outcome has a "
+        "probability of"
+        f" {likeliest['likelihood']:.2g}."
     )

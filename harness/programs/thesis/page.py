@@ -25,7 +25,7 @@ LEADS: dict[Answer, str] = {
     "not borne out": "Not in every respect",
     "undecided": "That is undecided",
 }
-"""Whether several views are better than one, by the verdict on the proposal."""
+"""The answer whether several views are better than one, by the verdict on the proposal."""
 
 
 def posterior_section(posterior: pd.DataFrame) -> list[Markup]:

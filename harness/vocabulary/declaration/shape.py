@@ -267,7 +267,8 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
     }
     if {"ge", "le"} <= bounds.keys():
         return f"{words} from {bounds['ge']} to {bounds['le']}"
-    return f"{words} {' and '.join(f'{BOUNDS[name]} {bound}' for name, bound in bounds.items())}".strip()
+    bound_texts = [f"{BOUNDS[name]} {bound}" for name, bound in bounds.items()]
+    return f"{words} {' and '.join(bound_texts)}".strip()
 
 
 def every_key(

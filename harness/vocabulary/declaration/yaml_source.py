@@ -25,12 +25,10 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
 
-SHOWN_COLUMNS = (
-    110  # Characters of a source line that a message shows; longer lines are cut around the caret
-)
-MAX_PROBLEMS = (
-    100  # Most problems that a message lists, and most that are searched for in a single mapping
-)
+# Characters of a source line that a message shows; longer lines are cut around the caret
+SHOWN_COLUMNS = 110
+# Most problems that a message lists, and most that are searched for in a single mapping
+MAX_PROBLEMS = 100
 
 
 @dataclass(frozen=True)

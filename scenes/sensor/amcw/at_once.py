@@ -6,11 +6,11 @@ first order, z is a moving sum of one normal per pixel, displaced and rounded in
 (`linear_frames`). Where a gate certainly stops it, nothing is drawn. All other pixels, mostly at
 rims, go through the whole chain (`listed`). Differences to real frames: amplitudes have their own
 noise, independent of that of z (in frames their correlation is at most 0.1); a pixel without a
-range has, in all its frames, the reason that its mean has; variance of second order (at most 2.5 %)
-is added to the centre's noise. The variance of averages of 50 frames of a board agrees to 0.002
+range has, in all its frames, the reason that its mean has; variance of second order (at most 2.5
+%) is added to the centre's noise. The variance of averages of 50 frames of a board agrees to 0.002
 (even pixels), 0.005 (uneven) and 0.017 (listed; tests/validation/at_once.py). Far behind a hole,
-where light is dim, the variance of means of 8 frames is 13 to 15 % less than that of single frames'
-means (standard error 3 %); the cause is not known."""
+where light is dim, the variance of means of 8 frames is 13 to 15 % less than that of single
+frames' means (standard error 3 %); the cause is not known."""
 
 from __future__ import annotations
 
@@ -173,8 +173,8 @@ def _metres_per_radian(imager: AmcwImager) -> np.ndarray:
 
 
 def _metres_by_phase(imager: AmcwImager, light: Light) -> np.ndarray:
-    """Return (f, n): metres of half path per radian of each phase, times the amplitude that carries
-    it, over its median."""
+    """Return (f, n): metres of half path per radian of each phase, times the amplitude that
+    carries it, over its median."""
     metres = _metres_per_radian(imager)
     if not imager.filter_settings.by_amplitude:
         return np.broadcast_to(metres, light.phase_noise.shape)
@@ -447,8 +447,8 @@ class AtOnce:
     def _finished(
         self, frames: int, part: int, linear_sums: _LinearSums, listed_sums: ListedSums
     ) -> FrameTotals:
-        """Return the sums over ``frames`` frames from those of the linear and of the listed pixels,
-        both at index ``part``."""
+        """Return the sums over ``frames`` frames from those of the linear and of the listed
+        pixels, both at index ``part``."""
         certain = self.certain
         shape = self.shape
         # the filter spreads the amplitude's noise over its window

@@ -1,5 +1,5 @@
-"""Pixels whose window shows one even surface: noise lowers the weight of all neighbours by the same
-share, which a table gives by the phase noise."""
+"""Pixels whose window shows one even surface: noise lowers the weight of all neighbours by the
+same share, which a table gives by the phase noise."""
 
 from typing import NamedTuple
 

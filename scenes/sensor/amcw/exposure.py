@@ -13,6 +13,7 @@ class AmcwExposure(NamedTuple):
     sigma: np.ndarray
     """(n,) float32: deviation of each sample."""
     limit: np.ndarray
-    """(n,) float32: largest sample that wells and converter hold; infinite if saturation is off."""
+    """(n,) float32: largest sample that wells and converter hold; infinite if saturation is off.
+    """
     shape: tuple[int, int]
     """(h, w) of the view."""

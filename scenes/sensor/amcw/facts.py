@@ -31,8 +31,8 @@ from scenes.sensor.common.facts import (
 
 
 class UnwrapTable(NamedTuple):
-    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path. Sums of the
-    wrapped phases that are whole numbers are a key of the wrap counts."""
+    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path. Sums of
+    the wrapped phases that are whole numbers are a key of the wrap counts."""
 
     lattice: np.ndarray
     """(f,) float32: integers m with f_k = m_k f_0."""
@@ -140,8 +140,8 @@ Phases = Annotated[
     Fact[int],
     checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3),
 ]
-# longest row with the filter's window: `kernels.STRIDE`, repeated here so that declarations compile
-# nothing
+# longest row with the filter's window: `kernels.STRIDE`, repeated here so that declarations
+# compile nothing
 WIDEST_PX = 2128
 
 
@@ -162,7 +162,8 @@ class EmitterFacts(ConeFacts):
             x, y = np.diff([*self.mask_slopes.value, *self.mask_slopes.value[:2]], axis=0).T
             if len(x) < 4 or not (x[:-1] * y[1:] - y[:-1] * x[1:] > 0).all():
                 raise ValueError(
-                    "mask_slopes must be the corners of a convex polygon, counter-clockwise in the "
+                    "mask_slopes must be the corners of a convex polygon, counter-clockwise "
+                    "in the "
                     "image's axes"
                 )
         return self
@@ -378,7 +379,10 @@ class AmcwCamera(CameraFacts):
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
             raise ValueError(
-                f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}"
+                
+                    f"lens.width_px is {self.lens.width_px.value}; the model allows at most "
+                    f"{widest_px}"
+                
             )
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
             raise ValueError(

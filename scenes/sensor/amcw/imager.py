@@ -210,8 +210,8 @@ class AmcwImager(UnitModel[AmcwCamera]):
         return samples
 
     def _largest_sample(self, both_wells: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-        """Return the largest sample (h, w) that fits, in converter units; infinite if saturation is
-        off. ``both_wells`` (h, w): electrons. ``share``: of the exposure, before it ends."""
+        """Return the largest sample (h, w) that fits, in converter units; infinite if saturation
+        is off. ``both_wells`` (h, w): electrons. ``share``: of the exposure, before it ends."""
         if not self.config.effects.saturation:
             return np.full(both_wells.shape, np.inf)
         photons = self.camera.photons

@@ -1,4 +1,5 @@
-"""The engine's filter to first order in the noise: the mean of each pixel, and its change by noise.
+"""The engine's filter to first order in the noise: the mean of each pixel, and its change by
+noise.
 
 The filtered phasor of a pixel is a sum over its window,
 
@@ -17,9 +18,9 @@ t_j its phase minus the centre's, and c the filter's concentration. Noise acts i
   phase noise s, and a neighbour's for less by c s^2.
 * Terms of second and third order are estimated; where they are large, frames must be drawn.
 
-`linearised` is the door. `scenes.sensor.amcw.linear_reference` has the same for one pixel, in NumPy
-and double precision. The compiled functions handle `ABREAST` pixels at once, side by side in one
-flat array, so that each inner loop is over one row of it and is vectorised."""
+`linearised` is the door. `scenes.sensor.amcw.linear_reference` has the same for one pixel, in
+NumPy and double precision. The compiled functions handle `ABREAST` pixels at once, side by side in
+one flat array, so that each inner loop is over one row of it and is vectorised."""
 
 from __future__ import annotations
 
@@ -38,8 +39,8 @@ DEVIATIONS = 4.5
 LARGEST_NORMAL = 0.35
 # limit of the phase noise in radians, which would be too large for float32 where there is no light
 LARGEST_PHASE_NOISE = 1e3
-# the mean resultant length of a phase is concave in 1 / noise: its slope at 0, sqrt(pi / 8), bounds
-# it
+# the mean resultant length of a phase is concave in 1 / noise: its slope at 0, sqrt(pi / 8),
+# bounds it
 RESULTANT_SLOPE = 0.6267
 # variance of (1 - cos)/2 of a uniform phase: no other phase scatters more
 UNIFORM_VARIANCE = 0.125
@@ -116,7 +117,8 @@ def linearised(
     lost: np.ndarray,
     filtered: Filtered,
 ) -> np.ndarray:
-    """Fill ``filtered`` at some pixels of a view, and return how each neighbour's noise turns them.
+    """Fill ``filtered`` at some pixels of a view, and return how each neighbour's noise turns
+    them.
 
     Args:
         pixels: (m,) flat indices; none of them is lost.
@@ -295,8 +297,8 @@ def _gather(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def _choose_neighbours(window, centre, neighbours, values, sums):  # type: ignore[no-untyped-def]
-    """Find which neighbours count, their weights, whether that is `CERTAIN`, and whether the linear
-    model `FITS`: certain, and not too noisy."""
+    """Find which neighbours count, their weights, whether that is `CERTAIN`, and whether the
+    linear model `FITS`: certain, and not too noisy."""
     dim = window.dim
     drop_dim = window.drop_dim
     for x in range(ROW):

@@ -1,14 +1,14 @@
 """Frames of the pixels whose z is linear in the noise: a moving sum of one normal per pixel.
 
-In a frame displaced by e steps, with u_j the normal of pixel j (times its noise), z in steps of the
-output is
+In a frame displaced by e steps, with u_j the normal of pixel j (times its noise), z in steps of
+the output is
 
     even pixels:    floor(z + p e + a sum_j w_j u_j + b u_centre + 1/2)
     uneven pixels:  floor(z + p e + sum_j m_j u_j + 1/2)
 
 with p the change of z by half path, w the weights by distance, and a, b and m of the pixel.
-`add_linear_frames` is the door; `scenes.sensor.amcw.linear_frames_reference` has the same in NumPy.
-Normals come from random bytes; `LANES` frames of a pixel stand side by side."""
+`add_linear_frames` is the door; `scenes.sensor.amcw.linear_frames_reference` has the same in
+NumPy. Normals come from random bytes; `LANES` frames of a pixel stand side by side."""
 
 from typing import NamedTuple
 

@@ -1,8 +1,8 @@
 """The linear model of `scenes.sensor.amcw.linear` for one pixel and frequency, in plain NumPy.
 
 Notation as there: t the neighbours' phases minus the centre's, s their weights by distance, v the
-variance of their phases, v0 that of the centre's, F(t) = exp(i t - c (1 - cos t)). For pixels whose
-neighbours certainly count and are not too noisy."""
+variance of their phases, v0 that of the centre's, F(t) = exp(i t - c (1 - cos t)). For pixels
+whose neighbours certainly count and are not too noisy."""
 
 from typing import NamedTuple
 

@@ -45,8 +45,8 @@ class ListedSums(NamedTuple):
 
 
 def listed_of(wanted: np.ndarray, side: int, flying: bool) -> Listed:
-    """Return the list for ``wanted`` (h, w) bool, with windows of ``side``. ``flying``: whether the
-    engine looks at a pixel's neighbours in the finished image."""
+    """Return the list for ``wanted`` (h, w) bool, with windows of ``side``. ``flying``: whether
+    the engine looks at a pixel's neighbours in the finished image."""
     ranges = pixels_within(wanted, 3) if flying else wanted
     halo = pixels_within(ranges, side)
     number_in_range = _running_numbers(ranges)

@@ -30,8 +30,8 @@ class Fact(Config, Generic[T]):
     """The number, in the unit that the key's name ends with."""
     tag: Literal["R", "D", "S", "W", "O", "C", "M", "G", "U"]
     """R: read in the named public source; D: derived from such; S: a single secondary source; W:
-    measured on public captures; O: measured on the owner's by `tofpod characterise`; C: calibrated;
-    M: a guess; G: a guess of the precision; U: set by the user of an experiment."""
+    measured on public captures; O: measured on the owner's by `tofpod characterise`; C:
+    calibrated; M: a guess; G: a guess of the precision; U: set by the user of an experiment."""
     source: str
     """The document or measurement that says so."""
     range: tuple[float, float] | None = None

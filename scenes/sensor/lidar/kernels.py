@@ -14,7 +14,8 @@ import numpy as np
 from harness.vocabulary.geometry import Reason
 from scenes.sensor.common.normals import FAST, IN_DOUBLE
 
-# samples of the correlation per spectral line in a period; two just represent it, four miss no peak
+# samples of the correlation per spectral line in a period; two just represent it, four miss no
+# peak
 SAMPLES_PER_LINE = 4
 # from a sample's parabola: three converge to 1e-7 of a sample even where two pulses almost
 # separate

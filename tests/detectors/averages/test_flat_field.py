@@ -272,6 +272,22 @@ def test_a_corrected_cloud_has_its_noise_and_the_map_s_left():
     assert single.mean_variance_m2 is None
 
 
+def test_the_map_s_variance_counts_along_the_axis() -> None:
+    """A range error of variance v makes one of z of v cos^2 of the ray's angle, beside the noise of
+    the frames."""
+    cloud = capture(5, wall(0.0))
+    zeros = np.zeros(cloud.valid.shape)
+    plain = corrected(cloud, FlatField(zeros, zeros, LENS, (0.5, 1.0)))
+    unsure = corrected(cloud, FlatField(zeros, zeros + 4e-6, LENS, (0.5, 1.0)))
+    assert plain.mean_variance_m2 is not None
+    assert unsure.mean_variance_m2 is not None
+    slopes = LENS.region_slopes(LENS.whole)
+    square_cosine = 1.0 / (1.0 + (slopes**2).sum(axis=-1))
+    added_m2 = unsure.mean_variance_m2 - plain.mean_variance_m2
+    np.testing.assert_allclose(added_m2, 4e-6 * square_cosine, rtol=1e-6)
+    assert square_cosine.min() < 0.9
+
+
 def test_pixels_without_a_pattern_stay_and_are_told():
     field = found(wall(0.0), poses=False).field
     cloud = capture(9, wall(0.0))

@@ -264,6 +264,25 @@ def test_the_misfit_of_noise_as_stated_is_1_and_that_of_twice_as_much_2() -> Non
     assert misfits == pytest.approx([1.0, 2.0], rel=0.08)
 
 
+def test_a_misfit_counts_the_six_parameters_and_the_pixels_left_out() -> None:
+    hole = np.array([6.2, 5.7, 4e-3, 0.004, 0.5])
+    blank = blank_patch(noise_m=3e-4, shape=(12, 13))
+    noise_m = 3e-4 * np.random.default_rng(6).standard_normal((12, 13))
+    near = np.zeros((12, 13), bool)
+    near[3:9, 3:10] = True
+    seen_m = pictures(blank, hole[None])[0] + noise_m
+    patch = whitened(replace(blank, residual_m=seen_m), WHITE, 0.0, near)
+    fit = fit_hole(patch, 6.0, 6.0, 4e-3, 0.004, 0.0)
+    fitted = np.array([[fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.wall]])
+    errors_m = pictures(patch, fitted)[0] + fit.offset_m - seen_m
+    deviations_m = np.hypot(3e-4, MODEL_ERROR * seen_m)
+    square = ((errors_m / deviations_m)[patch.used] ** 2).sum()
+    pixels = patch.used.sum() + patch.left_out
+    assert pixels == 12 * 13
+    expected = np.sqrt((square + patch.left_out) / (pixels - 6))
+    assert fit.misfit == pytest.approx(expected, rel=1e-6)
+
+
 def test_far_pixels_are_thinned_and_errors_of_the_model_added() -> None:
     patch = replace(blank_patch(noise_m=2e-4), residual_m=np.full((34, 37), 5e-3))
     vicinity = np.zeros((34, 37), bool)

@@ -13,6 +13,8 @@ from pydantic import ValidationError
 from detectors.findings.hole_model import HolePatch, pictures, sight
 from detectors.findings.measure import (
     HoleModelConfig,
+    _modelled,
+    _surroundings,
     blur_in_cells,
     extents,
     measure_detection,
@@ -310,6 +312,24 @@ def test_an_oblique_hole_has_the_diameter_and_the_place_of_its_mouth(
     assert m.model_note == ""
     assert m.model_diameter_m == pytest.approx(diameter_mm * 1e-3, abs=0.15e-3)
     np.testing.assert_allclose(m.model_centre_m, board.centre, atol=0.15e-3)
+
+
+def test_a_centre_s_error_is_that_along_one_axis() -> None:
+    """The error on the surface has two axes, which share the trace of its covariance."""
+    board = Board(12.7, 12.7)
+    cloud, evidence = board.seen(0.2, 1)
+    detection = strongest(cloud, evidence, 5.0)
+    around = _surroundings(cloud, evidence, detection, HoleModelConfig())
+    assert around is not None
+    fit, _ = _modelled(around, HoleModelConfig(), None)
+    assert fit is not None
+    u_m, v_m = np.linalg.norm(around.per_px_m, axis=1)
+    m = measure_detection(cloud, evidence, detection, HoleModelConfig())
+    # the derivatives by u and v are nearly at right angles
+    square_m2 = fit.covariance[0, 0] * u_m**2 + fit.covariance[1, 1] * v_m**2
+    assert m.model_centre_se_m == pytest.approx(np.sqrt(square_m2 / 2), rel=0.02)
+    assert m.model_depth_se_m == np.sqrt(fit.covariance[3, 3])
+    assert m.model_diameter_se_m == 2.0 * np.sqrt(fit.covariance[2, 2])
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,20 @@ def test_a_score_is_as_improbable_as_the_expected_number_of_clusters() -> None:
     assert missing.expected <= ALPHA < 3.0 * missing.expected
 
 
+def test_scores_fall_along_one_line_of_chance() -> None:
+    """The logarithm of the probability of two holes' scores and of the least size lie on a line
+    over their sizes."""
+    gone = scattered(np.random.default_rng(7), 0.2, 1) | disc(60.2, 45.3, 9) | disc(30, 60, 7)
+    missing = missing_returns(*looked(gone))
+    assert missing is not None
+    large, small = missing.detections
+    log_large = norm.logsf(large.score)
+    log_small = norm.logsf(small.score)
+    fall = (log_small - log_large) / (len(large.pixels) - len(small.pixels))
+    at_least = log_small + fall * (len(small.pixels) - missing.least_points)
+    assert at_least == pytest.approx(np.log(missing.expected), rel=1e-6)
+
+
 def depth_finding(pixels: np.ndarray, score: float = 9.0) -> Detection:
     return Detection(score, np.flatnonzero(pixels), np.zeros(3))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection
-from detectors.methods.local import LocalConfig, LocalDetector
+from detectors.methods.local import LocalConfig, LocalDetector, _scored
 from detectors.methods.matched import MatchedDetector
 from harness.testing import check_detector
 from harness.testing.synthetic_clouds import LENS, plane, with_gaps
@@ -215,6 +215,16 @@ def test_a_map_trusts_points_by_their_variance(detector: LocalDetector) -> None:
     gain = 1.2 if isinstance(detector, MatchedDetector) else 2.0
     assert scores[1] > gain * scores[0]
     assert scores[1] > 8
+
+
+def test_the_least_unit_is_what_rounding_leaves_in_a_mean() -> None:
+    """A tent over 3 pixels lowers the deviation of what differs from pixel to pixel to 2 / 9, and
+    nothing of what neighbours share."""
+    flat_m = np.zeros((80, 90))
+    weights = np.ones(flat_m.shape, np.float32)
+    for fixed_m2, random_m2, expected_m in ((4e-6, 0.0, 2e-3), (0.0, 4e-6, 2e-3 * 2 / 9)):
+        _, _, typical_m = _scored(flat_m, weights, (fixed_m2, random_m2))
+        assert typical_m == pytest.approx(expected_m, rel=1e-5)
 
 
 MOUTHS_U = (190, 300, 407, 517, 626, 736, 218, 321, 423, 729, 836, 944, 1059)

@@ -316,6 +316,9 @@ def test_what_the_rim_shares_is_taken_out_at_each_distance() -> None:
     shared[:, 2] = -1.0
     result = _without_rim(noise + shared, depth_px)
     remainder = result.mean(axis=0)
+    # what those next to the rim share too stays
+    level = _without_rim(noise + shared + np.float32(0.8), depth_px).mean(axis=0)
+    np.testing.assert_allclose(level[:RIM_PX], 0.8, atol=0.5)
     # 100 pixels, of which some 65 count at each
     assert np.abs(remainder[:RIM_PX]).max() < 0.35
     np.testing.assert_array_equal(result[:, RIM_PX:], noise[:, RIM_PX:])

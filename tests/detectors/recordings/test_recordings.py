@@ -140,11 +140,26 @@ def stray_scanner(tmp: Path) -> Recording:
 
 
 FORMATS = (
-    open3d, tum, sdk_names, file_list, npy_depth, npy_as_networks_take_it, npz_metres, npz_with_its_matrix_and_times,
-    npy_points, mat_grid, mat_frames_last,
-    mat_lists_on_a_lens, pcd, ply, xyz_with_a_stated_grid, csv_with_names_and_commas, raw_numbers, chosen_array,
+    open3d,
+    tum,
+    sdk_names,
+    file_list,
+    npy_depth,
+    npy_as_networks_take_it,
+    npz_metres,
+    npz_with_its_matrix_and_times,
+    npy_points,
+    mat_grid,
+    mat_frames_last,
+    mat_lists_on_a_lens,
+    pcd,
+    ply,
+    xyz_with_a_stated_grid,
+    csv_with_names_and_commas,
+    raw_numbers,
+    chosen_array,
     stray_scanner,
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("opened", FORMATS, ids=lambda f: f.__name__)
@@ -179,15 +194,18 @@ def test_a_cloud_keeps_colour_and_may_lack_a_grid(
 ) -> None:
     recording = open_capture([write(tmp_path / f"c.{suffix}", TRUE_M, False)])
     frame = next(recording.frames())
-    assert not recording.organised and recording.region.shape == (1, 72 * 96)
+    assert not recording.organised
+    assert recording.region.shape == (1, 72 * 96)
     np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
-    assert frame.rgb is not None and (frame.rgb == (16, 32, 48)).all()
+    assert frame.rgb is not None
+    assert (frame.rgb == (16, 32, 48)).all()
 
 
 def test_lists_of_points_without_a_lens_have_no_grid(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "c.mat", {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
     recording = open_capture([tmp_path / "c.mat"])
-    assert not recording.organised and len(list(recording.frames())) == 2
+    assert not recording.organised
+    assert len(list(recording.frames())) == 2
 
 
 def test_frames_stream_in_the_order_of_their_numbers_and_start_again(tmp_path: Path) -> None:
@@ -220,8 +238,9 @@ def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None
     for number, path in enumerate(pictures):
         path.rename(path.with_stem(str(100 + number)))
     recording = open_capture([folder])
-    told = f"{len(pictures)} colour pictures: 2 depth pictures have no colour"
-    assert any(told in note for note in recording.notes) and next(recording.frames()).rgb is None
+    message = f"{len(pictures)} colour pictures: 2 depth pictures have no colour"
+    assert any(message in note for note in recording.notes)
+    assert next(recording.frames()).rgb is None
 
 
 def test_colour_of_another_size_is_left_out_and_said(tmp_path: Path) -> None:
@@ -264,7 +283,6 @@ def test_the_rounding_step_is_found_in_floating_point_metres(step_m: float, seed
 
 
 # ---- lenses
-# ----------------------------------------------------------------------------------------------------------
 
 DISTORTION = (0.1, -0.2, 0.001, -0.002, 0.03, 0.4, 0.05, 0.006)
 
@@ -288,21 +306,28 @@ def opencv_yaml(lens: Lens) -> str:
     k = lens.matrix.ravel().tolist()
     d = list(lens.distortion)
     size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
-    return f"%YAML:1.0\n---\n{size}camera_matrix:{matrix(3, 3, k)}distortion_coefficients:{matrix(1, 8, d)}"
+    matrices = f"camera_matrix:{matrix(3, 3, k)}distortion_coefficients:{matrix(1, 8, d)}"
+    return f"%YAML:1.0\n---\n{size}{matrices}"
 
 
 def ros_yaml(lens: Lens) -> str:
     k = lens.matrix.ravel().tolist()
     d = list(lens.distortion)
     size = f"image_width: {lens.width}\nimage_height: {lens.height}\n"
-    matrices = f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\ndistortion_coefficients:\n  data: {d}\n"
-    return f"{size}camera_name: depth\ndistortion_model: rational_polynomial\n{matrices}"
+    return (
+        f"{size}camera_name: depth\ndistortion_model: rational_polynomial\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\n"
+        f"distortion_coefficients:\n  data: {d}\n"
+    )
 
 
 def ros_message(lens: Lens) -> str:
     k = lens.matrix.ravel().tolist()
     d = list(lens.distortion)
-    return f"height: {lens.height}\nwidth: {lens.width}\ndistortion_model: rational_polynomial\nD: {d}\nK: {k}\n"
+    return (
+        f"height: {lens.height}\nwidth: {lens.width}\n"
+        f"distortion_model: rational_polynomial\nD: {d}\nK: {k}\n"
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -336,16 +361,28 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
         ("500 510 300 200", (0.0,) * 8),
         ('{"intrinsic_matrix": [500, 0, 300, 0, 510, 200, 0, 0, 1]}', (0.0,) * 8),
         ('{"K": [500, 0, 0, 0, 510, 0, 300, 200, 1]}', (0.0,) * 8),
-        ('{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510, "coeffs": [0, 0, 0, 0, 0],'
-         ' "model": "distortion.inverse_brown_conrady"}', (0.0,) * 8),
-        ('{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576, "k1": 0.1, "k2": 0.2, "p1": 0.01,'
-         ' "p2": 0.02, "camera_model": "OPENCV", "frames": []}', (0.1, 0.2, 0.01, 0.02, 0, 0, 0, 0)),
-        ('{"0": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1},'
-         ' "1": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1}}', (0.0,) * 8),
-        ('{"color": {"fx": 900, "fy": 900, "cx": 640, "cy": 360}, "depth": {"fx": 500, "fy": 510, "cx": 300,'
-         ' "cy": 200}}', (0.0,) * 8),
+        (
+            '{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510,'
+            ' "coeffs": [0, 0, 0, 0, 0], "model": "distortion.inverse_brown_conrady"}',
+            (0.0,) * 8,
+        ),
+        (
+            '{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576,'
+            ' "k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.02, "camera_model": "OPENCV", "frames": []}',
+            (0.1, 0.2, 0.01, 0.02, 0, 0, 0, 0),
+        ),
+        (
+            '{"0": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1},'
+            ' "1": {"cam_K": [500, 0, 300, 0, 510, 200, 0, 0, 1], "depth_scale": 0.1}}',
+            (0.0,) * 8,
+        ),
+        (
+            '{"color": {"fx": 900, "fy": 900, "cx": 640, "cy": 360},'
+            ' "depth": {"fx": 500, "fy": 510, "cx": 300, "cy": 200}}',
+            (0.0,) * 8,
+        ),
     ),
-)  # fmt: skip
+)
 def test_lenses_as_other_programs_write_them(
     tmp_path: Path, text: str, distortion: tuple[float, ...]
 ) -> None:
@@ -379,7 +416,8 @@ def test_a_folder_of_arrays_is_one_capture(tmp_path: Path, suffix: str) -> None:
     recording = open_capture([tmp_path], unit="mm")
     for frame, number in zip(recording.frames(), (2, 9, 10), strict=True):
         assert np.allclose(1e3 * np.nan_to_num(frame.z_m), frames[number], atol=1e-3)
-    assert recording.lens == plane.LENS and len(recording.files) == 4
+    assert recording.lens == plane.LENS
+    assert len(recording.files) == 4
 
 
 def test_pages_of_a_tiff_are_frames_and_three_channels_are_points(tmp_path: Path) -> None:
@@ -403,9 +441,8 @@ def test_frames_along_the_last_axis(tmp_path: Path) -> None:
     for name, stack in (("three", frames), ("two", frames[:2]), ("one", frames[:1])):
         np.save(tmp_path / f"{name}.npy", np.moveaxis(stack, 0, -1))
         recording = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS)
-        assert recording.shape == frames.shape[1:] and any(
-            "last axis" in note for note in recording.notes
-        )
+        assert recording.shape == frames.shape[1:]
+        assert any("last axis" in note for note in recording.notes)
         for frame, stored in zip(recording.frames(), stack, strict=True):
             assert np.allclose(
                 frame.z_m, np.where(stored > 0, stored / 1e3, np.nan), equal_nan=True
@@ -420,7 +457,6 @@ def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
 
 
 # ---- real captures
-# ---------------------------------------------------------------------------------------------------
 
 
 def test_the_drilled_plate_opens_as_it_stands(shared_data: Path) -> None:
@@ -429,11 +465,13 @@ def test_the_drilled_plate_opens_as_it_stands(shared_data: Path) -> None:
         (float(np.nanmedian(frame.z_m)), frame.rgb is not None) for frame in recording.frames()
     ]
     medians = np.array([median for median, _ in frames])
-    assert len(frames) == 18 and recording.region.shape == (720, 1280)
+    assert len(frames) == 18
+    assert recording.region.shape == (720, 1280)
     # Frame 3 of this capture stands 18 mm behind all others.
     np.testing.assert_allclose(np.delete(medians, 3), 0.254, atol=1e-6)
     assert medians[3] == pytest.approx(0.272)
-    assert frames[0][1] and not any(coloured for _, coloured in frames[1:])
+    assert frames[0][1]
+    assert not any(coloured for _, coloured in frames[1:])
 
 
 def test_the_walls_need_a_lens_and_leave_their_mask_out(shared_data: Path) -> None:
@@ -462,17 +500,15 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
     (tmp_path / "calibration.json").write_bytes(plane.calibration().rstrip(b"\0"))
     cv2.imwrite(str(tmp_path / "depth0.png"), np.full((576, 640), 900, np.uint16))
     lens = open_capture([tmp_path]).lens
-    assert lens is not None and (lens.fx, lens.cx) == pytest.approx(
-        (0.49 * 1024, 0.51 * 1024 - 192.5)
-    )
+    assert lens is not None
+    assert (lens.fx, lens.cx) == pytest.approx((0.49 * 1024, 0.51 * 1024 - 192.5))
 
 
 # ---- lists of points
-# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("head", "apart", "rest"),
+    ("head", "separator", "ending"),
     (
         ("", " ", ""),
         ("//X,Y,Z,R,G,B\n", ",", ",16,32,48"),
@@ -482,15 +518,17 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
         ("", " ", " 0.5 -0.5 0.7"),
     ),
 )
-def test_lists_of_points_in_every_dialect(tmp_path: Path, head: str, apart: str, rest: str) -> None:
-    path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, apart, rest)
+def test_lists_of_points_in_every_dialect(
+    tmp_path: Path, head: str, separator: str, ending: str
+) -> None:
+    path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, separator, ending)
     recording = open_capture([path])
     frame = next(recording.frames())
-    assert not recording.organised and "unorganised points" in recording.notes[0]
+    assert not recording.organised
+    assert "unorganised points" in recording.notes[0]
     np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
-    assert (frame.rgb is not None) == ("16" in rest) and (frame.amplitude is not None) == (
-        "7" in rest.split("0.7")[0]
-    )
+    assert (frame.rgb is not None) == ("16" in ending)
+    assert (frame.amplitude is not None) == ("7" in ending.split("0.7")[0])
     if frame.rgb is not None:
         assert (frame.rgb == (16, 32, 48)).all()
 
@@ -501,13 +539,15 @@ def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do
     v, u = np.mgrid[:192, :256]
     points = np.stack([(u - 127) / 210, (v - 95) / 210, np.ones(u.shape)], axis=-1) * 0.8
     grid = open_capture([plane.write_points(tmp_path / "a.xyz", points)])
-    assert grid.organised and grid.region.shape == (192, 256)
+    assert grid.organised
+    assert grid.region.shape == (192, 256)
     # Arena and pylon leave a cloud's grid out, or state it in a comment; their points without
     # return are 0 0 0
     points[3, 5] = 0
     bare = plane.write_ply(tmp_path / "a.ply", points, grid=False)
     recording = open_capture([bare])
-    assert recording.organised and next(recording.frames()).reason[3, 5] == Reason.NO_RETURN
+    assert recording.organised
+    assert next(recording.frames()).reason[3, 5] == Reason.NO_RETURN
     stated = plane.write_ply(tmp_path / "b.ply", TRUE_M, grid=False)
     stated.write_bytes(
         stated.read_bytes().replace(b"element", b"comment Width=96, Height=72\nelement", 1)
@@ -518,11 +558,10 @@ def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do
 
 
 # ---- height maps
-# -----------------------------------------------------------------------------------------------------
 
 
 def height_map(relief: float = 1.0) -> np.ndarray:
-    """(72, 96) millimetres: a slope, with a pit 3 mm deep of radius 6 pixels at column 60, row 30."""
+    """(72, 96) millimetres: a slope; a pit 3 mm deep of radius 6 pixels at column 60, row 30."""
     v, u = np.mgrid[:72, :96]
     return relief * (100 + 0.02 * u - 3.0 * (np.hypot(u - 60, v - 30) < 6))
 
@@ -533,16 +572,21 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", height=heights, other=np.zeros((3, 3)))
     recording = open_capture([tmp_path / "a.npz"], pitch="0.5mm")
     frame = next(recording.frames())
-    assert recording.projection == "parallel" and recording.organised and recording.scale_m == 1e-3
-    assert "towards the viewer" in recording.notes[0] and "relief" in recording.unit_from
-    assert frame.reason[3, 5] == Reason.NO_RETURN and np.isnan(frame.z_m[3, 5])
+    assert recording.projection == "parallel"
+    assert recording.organised
+    assert recording.scale_m == 1e-3
+    assert "towards the viewer" in recording.notes[0]
+    assert "relief" in recording.unit_from
+    assert frame.reason[3, 5] == Reason.NO_RETURN
+    assert np.isnan(frame.z_m[3, 5])
     assert frame.xy_m is not None
     np.testing.assert_allclose(frame.xy_m[0, 1] - frame.xy_m[0, 0], (0.5e-3, 0), atol=1e-12)
     # a pit lies farther from the viewer
     assert frame.z_m[30, 60] - frame.z_m[30, 70] == pytest.approx(3e-3 + 0.2e-3, abs=1e-6)
     scipy.io.savemat(tmp_path / "a.mat", {"depth": -height_map(1e-3)})
     down = open_capture([tmp_path / "a.mat"], pitch="500um")
-    assert down.scale_m == 1 and "away from the viewer" in down.notes[0]
+    assert down.scale_m == 1
+    assert "away from the viewer" in down.notes[0]
     np.testing.assert_allclose(next(down.frames()).z_m[30, 60], frame.z_m[30, 60], atol=1e-4)
 
 
@@ -566,11 +610,11 @@ def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
             if row["kind"] != "no return"
         ]
         assert len(findings) == lines
-    assert findings[0]["kind"] == "hole" and float(findings[0]["u_px"]) == pytest.approx(120, abs=2)
+    assert findings[0]["kind"] == "hole"
+    assert float(findings[0]["u_px"]) == pytest.approx(120, abs=2)
 
 
 # ---- phones
-# ----------------------------------------------------------------------------------------------------------
 
 
 def test_pixels_of_low_confidence_are_no_return_and_motion_is_warned_of(tmp_path: Path) -> None:
@@ -580,11 +624,14 @@ def test_pixels_of_low_confidence_are_no_return_and_motion_is_warned_of(tmp_path
     cv2.imwrite(str(folder / "confidence" / "000001.png"), low)
     recording = open_capture([folder])
     frames = list(recording.frames())
-    assert recording.warnings == () and (frames[1].reason[low == 0] == Reason.NO_RETURN).all()
-    assert np.isfinite(frames[0].z_m[10, 30]) and np.isfinite(frames[1].z_m[9, 30])
+    assert recording.warnings == ()
+    assert (frames[1].reason[low == 0] == Reason.NO_RETURN).all()
+    assert np.isfinite(frames[0].z_m[10, 30])
+    assert np.isfinite(frames[1].z_m[9, 30])
     moved = plane.write_stray(tmp_path / "moved", 3, step_m=0.02)
     warning = open_capture([moved]).warnings[0]
-    assert "moved by 40 mm" in warning and "--max-frames 1" in warning
+    assert "moved by 40 mm" in warning
+    assert "--max-frames 1" in warning
     assert open_capture([moved], frames=slice(1)).warnings == ()
 
 
@@ -593,7 +640,8 @@ def test_record3d_keeps_its_depth_compressed(tmp_path: Path) -> None:
     recording = open_capture([plane.write_r3d(tmp_path / "a.r3d", 2)])
     frame = next(recording.frames())
     np.testing.assert_allclose(points_of(recording, frame), TRUE_M, atol=1e-6)
-    assert recording.warnings == () and len(list(recording.frames())) == 2
+    assert recording.warnings == ()
+    assert len(list(recording.frames())) == 2
     assert (
         "moved by 50 mm"
         in open_capture([plane.write_r3d(tmp_path / "b.r3d", 2, step_m=0.05)]).warnings[0]

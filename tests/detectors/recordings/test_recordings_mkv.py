@@ -31,7 +31,6 @@ def refusal(path: Path) -> str:
 
 
 # ---- the calibration
-# -------------------------------------------------------------------------------------------------
 
 
 def test_the_nfov_lens_by_hand() -> None:
@@ -44,7 +43,7 @@ def test_the_nfov_lens_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "other", "scale", "shift"),
+    ("mode", "second_mode", "scale", "shift"),
     (
         ("NFOV_UNBINNED", "WFOV_UNBINNED", 1, (192, 180)),
         ("NFOV_2X2BINNED", "NFOV_UNBINNED", 2, (0, 0)),
@@ -52,28 +51,29 @@ def test_the_nfov_lens_by_hand() -> None:
     ),
 )
 def test_modes_look_along_the_same_rays(
-    mode: str, other: str, scale: int, shift: tuple[int, int]
+    mode: str, second_mode: str, scale: int, shift: tuple[int, int]
 ) -> None:
     """A pixel of a crop, or the middle of four binned pixels, sees what it sees on the whole
     sensor."""
     u, v = np.meshgrid(np.linspace(100, 200, 5), np.linspace(100, 200, 5))
     there_u = scale * u + (scale - 1) / 2 + shift[0]
     there_v = scale * v + (scale - 1) / 2 + shift[1]
-    here = depth_lens("test", CAMERAS, mode).slopes(u, v)
+    slopes = depth_lens("test", CAMERAS, mode).slopes(u, v)
     np.testing.assert_allclose(
-        here, depth_lens("test", CAMERAS, other).slopes(there_u, there_v), atol=1e-9
+        slopes, depth_lens("test", CAMERAS, second_mode).slopes(there_u, there_v), atol=1e-9
     )
 
 
 def test_colour_modes_are_crops_of_one_picture() -> None:
-    whole = colour_camera("test", CAMERAS, 4096, 3072)
+    full_sensor = colour_camera("test", CAMERAS, 4096, 3072)
     cropped = colour_camera("test", CAMERAS, 1280, 720)
-    assert whole is not None and cropped is not None
+    assert full_sensor is not None
+    assert cropped is not None
     # 1280 x 960 scaled down from 4096 x 3072, then rows 120 to 839
     u = 300.0
     v = 200.0
     scale = 3.2
-    expected = whole.lens.slopes(
+    expected = full_sensor.lens.slopes(
         np.array((u + 0.5) * scale - 0.5), np.array((v + 120 + 0.5) * scale - 0.5)
     )
     np.testing.assert_allclose(cropped.lens.slopes(np.array(u), np.array(v)), expected, atol=1e-12)
@@ -88,12 +88,13 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
     numbers[1], numbers[3] = (0.5 * 3072 - 384) / 2304, 0.64 * 3072 / 2304
     early = colour_camera("test", parse_calibration("test", json.dumps(data).encode()), 1280, 720)
     late = colour_camera("test", CAMERAS, 1280, 720)
-    assert early is not None and late is not None
+    assert early is not None
+    assert late is not None
     assert (early.lens.fy, early.lens.cy) == pytest.approx((late.lens.fy, late.lens.cy))
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "told"),
+    ("path", "value", "message"),
     (
         (("Intrinsics", "ModelType"), "CALIBRATION_LensDistortionModelOther", "ModelOther"),
         (("Intrinsics", "ModelParameters"), [1.0], "1 parameters"),
@@ -103,19 +104,18 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
     ),
 )
 def test_a_calibration_that_is_not_understood_is_refused(
-    path: tuple[str, ...], value: object, told: str
+    path: tuple[str, ...], value: object, message: str
 ) -> None:
     data = json.loads(plane.calibration().rstrip(b"\0"))
-    place = data["CalibrationInformation"]["Cameras"][0]
+    camera = data["CalibrationInformation"]["Cameras"][0]
     for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = value
-    with pytest.raises(UserError, match=told):
+        camera = camera[key]
+    camera[path[-1]] = value
+    with pytest.raises(UserError, match=message):
         depth_lens("test", parse_calibration("test", json.dumps(data).encode()), "NFOV_UNBINNED")
 
 
 # ---- colour
-# ----------------------------------------------------------------------------------------------------------
 
 
 def test_colour_is_taken_where_the_point_appears_in_the_colour_camera() -> None:
@@ -136,7 +136,6 @@ def test_colour_is_taken_where_the_point_appears_in_the_colour_camera() -> None:
 
 
 # ---- the file
-# --------------------------------------------------------------------------------------------------------
 
 
 def test_a_recording_gives_its_pictures_together(tmp_path: Path) -> None:
@@ -150,8 +149,10 @@ def test_a_recording_gives_its_pictures_together(tmp_path: Path) -> None:
     assert [frame.name for frame in read] == ["r.mkv frame 0", "r.mkv frame 1", "r.mkv frame 2"]
     for i, frame in enumerate(read):
         np.testing.assert_allclose(frame.z_m, 1.0 + i / 1000, atol=1e-6)
-        assert frame.amplitude is not None and (frame.amplitude == 100 + i).all()
-        assert frame.rgb is not None and frame.rgb[288, 320].tolist() == [10 + i, 20 + i, 30 + i]
+        assert frame.amplitude is not None
+        assert (frame.amplitude == 100 + i).all()
+        assert frame.rgb is not None
+        assert frame.rgb[288, 320].tolist() == [10 + i, 20 + i, 30 + i]
 
 
 def test_captures_without_depth_are_skipped(tmp_path: Path) -> None:
@@ -166,15 +167,14 @@ def test_captures_without_depth_are_skipped(tmp_path: Path) -> None:
 
 
 def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
-    whole = plane.write_mkv(
+    intact = plane.write_mkv(
         tmp_path / "r.mkv", [{"DEPTH": DEPTH}] * 3, attached=plane.calibration()
     )
-    content = whole.read_bytes()
+    content = intact.read_bytes()
     for part in (0.0, 0.001, 0.3, 0.7, 0.99):
         (tmp_path / "cut.mkv").write_bytes(content[: int(part * len(content))])
-        assert "cut.mkv" in refusal(tmp_path / "cut.mkv") and "truncated" in refusal(
-            tmp_path / "cut.mkv"
-        )
+        assert "cut.mkv" in refusal(tmp_path / "cut.mkv")
+        assert "truncated" in refusal(tmp_path / "cut.mkv")
     assert "no DEPTH track (its tracks: IR)" in refusal(
         plane.write_mkv(tmp_path / "ir.mkv", [{"IR": DEPTH}])
     )
@@ -184,7 +184,8 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
     odd = plane.write_mkv(
         tmp_path / "odd.mkv", [{"DEPTH": DEPTH}], "PASSIVE_IR", plane.calibration()
     )
-    assert "PASSIVE_IR" in refusal(odd) and "NFOV_UNBINNED" in refusal(odd)
+    assert "PASSIVE_IR" in refusal(odd)
+    assert "NFOV_UNBINNED" in refusal(odd)
     wrong = plane.write_mkv(
         tmp_path / "wrong.mkv", [{"DEPTH": DEPTH}], "WFOV_UNBINNED", plane.calibration()
     )
@@ -195,7 +196,6 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
 
 
 # ---- a real one
-# ------------------------------------------------------------------------------------------------------
 
 
 def plane_rms_mm(points: np.ndarray) -> float:
@@ -206,7 +206,9 @@ def plane_rms_mm(points: np.ndarray) -> float:
 def test_the_calibration_flattens_a_real_wall(shared_data: Path) -> None:
     recording = open_capture([shared_data / "azure_mkv" / "recording.mkv"])
     (frame,) = recording.frames()
-    assert frame.rgb is not None and frame.amplitude is not None and recording.lens is not None
+    assert frame.rgb is not None
+    assert frame.amplitude is not None
+    assert recording.lens is not None
     cut = slice(60, 260), slice(20, 230)  # the papered wall on the left
     valid = frame.reason[cut] == Reason.VALID
     z = frame.z_m[cut][valid].astype(float)[:, None]
@@ -224,7 +226,8 @@ def test_real_colour_falls_on_the_depth_pixels(shared_data: Path) -> None:
     """The window's blind is bright in colour and dark in infrared: its edge must lie on the same
     pixels in both."""
     (frame,) = open_capture([shared_data / "azure_mkv" / "recording.mkv"]).frames()
-    assert frame.rgb is not None and frame.amplitude is not None
+    assert frame.rgb is not None
+    assert frame.amplitude is not None
     rows = slice(160, 300)
     grey = np.abs(np.diff(frame.rgb[rows, 380:450].mean(axis=(0, 2))))
     infrared = np.abs(np.diff(frame.amplitude[rows, 380:450].mean(axis=0)))
@@ -239,6 +242,5 @@ def test_a_recording_without_the_tag_of_its_mode_has_the_mode_of_its_size(tmp_pa
         tmp_path / "femto.mkv", [{"DEPTH": depth}], mode="", attached=plane.calibration()
     )
     lens = open_capture([path]).lens
-    assert lens is not None and (lens.fx, lens.cx) == pytest.approx(
-        (0.49 * 1024, 0.51 * 1024 - 192.5)
-    )
+    assert lens is not None
+    assert (lens.fx, lens.cx) == pytest.approx((0.49 * 1024, 0.51 * 1024 - 192.5))

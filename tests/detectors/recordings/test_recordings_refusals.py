@@ -45,15 +45,15 @@ def cut(path: Path, part: float) -> Path:
 
 def test_a_missing_path_is_named(tmp_path: Path) -> None:
     message = refusal(tmp_path / "nowhere")
-    assert str(tmp_path / "nowhere") in message and ".mkv" in message
+    assert str(tmp_path / "nowhere") in message
+    assert ".mkv" in message
 
 
 def test_an_unknown_kind_of_file_lists_the_known_ones(tmp_path: Path) -> None:
     (tmp_path / "scan.las").write_bytes(b"LASF")
     message = refusal(tmp_path / "scan.las")
-    assert "'.las'" in message and all(
-        kind in message for kind in (".png", ".ply", ".npz", ".mat", ".mkv")
-    )
+    assert "'.las'" in message
+    assert all(kind in message for kind in (".png", ".ply", ".npz", ".mat", ".mkv"))
 
 
 def test_a_mixed_list_is_refused(tmp_path: Path) -> None:
@@ -74,11 +74,12 @@ def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:
         refusal(tmp_path).splitlines()[0] == f"{tmp_path}: contains no capture; it holds notes.txt"
     )
     bag = bags.write_bag(tmp_path / "left", bags.clouds(1))
-    other = tmp_path / "other.mkv"
-    other.touch()
+    second = tmp_path / "other.mkv"
+    second.touch()
     plane.write_open3d_folder(tmp_path / "right", 1)
-    said = refusal(tmp_path)
-    assert f"to do: name one of {bag}, {other}, {tmp_path / 'right'}" in said and ".npz" in said
+    message = refusal(tmp_path)
+    assert f"to do: name one of {bag}, {second}, {tmp_path / 'right'}" in message
+    assert ".npz" in message
 
 
 @pytest.mark.parametrize("part", (0.0, 0.02, 0.5, 0.98))
@@ -86,7 +87,8 @@ def test_a_truncated_picture_is_named(tmp_path: Path, part: float) -> None:
     folder = plane.write_open3d_folder(tmp_path / "c", 3)
     cut(folder / "depth" / "00001.png", part)
     message = refusal(folder)
-    assert "00001.png" in message and "truncated" in message
+    assert "00001.png" in message
+    assert "truncated" in message
 
 
 def test_a_damaged_picture_is_named(tmp_path: Path) -> None:
@@ -98,16 +100,18 @@ def test_a_damaged_picture_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stored", "told"),
+    ("stored", "picture_kind"),
     ((np.zeros((72, 96), np.uint8), "8 bits"), (np.ones((72, 96, 3), np.uint16), "RGB")),
 )
 def test_a_picture_that_is_no_depth_image_is_named(
-    tmp_path: Path, stored: np.ndarray, told: str
+    tmp_path: Path, stored: np.ndarray, picture_kind: str
 ) -> None:
     png(tmp_path / "1.png")
     png(tmp_path / "2.png", stored)
     message = refusal(tmp_path, lens=plane.LENS)
-    assert "2.png" in message and told in message and "16-bit" in message
+    assert "2.png" in message
+    assert picture_kind in message
+    assert "16-bit" in message
     assert "2.png" in refusal(tmp_path / "2.png", lens=plane.LENS)
 
 
@@ -115,7 +119,8 @@ def test_sizes_that_differ_name_both_pictures(tmp_path: Path) -> None:
     png(tmp_path / "1.png")
     png(tmp_path / "2.png", STORED[:-2])
     message = refusal(tmp_path, lens=plane.LENS)
-    assert "2.png: 96 x 70" in message and "first frame has 96 x 72" in message
+    assert "2.png: 96 x 70" in message
+    assert "first frame has 96 x 72" in message
 
 
 def test_clouds_of_different_sizes_are_named(tmp_path: Path) -> None:
@@ -153,7 +158,8 @@ def test_a_wrong_unit_is_noticed_and_the_right_one_offered(
 ) -> None:
     np.save(tmp_path / "d.npy", stored)
     message = refusal(tmp_path / "d.npy", lens=plane.LENS, unit=unit)
-    assert "wrong unit" in message and advice in message
+    assert "wrong unit" in message
+    assert advice in message
 
 
 def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
@@ -162,11 +168,9 @@ def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
 
 def test_depth_without_a_lens_says_what_to_give(tmp_path: Path) -> None:
     message = refusal(png(tmp_path / "1.png"))
-    assert (
-        "lens of these depth images" in message
-        and "--intrinsics" in message
-        and "camera_info" in message
-    )
+    assert "lens of these depth images" in message
+    assert "--intrinsics" in message
+    assert "camera_info" in message
 
 
 def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
@@ -177,7 +181,7 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("array", "told"),
+    ("array", "message"),
     (
         (np.zeros((4, 5), np.uint8), "8-bit"),
         (np.zeros((4, 5), bool), "bool"),
@@ -190,10 +194,10 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
     ),
 )
 def test_an_array_that_is_no_capture_is_refused(
-    tmp_path: Path, array: np.ndarray, told: str
+    tmp_path: Path, array: np.ndarray, message: str
 ) -> None:
     np.save(tmp_path / "a.npy", array)
-    assert told in refusal(tmp_path / "a.npy", lens=plane.LENS)
+    assert message in refusal(tmp_path / "a.npy", lens=plane.LENS)
 
 
 @pytest.mark.parametrize("planes", ("x y z", "red green blue depth", "depth confidence"))
@@ -218,7 +222,8 @@ def test_planes_that_are_no_frames_of_one_scene_are_refused(
     np.save(tmp_path / "a.npy", np.stack([values[name] for name in names], axis=axis))
     if (planes, axis) != ("x y z", -1):  # these are points
         message = refusal(tmp_path / "a.npy", lens=plane.LENS)
-        assert f"{len(names)} planes" in message and "--array :N" in message
+        assert f"{len(names)} planes" in message
+        assert "--array :N" in message
         frame = next(
             open_capture([tmp_path / "a.npy"], lens=plane.LENS, array=f":{number}").frames()
         )
@@ -274,9 +279,9 @@ def test_a_folder_whose_depth_lies_in_arrays_beside_pictures_names_them(tmp_path
 
 
 def test_files_that_are_not_read_are_told_how_to_be_converted(tmp_path: Path) -> None:
-    for name, told in (("a.exr", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
+    for name, message in (("a.exr", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
         (tmp_path / name).write_bytes(b"abc")
-        assert told in refusal(tmp_path / name)
+        assert message in refusal(tmp_path / name)
 
 
 def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
@@ -302,7 +307,7 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     (
         ("", "no line of numbers"),
         ("x y z\n", "no line of numbers"),
@@ -314,9 +319,9 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
         ("9" * 400 + " 1 1\n", "wrong unit|no valid pixel|finite"),
     ),
 )
-def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, told: str) -> None:
+def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "a.xyz").write_text(text)
-    assert re.search(told, refusal(tmp_path / "a.xyz"))
+    assert re.search(message, refusal(tmp_path / "a.xyz"))
 
 
 def test_a_height_map_that_is_none_is_explained(tmp_path: Path) -> None:
@@ -363,17 +368,16 @@ EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location',
 
 def test_a_saved_point_cloud_object_gets_the_line_that_exports_it(tmp_path: Path) -> None:
     message = refusal(plane.write_opaque_mat(tmp_path / "pc.mat"))
-    assert (
-        "it holds a MATLAB object, which cannot be read outside MATLAB" in message
-        and EXPORT in message
-    )
+    assert "it holds a MATLAB object, which cannot be read outside MATLAB" in message
+    assert EXPORT in message
 
 
 def test_a_v73_file_is_told_how_to_be_saved(tmp_path: Path) -> None:
     head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(100)
     (tmp_path / "a.mat").write_bytes(head)
     message = refusal(tmp_path / "a.mat")
-    assert "-v7.3" in message and "'-v7'" in message
+    assert "-v7.3" in message
+    assert "'-v7'" in message
 
 
 @pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
@@ -385,9 +389,9 @@ def test_a_truncated_cloud_is_named(
     missing: int,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    whole = write(tmp_path / f"c.{suffix}", plane.points_m(STORED)).stat().st_size
+    intact_bytes = write(tmp_path / f"c.{suffix}", plane.points_m(STORED)).stat().st_size
     message = refusal(
-        write(tmp_path / f"c.{suffix}", plane.points_m(STORED), cut=min(missing, whole))
+        write(tmp_path / f"c.{suffix}", plane.points_m(STORED), cut=min(missing, intact_bytes))
     )
     assert f"c.{suffix}" in message
     assert capfd.readouterr().out == ""
@@ -397,7 +401,8 @@ def test_a_cloud_on_both_sides_of_the_camera_is_refused(tmp_path: Path) -> None:
     points = plane.points_m(STORED) * [1, -1, -1]
     points[:20] *= [1, -1, -1]
     message = refusal(plane.write_pcd(tmp_path / "c.pcd", points))
-    assert "behind the camera" in message and "negate" in message
+    assert "behind the camera" in message
+    assert "negate" in message
     centred = plane.points_m(STORED) - np.nanmean(plane.points_m(STORED), axis=(0, 1))
     assert "behind the camera" in refusal(plane.write_pcd(tmp_path / "d.pcd", centred))
     assert "behind the camera" in refusal(
@@ -409,15 +414,15 @@ def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> Non
     message = refusal(
         plane.write_pcd(tmp_path / "c.pcd", plane.points_m(STORED) + np.array([431.0, 58.0, 0.0]))
     )
-    assert "off the camera's axis" in message and "another frame" in message
+    assert "off the camera's axis" in message
+    assert "another frame" in message
 
 
 # ---- lenses
-# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     (
         ('{"fx": 500, "fy": 500, "cx": 300}', "its keys: fx, fy, cx"),
         ('{"fx": 500, "fx": 500, "fy": 500, "cx": 300, "cy": 200}', "fx occurs twice"),
@@ -435,23 +440,26 @@ def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> Non
         ),
         ('{"intrinsic_matrix": [1, 2, 3]}', "list of 9"),
         (
-            "K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\nD: [.1, 0, 0, 0]\ndistortion_model: equidistant",
+            "K: [500, 0, 300, 0, 500, 200, 0, 0, 1]\nD: [.1, 0, 0, 0]\n"
+            "distortion_model: equidistant",
             "equidistant",
         ),
         (
-            '{"a": {"fx": 500, "fy": 500, "cx": 300, "cy": 200}, "b": {"fx": 400, "fy": 500, "cx": 300, "cy": 200}}',
+            '{"a": {"fx": 500, "fy": 500, "cx": 300, "cy": 200},'
+            ' "b": {"fx": 400, "fy": 500, "cx": 300, "cy": 200}}',
             "2 dif",
         ),
         ("fx: 500\nfx: 500\n", ":2:1:"),
         ("just text", "no keys"),
     ),
 )
-def test_a_faulty_lens_file_is_explained(tmp_path: Path, text: str, told: str) -> None:
+def test_a_faulty_lens_file_is_explained(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "lens.txt"
     path.write_text(text)
     with pytest.raises(UserError) as caught:
         read_lens(path, 640, 576)
-    assert told in str(caught.value) and "lens.txt" in str(caught.value)
+    assert message in str(caught.value)
+    assert "lens.txt" in str(caught.value)
 
 
 def test_a_missing_lens_file_is_named(tmp_path: Path) -> None:

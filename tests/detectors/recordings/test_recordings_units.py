@@ -40,7 +40,6 @@ def opened(
 
 
 # ---- codes for no return
-# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -89,7 +88,8 @@ def test_no_return_is_said_and_left_out(tmp_path: Path) -> None:
     stored[:7] = 65535
     recording = opened(tmp_path / "c", stored)
     frame = next(recording.frames())
-    assert (frame.reason[:7] == Reason.NO_RETURN).all() and np.isfinite(frame.z_m[7:]).all()
+    assert (frame.reason[:7] == Reason.NO_RETURN).all()
+    assert np.isfinite(frame.z_m[7:]).all()
     assert "65535 is read as no return, 9.7 % of pixels" in recording.notes
 
 
@@ -102,7 +102,6 @@ def test_a_cloud_that_looks_backwards_is_turned_and_said(tmp_path: Path) -> None
 
 
 # ---- units
-# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -133,17 +132,18 @@ def test_the_unit_is_told_by_the_data_and_printed(
 def test_where_two_units_are_plausible_it_asks(tmp_path: Path, unit_m: float) -> None:
     with pytest.raises(UserError, match="nothing states the unit") as caught:
         opened(tmp_path / "c", noisy(0.9, unit_m))
-    assert f"--unit {1 / unit_m:.0f}/m (0.9 m)" in str(caught.value) and "--unit mm (" in str(
-        caught.value
-    )
+    assert f"--unit {1 / unit_m:.0f}/m (0.9 m)" in str(caught.value)
+    assert "--unit mm (" in str(caught.value)
     recording = opened(tmp_path / "c", noisy(0.9, unit_m), unit=f"{1 / unit_m:.0f}/m")
-    assert recording.warnings == () and f"from --unit {1 / unit_m:.0f}/m" in recording.unit_text
+    assert recording.warnings == ()
+    assert f"from --unit {1 / unit_m:.0f}/m" in recording.unit_text
 
 
 def test_a_camera_with_millimetres_is_believed_within_its_reach_only(tmp_path: Path) -> None:
     assert opened(tmp_path / "near", np.full((576, 640), 1700), lens=LENS).warnings == ()
     (warning,) = opened(tmp_path / "far", np.full((576, 640), 3200), lens=LENS).warnings
-    assert "3.2 m" in warning and "--unit 4000/m (0.8 m)" in warning
+    assert "3.2 m" in warning
+    assert "--unit 4000/m (0.8 m)" in warning
     with pytest.raises(UserError, match="--unit 4000/m"):
         opened(tmp_path / "beyond", np.full((576, 640), 5200), lens=LENS)
 
@@ -165,10 +165,8 @@ def test_a_file_beside_the_pictures_states_the_unit(
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "metadata.json").write_text(json.dumps({"serial": "f1", key: value}))
     recording = opened(tmp_path / "c", noisy(0.9, unit_mm / 1e3))
-    assert (
-        recording.unit_text == f"depth unit {unit_mm:g} mm, from metadata.json"
-        and not recording.warnings
-    )
+    assert recording.unit_text == f"depth unit {unit_mm:g} mm, from metadata.json"
+    assert not recording.warnings
     assert np.nanmedian(next(recording.frames()).z_m) == pytest.approx(0.9, rel=0.02)
 
 
@@ -183,10 +181,10 @@ def test_inches_are_asked_for_and_read(tmp_path: Path) -> None:
 def test_lengths_along_the_rays_are_told_from_z(tmp_path: Path) -> None:
     z_m = 0.7 + np.random.default_rng(2).normal(0, 1e-4, (72, 96)) + 0.1 * plane.slopes()[..., 0]
     along = z_m * np.linalg.norm(np.dstack([plane.slopes(), np.ones_like(z_m)]), axis=-1)
-    for name, stored, told in (("z", z_m, 0), ("range", along, 1)):
+    for name, stored, doubts in (("z", z_m, 0), ("range", along, 1)):
         np.save(tmp_path / f"{name}.npy", stored)
         warnings = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS).warnings
-        assert sum("lengths along the rays" in text for text in warnings) == told
+        assert sum("lengths along the rays" in text for text in warnings) == doubts
 
 
 def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
@@ -201,7 +199,6 @@ def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
 
 
 # ---- named cameras and lenses of other sizes
-# -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -220,9 +217,8 @@ def test_a_named_camera_knows_its_modes_and_its_unit(
         tmp_path / "c", np.full(size[::-1], round(900 / unit_mm)), lens=lens_named(name)
     )
     assert recording.unit_text == f"depth unit {unit_mm:g} mm, from the camera of {mode}"
-    assert (
-        f"the lens is the nominal one of {mode}" in recording.notes and type(recording.lens) is Lens
-    )
+    assert f"the lens is the nominal one of {mode}" in recording.notes
+    assert type(recording.lens) is Lens
     assert (recording.lens.width, recording.lens.height) == size
 
 
@@ -233,9 +229,8 @@ def test_a_size_that_no_mode_of_the_camera_has_is_told_with_those_that_exist(
         opened(
             tmp_path / "c", np.full((720, 1280), 900), lens=lens_named("azure_kinect_wfov_binned")
         )
-    assert "azure_kinect_nfov_binned 320 x 288" in str(caught.value) and "aligned" in str(
-        caught.value
-    )
+    assert "azure_kinect_nfov_binned 320 x 288" in str(caught.value)
+    assert "aligned" in str(caught.value)
 
 
 def test_modes_look_along_the_directions_of_the_factory_calibration() -> None:
@@ -245,12 +240,12 @@ def test_modes_look_along_the_directions_of_the_factory_calibration() -> None:
         "azure_kinect_wfov_unbinned",
         "realsense_l515_vga",
     }
-    whole = lens_named("azure_kinect_wfov_unbinned")
+    wide = lens_named("azure_kinect_wfov_unbinned")
     binned = lens_named("azure_kinect_wfov_binned")
-    np.testing.assert_allclose(binned.slopes(100, 200), whole.slopes(200.5, 400.5), atol=1e-6)
+    np.testing.assert_allclose(binned.slopes(100, 200), wide.slopes(200.5, 400.5), atol=1e-6)
     narrow = lens_named("azure_kinect_nfov")
     small = lens_named("azure_kinect_nfov_binned")
-    np.testing.assert_allclose(narrow.slopes(8, 20), whole.slopes(200, 200), atol=1e-6)
+    np.testing.assert_allclose(narrow.slopes(8, 20), wide.slopes(200, 200), atol=1e-6)
     np.testing.assert_allclose(small.slopes(8, 20), narrow.slopes(16.5, 40.5), atol=1e-6)
 
 
@@ -259,11 +254,11 @@ def test_a_lens_of_larger_images_of_the_same_shape_is_scaled_and_said(tmp_path: 
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "intrinsic.json").write_text(json.dumps(text))
     recording = opened(tmp_path / "c", noisy(0.7, 1e-3), lens=None)
-    assert recording.lens == plane.LENS and "scaled to 96 x 72" in recording.warnings[0]
+    assert recording.lens == plane.LENS
+    assert "scaled to 96 x 72" in recording.warnings[0]
 
 
 # ---- images that are not the camera's own
-# ----------------------------------------------------------------------------
 
 
 def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: Path) -> None:
@@ -279,15 +274,16 @@ def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: 
     ):
         (tmp_path / "lens.json").write_text(json.dumps(lens))
         np.save(tmp_path / "d.npy", plane.depth_mm())
-        said = open_capture([tmp_path / "d.npy"], intrinsics=tmp_path / "lens.json").warnings
-        assert any("principal point" in each for each in said) == is_doubted
+        warnings = open_capture([tmp_path / "d.npy"], intrinsics=tmp_path / "lens.json").warnings
+        assert any("principal point" in warning for warning in warnings) == is_doubted
 
 
 @pytest.mark.parametrize(
-    ("side", "finer", "least", "most"), ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10))
+    ("side", "finer", "least", "largest"),
+    ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10)),
 )
 def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
-    side: int, finer: int, least: int, most: int
+    side: int, finer: int, least: int, largest: int
 ) -> None:
     rng = np.random.default_rng(3)
     frames = []
@@ -297,7 +293,7 @@ def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
             0.7 + noise, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR
         ).astype(np.float32)
         frames.append(Frame(str(number), z_m, np.zeros(z_m.shape, np.uint8)))
-    assert least <= noise_reach_px(frames, 0.0) <= most
+    assert least <= noise_reach_px(frames, 0.0) <= largest
     assert noise_reach_px([frames[0], frames[0]], 0.0) == 0.0
 
 
@@ -322,8 +318,8 @@ def test_a_lone_frame_shows_the_reach_of_its_noise_beside_edges(side, reach_px, 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs the real captures")
 def test_real_depth_that_was_aligned_to_colour_is_told_from_the_cameras_own() -> None:
     aligned = list(islice(open_capture([DATA / "azure_drilled_board"]).frames(), 6))
-    own = list(islice(open_capture(walls(), lens=lens_named("azure_kinect_nfov")).frames(), 6))
-    assert noise_reach_px(own, 1e-3) == 5.0  # the depth engine's filter
+    native = list(islice(open_capture(walls(), lens=lens_named("azure_kinect_nfov")).frames(), 6))
+    assert noise_reach_px(native, 1e-3) == 5.0  # the depth engine's filter
     assert (
         noise_reach_px(aligned, 1e-3) > 7.0
     )  # 5 pixels of 252 px focal length in an image of 601 px
@@ -343,11 +339,10 @@ def test_a_missing_colour_picture_is_said(tmp_path: Path) -> None:
 
 
 # ---- how often the unit is right
-# -------------------------------------------------------------------------------------
 
 
 def test_units_of_many_scenes_are_right_or_asked_for() -> None:
-    """Targets at 0.3 to 1.5 m over a tenth to all of the view, before walls up to 2 m behind them."""
+    """Targets at 0.3 to 1.5 m over a tenth to all of the view, up to 2 m before walls."""
     counts = {unit_mm: verdicts(unit_mm) for unit_mm in (1.0, 0.25, 0.2, 0.1, 10.0)}
     assert (
         counts[1.0]["asked"] <= 2 and counts[1.0]["wrong"] == counts[1.0]["silently wrong"] == 0
@@ -358,7 +353,7 @@ def test_units_of_many_scenes_are_right_or_asked_for() -> None:
 
 def verdicts(unit_mm: float, scenes: int = 200) -> Counter[str]:
     rng = np.random.default_rng(11)
-    found = Counter[str]()
+    counts = Counter[str]()
     for _ in range(scenes):
         near_m = rng.uniform(0.3, 1.5)
         share = rng.uniform(0.1, 1.0)
@@ -376,8 +371,8 @@ def verdicts(unit_mm: float, scenes: int = 200) -> Counter[str]:
         try:
             unit = decided_unit("x", stored, 1e-3, (int(size[0]), int(size[1])))
         except UserError:
-            found["asked"] += 1
+            counts["asked"] += 1
             continue
         right = unit.scale_m == pytest.approx(unit_mm * 1e-3)
-        found[("" if unit.warning else "silently ") + ("right" if right else "wrong")] += 1
-    return found
+        counts[("" if unit.warning else "silently ") + ("right" if right else "wrong")] += 1
+    return counts

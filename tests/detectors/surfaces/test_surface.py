@@ -19,7 +19,9 @@ METHODS = ("lar", "bisquare", "lts", "least_squares")
 
 
 def truth(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return 0.75 + 0.1 * x - 0.2 * y + 0.3 * x * x + 0.2 * x * y - 0.5 * y**3 + 0.4 * x * x * y
+    slope = 0.75 + 0.1 * x - 0.2 * y
+    bend = 0.3 * x * x + 0.2 * x * y
+    return slope + bend - 0.5 * y**3 + 0.4 * x * x * y
 
 
 def cloud(
@@ -35,11 +37,21 @@ def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The ten columns of a cubic, scaled by hand and independently of the fit's basis."""
     u = 4 * x - 0.2
     v = 6 * y - 0.3
-    return np.stack([u**i * v**j for i in range(4) for j in range(4) if i + j <= 3], axis=1)
+    columns = []
+    for i in range(4):
+        for j in range(4 - i):
+            columns.append(u**i * v**j)
+    return np.stack(columns, axis=1)
 
 
 def difference_m(surface: Surface, values: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
+    """Largest distance of a surface from values at x, y."""
     return float(np.abs(surface.evaluate(x, y) - values).max())
+
+
+def error_m(surface: Surface, x: np.ndarray, y: np.ndarray) -> float:
+    """Largest distance of a surface from the truth."""
+    return difference_m(surface, truth(x, y), x, y)
 
 
 def fit(x: np.ndarray, y: np.ndarray, z: np.ndarray, **settings: object) -> Surface:
@@ -49,45 +61,54 @@ def fit(x: np.ndarray, y: np.ndarray, z: np.ndarray, **settings: object) -> Surf
 @pytest.mark.parametrize("method", METHODS)
 def test_a_noise_free_cubic_is_recovered(method: str) -> None:
     x, y, z = cloud(5000, sigma_m=0.0)
-    assert difference_m(fit(x, y, z, method=method), truth(x, y), x, y) < 1e-9
+    surface = fit(x, y, z, method=method)
+    assert error_m(surface, x, y) < 1e-9
 
 
 def test_least_squares_equals_numpy() -> None:
     x, y, z = cloud(3000)
-    a = monomials(x, y)
-    expected = a @ np.linalg.lstsq(a, z, rcond=None)[0]
-    assert difference_m(fit(x, y, z, method="least_squares"), expected, x, y) < 1e-12
+    design = monomials(x, y)
+    coefficients = np.linalg.lstsq(design, z, rcond=None)[0]
+    surface = fit(x, y, z, method="least_squares")
+    assert difference_m(surface, design @ coefficients, x, y) < 1e-12
 
 
 @pytest.mark.parametrize("n", [40, 300, 2500])
 def test_lar_is_the_exact_least_absolute_solution(n: int) -> None:
     x, y, z = cloud(n, seed=n)
     z[: n // 10] += 0.03
-    a = monomials(x, y)
-    p = a.shape[1]
-    cost = np.concatenate([np.zeros(p), np.ones(2 * n)])
-    equalities = np.hstack([a, np.eye(n), -np.eye(n)])
-    bounds = [(None, None)] * p + [(0, None)] * (2 * n)
-    exact = linprog(cost, A_eq=equalities, b_eq=z, bounds=bounds, method="highs")
+    design = monomials(x, y)
+    terms = design.shape[1]
+    # residuals are the differences of two numbers above 0, whose sum is least
+    cost = np.concatenate([np.zeros(terms), np.ones(2 * n)])
+    equalities = np.hstack([design, np.eye(n), -np.eye(n)])
+    free = [(None, None)] * terms
+    positive = [(0, None)] * (2 * n)
+    exact = linprog(cost, A_eq=equalities, b_eq=z, bounds=free + positive, method="highs")
     surface = fit(x, y, z, method="lar")
-    assert np.abs(z - surface.evaluate(x, y)).sum() <= exact.fun * (1 + 2e-6)
+    residuals = z - surface.evaluate(x, y)
+    assert np.abs(residuals).sum() <= exact.fun * (1 + 2e-6)
     # 0.3 mm of noise; the standard error of an L1 fit is 1.25 sigma sqrt(p / n), at the corners
     # three times that
-    assert difference_m(surface, a @ exact.x[:p], x, y) < 0.15 * 3e-4 * np.sqrt(10 / n)
+    standard_error = 3e-4 * np.sqrt(10 / n)
+    assert difference_m(surface, design @ exact.x[:terms], x, y) < 0.15 * standard_error
 
 
 def matlab_bisquare(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """robustfit's algorithm, written plainly and run to the end on all points."""
-    a = monomials(x, y)
-    q, _ = np.linalg.qr(a)
-    adjust = 1 / np.sqrt(1 - np.minimum(0.9999, (q**2).sum(axis=1)))
-    c = np.linalg.lstsq(a, z, rcond=None)[0]
+    design = monomials(x, y)
+    q, _ = np.linalg.qr(design)
+    leverage = (q**2).sum(axis=1)
+    adjust = 1 / np.sqrt(1 - np.minimum(0.9999, leverage))
+    c = np.linalg.lstsq(design, z, rcond=None)[0]
     for _ in range(100):
-        r = (z - a @ c) * adjust
+        r = (z - design @ c) * adjust
         scale = np.median(np.sort(np.abs(r))[9:]) / 0.6745
-        w = np.sqrt(np.where(np.abs(r) < 4.685 * scale, (1 - (r / (4.685 * scale)) ** 2) ** 2, 0.0))
-        c = np.linalg.lstsq(a * w[:, None], z * w, rcond=None)[0]
-    return a @ c
+        u = r / (4.685 * scale)
+        weights = np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
+        w = np.sqrt(weights)
+        c = np.linalg.lstsq(design * w[:, None], z * w, rcond=None)[0]
+    return design @ c
 
 
 @pytest.mark.parametrize("n", [200, 33_000])
@@ -95,57 +116,76 @@ def test_bisquare_is_the_fixed_point_of_matlabs_iteration(n: int) -> None:
     x, y, z = cloud(n)
     z[: n // 20] += 0.02
     surface = fit(x, y, z, method="bisquare")
+    expected = matlab_bisquare(x, y, z)
     standard_error = 3e-4 * np.sqrt(10 / n)
-    assert difference_m(surface, matlab_bisquare(x, y, z), x, y) < 0.05 * standard_error
+    assert difference_m(surface, expected, x, y) < 0.05 * standard_error
 
 
 def test_dropped_cross_terms_leave_a_separable_surface() -> None:
     x, y, z = cloud(4000, sigma_m=0.0)
     surface = fit(x, y, z, method="least_squares", drop_cross_terms=True)
     assert len(surface.coefficients) == 7
-    a = np.stack([np.ones_like(x), x, y, x**2, y**2, x**3, y**3], axis=1)
-    expected = a @ np.linalg.lstsq(a, z, rcond=None)[0]
-    assert difference_m(surface, expected, x, y) < 1e-10
-    corners = surface.evaluate(np.array([-0.1, 0.2, -0.1, 0.2]), np.array([0.0, 0.0, 0.1, 0.1]))
-    assert abs(corners[0] - corners[1] - corners[2] + corners[3]) < 1e-13
+    design = np.stack([np.ones_like(x), x, y, x**2, y**2, x**3, y**3], axis=1)
+    coefficients = np.linalg.lstsq(design, z, rcond=None)[0]
+    assert difference_m(surface, design @ coefficients, x, y) < 1e-10
+    corner_x = np.array([-0.1, 0.2, -0.1, 0.2])
+    corner_y = np.array([0.0, 0.0, 0.1, 0.1])
+    near_left, near_right, far_left, far_right = surface.evaluate(corner_x, corner_y)
+    assert abs(near_left - near_right - far_left + far_right) < 1e-13
+
+
+def test_gradients_are_those_of_a_plane_and_of_a_bend() -> None:
+    """z - surface falls by the surface's slope; central differences are exact up to degree 2."""
+    x, y, _ = cloud(500)
+    z = 0.7 + 0.3 * x - 0.2 * y + 0.5 * x * x + 0.4 * x * y
+    surface = fit(x, y, z, degree=2, method="least_squares")
+    gradients = surface.gradients(x, y, 1e-3)
+    np.testing.assert_allclose(gradients[:, 0], -(0.3 + x + 0.4 * y), atol=1e-9)
+    np.testing.assert_allclose(gradients[:, 1], -(-0.2 + 0.4 * x), atol=1e-9)
+    np.testing.assert_array_equal(gradients[:, 2], 1.0)
 
 
 @pytest.mark.parametrize(("method", "limit_mm"), [("lar", 1.0), ("bisquare", 0.1), ("lts", 0.1)])
 def test_damage_of_a_tenth_of_the_area_is_survived(method: str, limit_mm: float) -> None:
     x, y, z = cloud(40_000)
-    for cx, cy in (
-        (-0.1, 0.0),
-        (0.05, 0.1),
-        (0.2, 0.02),
-    ):  # three craters, a tenth of the area in all
-        z[(x - cx) ** 2 + (y - cy) ** 2 < 0.04**2] += 0.03
+    # three craters, a tenth of the area in all
+    for centre_x, centre_y in ((-0.1, 0.0), (0.05, 0.1), (0.2, 0.02)):
+        inside = (x - centre_x) ** 2 + (y - centre_y) ** 2 < 0.04**2
+        z[inside] += 0.03
     assert 0.09 < np.mean(z - truth(x, y) > 0.015) < 0.11
-    assert difference_m(fit(x, y, z, method=method), truth(x, y), x, y) < limit_mm * 1e-3
-    plain = difference_m(fit(x, y, z, method="least_squares"), truth(x, y), x, y)
-    assert plain > 3e-3
+    robust = fit(x, y, z, method=method)
+    assert error_m(robust, x, y) < limit_mm * 1e-3
+    plain = fit(x, y, z, method="least_squares")
+    assert error_m(plain, x, y) > 3e-3
 
 
 @pytest.mark.parametrize("part", [0.25, 0.35])
 def test_contiguous_damage_needs_the_lts_start(part: float) -> None:
     x, y, z = cloud(20_000)
-    z[x < -0.2 + 0.5 * part] += 0.03
-    inside = x > -0.2 + 0.5 * part
-    assert difference_m(fit(x, y, z, method="lts"), truth(x, y), x, y) < 0.1e-3
+    edge = -0.2 + 0.5 * part
+    z[x < edge] += 0.03
+    inside = x > edge
+    by_lts = fit(x, y, z, method="lts")
+    assert error_m(by_lts, x, y) < 0.1e-3
     for method in ("lar", "bisquare"):
         surface = fit(x, y, z, method=method)
-        assert difference_m(surface, truth(x, y), x, y) > 10e-3
+        assert error_m(surface, x, y) > 10e-3
         assert np.isfinite(surface.evaluate(x[inside], y[inside])).all()
 
 
 @settings(max_examples=4, deadline=None)
 @given(
-    dx=st.floats(-3, 3), dy=st.floats(-3, 3), dz=st.floats(-0.5, 3), method=st.sampled_from(METHODS)
+    dx=st.floats(-3, 3),
+    dy=st.floats(-3, 3),
+    dz=st.floats(-0.5, 3),
+    method=st.sampled_from(METHODS),
 )
 def test_moving_the_cloud_moves_the_surface(dx: float, dy: float, dz: float, method: str) -> None:
     x, y, z = cloud(1500)
     surface = fit(x, y, z, method=method)
     moved = fit(x + dx, y + dy, z + dz, method=method)
-    assert difference_m(moved, surface.evaluate(x, y) + dz, x + dx, y + dy) < 1e-6
+    expected = surface.evaluate(x, y) + dz
+    assert difference_m(moved, expected, x + dx, y + dy) < 1e-6
 
 
 @pytest.mark.parametrize("method", ["lar", "bisquare", "least_squares"])
@@ -154,7 +194,8 @@ def test_the_order_of_points_does_not_matter(method: str) -> None:
     order = np.random.default_rng(1).permutation(len(x))
     surface = fit(x, y, z, method=method)
     shuffled = fit(x[order], y[order], z[order], method=method)
-    assert difference_m(shuffled, surface.evaluate(x, y), x, y) < 0.2 * 3e-4 * np.sqrt(10 / len(x))
+    standard_error = 3e-4 * np.sqrt(10 / len(x))
+    assert difference_m(shuffled, surface.evaluate(x, y), x, y) < 0.2 * standard_error
 
 
 def test_repeating_a_fit_repeats_every_bit() -> None:
@@ -168,8 +209,10 @@ def test_repeating_a_fit_repeats_every_bit() -> None:
 @pytest.mark.parametrize("method", ["lar", "bisquare", "lts"])
 def test_depths_rounded_to_a_few_steps_are_fitted(method: str) -> None:
     x, y, z = cloud(20_000, sigma_m=2e-4)
-    flat = np.round((0.75 + (z - truth(x, y))) * 1e3) * 1e-3
-    assert difference_m(fit(x, y, flat, method=method), np.full(len(x), 0.75), x, y) < 0.2e-3
+    noise = z - truth(x, y)
+    rounded = np.round((0.75 + noise) * 1e3) * 1e-3
+    surface = fit(x, y, rounded, method=method)
+    assert difference_m(surface, np.full(len(x), 0.75), x, y) < 0.2e-3
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 5, 8])
@@ -177,7 +220,8 @@ def test_every_degree_holds_its_polynomials(degree: int) -> None:
     x, y, _ = cloud(4000)
     z = 0.8 + (2 * x - 3 * y) ** degree * 0.05
     surface = fit(x, y, z, degree=degree, method="least_squares")
-    assert len(surface.coefficients) == (degree + 1) * (degree + 2) // 2
+    terms = (degree + 1) * (degree + 2) // 2
+    assert len(surface.coefficients) == terms
     assert difference_m(surface, z, x, y) < 1e-10
 
 
@@ -185,8 +229,9 @@ def test_too_few_or_degenerate_points_are_a_clear_mistake() -> None:
     x, y, z = cloud(9)
     with pytest.raises(UserError, match="9 valid points cannot determine the 10 coefficients"):
         fit(x, y, z)
+    line = np.linspace(0, 1, 50)
     with pytest.raises(UserError, match="lie on a line"):
-        fit(np.linspace(0, 1, 50), np.linspace(0, 1, 50), np.ones(50))
+        fit(line, line, np.ones(50))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 5])
@@ -194,13 +239,15 @@ def test_products_and_their_sum_are_numpys(degree: int) -> None:
     xy = np.random.default_rng(degree).uniform(-0.2, 0.3, (50, 2))
     chebyshev = Chebyshev.over(xy, degree)
     scaled = 2 * (xy - xy.min(axis=0)) / np.ptp(xy, axis=0) - 1
+    products = chebvander2d(scaled[:, 0], scaled[:, 1], [degree, degree])
+    products = products.reshape(50, degree + 1, degree + 1)
     a, b = chebyshev.powers.T
-    expected = chebvander2d(*scaled.T, [degree, degree]).reshape(50, degree + 1, degree + 1)[
-        :, a, b
-    ]
+    expected = products[:, a, b]
     np.testing.assert_allclose(chebyshev.basis(xy).T, expected, atol=1e-13)
-    surface = Surface(chebyshev, np.arange(1.0, 1.0 + len(chebyshev.powers)), "")
-    np.testing.assert_allclose(surface.evaluate(*xy.T), expected @ surface.coefficients, atol=1e-11)
+    coefficients = np.arange(1.0, 1.0 + len(chebyshev.powers))
+    surface = Surface(chebyshev, coefficients, "")
+    values = surface.evaluate(xy[:, 0], xy[:, 1])
+    np.testing.assert_allclose(values, expected @ coefficients, atol=1e-11)
 
 
 def test_a_free_form_is_the_penalised_spline() -> None:
@@ -209,27 +256,39 @@ def test_a_free_form_is_the_penalised_spline() -> None:
     spacing = 0.05
     wavelength = 0.2
     cell = 0.01
-    points = np.column_stack([random.uniform(0, 0.3, (400, 2)), random.normal(0, 1e-3, 400)])
+    xy = random.uniform(0, 0.3, (400, 2))
+    points = np.column_stack([xy, random.normal(0, 1e-3, 400)])
     points[:2, :2] = [[0, 0], [0.3, 0.3]]
     weights = random.uniform(0, 1, 400)
-    counts = np.ceil(np.ptp(points[:, :2], axis=0) / spacing).astype(int) + 3
-    designs = []
-    for k in (0, 1):
-        knots = spacing * (np.arange(counts[k] + 4) - 3.0)
-        designs.append(
-            BSpline.design_matrix(np.minimum(points[:, k], 0.3 - 1e-12), knots, 3).toarray()
-        )
-    design = np.einsum("ni,nj->nij", *designs).reshape(400, -1)
-    squares = [
-        [d.T @ d for d in (np.diff(np.eye(n), order, axis=0) for order in range(4))] for n in counts
-    ]
-    penalty = sum(f * np.kron(squares[0][k], squares[1][3 - k]) for k, f in enumerate((1, 3, 3, 1)))
+    rows, columns = np.ceil(np.ptp(points[:, :2], axis=0) / spacing).astype(int) + 3
+    down = spline_design(points[:, 0], spacing, rows)
+    across = spline_design(points[:, 1], spacing, columns)
+    design = np.einsum("ni,nj->nij", down, across).reshape(400, -1)
+    penalty = 0
+    for order, factor in enumerate((1, 3, 3, 1)):
+        mixed = np.kron(squared_differences(rows, order), squared_differences(columns, 3 - order))
+        penalty = penalty + factor * mixed
     stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
     gram = design.T @ (weights[:, None] * design) + stiffness * penalty
     gram += 1e-9 * gram.diagonal().max() * np.eye(len(gram))
-    expected = design @ np.linalg.solve(gram, design.T @ (weights * points[:, 2]))
-    fitted = free_form(
-        points, weights, lambda p: np.zeros(len(p)), wavelength, cell, central=False
-    )(points)
-    np.testing.assert_allclose(fitted, expected, atol=1e-9)
+    right = design.T @ (weights * points[:, 2])
+    expected = design @ np.linalg.solve(gram, right)
+    surface = free_form(points, weights, flat, wavelength, cell, central=False)
+    np.testing.assert_allclose(surface(points), expected, atol=1e-9)
     assert np.abs(expected).max() > 1e-4
+
+
+def flat(points: np.ndarray) -> np.ndarray:
+    return np.zeros(len(points))
+
+
+def spline_design(places: np.ndarray, spacing: float, count: int) -> np.ndarray:
+    """The cubic splines (n, count) at places from 0 to 0.3."""
+    knots = spacing * (np.arange(count + 4) - 3.0)
+    inside = np.minimum(places, 0.3 - 1e-12)
+    return BSpline.design_matrix(inside, knots, 3).toarray()
+
+
+def squared_differences(count: int, order: int) -> np.ndarray:
+    differences = np.diff(np.eye(count), order, axis=0)
+    return differences.T @ differences

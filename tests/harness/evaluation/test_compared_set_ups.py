@@ -41,14 +41,17 @@ def test_a_row_holds_what_its_trials_say(two_variants: Tables) -> None:
     assert compared["variant"].tolist() == ["varied", "main", "main"]
     assert compared["frames"].tolist() == [50, 1, 50]
     row = compared.iloc[2]
-    assert (row["holes"], row["repeats"]) == (11, 6)
+    assert row["holes"] == 11
+    assert row["repeats"] == 6
     assert row["found"] == [str(number) for number in range(5, 12)]
     assert row["undecided"] == []
     assert row["limit_mm"] == pytest.approx(DIAMETERS_MM[4])
     assert row["half_mm"] == pytest.approx((DIAMETERS_MM[3] + DIAMETERS_MM[4]) / 2)
     assert row["half_low_mm"] == row["half_high_mm"] == pytest.approx(row["half_mm"])
     assert np.isnan(compared.iloc[0]["half_mm"])
-    assert (row["runs"], row["false_calls"], row["threshold"]) == (6, 1, 5.0)
+    assert row["runs"] == 6
+    assert row["false_calls"] == 1
+    assert row["threshold"] == 5.0
     assert compared.iloc[0]["threshold"] == 7.0
     damaged = two_variants.runs[
         (two_variants.runs["role"] == "damaged") & (two_variants.runs["frames"] == 50)

@@ -72,7 +72,9 @@ def test_registrations_are_summed_up_by_hand():
         failure=["", "too few marks"], repeat=[2, 3], tre_in_plane_mm=[0.5, 90.0]
     )
     (row,) = summarise_registrations(pd.concat([registrations(), failed])).to_dict("records")
-    assert (row["n"], row["failed"], row["reasons"]) == (4, 1, ["too few marks (1)"])
+    assert row["n"] == 4
+    assert row["failed"] == 1
+    assert row["reasons"] == ["too few marks (1)"]
     assert row["in_plane_median_mm"] == pytest.approx(0.4)
     assert row["in_plane_rms_mm"] == pytest.approx(np.sqrt((0.09 + 0.16 + 0.25) / 3))
     assert row["in_plane_predicted_mm"] == pytest.approx(0.25)
@@ -105,7 +107,10 @@ def test_a_ratio_is_paired_by_view():
     ratio, low, high, n = paired_ratio(
         first, first.assign(tre_in_plane_mm=first["tre_in_plane_mm"] / 2), "tre_in_plane_mm"
     )
-    assert (ratio, low, high, n) == (pytest.approx(0.5), pytest.approx(0.5), pytest.approx(0.5), 2)
+    assert ratio == pytest.approx(0.5)
+    assert low == pytest.approx(0.5)
+    assert high == pytest.approx(0.5)
+    assert n == 2
     gone = first.assign(failure=["", "", "x", "x"])
     assert np.isnan(paired_ratio(first, gone, "tre_in_plane_mm")[0])
 
@@ -130,7 +135,11 @@ def test_the_registrations_of_a_map_are_found_under_whichever_number_of_views_th
     assert counts.to_dict() == {("marks", 2): 2, ("marks", 3): 4, ("joint", 2): 2, ("joint", 3): 4}
 
 
-def holes(diameters, repeats=4, true=(10.0, 5.0)):
+def holes(
+    diameters,
+    repeats=4,
+    true=(10.0, 5.0),
+):
     return pd.DataFrame(
         [
             {
@@ -151,10 +160,12 @@ def test_size_errors_are_paired_and_need_both_maps():
     errors = size_errors(first, second)
     assert errors.holes == ("0",)
     change = errors.change()
-    assert (change.mean, change.n) == (pytest.approx(-0.5), 4)
+    assert change.mean == pytest.approx(-0.5)
+    assert change.n == 4
     assert change.is_below is True
     # differences do not vary though sizes do: a point
-    assert (change.interval.low, change.interval.high) == (pytest.approx(-0.5), pytest.approx(-0.5))
+    assert change.interval.low == pytest.approx(-0.5)
+    assert change.interval.high == pytest.approx(-0.5)
 
 
 def test_holes_are_in_the_order_of_their_size():
@@ -172,9 +183,14 @@ def test_holes_are_in_the_order_of_their_size():
         ([0.0, 0.0], False, False),
     ],
 )
-def test_a_change_is_certain_or_open(values, above, below):
+def test_a_change_is_certain_or_open(
+    values,
+    above,
+    below,
+):
     change = change_of(np.array(values))
-    assert (change.interval.over(0), change.is_below) == (above, below)
+    assert change.interval.over(0) == above
+    assert change.is_below == below
     assert change_of(np.array(values[:1])).interval.over(0) is None
 
 
@@ -196,25 +212,15 @@ def small():
 def test_maps_are_known_by_their_axes(small):
     varied = with_variation(small, MapWorld(), "hand-held", (24, "odometry", "volume"), (1,))
     maps = {set_up.variant: set_up for set_up in maps_of(varied)}
-    assert (maps["hand-held"].views, maps["hand-held"].merge, maps["hand-held"].is_variation) == (
-        24,
-        "volume",
-        True,
-    )
+    assert maps["hand-held"].views == 24
+    assert maps["hand-held"].merge == "volume"
+    assert maps["hand-held"].is_variation is True
     set_up = maps[name_of(2, "cpd", "grid")]
-    assert (
-        set_up.views,
-        set_up.registration,
-        set_up.merge,
-        set_up.conditions,
-        set_up.is_variation,
-    ) == (
-        2,
-        "cpd",
-        "grid",
-        "",
-        False,
-    )
+    assert set_up.views == 2
+    assert set_up.registration == "cpd"
+    assert set_up.merge == "grid"
+    assert set_up.conditions == ""
+    assert set_up.is_variation is False
     (case,) = map_cases(varied, summarise_holes(varied.holes, [VIEWS, REGISTRATION, MERGE]))
     assert case.variant(1, "joint", "grid") == name_of(
         1, "cpd", "grid"
@@ -244,7 +250,8 @@ def test_maps_side_by_side(small):
     assert row["found"] == [str(number) for number in range(4, 12)]
     assert row["seconds_map"] == pytest.approx(0.1)
     assert row["temporal_mm"] == pytest.approx(0.09, rel=0.1)
-    assert (row["views"], row["views_left_out"]) == (2, 0)
+    assert row["views"] == 2
+    assert row["views_left_out"] == 0
 
 
 def test_other_axes_make_places_of_their_own(small):
@@ -279,7 +286,9 @@ def test_two_views_against_one_by_hand() -> None:
     (case,) = map_cases(experiment, summarise_holes(experiment.holes, [VIEWS, REGISTRATION, MERGE]))
     against = against_one(case, "cpd", "grid")
     assert against is not None
-    assert (against.frames, against.lost, against.gained) == (50, (), ("4",))
+    assert against.frames == 50
+    assert against.lost == ()
+    assert against.gained == ("4",)
     # holes from 9.525 mm = 3/8 in are large
     assert against.sizes.holes == tuple(str(number) for number in range(5, 12))
     assert against.large.mean == pytest.approx(-1.0)
@@ -294,7 +303,8 @@ def test_two_views_against_one_by_hand() -> None:
     experiment = perspectives(turned, counts=(1, 2), methods=("cpd",), merges=("grid",))
     (case,) = map_cases(experiment, summarise_holes(experiment.holes, [VIEWS, REGISTRATION, MERGE]))
     against = against_one(case, "cpd", "grid")
-    assert (against.lost, against.gained) == (("4",), ())
+    assert against.lost == ("4",)
+    assert against.gained == ()
 
 
 def test_a_hole_of_three_eighths_of_an_inch_is_large(small) -> None:
@@ -313,7 +323,9 @@ def test_maps_are_compared_with_fifty_frames_or_the_most_that_all_have(small) ->
     assert case.common_frames(single) == 50
     assert case.common_frames(single, None) is None
     chosen = case.named(1, "cpd", "grid")
-    assert (chosen.variant, chosen.frames, chosen.views) == (single, 50, 1)
+    assert chosen.variant == single
+    assert chosen.frames == 50
+    assert chosen.views == 1
     assert case.named(1, "cpd", "grid", 7) is None
     assert case.named(2, "cpd", "grid", 1).frames == 1
     assert case.single(1).frames == 1
@@ -333,7 +345,8 @@ def test_a_ratio_over_pairs_of_views_by_hand() -> None:
     ratio, low, high, pairs = paired_ratio(first, second, "tre_mm")
     # t(0.975, 1) = 12.7062 times ln(2) / sqrt(2) / sqrt(2)
     half = 12.7062 * np.log(2) / 2
-    assert (ratio, pairs) == (pytest.approx(np.sqrt(2)), 2)
+    assert ratio == pytest.approx(np.sqrt(2))
+    assert pairs == 2
     assert low == pytest.approx(np.sqrt(2) * np.exp(-half), rel=1e-4)
     assert high == pytest.approx(np.sqrt(2) * np.exp(half), rel=1e-4)
     nothing = first.assign(tre_mm=0.0)
@@ -361,9 +374,11 @@ def test_failures_are_counted_by_reason_most_frequent_first() -> None:
     rows["guess_tre_mm"] = np.arange(10.0)
     rows["seconds"] = np.arange(10.0)
     (row,) = summarise_registrations(rows).to_dict("records")
-    assert (row["n"], row["failed"]) == (10, 8)
+    assert row["n"] == 10
+    assert row["failed"] == 8
     assert row["reasons"] == ["d (3)", "a (2)", "b (2)"]
-    assert (row["guess_mm"], row["seconds"]) == (4.5, 4.5)
+    assert row["guess_mm"] == 4.5
+    assert row["seconds"] == 4.5
 
 
 def test_changes_in_words() -> None:
@@ -377,14 +392,16 @@ def test_changes_in_words() -> None:
     assert span(Interval(-0.001, 1.25), 1) == "0.0 to 1.2"
     assert label_of("cpd", "grid", "0.7 m") == "cpd, grid, 0.7 m"
     assert label_of("", "") == "as declared"
-    assert (frames_text(1), frames_text(2)) == ("1 frame a view", "2 frames a view")
+    assert frames_text(1) == "1 frame a view"
+    assert frames_text(2) == "2 frames a view"
 
 
 def test_a_mean_change_by_hand() -> None:
     """Differences 1, 2 and 6: mean 3, standard deviation 2.645751, t(0.975, 2) = 4.302653."""
     change = change_of(np.array([1.0, np.nan, 2.0, 6.0, np.inf]))
     half = 4.302653 * np.sqrt(7.0) / np.sqrt(3)
-    assert (change.mean, change.n) == (3.0, 3)
+    assert change.mean == 3.0
+    assert change.n == 3
     assert change.interval.low == pytest.approx(3 - half, abs=1e-5)
     assert change.interval.high == pytest.approx(3 + half, abs=1e-5)
     assert change_of(np.array([1.0, np.nan])).n == 0

@@ -50,7 +50,9 @@ def test_three_pixels_by_hand() -> None:
         }
     )
     row = noise_against_frames(probes).iloc[0]
-    assert (row["pixels"], row["offset_mm"], row["temporal_rms_mm"]) == (3, 2.0, 0.5)
+    assert row["pixels"] == 3
+    assert row["offset_mm"] == 2.0
+    assert row["temporal_rms_mm"] == 0.5
     assert row["pattern_mm"] == pytest.approx(np.sqrt(1 - 0.25 / 5))
     assert row["systematic_mm"] == pytest.approx(np.sqrt(4 + 0.95))
 
@@ -79,7 +81,8 @@ def test_law_uses_only_pixels_seen_at_every_count_and_needs_two_counts() -> None
     law = noise_law(probes.sample(frac=1, random_state=0), "main")
     assert law is not None
     assert law.pixels == 700
-    assert (law.few_frames, law.many_frames) == (1, 50)
+    assert law.few_frames == 1
+    assert law.many_frames == 50
     assert noise_law(probes[probes["frames"] == 1], "main") is None
     assert noise_law(probes, "elsewhere") is None
 
@@ -107,7 +110,9 @@ def test_a_law_by_hand() -> None:
     first = 9 + 14 / 3 - 0.5
     last = 6.25 + 14 / 12 - 0.125
     assert law.systematic_ratio == pytest.approx(np.sqrt(last / first))
-    assert (law.few_frames, law.many_frames, law.pixels) == (1, 16, 4)
+    assert law.few_frames == 1
+    assert law.many_frames == 16
+    assert law.pixels == 4
 
     def ratio(indices: np.ndarray) -> np.ndarray:
         squares = []

@@ -92,7 +92,9 @@ def test_misfits_are_those_of_least_squares(measured: str) -> None:
     ],
 )
 def test_a_shape_fits_clearly_better_from_four_fifths(
-    bowl_rms: float, cylinder_rms: float, looks: str
+    bowl_rms: float,
+    cylinder_rms: float,
+    looks: str,
 ) -> None:
     assert HoleShape("a", 40, cylinder_rms, bowl_rms, 0.0, 0.0).looks == looks
 
@@ -110,7 +112,8 @@ def test_a_hole_needs_twelve_pixels_and_half_of_them_valid() -> None:
 
     assert hole_shape(with_valid(half - 1), LARGE) is None
     shape = hole_shape(with_valid(half), LARGE)
-    assert shape is not None and shape.pixels == half
+    assert shape is not None
+    assert shape.pixels == half
     tiny = HoleInView("tiny", 45.0, 20.0, 1.9, 4.0, DEPTH_MM)
     assert (rho_of(tiny) < 1).sum() == 9
     assert hole_shape(cloud("bowl", tiny), tiny) is None

@@ -17,7 +17,11 @@ from harness.evaluation.summary import summarise_holes
 from tests.support.synthetic_tables import World, joined, tables
 
 
-def ladder(rates: list[float], copies: int = 1, repeats: int = 20) -> Ladder:
+def ladder(
+    rates: list[float],
+    copies: int = 1,
+    repeats: int = 20,
+) -> Ladder:
     """Holes of 1, 2, 3 ... mm, found in exactly these shares of the repeats."""
     sizes = np.repeat(np.arange(1.0, len(rates) + 1), copies)
     detected = np.arange(repeats)[:, None] < np.repeat(np.array(rates) * repeats, copies).round()
@@ -141,7 +145,9 @@ def test_a_size_off_the_ladder_gives_a_bound():
     assert noise_alone == np.inf
     assert np.isnan(pattern_last) or pattern_last == np.inf
     # nothing on finds the smallest hole already
-    assert not rows["on_ladder"][0] and not rows["on_ladder"][1] and np.isfinite(pattern_alone)
+    assert not rows["on_ladder"][0]
+    assert not rows["on_ladder"][1]
+    assert np.isfinite(pattern_alone)
 
 
 def test_without_switches_there_are_no_costs():

@@ -36,7 +36,11 @@ centres = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=0
 
 @settings(max_examples=60, deadline=None)
 @given(centres, centres, st.floats(0.1, 40))
-def test_matching_is_one_to_one_within_the_radius_and_maximal(a, b, radius):
+def test_matching_is_one_to_one_within_the_radius_and_maximal(
+    a,
+    b,
+    radius,
+):
     truth = np.array(a).reshape(-1, 2)
     findings = np.array(b).reshape(-1, 2)
     pairs = match(truth, findings, radius)
@@ -49,7 +53,9 @@ def test_matching_is_one_to_one_within_the_radius_and_maximal(a, b, radius):
 
 
 def by_falling_through_all_pairs(
-    truth: np.ndarray, findings: np.ndarray, radius: float
+    truth: np.ndarray,
+    findings: np.ndarray,
+    radius: float,
 ) -> dict[int, int]:
     """The same, written plainly: every pair in the order of its distance."""
     distance = np.linalg.norm(truth[:, None] - findings[None], axis=-1)
@@ -63,7 +69,11 @@ def by_falling_through_all_pairs(
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 8), m=st.integers(1, 20))
-def test_pairs_are_those_of_all_pairs_in_order_ties_included(seed: int, n: int, m: int):
+def test_pairs_are_those_of_all_pairs_in_order_ties_included(
+    seed: int,
+    n: int,
+    m: int,
+):
     random = np.random.default_rng(seed)
     truth = random.integers(0, 8, (n, 2)).astype(float)
     findings = random.integers(0, 8, (m, 2)).astype(float)

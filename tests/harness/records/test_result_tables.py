@@ -167,7 +167,9 @@ def test_every_declared_column_has_a_name_of_its_own_and_says_what_it_is() -> No
         assert len(set(names)) == len(names), table.name
         assert all(column.note for column in table.stored), table.name
         assert set(table.order) <= set(names), table.name
-    files = [output.name for output in outputs() if output.place == "results" and output.of != "capture"]
+    files = [
+        output.name for output in outputs() if output.place == "results" and output.of != "capture"
+    ]
     assert len(set(files)) == len(files)
 
 

@@ -38,14 +38,14 @@ class Outline(HTMLParser):
         self.labels = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        named = dict(attrs)
+        attributes = dict(attrs)
         if tag not in VOID:
             self.stack.append(tag)
         self.addresses += [
             value or "" for name, value in attrs if name in ("src", "href", "xlink:href", "data")
         ]
-        self.ids += [named["id"] or ""] if "id" in named else []
-        self.labels += tag == "svg" and bool(named.get("aria-label"))
+        self.ids += [attributes["id"] or ""] if "id" in attributes else []
+        self.labels += tag == "svg" and bool(attributes.get("aria-label"))
 
     def handle_endtag(self, tag: str) -> None:
         assert self.stack.pop() == tag
@@ -140,8 +140,8 @@ def test_the_same_input_gives_the_same_bytes(page: str, results: Tables) -> None
 
 def test_answer_counts_and_verdicts_are_told(page: str) -> None:
     assert (
-        "With 50 averaged frames the camera finds 8 of 11 holes (no. 4–11; the smallest is 6.35 mm, 1/4 in)"
-        in page
+        "With 50 averaged frames the camera finds 8 of 11 holes"
+        " (no. 4–11; the smallest is 6.35 mm, 1/4 in)" in page
     )
     assert "with one frame 7 of 11 holes (no. 5–11; the smallest is 7.94 mm, 5/16 in)" in page
     assert page.count("✓ borne out") == 8
@@ -154,14 +154,16 @@ def test_answer_counts_and_verdicts_are_told(page: str) -> None:
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_page_of_another_target_does_not_mention_the_thesis(results: Tables, page: str) -> None:
-    other = report_html(
+    page_without_claims = report_html(
         results, [example(50), example(1, noise_mm=0.9)], About(provenance(), YAML, "Dents")
     )
     assert "thesis" in page
-    assert "thesis" not in other.lower()
-    assert not re.search(r"\bC[1-9]\b", re.sub(r"<svg.*?</svg>", "", other, flags=re.DOTALL))
-    assert "The thesis' claims" not in other
-    assert "If the facts were different" in other
+    assert "thesis" not in page_without_claims.lower()
+    assert not re.search(
+        r"\bC[1-9]\b", re.sub(r"<svg.*?</svg>", "", page_without_claims, flags=re.DOTALL)
+    )
+    assert "The thesis' claims" not in page_without_claims
+    assert "If the facts were different" in page_without_claims
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -171,11 +173,11 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
     failures += [
         {"what": f"repeat {number}", "state": "failed", "why": "boom"} for number in range(5)
     ]
-    told = provenance() | {"failures": failures}
+    origin = provenance() | {"failures": failures}
     page = report_html(
         tables(world, frames=(1, 50)),
         [example(50, "cylinder")],
-        About(told, YAML, "Averaging", THESIS),
+        About(origin, YAML, "Averaging", THESIS),
     )
     assert page.count("✗ not borne out") >= 4
     assert "More than the thesis: 2–3" in page
@@ -186,17 +188,17 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
 
 @pytest.mark.usefixtures("unsaved")
 def test_little_data_still_make_a_page() -> None:
-    few = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
-    page = report_html(few, [], About({}, "", "Averaging", THESIS))
+    results = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
+    page = report_html(results, [], About({}, "", "Averaging", THESIS))
     assert (
-        "With one frame the camera finds 0 of 11 holes, with 1–11 undecided. Of 8 claims, 8 are undecided"
-        in page
+        "With one frame the camera finds 0 of 11 holes, with 1–11 undecided."
+        " Of 8 claims, 8 are undecided" in page
     )
     assert "The one repeat is" in page
     assert "No data for this figure were stored." in page
     assert "not recorded" in page
     nothing = dataclasses.replace(
-        few, holes=pd.DataFrame(), runs=few.runs[:0], probes=few.probes[:0]
+        results, holes=pd.DataFrame(), runs=results.runs[:0], probes=results.probes[:0]
     )
     assert "No trial of the main experiment finished" in report_html(
         nothing, [], About(provenance(), YAML, "Averaging")
@@ -213,23 +215,23 @@ def test_an_all_invalid_cloud_is_drawn() -> None:
     page = report_html(tables(frames=(50,)), [blank], About(provenance(), YAML, "Averaging"))
     assert "0 of 11 holes marked" in page
     (figure,) = (
-        each
-        for each in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
-        if "0 of 11 holes marked" in each
+        drawing
+        for drawing in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
+        if "0 of 11 holes marked" in drawing
     )
     ET.fromstring(figure)
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_file_is_written_whole_or_refused(tmp_path: Path) -> None:
-    one = tables(frames=(50,))
-    path = write_report(tmp_path / "new", one, [], provenance(), YAML, "Averaging")
+    one_set_up = tables(frames=(50,))
+    path = write_report(tmp_path / "new", one_set_up, [], provenance(), YAML, "Averaging")
     assert path == tmp_path / "new" / "report.html"
     assert path.read_text(encoding="utf-8").endswith("</html>\n")
     assert [entry.name for entry in path.parent.iterdir()] == ["report.html"]
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError):
-        write_report(tmp_path / "file", one, [], provenance(), YAML, "Averaging")
+        write_report(tmp_path / "file", one_set_up, [], provenance(), YAML, "Averaging")
 
 
 def test_answer_tells_what_is_undecided() -> None:

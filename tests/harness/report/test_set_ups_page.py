@@ -15,8 +15,9 @@ import pytest
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
 from harness.programs.thesis.answers import THESIS
-from harness.report.page import Layout, set_ups_html, write_report
+from harness.report.page import write_report
 from harness.report.sections import About, set_ups_grid
+from harness.report.set_ups_page import Layout, set_ups_html
 from harness.trials.clouds import pair_noise
 from harness.vocabulary.path_names import camera_title, in_words
 from tests.harness.evaluation.test_limits import switched
@@ -69,23 +70,25 @@ def headings(page: str) -> list[str]:
 
 
 def test_rows_name_their_axes_beside_a_variation_that_leaves_them_empty():
-    found = {
+    results = {
         "source.camera.name": ["kinect_v2"] * 4 + [None],
         "source.camera.unit_seed": [1, 1, 2, 2, None],
     }
-    found |= {
+    results |= {
         "source.target.distance_m": [0.5, 1.0, 0.5, 1.0, None],
         "is_variation": [False] * 4 + [True],
     }
     axes = pd.DataFrame(
         {
-            "path": list(found)[:3],
+            "path": list(results)[:3],
             "name": ["camera", "unit seed", "distance"],
             "unit": ["", "", "m"],
         }
     )
     layout = Layout.of(
-        replace(tables(World()), variants=pd.DataFrame({"variant": [*"abcde"], **found}), axes=axes)
+        replace(
+            tables(World()), variants=pd.DataFrame({"variant": [*"abcde"], **results}), axes=axes
+        )
     )
     assert layout.rows == {
         "Kinect v2, unit seed 1": ["a", "b"],
@@ -124,14 +127,19 @@ def test_the_same_input_gives_the_same_bytes(varied, page):
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_page_of_another_target_does_not_mention_the_thesis():
-    other = set_ups_html(cameras(SMALLEST), [], About(provenance(), YAML, "Three cameras"))
-    assert "thesis" not in other.lower() and "C11" not in other
+    page_without_claims = set_ups_html(
+        cameras(SMALLEST), [], About(provenance(), YAML, "Three cameras")
+    )
+    assert "thesis" not in page_without_claims.lower() and "C11" not in page_without_claims
 
 
 def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
     answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
-    said = "with 50 averaged frames: Azure Kinect DK NFOV unbinned: 9, 8; Kinect v2: 8, 7; RealSense L515 XGA: 8, 8."
-    assert f"Found of 11 holes at 0.5 m, 1 m {said}" in answer
+    expected = (
+        "with 50 averaged frames: Azure Kinect DK NFOV unbinned: 9, 8; Kinect v2: 8, 7;"
+        " RealSense L515 XGA: 8, 8."
+    )
+    assert f"Found of 11 holes at 0.5 m, 1 m {expected}" in answer
     # one unit of each camera
     assert "is undecided" in answer
 
@@ -150,9 +158,9 @@ def test_a_camera_s_file_is_named_by_its_name():
 
 
 def test_the_table_has_the_counts_of_both_numbers_of_frames():
-    found = cameras(SMALLEST)
-    compared = compare_set_ups(found, summarise_holes(found.holes, AXES), set_ups_of(found))
-    layout = Layout.of(found)
+    results = cameras(SMALLEST)
+    compared = compare_set_ups(results, summarise_holes(results.holes, AXES), set_ups_of(results))
+    layout = Layout.of(results)
     assert list(layout.rows) == [camera_title(camera) for camera in CAMERAS]
     assert (layout.columns, layout.column_name, layout.column_values) == (
         ("0.5 m", "1 m"),
@@ -168,18 +176,21 @@ def test_the_table_has_the_counts_of_both_numbers_of_frames():
 
 @pytest.mark.usefixtures("unsaved")
 def test_failures_and_missing_set_ups_are_told():
-    found = cameras(SMALLEST)
+    results = cameras(SMALLEST)
     gone = set_up_name("kinect_v2", 1.0)
     parts = ("holes", "runs", "probes", "noise")
-    found = replace(
-        found,
-        **{name: getattr(found, name)[getattr(found, name)["variant"] != gone] for name in parts},
+    results = replace(
+        results,
+        **{
+            name: getattr(results, name)[getattr(results, name)["variant"] != gone]
+            for name in parts
+        },
     )
-    said = provenance() | {
+    expected = provenance() | {
         "failures": [{"what": "damaged-00001", "state": "failed", "why": "ValueError: empty crop"}]
     }
     kept = [cloud for cloud in clouds() if cloud.variant != gone]
-    page = set_ups_html(found, kept, About(said, YAML, "Three cameras"))
+    page = set_ups_html(results, kept, About(expected, YAML, "Three cameras"))
     assert "damaged-00001: failed: ValueError: empty crop" in page
     assert gone not in page
     assert ">nan" not in page
@@ -187,9 +198,9 @@ def test_failures_and_missing_set_ups_are_told():
 
 def test_effects_have_a_figure_and_a_table():
     names = ("noise", "fixed_pattern")
-    found = switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names)
+    results = switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names)
     cloud = [replace(example(50), variant="noise+fixed_pattern")]
-    page = set_ups_html(found, cloud, About(provenance(), YAML, "Anatomy"))
+    page = set_ups_html(results, cloud, About(provenance(), YAML, "Anatomy"))
     assert "Loss due to each effect" in headings(page)
     assert '<figure id="effects">' in page
     # noise alone, with 1 and 50 frames, in the answer and in the table: 2/16 in, which is 3.175 mm
@@ -205,8 +216,8 @@ def test_the_page_of_several_set_ups_is_chosen_by_the_tables(tmp_path):
         tmp_path / "a", cameras(SMALLEST), [], provenance(), YAML, "T"
     ).read_text()
     assert "Holes found" in headings(several)
-    one = write_report(tmp_path / "b", tables(), [], provenance(), YAML, "T").read_text()
-    assert "Holes against frames" in headings(one)
+    plain_page = write_report(tmp_path / "b", tables(), [], provenance(), YAML, "T").read_text()
+    assert "Holes against frames" in headings(plain_page)
 
 
 def test_pair_noise_finds_the_grain_of_a_known_filter():
@@ -221,17 +232,17 @@ def test_pair_noise_finds_the_grain_of_a_known_filter():
     first = frame(0.0)
     second = frame(0.017)
     first[:3] = np.nan
-    found = pair_noise(first, second, everywhere)
+    results = pair_noise(first, second, everywhere)
     # three of 60,000 pixels' worth of averages: 1 mm, 2/3, 1/3 and 0 to four standard errors of
     # about 0.01
-    assert found["single_frame_mm"] == pytest.approx(1.0, abs=0.02)
-    assert found["correlation_u1"] == pytest.approx(2 / 3, abs=0.02)
-    assert found["correlation_u2"] == pytest.approx(1 / 3, abs=0.03)
-    assert found["correlation_u3"] == pytest.approx(0.0, abs=0.03)
-    assert found["correlation_v1"] == pytest.approx(0.0, abs=0.03)
+    assert results["single_frame_mm"] == pytest.approx(1.0, abs=0.02)
+    assert results["correlation_u1"] == pytest.approx(2 / 3, abs=0.02)
+    assert results["correlation_u2"] == pytest.approx(1 / 3, abs=0.03)
+    assert results["correlation_u3"] == pytest.approx(0.0, abs=0.03)
+    assert results["correlation_v1"] == pytest.approx(0.0, abs=0.03)
     nowhere = pair_noise(first, second, np.zeros_like(everywhere))
     assert all(np.isnan(value) for value in nowhere.values())
-    assert set(nowhere) == set(found)
+    assert set(nowhere) == set(results)
     assert json.dumps(
-        {key: value for key, value in found.items()}
+        {key: value for key, value in results.items()}
     )  # plain numbers, for the journal

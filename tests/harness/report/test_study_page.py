@@ -77,11 +77,11 @@ def whole() -> StudyResult:
         SetUp(
             variant=f"depth <{name}>",
             frames=n,
-            axes={"source.target.distance_m": at},
+            axes={"source.target.distance_m": distance_m},
             a50_mm=a,
             mm_per_depth_mm=0.3,
         )
-        for name, at, a in (("near", 0.5, 5.0), ("far", 1.0, 7.0))
+        for name, distance_m, a in (("near", 0.5, 5.0), ("far", 1.0, 7.0))
         for n in (1, 50)
     ]
     return judged(small(*set_ups, depths_mm=(2.0, 10.0)))
@@ -108,20 +108,20 @@ class Structure(HTMLParser):
         self.tags: set[str] = set()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        named = dict(attrs)
+        attributes = dict(attrs)
         self.tags.add(tag)
-        self.ids += [named["id"] or ""] if "id" in named else []
+        self.ids += [attributes["id"] or ""] if "id" in attributes else []
         self.links += [
             value or "" for name, value in attrs if name in ("href", "src", "xlink:href")
         ]
-        self.labels += [named.get("aria-label") or ""] if tag == "svg" else []
+        self.labels += [attributes.get("aria-label") or ""] if tag == "svg" else []
 
 
 @pytest.fixture(scope="module")
 def structure(page: str) -> Structure:
-    seen = Structure()
-    seen.feed(page)
-    return seen
+    parsed = Structure()
+    parsed.feed(page)
+    return parsed
 
 
 def test_every_section_is_there(page: str) -> None:
@@ -194,30 +194,36 @@ def test_a_threshold_that_noise_cannot_set_is_warned_of_first() -> None:
     """In the first lines of the page and of the terminal, with the place; not at ten deviations,
     not where given."""
     result = judged(small(SetUp()))
-    (one,) = result.record.set_ups
+    (set_up,) = result.record.set_ups
 
     def warned(threshold: float, **changed: object) -> StudyResult:
-        assert one.calibrated is not None
+        assert set_up.calibrated is not None
         score = np.array([4.1, threshold, 60.0, 4.4])
-        calibrated = replace(one.calibrated, score=score, **changed)  # type: ignore[arg-type]
+        calibrated = replace(set_up.calibrated, score=score, **changed)  # type: ignore[arg-type]
         record = replace(
-            result.record, set_ups=(replace(one, threshold=threshold, calibrated=calibrated),)
+            result.record, set_ups=(replace(set_up, threshold=threshold, calibrated=calibrated),)
         )
         return evaluate_study(record, study_tables(small(SetUp())), {}, draws=20)
 
     high = warned(83.0)
-    told = "1 frame: the threshold is 83 deviations, above 10: something other than noise sets it (calibration board 1, "
-    assert text_of(study_parts(high)).startswith(f"warning: {told}at x, y = −120, 33 mm)")
+    warning = (
+        "1 frame: the threshold is 83 deviations, above 10: something other than noise sets it"
+        " (calibration board 1, "
+    )
+    assert text_of(study_parts(high)).startswith(f"warning: {warning}at x, y = −120, 33 mm)")
     assert (
-        f"warning: {told}" in words(html(high)).replace("\u00a0", " ").partition("is found 90 %")[0]
+        f"warning: {warning}"
+        in words(html(high)).replace("\u00a0", " ").partition("is found 90 %")[0]
     )
     off = np.full(4, np.nan)
-    assert f"warning: {told}off the board)" in text_of(
+    assert f"warning: {warning}off the board)" in text_of(
         study_parts(warned(83.0, x_mm=off, y_mm=off))
     )
     assert "warning" not in text_of(study_parts(warned(10.0)))
-    given = replace(high.record, set_ups=(replace(high.record.set_ups[0], calibrated=None),))
-    told_nothing = evaluate_study(given, study_tables(small(SetUp())), {}, draws=20)
+    without_calibration = replace(
+        high.record, set_ups=(replace(high.record.set_ups[0], calibrated=None),)
+    )
+    told_nothing = evaluate_study(without_calibration, study_tables(small(SetUp())), {}, draws=20)
     assert "warning" not in text_of(study_parts(told_nothing))
     assert "What set each threshold" not in html(told_nothing)
 
@@ -265,15 +271,15 @@ def test_where_everything_is_found_the_bound_needs_no_curve() -> None:
 
 def test_the_depths_that_are_drawn_stand_in_their_file(whole: StudyResult) -> None:
     frame = DEPTH_LIMITS.frame(depths_at(whole.set_ups))
-    for one in whole.set_ups:
-        rows = frame[frame["set_up"] == one.limit.record.label]
-        assert rows["diameter_mm"].tolist() == one.surface.diameter_mm.tolist()
+    for set_up in whole.set_ups:
+        rows = frame[frame["set_up"] == set_up.limit.record.label]
+        assert rows["diameter_mm"].tolist() == set_up.surface.diameter_mm.tolist()
         for name, column in (
             ("depth_mm", "d90_mm"),
             ("depth_low_mm", "d90_low_mm"),
             ("depth_high_mm", "d90_high_mm"),
         ):
-            np.testing.assert_array_equal(rows[name], getattr(one.surface, column))
+            np.testing.assert_array_equal(rows[name], getattr(set_up.surface, column))
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -307,8 +313,10 @@ def test_no_number_on_the_page_lies_beyond_the_sizes_inspected(beyond: StudyResu
     assert rows.replace("&gt;", ">").count(f"> {largest:.3g}") >= 9
     for part in ("Detection limits", "Limits against each axis", "Size and depth"):
         sizes = [
-            float(one)
-            for one in re.findall(r"\d+\.\d\d\b", section(page, part).partition("no regression")[0])
+            float(number)
+            for number in re.findall(
+                r"\d+\.\d\d\b", section(page, part).partition("no regression")[0]
+            )
         ]
         assert max(sizes, default=0.0) <= largest, part
         assert "e+" not in section(page, part)
@@ -338,8 +346,8 @@ def test_given_thresholds_and_no_hole_free_boards() -> None:
     study = small(SetUp())
     record: StudyRecord = study_record(study)
     nothing = Unflawed(*(np.zeros(0, kind) for kind in (int, int, int, float)))
-    one = replace(record.set_ups[0], unflawed=nothing, calibration_runs=0)
-    record = replace(record, false_calls_per_m2=None, set_ups=(one,))
+    set_up = replace(record.set_ups[0], unflawed=nothing, calibration_runs=0)
+    record = replace(record, false_calls_per_m2=None, set_ups=(set_up,))
     tables: ResultTables = study_tables(study)
     damaged = {name: getattr(tables, name) for name in ("runs", "findings", "operating")}
     tables = replace(

@@ -1,4 +1,4 @@
-"""The cloud that turns: what is packed comes out again, and a browser turns it when it is dragged."""
+"""The cloud that turns: what is packed comes out again, and a browser turns it when dragged."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ function sum() {
   draw(); gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
   return pixels.reduce((total, value, at) => (total * 31 + value * (at % 97)) % 1000003, 7);
 }
-const point = (kind, clientX, clientY) =>
-  canvas.dispatchEvent(new PointerEvent(kind, { pointerId: 1, clientX, clientY, buttons: 1, bubbles: true }));
+const point = (kind, clientX, clientY) => canvas.dispatchEvent(
+  new PointerEvent(kind, { pointerId: 1, clientX, clientY, buttons: 1, bubbles: true }));
 canvas.setPointerCapture = () => {};
 const said = [gl ? 1 : 0, sum(), sum()];
 point("pointerdown", 300, 200); point("pointermove", 400, 230); point("pointerup", 400, 230);
@@ -157,13 +157,13 @@ def test_a_browser_turns_the_cloud_when_it_is_dragged(tmp_path):
     if "data-said" not in shown:
         assert 'style="display: block;"' in shown  # it says what is missing ...
         pytest.skip("this Chromium has no WebGL, not even in software")
-    _, first, again, turned, yaw, pitch, near, zoom, other, back = (
+    _, first, again, turned, yaw, pitch, zoomed, zoom, recoloured, back = (
         re.search(r'data-said="([^"]+)"', shown).group(1).split()
     )
     assert first == again
     # 100 and 30 pixels of 0.006; exp(0.6)
     assert (yaw, pitch, zoom) == ("0.600", "0.180", "1.822")
-    assert len({first, turned, near, other}) == 4
+    assert len({first, turned, zoomed, recoloured}) == 4
     assert back == first
 
 

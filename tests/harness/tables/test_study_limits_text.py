@@ -16,13 +16,8 @@ from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, ax
 from harness.records.examples import StudyExample
 from harness.records.schema import Estimate
 from harness.report.clouds import examples_figure
-from harness.report.study_page import (
-    MOST_CURVES,
-    axis_figure,
-    overlay_figure,
-    study_parts,
-    with_room,
-)
+from harness.report.study_figures import MOST_CURVES, axis_figure, overlay_figure, with_room
+from harness.report.study_page import study_parts
 from harness.tables.limits import (
     LIMITS,
     is_within_sizes,
@@ -76,7 +71,8 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
     for limit in two:
         sentence = limit_sentence(limit)
         assert sentence.startswith(
-            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the time"
+            f"{limit.record.label}: damage of {size(limit.a90_95.value)} mm is found 90 % of the "
+            "time"
         )
         assert limit.false_calls is not None
         rate = f"{limit.false_calls.rate_per_m2:.2g}"
@@ -205,15 +201,11 @@ def test_every_number_of_a_limit_stands_in_its_file(
     )
     assert numbers == (limit.a90_95.value, limit.a90_mm, ends.low, ends.high, limit.a50_mm)
     rate = limit.false_calls.interval_per_m2
-    assert (first["false_calls_low_per_m2"], first["false_calls_high_per_m2"]) == (
-        rate.low,
-        rate.high,
-    )
-    assert (first["targets"], first["boards"], first["hits"]) == (
-        limit.targets,
-        limit.boards,
-        limit.hits,
-    )
+    assert first["false_calls_low_per_m2"] == rate.low
+    assert first["false_calls_high_per_m2"] == rate.high
+    assert first["targets"] == limit.targets
+    assert first["boards"] == limit.boards
+    assert first["hits"] == limit.hits
     assert first["a90_95_method"] == "likelihood ratio"
     assert list(frame["a90_95_verdict"]) == ["demonstrated", "demonstrated", "not demonstrated"]
     assert np.isnan(frame["a90_95_mm"].iloc[2])
@@ -247,7 +239,11 @@ def test_few_targets_are_told() -> None:
 
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
-def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
+def test_intervals_as_text_hold_their_numbers(
+    value: float,
+    down: float,
+    up: float,
+) -> None:
     """To two decimals, or to two significant digits of the estimate (of the upper end where that
     is 0), where the interval is wider than a tenth of it."""
     text = with_interval(value, value - down, value + up)
@@ -282,7 +278,11 @@ def test_intervals_without_ends() -> None:
 
 
 def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
-    def one(camera: str, distance: float, frames: int) -> SetUp:
+    def one(
+        camera: str,
+        distance: float,
+        frames: int,
+    ) -> SetUp:
         axes = {
             "source.camera.name": camera,
             "source.target.distance_m": distance,
@@ -306,8 +306,11 @@ def test_axes_are_those_with_several_values_and_lines_hold_the_rest() -> None:
         "source.target.distance_m",
         FRAMES,
     ]
-    assert (distance.title, distance.values, distance.numeric) == ("distance (m)", (0.5, 1.0), True)
-    assert (camera.values, camera.numeric) == (("a", "b"), False)
+    assert distance.title == "distance (m)"
+    assert distance.values == (0.5, 1.0)
+    assert distance.numeric is True
+    assert camera.values == ("a", "b")
+    assert camera.numeric is False
     assert list(camera.lines) == [
         f"distance={metres} m, {n}" for metres in ("0.5", "1") for n in ("1 frame", "50 frames")
     ]

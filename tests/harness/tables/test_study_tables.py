@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 
 from harness.evaluation.intervals import Interval
-from harness.evaluation.study.curves import PixelCurves
+from harness.evaluation.study.curves import ChanceHits, PixelCurves
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import Calibrated
-from harness.evaluation.study.result import FRAMES, Difference, SetUpResult, axis_lines
+from harness.evaluation.study.result import (
+    FRAMES,
+    Difference,
+    SetUpResult,
+    StudyResult,
+    axis_lines,
+)
 from harness.evaluation.study.surface import PodSurface
 from harness.evaluation.study.units import OverUnits
 from harness.tables.limits import (
@@ -27,6 +33,10 @@ from harness.tables.limits import (
 )
 from harness.tables.study import (
     AXES,
+    CHANCE,
+    DEPTH_LIMITS,
+    OPERATING,
+    THRESHOLDS,
     AxisRow,
     axis_groups,
     axis_note,
@@ -35,6 +45,7 @@ from harness.tables.study import (
     depths_at,
     operating_notes,
     set_by,
+    study_tables,
     threshold_note,
     threshold_warnings,
 )
@@ -51,7 +62,11 @@ def two() -> list[SetUpLimit]:
     return limits_of(SetUp(frames=1, a50_mm=6.0), SetUp(frames=50, a50_mm=4.0))
 
 
-def with_runs(limit: SetUpLimit, threshold: float, **columns: object) -> SetUpLimit:
+def with_runs(
+    limit: SetUpLimit,
+    threshold: float,
+    **columns: object,
+) -> SetUpLimit:
     """A limit whose threshold four runs set."""
     runs = Calibrated(
         board=np.array([3, 5, 7, 9]),
@@ -69,10 +84,15 @@ def with_runs(limit: SetUpLimit, threshold: float, **columns: object) -> SetUpLi
 
 def test_the_run_that_set_a_threshold_has_the_nearest_score(two: list[SetUpLimit]) -> None:
     (row,) = set_by([with_runs(two[0], 11.9)])
-    assert (row.board, row.x_mm, row.y_mm, row.runs) == (5, -120.4, 33.2, 4)
-    assert (row.place, row.same_pixels) == ("−120, 33", None)
+    assert row.board == 5
+    assert row.x_mm == -120.4
+    assert row.y_mm == 33.2
+    assert row.runs == 4
+    assert row.place == ("−120, 33")
+    assert row.same_pixels is None
     (off,) = set_by([with_runs(two[0], 7.5)])
-    assert (off.board, off.place) == (7, "off the board")
+    assert off.board == 7
+    assert off.place == "off the board"
     assert set_by([replace(two[0], record=replace(two[0].record, calibrated=None))]) == []
 
 
@@ -85,7 +105,10 @@ def test_the_run_that_set_a_threshold_has_the_nearest_score(two: list[SetUpLimit
     ],
 )
 def test_runs_within_five_pixels_are_on_the_same_pixels(
-    two: list[SetUpLimit], u_px: list[float], v_px: list[float], same: int
+    two: list[SetUpLimit],
+    u_px: list[float],
+    v_px: list[float],
+    same: int,
 ) -> None:
     limit = with_runs(two[0], 12.0, u_px=np.array(u_px), v_px=np.array(v_px))
     (row,) = set_by([limit])
@@ -209,7 +232,10 @@ def test_depths_are_estimates_up_to_the_deepest_inspected(two: list[SetUpLimit])
     assert [row.limit for row in rows] == [two[1], two[1]]
     assert [row.diameter_mm for row in rows] == [2.0, 4.0]
     depth = rows[1].depth
-    assert (depth.value, depth.low, depth.high, depth.most) == (3.0, 2.0, 4.0, 9.0)
+    assert depth.value == 3.0
+    assert depth.low == 2.0
+    assert depth.high == 4.0
+    assert depth.most == 9.0
 
 
 def test_areas_that_could_not_be_computed_are_named(two: list[SetUpLimit]) -> None:
@@ -252,8 +278,11 @@ def test_the_limit_of_a_new_unit_is_quoted(units: SetUpLimit, two: list[SetUpLim
     assert sentence.endswith("(0.01 to 100).")
     assert study_answer([units]) == sentence
     row = LIMITS.frame([units]).iloc[0]
-    assert (row["one_unit_mm"], row["one_unit_low_mm"], row["one_unit_high_mm"]) == (8.4, 8.0, 9.1)
-    assert (row["new_unit_mm"], row["new_unit_verdict"]) == (9.5, "demonstrated")
+    assert row["one_unit_mm"] == 8.4
+    assert row["one_unit_low_mm"] == 8.0
+    assert row["one_unit_high_mm"] == 9.1
+    assert row["new_unit_mm"] == 9.5
+    assert row["new_unit_verdict"] == "demonstrated"
     single = LIMITS.frame(two).iloc[0]
     assert single["one_unit_mm"] == two[0].a90_95.value
     assert "all units (mm)" in limits_grid([units, two[1]]).heads
@@ -277,12 +306,10 @@ def test_of_many_limits_depths_are_not_compared_with_diameters(two: list[SetUpLi
 def test_estimates_and_bounds(two: list[SetUpLimit]) -> None:
     limit = two[0]
     estimate = size_estimate(limit, "a90")
-    assert (estimate.value, estimate.low, estimate.high, estimate.most) == (
-        limit.a90_mm,
-        limit.a90_interval_mm.low,
-        limit.a90_interval_mm.high,
-        limit.largest_mm,
-    )
+    assert estimate.value == limit.a90_mm
+    assert estimate.low == limit.a90_interval_mm.low
+    assert estimate.high == limit.a90_interval_mm.high
+    assert estimate.most == limit.largest_mm
     assert np.isnan(size_estimate(replace(limit, a50_mm=0.0), "a50").value)
     nothing = replace(limit.a90_95, value=np.inf)
     assert bound_text(bound_estimate(limit, nothing)) == "not demonstrated"
@@ -300,7 +327,8 @@ def test_hits_by_missing_returns_alone_are_noted(two: list[SetUpLimit]) -> None:
     limit = replace(two[0], record=replace(two[0].record, inspected=split))
     assert f"3 of {limit.hits} hits by missing returns alone" in "; ".join(notes_of(limit))
     row = LIMITS.frame([limit]).iloc[0]
-    assert (row["hits_by_depth"], row["hits_by_no_return"]) == (limit.hits - 3, 5)
+    assert row["hits_by_depth"] == limit.hits - 3
+    assert row["hits_by_no_return"] == 5
     cells = LIMITS.grid([limit])
     text = cells.rows[0][cells.heads.index("found")].text
     assert text == (
@@ -315,3 +343,69 @@ def test_hits_by_missing_returns_alone_are_noted(two: list[SetUpLimit]) -> None:
             )
         )
     )
+
+
+# files
+
+
+def test_every_column_of_a_limit_is_its_own_number(two: list[SetUpLimit]) -> None:
+    limit = replace(two[0], size_error_mm=0.25, sized=7, seconds_detect=0.0423)
+    row = LIMITS.frame([limit]).iloc[0]
+    inspected = limit.record.inspected
+    assert row["smallest_mm"] == inspected.diameter_mm.min()
+    assert row["largest_mm"] == inspected.diameter_mm.max()
+    assert row["over_boards_mm"] == limit.over_boards.value
+    assert row["a50_low_mm"] == limit.a50_interval_mm.low
+    assert row["a50_high_mm"] == limit.a50_interval_mm.high
+    assert row["false_calls"] == limit.false_calls.calls
+    assert row["false_calls_per_m2"] == limit.false_calls.rate_per_m2
+    assert row["hole_free_m2"] == pytest.approx(12 * 0.25)
+    assert row["inspections"] == limit.inspections
+    assert row["design_effect"] == limit.design_effect
+    assert row["threshold"] == limit.record.threshold
+    assert row["calibration_runs"] == limit.record.calibration_runs
+    assert (row["size_error_mm"], row["sized"], row["seconds_detect"]) == (0.25, 7, 0.0423)
+    assert row["frames"] == 1
+    assert row["is_at_most"] == limit.is_at_most
+    assert row["detector"] == "plane"
+    cells = LIMITS.grid([limit])
+    texts = dict(zip(cells.heads, (cell.text for cell in cells.rows[0]), strict=True))
+    assert texts["ms a cloud"] == "42"
+    beyond = replace(limit, over_boards=replace(limit.over_boards, value=14.1))
+    verdicts = LIMITS.frame([beyond]).iloc[0]
+    assert verdicts["over_boards_verdict"] == "beyond the sizes inspected"
+    assert verdicts["a90_95_verdict"] == "demonstrated"
+
+
+def test_tables_hold_the_set_ups_they_are_of(two: list[SetUpLimit]) -> None:
+    chance = ChanceHits(0.1, 9, 0.2, 30, 0.3, Interval(0.2, 0.4))
+    set_ups = (
+        SetUpResult(two[0], chance, None, None, None, None, ""),
+        SetUpResult(two[1], None, None, None, None, None, ""),
+    )
+    result = StudyResult(study_record(), set_ups, tuple(two), axis_lines(two), (), {})
+    tables = study_tables(result)
+    assert tables[LIMITS] == two
+    assert tables[THRESHOLDS] == two
+    assert tables[CHANCE] == [set_ups[0]]
+    assert tables[OPERATING] == list(set_ups)
+    assert [row.value for row in tables[AXES]] == [1, 50]
+    assert tables[DEPTH_LIMITS] == []
+    row = CHANCE.frame(tables[CHANCE]).iloc[0]
+    assert (row["shuffled_share"], row["expected_share"], row["places"]) == (0.1, 0.2, 30)
+    assert row["unflawed_share"] == 0.3
+
+
+def test_an_axis_is_numeric_if_all_its_lines_are(two: list[SetUpLimit]) -> None:
+    (group,) = axis_groups(axis_lines(two))
+    line = group.lines[""]
+    mixed = replace(group, lines={"a": line, "b": replace(line, numeric=False)})
+    assert group.numeric
+    assert not mixed.numeric
+    words = replace(line, fixed={"camera": "b"}, values=("off", 1), numeric=False)
+    (joined,) = axis_groups([replace(line, fixed={"camera": "a"}, values=(50, 1)), words])
+    assert joined.values == (50, 1, "off")
+    assert list(joined.lines) == ["a", "b"]
+    numbers = replace(line, fixed={"camera": "b"}, values=(7, 60))
+    (joined,) = axis_groups([replace(line, fixed={"camera": "a"}), numbers])
+    assert joined.values == (1, 7, 50, 60)

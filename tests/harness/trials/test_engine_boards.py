@@ -22,7 +22,15 @@ from harness.trials.board import (
     met_on_face,
     pixel_areas,
 )
-from harness.trials.judge import FINDING_OCTAVES, PIXEL_OCTAVES, Criteria, Judgement, grid
+from harness.trials.judge import (
+    FINDING_OCTAVES,
+    PIXEL_OCTAVES,
+    SMEARED_PX,
+    Criteria,
+    Judgement,
+    grid,
+    smeared,
+)
 from harness.trials.record import add_judgement
 from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.custom import BoardConfig, SphereConfig, TargetConfig
@@ -143,12 +151,27 @@ def test_a_place_where_nothing_was_judged_has_no_signal():
     assert np.isnan(study_record(judgement).sites[0].signal)
 
 
-def test_the_grid_of_thresholds_holds_the_one_in_use():
+@pytest.mark.parametrize("threshold", [0.3, 3.7])
+def test_the_grid_of_thresholds_holds_the_one_in_use(threshold: float):
     for octaves in (FINDING_OCTAVES, PIXEL_OCTAVES):
-        found = grid(3.7, octaves)
-        assert 3.7 in found
-        assert found[1:] / found[:-1] == pytest.approx(2**0.25)
+        thresholds = grid(threshold, octaves)
+        assert threshold in thresholds
+        assert thresholds[1:] / thresholds[:-1] == pytest.approx(2**0.25)
+        lowest, highest = octaves
+        assert thresholds[0] == pytest.approx(threshold * 2.0**lowest)
+        assert thresholds[-1] == pytest.approx(threshold * 2.0**highest)
     assert grid(0.0, FINDING_OCTAVES).tolist() == [0.0]
+
+
+def test_outlines_are_smeared_by_half_a_window_on_a_grid():
+    shape = (9, 11)
+    outline = np.array([4 * 11 + 5])
+    (mask,) = smeared([outline], shape)
+    rows, columns = np.nonzero(mask.reshape(shape))
+    assert (rows.min(), rows.max()) == (4 - SMEARED_PX, 4 + SMEARED_PX)
+    assert (columns.min(), columns.max()) == (5 - SMEARED_PX, 5 + SMEARED_PX)
+    (single,) = smeared([outline], shape, grid=False)
+    assert np.flatnonzero(single).tolist() == outline.tolist()
 
 
 def test_pixels_cover_the_face_however_it_is_tilted():

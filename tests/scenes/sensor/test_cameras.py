@@ -416,7 +416,10 @@ def test_what_a_guessed_gain_means_is_told(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(
         OWN
-        + "photons: {signal_electrons: {value: 600.0, tag: G, range: [150.0, 2400.0], source: s}}\n"
+        + (
+            "photons: {signal_electrons: {value: 600.0, tag: G, range: [150.0, 2400.0], source: "
+            "s}}\n"
+        )
     )
     assert guessed_precision(load_camera(str(path))).endswith("which may be 0.5 to 2 times as much")
     assert guessed_precision(load_camera("azure_kinect_nfov")) == ""

@@ -14,6 +14,7 @@ from scipy import optimize, stats
 from harness.evaluation.pod.ahat import (
     LEVEL,
     AhatFit,
+    _anderson_darling,
     ahat_band,
     ahat_bound,
     choose_axes,
@@ -66,14 +67,17 @@ def test_the_handbook_example_to_its_printed_digits(
     assert round(fit.curve.size_at(0.5), 1) == 8.8
     assert round(fit.curve.size_at(0.9), 2) == 12.69
     assert round(ahat_bound(fit).value, 2) == 13.68
-    assert (fit.n, fit.below.sum(), fit.above.sum()) == (92, 3, 1)
+    assert fit.n == 92
+    assert fit.below.sum() == 3
+    assert fit.above.sum() == 1
 
 
 def test_the_handbook_axes_are_those_of_least_deviance(
     example1: tuple[np.ndarray, np.ndarray],
 ) -> None:
     fits = choose_axes(*example1, decision=200, left=50, right=1375)
-    assert (fits[0].log_size, fits[0].log_signal) == (True, False)
+    assert fits[0].log_size is True
+    assert fits[0].log_signal is False
     assert len(fits) == 4
     assert [fit.deviance for fit in fits] == sorted(fit.deviance for fit in fits)
 
@@ -112,7 +116,8 @@ def test_censored_rows_against_brute_force() -> None:
         negative, [0.0, 1.2, 0.5], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}
     )
     fitted = np.array([fit.b0, fit.b1, fit.tau])
-    assert fit.below.any() and fit.above.any()
+    assert fit.below.any()
+    assert fit.above.any()
     assert fitted == pytest.approx(best.x, abs=1e-6)
     assert fit.log_likelihood == pytest.approx(-negative(fitted), rel=1e-12)
     step = 1e-4 * np.eye(3)
@@ -154,13 +159,18 @@ def test_deviance_compares_signal_and_its_logarithm() -> None:
     density = stats.lognorm.logpdf(signal, fit.tau, scale=np.exp(fit.b0 + fit.b1 * np.log(size)))
     assert fit.log_likelihood == pytest.approx(density.sum(), rel=1e-10)
     best = choose_axes(size, signal, decision=2.0)[0]
-    assert (best.log_size, best.log_signal) == (True, True)
+    assert best.log_size is True
+    assert best.log_signal is True
 
 
 def test_logarithms_are_tried_only_where_all_values_have_one() -> None:
     size, signal = study(4)
 
-    def axes(sizes: np.ndarray, signals: np.ndarray, **limits: float) -> set[tuple[bool, bool]]:
+    def axes(
+        sizes: np.ndarray,
+        signals: np.ndarray,
+        **limits: float,
+    ) -> set[tuple[bool, bool]]:
         fits = choose_axes(sizes, signals, decision=2.0, **limits)
         return {(fit.log_size, fit.log_signal) for fit in fits}
 
@@ -181,7 +191,10 @@ def test_logarithms_are_tried_only_where_all_values_have_one() -> None:
     log_size=st.booleans(),
 )
 def test_units_of_size_and_signal_do_not_matter(
-    unit: float, gain: float, offset: float, log_size: bool
+    unit: float,
+    gain: float,
+    offset: float,
+    log_size: bool,
 ) -> None:
     size, signal = study(5)
     fit = fit_ahat(size, signal, decision=2.0, left=1.5, right=3.1, log_size=log_size)
@@ -208,8 +221,10 @@ def test_the_band_is_that_of_the_bounds() -> None:
     sizes = np.linspace(0, 40, 200)
     low, high = ahat_band(fit, sizes)
     pod = fit.curve.pod(sizes[1:])
-    assert np.all(low[1:] <= pod) and np.all(pod <= high[1:])
-    assert np.all(np.diff(low) >= 0) and np.all(np.diff(high) >= 0)
+    assert np.all(low[1:] <= pod)
+    assert np.all(pod <= high[1:])
+    assert np.all(np.diff(low) >= 0)
+    assert np.all(np.diff(high) >= 0)
 
 
 def test_a_signal_that_hardly_grows_demonstrates_nothing() -> None:
@@ -217,9 +232,11 @@ def test_a_signal_that_hardly_grows_demonstrates_nothing() -> None:
     size = np.linspace(1, 2, 12)
     fit = fit_ahat(size, 0.4 * size + rng.normal(size=12), decision=1.0)
     limit = ahat_bound(fit)
-    assert not limit.demonstrated and "uncertain" in limit.why
+    assert not limit.demonstrated
+    assert "uncertain" in limit.why
     low, high = ahat_band(fit, size)
-    assert not low.any() and np.all(high == 1)
+    assert not low.any()
+    assert np.all(high == 1)
 
 
 def test_repeats_of_targets_are_not_targets() -> None:
@@ -232,7 +249,9 @@ def test_repeats_of_targets_are_not_targets() -> None:
         log_size=True,
         inspections=np.tile(np.arange(12), 50),
     )
-    assert (again.n, again.targets, again.per_target) == (600, 12, 50)
+    assert again.n == 600
+    assert again.targets == 12
+    assert again.per_target == 50
     assert ahat_bound(again).value == pytest.approx(ahat_bound(once).value, rel=1e-9)
     assert any("12 targets count" in note for note in again.notes)
 
@@ -261,11 +280,41 @@ def test_diagnostics_against_statsmodels() -> None:
         [lm, p], rel=1e-9
     )
     assert tests["Anderson-Darling"].p_value == pytest.approx(diagnostic.normal_ad(z)[1], rel=1e-9)
-    assert tests["Durbin-Watson"].statistic == pytest.approx(stattools.durbin_watson(z), rel=1e-9)
+    ratio = tests["Durbin-Watson"].statistic
+    assert ratio == pytest.approx(stattools.durbin_watson(z), rel=1e-9)
+    # mean 2 and variance 4 (n - 2) / ((n - 1)(n + 1)) of 60 independent values
+    score = (ratio - 2) / np.sqrt(4 * 58 / (59 * 61))
+    p_value = 2 * stats.norm.sf(abs(score))
+    assert tests["Durbin-Watson"].p_value == pytest.approx(p_value, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("power", "low", "high"),
+    [
+        (1.0, 0.0, 0.2),
+        (1.25, 0.2, 0.34),
+        (1.35, 0.34, 0.6),
+        (1.6, 0.6, 13.0),
+        (12.0, 13.0, 99.0),
+    ],
+)
+def test_every_piece_of_the_p_value_of_normality_agrees_with_statsmodels(
+    power: float,
+    low: float,
+    high: float,
+) -> None:
+    """Normal quantiles, whose tails a power above 1 stretches."""
+    diagnostic = pytest.importorskip("statsmodels.stats.diagnostic")
+    quantiles = stats.norm.ppf((np.arange(60) + 0.5) / 60)
+    z = np.sign(quantiles) * np.abs(quantiles) ** power + 0.3
+    statistic, p_value = _anderson_darling(z)
+    assert low < statistic <= high
+    _, expected = diagnostic.normal_ad(z)
+    assert p_value == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
 def test_diagnostics_hold_their_level_with_a_third_of_the_signals_censored() -> None:
-    """200 sound studies: p-values uniform by Kolmogorov and Smirnov at alpha = 0.001, seeds fixed."""
+    """200 sound studies: p-values are uniform by Kolmogorov and Smirnov at alpha = 0.001."""
     p = np.array(
         [
             [diagnostic_test.p_value for diagnostic_test in diagnose(fit_study(2000 + i))]

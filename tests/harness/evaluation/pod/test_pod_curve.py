@@ -37,7 +37,11 @@ HITS = np.array([0.0, 0.0, 1.0, 0.0, 2.0, 0.0, 1.0, 1.0, 3.0])
 MISSES = np.array([1.0, 2.0, 0.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0])
 
 
-def data_of(link: str, penalty: float | None = None, offset: float = 0.0) -> HitsAndMisses:
+def data_of(
+    link: str,
+    penalty: float | None = None,
+    offset: float = 0.0,
+) -> HitsAndMisses:
     """One study of nine sizes, of which hits and misses overlap."""
     design = np.column_stack([np.ones_like(SIZES), SIZES])
     return HitsAndMisses(design, HITS, MISSES, link, penalty, offset)

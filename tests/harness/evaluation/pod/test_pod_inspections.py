@@ -18,7 +18,11 @@ from harness.vocabulary.errors import UserError
 SIZES = [0.5 * row for row in range(1, 13)]
 
 
-def written(folder: Path, rows: list[str], head: str = "a,hit,t") -> Path:
+def written(
+    folder: Path,
+    rows: list[str],
+    head: str = "a,hit,t",
+) -> Path:
     path = folder / "table.csv"
     path.write_text("\n".join([head, *rows]), encoding="utf-8")
     return path
@@ -29,7 +33,11 @@ def good_rows() -> list[str]:
     return [f"{size},{int(size > 3)},t{row}" for row, size in enumerate(SIZES)]
 
 
-def read_text(folder: Path, text: str | bytes, **options: object) -> Inspections:
+def read_text(
+    folder: Path,
+    text: str | bytes,
+    **options: object,
+) -> Inspections:
     path = folder / "table.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
     return read_inspections(path, "a", ["hit"], **options)  # type: ignore[arg-type]
@@ -40,7 +48,10 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
     assert read.size.tolist() == SIZES
     assert read.response.tolist() == 6 * [0.0] + 6 * [1.0]
     assert read.line.tolist() == list(range(2, 14))
-    assert (read.target, read.targets, read.unflawed.size, read.notes) == (None, 12, 0, ())
+    assert read.target is None
+    assert read.targets == 12
+    assert read.unflawed.size == 0
+    assert read.notes == ()
     assert texts_of(read, "t").tolist() == [f"t{row}" for row in range(12)]
 
 
@@ -82,7 +93,11 @@ def test_named_targets_are_kept_for_every_inspector(tmp_path: Path) -> None:
     ("word", "value"),
     [("1", 1), ("1.0", 1), ("1,", 1), ("Yes", 1), ("HIT", 1), ("0.00", 0), ("miss", 0), ("F", 0)],
 )
-def test_words_for_hits_and_misses(tmp_path: Path, word: str, value: int) -> None:
+def test_words_for_hits_and_misses(
+    tmp_path: Path,
+    word: str,
+    value: int,
+) -> None:
     rows = [f"{size};{word}" for size in SIZES]
     read = read_text(tmp_path, "\n".join(["a;hit", *rows]))
     assert read.response.tolist() == 12 * [value]
@@ -105,7 +120,10 @@ def test_words_for_hits_and_misses(tmp_path: Path, word: str, value: int) -> Non
     ],
 )
 def test_numbers_with_marks(
-    tmp_path: Path, texts: list[str], values: list[float], notes: int
+    tmp_path: Path,
+    texts: list[str],
+    values: list[float],
+    notes: int,
 ) -> None:
     rows = [f"{texts[row % 2]};{row % 2}" for row in range(12)]
     read = read_text(tmp_path, "\n".join(["a;hit", *rows]))
@@ -165,7 +183,12 @@ def test_a_sheet_may_begin_in_any_column(tmp_path: Path) -> None:
         (3, '"3,5",0,t', "a has numbers with the decimal marks , and ."),
     ],
 )
-def test_rows_that_are_refused(tmp_path: Path, row: int, text: str, message: str | None) -> None:
+def test_rows_that_are_refused(
+    tmp_path: Path,
+    row: int,
+    text: str,
+    message: str | None,
+) -> None:
     rows = good_rows()
     rows[row] = text
     path = written(tmp_path, rows)
@@ -193,7 +216,11 @@ def test_nine_rows_are_too_few(tmp_path: Path) -> None:
         ("a,a,hit\n1,2,1\n", "2 columns are called 'a'"),
     ],
 )
-def test_files_that_are_refused(tmp_path: Path, text: str | bytes, message: str) -> None:
+def test_files_that_are_refused(
+    tmp_path: Path,
+    text: str | bytes,
+    message: str,
+) -> None:
     with pytest.raises(UserError, match=message):
         read_text(tmp_path, text)
 

@@ -26,7 +26,11 @@ from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import drawn_sizes, false_positives, state_hits, state_signals
 
 
-def inspections(size: np.ndarray, response: np.ndarray, **columns: object) -> Inspections:
+def inspections(
+    size: np.ndarray,
+    response: np.ndarray,
+    **columns: object,
+) -> Inspections:
     return Inspections(
         path=Path("table.csv"),
         size_column="size",
@@ -39,7 +43,12 @@ def inspections(size: np.ndarray, response: np.ndarray, **columns: object) -> In
     )
 
 
-def hits_of(targets: int, seed: int, floor: float = 0.0, ceiling: float = 1.0) -> Inspections:
+def hits_of(
+    targets: int,
+    seed: int,
+    floor: float = 0.0,
+    ceiling: float = 1.0,
+) -> Inspections:
     """Sizes of 0.5 to 10 mm and hits of a logistic curve at 4 mm with sigma 0.8 mm."""
     size = np.linspace(0.5, 10.0, targets)
     chance = floor + (ceiling - floor) * link_cdf("logit", (size - 4.0) / 0.8)
@@ -123,10 +132,8 @@ def test_the_bound_is_the_largest_and_the_band_the_widest_of_near_models() -> No
     assert [fit.deviance for fit in stated.fits] == [fit.deviance for fit in near_fits]
     assert stated.bound == largest_bound(near_fits)
     assert stated.bound.value == max(bound(fit).value for fit in near_fits)
-    assert (stated.a50, stated.a90) == (
-        near_fits[0].curve.size_at(0.5),
-        near_fits[0].curve.size_at(0.9),
-    )
+    assert stated.a50 == near_fits[0].curve.size_at(0.5)
+    assert stated.a90 == near_fits[0].curve.size_at(0.9)
     bands = [band(fit, stated.sizes) for fit in near_fits]
     low, high = stated.band
     assert np.array_equal(low, np.min([edges[0] for edges in bands], axis=0))
@@ -304,7 +311,10 @@ def test_noise_at_the_floor_is_censored_and_little_noise_is_not_fitted() -> None
     ],
 )
 def test_sizes_are_drawn_a_little_beyond_those_inspected(
-    size: list[float], log_size: bool, marks: tuple[float, ...], ends: tuple[float, float]
+    size: list[float],
+    log_size: bool,
+    marks: tuple[float, ...],
+    ends: tuple[float, float],
 ) -> None:
     sizes = drawn_sizes(np.array(size), log_size, marks)
     assert (sizes[0], sizes[-1]) == pytest.approx(ends, abs=1e-12)
@@ -327,9 +337,11 @@ def test_a_statement_as_plain_data() -> None:
         "why": "",
         "size": stated.bound.value,
     }
-    assert (data["a50"], data["a90"]) == (stated.a50, stated.a90)
+    assert data["a50"] == stated.a50
+    assert data["a90"] == stated.a90
     assert data["curve"]["mu"] == stated.curve.mu
     assert data["curve"]["covariance_mu_sigma"] == stated.curve.covariance.tolist()
     assert [row["in_a90_95"] for row in data["models"]] == [row.in_bound for row in stated.models]
-    assert (data["hits"], data["inspections"]) == (int(stated.read.response.sum()), 60)
+    assert data["hits"] == int(stated.read.response.sum())
+    assert data["inspections"] == 60
     assert [test["p"] for test in data["tests"]] == [p for _, p, _ in stated.tests]

@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 from scipy import special, stats
 
-from harness.evaluation.intervals import false_call_rate
+from harness.evaluation.intervals import false_call_rate, percentiles
+from harness.evaluation.study.boards import weights_in_blocks
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curve
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord
@@ -65,7 +66,8 @@ class TestChance:
         )
         chance = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0)
         # a over board 1: hit; b over board 0: not; a, b over board 9: one of two
-        assert (chance.laid, chance.probability) == (4, 0.5)
+        assert chance.laid == 4
+        assert chance.probability == 0.5
 
     def test_findings_that_count_for_damage_are_no_chance(self):
         tables = two_boards([("damaged", 1, 0.0, 0.0, "b")])
@@ -90,10 +92,8 @@ class TestChance:
         assert chance.expected == pytest.approx(expected, rel=1e-12)
         assert chance.probability == pytest.approx(expected, rel=0.3)
         assert chance.laid == 240 * 59
-        assert (
-            chance.sites == 240
-            and chance.sites_interval.low < expected < chance.sites_interval.high
-        )
+        assert chance.sites == 240
+        assert chance.sites_interval.low < expected < chance.sites_interval.high
         assert chance.of_sites == loud.sites["detected"].mean()
 
     def test_repeats_of_a_site_are_shares_of_it(self):
@@ -102,7 +102,8 @@ class TestChance:
             {"board": [9, 9, 8], "hole": "a", "repeat": [0, 1, 0], "detected": [True, False, False]}
         )
         chance = chance_hits(tables.holes, sites, tables.runs, tables.findings, 5.0)
-        assert (chance.sites, chance.of_sites) == (2, 0.25)
+        assert chance.sites == 2
+        assert chance.of_sites == 0.25
 
 
 class TestRoc:
@@ -124,7 +125,10 @@ class TestRoc:
         curve = roc_curve(holes, sites, 0.5)
         assert curve.area == pytest.approx(4 / 6)
         assert curve.in_use == (0.5, pytest.approx(2 / 3))
-        assert (curve.false[0], curve.true[0], curve.false[-1], curve.true[-1]) == (0, 0, 1, 1)
+        assert curve.false[0] == 0
+        assert curve.true[0] == 0
+        assert curve.false[-1] == 1
+        assert curve.true[-1] == 1
 
     def test_none_without_sites(self, loud):
         assert roc_curve(loud.holes, loud.sites.iloc[:0], THRESHOLD) is None
@@ -174,19 +178,21 @@ class TestFreeResponse:
         curve = free_response(pd.concat([free, hits]), runs, holes, draws=10)
         assert curve.threshold.tolist() == [6.0, 5.0, 3.0, 2.0]
         assert curve.false_calls_per_m2.tolist() == [0.0, 4.0, 4.0, 6.0]
-        assert curve.found_share.tolist() == [0.0, 0.5, 0.5, 1.0] and curve.in_use == (4.0, 0.5)
+        assert curve.found_share.tolist() == [0.0, 0.5, 0.5, 1.0]
+        assert curve.in_use == (4.0, 0.5)
 
     def test_none_without_hole_free_boards(self, loud):
         runs = loud.runs[loud.runs["role"] == "damaged"]
         assert free_response(loud.operating, runs, loud.holes) is None
 
     def test_false_calls_fall_as_their_scores_do(self, loud):
-        """Scores are exponential, so the logarithm of the rate falls by 1 in a unit of threshold."""
+        """Scores are exponential: the logarithm of the rate falls by 1 in a unit of threshold."""
         curve = free_response(loud.operating, loud.runs, loud.holes)
         expected = LOUD * np.exp(THRESHOLD - curve.threshold)
         scatter = np.sqrt(expected / curve.area_m2)
         assert np.all(np.abs(curve.false_calls_per_m2 - expected) < 4 * scatter)
-        assert np.all(np.diff(curve.found_share) >= 0) and np.all(np.diff(curve.threshold) < 0)
+        assert np.all(np.diff(curve.found_share) >= 0)
+        assert np.all(np.diff(curve.threshold) < 0)
 
 
 class TestPixels:
@@ -215,7 +221,8 @@ class TestPixels:
     def test_thresholds_that_end_early_give_no_overlap_score(self, loud):
         above = [counts[PIXEL_GRID > 1.0] for counts in loud.pixels["above"]]
         curves = pixel_curves(loud.pixels.assign(above=above))
-        assert np.isnan(curves.pro) and "0.1" in curves.why
+        assert np.isnan(curves.pro)
+        assert "0.1" in curves.why
 
     def test_none_without_damage(self, loud):
         assert pixel_curves(loud.pixels[loud.pixels["hole"] == ""]) is None
@@ -241,7 +248,8 @@ class TestSurface:
         fit = sm.GLM(
             inspected.hit.astype(float), np.column_stack(columns), family=sm.families.Binomial(link)
         ).fit()
-        assert surface.b[:3] == pytest.approx(fit.params, rel=1e-5) and surface.b[3] == 0
+        assert surface.b[:3] == pytest.approx(fit.params, rel=1e-5)
+        assert surface.b[3] == 0
         assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
 
     def drawn(self, predictor: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> SetUpRecord:
@@ -256,7 +264,8 @@ class TestSurface:
         sm = pytest.importorskip("statsmodels.api")
         record = self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d)
         surface, why = surface_of(record, draws=50)
-        assert why == surface.note == "" and surface.interaction_p < 0.05
+        assert why == surface.note == ""
+        assert surface.interaction_p < 0.05
         a = np.log(record.inspected.diameter_mm)
         d = np.log(record.inspected.depth_mm)
         link = {"logit": sm.families.links.Logit(), "probit": sm.families.links.Probit()}[
@@ -278,10 +287,10 @@ class TestSurface:
         assert surface.pod(surface.diameter_mm, surface.d90_mm)[reached] == pytest.approx(
             0.9, abs=1e-9
         )
-        assert reached.sum() > 15 and np.all(np.diff(surface.d90_mm[reached]) < 0)
-        assert np.all(surface.d90_low_mm <= surface.d90_mm) and np.all(
-            surface.d90_mm <= surface.d90_high_mm
-        )
+        assert reached.sum() > 15
+        assert np.all(np.diff(surface.d90_mm[reached]) < 0)
+        assert np.all(surface.d90_low_mm <= surface.d90_mm)
+        assert np.all(surface.d90_mm <= surface.d90_high_mm)
 
     @pytest.mark.slow
     def test_the_depth_found_holds_the_truth(self):
@@ -308,7 +317,8 @@ class TestSurface:
 
     def test_a_chance_that_falls_with_diameter_has_none(self):
         surface, why = surface_of(self.drawn(lambda a, d: 3.0 - 2.0 * a + 0.5 * d))
-        assert surface is None and why == "the probability of detection does not grow with diameter"
+        assert surface is None
+        assert why == "the probability of detection does not grow with diameter"
 
     def test_a_chance_that_falls_with_depth_is_said(self):
         surface, _ = surface_of(self.drawn(lambda a, d: -3.0 + 4.0 * a - 2.0 * d), draws=50)
@@ -316,7 +326,8 @@ class TestSurface:
 
     def test_refused_where_depth_does_not_vary(self):
         surface, why = surface_of(study_record(Study(hole_free_boards=0)).set_ups[0])
-        assert surface is None and why == "depth does not vary: 5 to 5 mm"
+        assert surface is None
+        assert why == "depth does not vary: 5 to 5 mm"
 
     def test_refused_where_a_plane_parts_hits_from_misses(self):
         record = study_record(self.study()).set_ups[0]
@@ -325,7 +336,8 @@ class TestSurface:
         surface, why = surface_of(
             dataclasses.replace(record, inspected=dataclasses.replace(inspected, hit=hit))
         )
-        assert surface is None and "separation" in why
+        assert surface is None
+        assert "separation" in why
 
 
 @pytest.fixture(scope="module")
@@ -352,24 +364,18 @@ class TestAxes:
             ("camera", ("b", "a")),
             (FRAMES, (1, 20)),
         ]
-        assert (
-            lines[0].fixed == {"camera": "b", FRAMES: 1}
-            and lines[0].numeric
-            and not lines[1].numeric
-        )
+        assert lines[0].fixed == {"camera": "b", FRAMES: 1}
+        assert lines[0].numeric
+        assert not lines[1].numeric
         assert lines[0].limits == (limits[2], limits[0])
 
     def test_what_differs_is_told_from_what_does_not(self, limits):
         distance, camera, _ = axis_lines(limits)
-        assert (
-            distance.steps[0].paired
-            and distance.steps[0].beyond_chance
-            and distance.steps[0].interval.low > 1
-        )
-        assert (
-            not camera.steps[0].beyond_chance
-            and camera.steps[0].interval.low < 1 < camera.steps[0].interval.high
-        )
+        assert distance.steps[0].paired
+        assert distance.steps[0].beyond_chance
+        assert distance.steps[0].interval.low > 1
+        assert not camera.steps[0].beyond_chance
+        assert camera.steps[0].interval.low < 1 < camera.steps[0].interval.high
         assert distance.steps[0].ratio == limits[0].a90_mm / limits[2].a90_mm
         assert len(distance.steps) == 1
 
@@ -382,14 +388,65 @@ class TestAxes:
             boards=30,
             hole_free_boards=0,
         )
-        first, second = (limit_of(record, draws=300) for record in study_record(study).set_ups)
+        records = study_record(study).set_ups
+        first = limit_of(records[0], draws=300)
+        second = limit_of(records[1], draws=300)
         paired = difference(first, second)
         elsewhere = dataclasses.replace(
             second.record.inspected, x_mm=second.record.inspected.x_mm + 1
         )
         moved = dataclasses.replace(second.record, targets_digest="others", inspected=elsewhere)
         unpaired = difference(first, dataclasses.replace(second, record=moved))
-        assert paired.paired and not unpaired.paired and unpaired.ratio == paired.ratio
+        assert paired.paired
+        assert not unpaired.paired
+        assert unpaired.ratio == paired.ratio
         assert unpaired.interval.high - unpaired.interval.low > 1.5 * (
             paired.interval.high - paired.interval.low
         )
+
+
+class TestEdges:
+    """What curves hold where one of their tables is empty or ends early."""
+
+    def test_free_response_needs_every_table(self, loud):
+        runs = loud.runs
+        assert free_response(loud.operating.iloc[:0], runs, loud.holes) is None
+        assert free_response(loud.operating, runs, loud.holes.iloc[:0]) is None
+        assert free_response(loud.operating, pd.DataFrame(), loud.holes) is None
+
+    def test_intervals_of_a_free_response_are_over_boards(self, loud):
+        curve = free_response(loud.operating, loud.runs, loud.holes, draws=30)
+        index = np.flatnonzero(curve.threshold == THRESHOLD)[0]
+        boards = np.unique(loud.holes["board"])
+        hits = loud.holes.groupby("board")["detected"].sum().to_numpy(float)
+        count = loud.holes.groupby("board").size().to_numpy(float)
+        (weights,) = next(iter(weights_in_blocks(30, (boards, "damaged"))))
+        expected = percentiles((weights @ hits) / (weights @ count))
+        assert curve.found_low[index] == pytest.approx(expected.low)
+        assert curve.found_high[index] == pytest.approx(expected.high)
+
+    def test_pixels_that_end_early_keep_their_curves(self):
+        rows = [("", 100, np.array([20, 10])), ("a", 4, np.array([3, 1]))]
+        pixels = pd.DataFrame(rows, columns=["hole", "pixels", "above"])
+        curves = pixel_curves(pixels)
+        assert curves.false.tolist() == [0.0, 0.1, 0.2, 1.0]
+        assert curves.overlap.tolist() == [0.0, 0.25, 0.75, 1.0]
+        assert np.isnan(curves.pro)
+        assert curves.why == "the thresholds counted end at a false-positive rate of 0.2"
+
+    def test_pixels_that_are_all_found_early_have_an_area(self):
+        rows = [("", 100, np.array([20, 10])), ("a", 4, np.array([4, 2]))]
+        pixels = pd.DataFrame(rows, columns=["hole", "pixels", "above"])
+        curves = pixel_curves(pixels)
+        # 0 -> 0.5 over 0.1, then 0.5 -> 1 over 0.1, then 1 over 0.1
+        assert curves.pro == pytest.approx((0.1 * 0.25 + 0.1 * 0.75 + 0.1) / 0.3)
+        assert curves.why == ""
+
+    def test_chance_without_sites_and_without_a_rate(self, loud):
+        chance = chance_hits(loud.holes, pd.DataFrame(), loud.runs, loud.findings, RADIUS_MM)
+        assert chance.sites == 0
+        assert np.isnan(chance.of_sites)
+        assert np.isnan(chance.expected)
+        assert not chance.sites_interval.known
+        only = loud.runs.iloc[:0]
+        assert np.isnan(chance_hits(loud.holes, pd.DataFrame(), only, only, RADIUS_MM).probability)

@@ -20,6 +20,7 @@ from harness.evaluation.study.record import (
     Unflawed,
     read_record,
     record_text,
+    set_up_named,
 )
 from harness.vocabulary.errors import UserError
 from tests.support.synthetic_study import SetUp, Study, study_record
@@ -49,7 +50,8 @@ def changed(path: tuple[str | int, ...], value: Any) -> Any:
 def refusal(file: Path) -> UserError:
     with pytest.raises(UserError) as caught:
         read_record(file)
-    assert str(file) in caught.value.message and (caught.value.fix or caught.value.legal)
+    assert str(file) in caught.value.message
+    assert caught.value.fix or caught.value.legal
     return caught.value
 
 
@@ -138,11 +140,17 @@ def test_written_and_read_it_is_the_same(tmp_path):
         (("further",), 1, "further: "),
     ],
 )
-def test_a_damaged_one_is_told_with_its_place(tmp_path, path, value, told):
+def test_a_damaged_one_is_told_with_its_place(
+    tmp_path,
+    path,
+    value,
+    told,
+):
     file = tmp_path / "study.json"
     file.write_text(json.dumps(changed(path, value)))
     mistake = refusal(file)
-    assert f"{file}: is damaged: " in mistake.message and told in mistake.message
+    assert f"{file}: is damaged: " in mistake.message
+    assert told in mistake.message
     assert "run the study again" in (mistake.fix or "")
 
 
@@ -156,4 +164,51 @@ def test_several_mistakes_are_counted(tmp_path):
 def test_what_is_no_json_is_told_what_to_do(tmp_path, content):
     (tmp_path / "no.json").write_bytes(content)
     mistake = refusal(tmp_path / "no.json")
-    assert "is not JSON" in mistake.message and mistake.fix and mistake.legal
+    assert "is not JSON" in mistake.message
+    assert mistake.fix
+    assert mistake.legal
+
+
+def test_a_set_up_is_found_by_its_label_or_alone() -> None:
+    first, second = STUDY.set_ups
+    alone = replace(STUDY, set_ups=(first,))
+    assert set_up_named(STUDY, "5 frames") is second
+    assert set_up_named(alone, None) is first
+    assert set_up_named(alone, "") is first
+    for name in (None, ""):
+        with pytest.raises(UserError, match="synthetic has 2 set-ups") as caught:
+            set_up_named(STUDY, name)
+        assert caught.value.legal == "1 frame; 5 frames"
+    with pytest.raises(UserError, match=r"no set-up '5 frame'; did you mean '5 frames'\?"):
+        set_up_named(STUDY, "5 frame")
+
+
+def test_labels_name_variant_and_frames() -> None:
+    first = STUDY.set_ups[0]
+    assert first.label == "1 frame"
+    assert replace(first, frames=2).label == "2 frames"
+    assert replace(first, variant="distance=0.5 m").label == "distance 0.5 m, 1 frame"
+
+
+def test_limits_are_of_depth_if_only_the_depth_varies() -> None:
+    inspected = STUDY.set_ups[0].inspected
+    count = len(inspected.hit)
+    same = replace(inspected, diameter_mm=np.full(count, 5.0))
+    assert same.limit_of == "diameter"
+    depths = np.linspace(1.0, 2.0, count)
+    assert replace(same, depth_mm=depths).limit_of == "depth"
+    assert replace(same, depth_mm=depths).size_mm.tolist() == depths.tolist()
+    assert replace(same, depth_mm=depths - 1.0).limit_of == "diameter"
+    assert replace(inspected, depth_mm=depths, size_of="width").limit_of == "width"
+
+
+def test_the_rule_for_a_hit_in_words() -> None:
+    rule = "where the centre of a finding lies within 15 mm of"
+    assert STUDY.hit_rule == f"{rule} its own"
+    overlap = replace(STUDY, hit_overlap=0.5)
+    assert overlap.hit_rule == (
+        f"{rule} its centre, or at least 50 % of a finding's pixels lie on it or 2 pixels beside it"
+    )
+    first = STUDY.set_ups[0]
+    long = replace(first, inspected=replace(first.inspected, size_of="width"))
+    assert replace(STUDY, set_ups=(long,)).hit_rule == f"{rule} its centre line"

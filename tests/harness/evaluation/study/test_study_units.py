@@ -11,10 +11,10 @@ from scipy import stats
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.limit import limit_of
-from harness.evaluation.study.units import over_units
+from harness.evaluation.study.units import METHOD, over_units
 from tests.support.synthetic_study import Study, study_record
 
-A50_MM = (3.5, 4.0, 5.0)
+A50_MM = np.array([3.5, 4.0, 5.0])
 SIZES_MM = np.linspace(1.0, 9.0, 40)
 SIZE_MM = np.tile(SIZES_MM, 3)
 TARGET = np.tile(np.arange(40).astype(str), 3)
@@ -24,7 +24,7 @@ UNIT = np.repeat(np.arange(3), 40)
 def hits_of_units() -> np.ndarray:
     """Hits of three units whose a50 differ."""
     rng = np.random.default_rng(4)
-    chance = 1 / (1 + np.exp(-(SIZE_MM - np.array(A50_MM)[UNIT]) / 0.7))
+    chance = 1 / (1 + np.exp(-(SIZE_MM - A50_MM[UNIT]) / 0.7))
     return rng.random(120) < chance
 
 
@@ -33,7 +33,7 @@ def test_a_new_unit_by_hand() -> None:
     curve = fit_hit_miss(SIZE_MM, hit, link="probit", inspections=TARGET).curve
     limit = Bound(0.9, 0.95, "likelihood ratio", 1.1 * curve.size_at(0.9))
     judged = over_units(SIZE_MM, hit, TARGET, UNIT, curve, limit)
-    fits = [fit_hit_miss(SIZES_MM, hit[UNIT == unit], link="probit") for unit in range(3)]
+    fits = [fit_hit_miss(SIZES_MM, hit[unit == UNIT], link="probit") for unit in range(3)]
     a90_mm = np.array([fit.curve.size_at(0.9) for fit in fits])
     assert judged.units == 3
     assert judged.a90_mm.tolist() == a90_mm.tolist()
@@ -46,7 +46,8 @@ def test_a_new_unit_by_hand() -> None:
     assert stats.t.ppf(0.95, 2) == pytest.approx(2.919986, abs=1e-6)
     assert judged.new_unit.value == pytest.approx(expected, rel=1e-6)
     assert judged.new_unit.why == ""
-    assert (judged.new_unit.pod, judged.new_unit.confidence) == (0.9, 0.95)
+    assert judged.new_unit.pod == 0.9
+    assert judged.new_unit.confidence == 0.95
 
 
 def test_a_unit_that_found_everything_cannot_be_compared() -> None:
@@ -58,6 +59,8 @@ def test_a_unit_that_found_everything_cannot_be_compared() -> None:
     assert judged.spread == np.inf
     assert not judged.new_unit.demonstrated
     assert "a unit found every damage or none" in judged.new_unit.why
+    assert (judged.new_unit.pod, judged.new_unit.confidence) == (0.9, 0.95)
+    assert judged.new_unit.method == METHOD
 
 
 def test_without_a_limit_over_boards_there_is_none_of_a_new_unit() -> None:
@@ -67,6 +70,8 @@ def test_without_a_limit_over_boards_there_is_none_of_a_new_unit() -> None:
     judged = over_units(SIZE_MM, hit, TARGET, UNIT, curve, nothing)
     assert judged.new_unit.value == np.inf
     assert judged.new_unit.why == "not demonstrated: a reason"
+    assert (judged.new_unit.pod, judged.new_unit.confidence) == (0.9, 0.95)
+    assert judged.new_unit.method == METHOD
     assert np.isfinite(judged.spread)
 
 

@@ -38,7 +38,7 @@ def limits(seed: int = 1, lost: float = 40.0) -> pd.DataFrame:
         for distance_m in (0.5, 0.75, 1.0, 1.5):
             for frames in (1, 10, 50):
                 truth = law_mm(distance_m, frames, damage.get("depth_mm", [None])[0])
-                found = truth * np.exp(stream.normal(0, SCATTER))
+                a90_mm = truth * np.exp(stream.normal(0, SCATTER))
                 rows.append(
                     {
                         "source.camera.name": "azure_kinect_nfov",
@@ -46,27 +46,27 @@ def limits(seed: int = 1, lost: float = 40.0) -> pd.DataFrame:
                         "source.target.distance_m": distance_m,
                         "frames": frames,
                         "detector": "matched",
-                        "a90_mm": found if found < lost else np.nan,
-                        "a90_low_mm": found * np.exp(-1.96 * SCATTER),
-                        "a90_high_mm": found * np.exp(1.96 * SCATTER),
+                        "a90_mm": a90_mm if a90_mm < lost else np.nan,
+                        "a90_low_mm": a90_mm * np.exp(-1.96 * SCATTER),
+                        "a90_high_mm": a90_mm * np.exp(1.96 * SCATTER),
                         "largest_mm": 40.0,
                         "is_at_most": False,
-                        "hits": 0 if found >= lost else 50,
+                        "hits": 0 if a90_mm >= lost else 50,
                     }
                 )
     return pd.DataFrame(rows)
 
 
 def test_intervals_of_the_surface_hold_the_law():
-    held = []
+    covered = []
     widths = []
     for seed in range(100):
         surface = surfaces_of(limits(seed))[0]
-        for place in ({"distance_m": 0.6, "frames": 1}, {"distance_m": 1.2, "frames": 25}):
-            answer = surface.at(**place)
-            held.append(answer.low_mm <= law_mm(**place) <= answer.high_mm)
+        for setting in ({"distance_m": 0.6, "frames": 1}, {"distance_m": 1.2, "frames": 25}):
+            answer = surface.at(**setting)
+            covered.append(answer.low_mm <= law_mm(**setting) <= answer.high_mm)
             widths.append(answer.high_mm / answer.low_mm)
-    assert np.mean(held) > 0.95 and np.median(widths) < 1.5
+    assert np.mean(covered) > 0.95 and np.median(widths) < 1.5
 
 
 def test_a_wrong_surface_states_its_error():
@@ -78,25 +78,28 @@ def test_a_wrong_surface_states_its_error():
     first = surfaces_of(smooth)[0]
     second = surfaces_of(rough)[0]
     assert second.error > 3 * first.error
-    near = {"distance_m": 0.75, "frames": 10}
-    width = [np.log(one.at(**near).high_mm / one.at(**near).low_mm) for one in (first, second)]
+    node = {"distance_m": 0.75, "frames": 10}
+    width = [
+        np.log(surface.at(**node).high_mm / surface.at(**node).low_mm)
+        for surface in (first, second)
+    ]
     assert width[1] > 3 * width[0]
 
 
 def test_depth_is_an_axis():
-    surface = next(one for one in surfaces_of(limits()) if one.kind == "blind")
+    surface = next(surface for surface in surfaces_of(limits()) if surface.kind == "blind")
     assert surface.grid["depth_mm"] == (3.0, 6.0)
-    place = {"distance_m": 1.0, "frames": 10, "depth_mm": 4.5}
-    answer = surface.at(**place)
-    assert answer.low_mm < law_mm(**place) < answer.high_mm
+    setting = {"distance_m": 1.0, "frames": 10, "depth_mm": 4.5}
+    answer = surface.at(**setting)
+    assert answer.low_mm < law_mm(**setting) < answer.high_mm
 
 
 @pytest.mark.parametrize(
-    "place", [{"distance_m": 1.6, "frames": 1}, {"distance_m": 1.0, "frames": 100}]
+    "setting", [{"distance_m": 1.6, "frames": 1}, {"distance_m": 1.0, "frames": 100}]
 )
-def test_nothing_is_extrapolated(place: dict[str, float]):
+def test_nothing_is_extrapolated(setting: dict[str, float]):
     with pytest.raises(Outside, match="the atlas has"):
-        surfaces_of(limits())[0].at(**place)
+        surfaces_of(limits())[0].at(**setting)
 
 
 def test_beside_a_set_up_without_a_limit_none_is_stated():
@@ -148,8 +151,8 @@ def test_answer_page_and_data_say_the_same(stored: Path, capsys: pytest.CaptureF
         str(out),
     ]
     assert main(asked) == 0
-    told = capsys.readouterr().out
-    assert told.startswith(
+    output = capsys.readouterr().out
+    assert output.startswith(
         "Through-holes of 7.62 mm at 0.75 m are found nine times out of ten in 2 of 2 set-ups."
     )
     data = pd.read_csv(out / "atlas.csv")
@@ -165,15 +168,18 @@ def test_answer_page_and_data_say_the_same(stored: Path, capsys: pytest.CaptureF
 
 
 SLIDE = """<script>
-const controls = [...document.querySelectorAll("select, input[type=range]")].filter(one => one.offsetParent);
-const reached = controls.filter(one => (one.focus(), document.activeElement === one && one.closest("label")));
+const inputs = [...document.querySelectorAll("select, input[type=range]")];
+const controls = inputs.filter(one => one.offsetParent);
+const focused = one => (one.focus(), document.activeElement === one);
+const reached = controls.filter(one => focused(one) && one.closest("label"));
 const said = [`${reached.length} of ${controls.length}`];
 for (const value of [200, 0]) {
   at("size").value = value;
   at("size").dispatchEvent(new Event("input"));
   said.push(document.querySelector(".answer").textContent, at("rows").textContent);
 }
-said.push(document.querySelectorAll("#chart polyline").length, document.documentElement.scrollWidth <= innerWidth);
+const fits = document.documentElement.scrollWidth <= innerWidth;
+said.push(document.querySelectorAll("#chart polyline").length, fits);
 document.body.dataset.said = said.join("|");
 </script></body>"""
 
@@ -197,9 +203,9 @@ def test_a_browser_answers_as_the_sliders_move(stored: Path):
     )
     page = stored / "out" / "moved.html"
     page.write_text((stored / "out" / "atlas.html").read_text().replace("</body>", SLIDE))
-    found = re.search(r'data-said="([^"]+)"', browsed(page))
-    assert found is not None
-    reached, large, large_row, small, small_row, lines, fits = found[1].split("|")
+    answers = re.search(r'data-said="([^"]+)"', browsed(page))
+    assert answers is not None
+    reached, large, large_row, small, small_row, lines, fits = answers[1].split("|")
     assert reached == "5 of 5"  # of one albedo there is no choice
     assert large.startswith("Through-hole, 40 mm") and large.endswith(
         "by Azure Kinect DK, NFOV unbinned."
@@ -218,14 +224,15 @@ def test_both_ends_of_the_albedo_are_answered_unless_one_is_asked_for(
     pd.concat([dark, bright]).to_parquet(tmp_path / "limits.parquet")
     question = ["--size", "7mm", "--distance", "1m", "--atlas", str(tmp_path)]
     assert main([*question, "--out", str(tmp_path / "out")]) == 0
-    told = capsys.readouterr().out
-    assert told.startswith(
-        "Through-holes of 7 mm at 1 m are found nine times out of ten in 2 of 4 set-ups (no for 1, undecided for 1)."
+    output = capsys.readouterr().out
+    assert output.startswith(
+        "Through-holes of 7 mm at 1 m are found nine times out of ten in 2 of 4 set-ups"
+        " (no for 1, undecided for 1)."
     )
-    assert re.search(r"distance \(m\) +frames +albedo +a90", told)
+    assert re.search(r"distance \(m\) +frames +albedo +a90", output)
     assert main([*question, "--albedo", "0.6"]) == 0
-    told = capsys.readouterr().out
-    assert "in 2 of 2 set-ups" in told and "albedo  " not in told
+    output = capsys.readouterr().out
+    assert "in 2 of 2 set-ups" in output and "albedo  " not in output
     page = (tmp_path / "out" / "atlas.html").read_text()
     curves = json.loads(re.search(r"const .* = (\{.*\});", page)[1])["curves"]  # type: ignore[index]
     assert {curve["albedo"] for curve in curves} == {0.2, 0.6}
@@ -255,7 +262,7 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("asked", "message"),
     [
         (["--size", "5mm"], "--size and --distance are needed"),
         (["--size", "5", "--distance", "1m"], "--size 5: is not a length with a unit"),
@@ -280,20 +287,20 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
     ],
 )
 def test_a_question_without_an_answer_is_refused(
-    asked: list[str], said: str, stored: Path, capsys: pytest.CaptureFixture[str]
+    asked: list[str], message: str, stored: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert main([*asked, "--atlas", str(stored), "--out", str(stored / "none")]) == 2
-    assert said in capsys.readouterr().err and not (stored / "none").exists()
+    assert message in capsys.readouterr().err and not (stored / "none").exists()
 
 
 def test_other_tables_are_refused(stored: Path, capsys: pytest.CaptureFixture[str]):
     (stored / "text.parquet").write_text("no table")
     limits().drop(columns="source.target.damage").to_parquet(stored / "lacking.parquet")
     question = ["--size", "5mm", "--distance", "1m"]
-    for name, said in (
+    for name, message in (
         ("text", "cannot be read"),
         ("lacking", "lacks the columns source.target.damage"),
         ("no", "there is no such"),
     ):
         assert main([*question, "--atlas", str(stored / f"{name}.parquet")]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err

@@ -7,28 +7,28 @@ import pytest
 
 from harness.evaluation.set_ups import compare_set_ups, set_ups_of
 from harness.evaluation.summary import summarise_holes
-from harness.programs.thesis.claims import claim_c11
+from harness.programs.thesis.cameras import claim_c11
 from tests.support.synthetic_tables import World, cameras, joined, placed, set_up_name, tables
 
 UNIT = "source.camera.unit_seed"
 AXES = ["source.camera.name", "source.target.distance_m", UNIT]
 
 
-def judged(found, units=3, axes=AXES):
+def judged(results, units=3, axes=AXES):
     """C11 on these tables, all units of a camera being alike."""
-    holes = found.holes
-    alike = [
+    holes = results.holes
+    parts = [
         holes.assign(**{UNIT: unit, "variant": holes["variant"] + f", unit={unit}"})
         for unit in range(units)
     ]
-    return claim_c11(summarise_holes(pd.concat(alike, ignore_index=True), AXES), axes)
+    return claim_c11(summarise_holes(pd.concat(parts, ignore_index=True), AXES), axes)
 
 
 def verdict(azure, v2, l515, **changes):
-    found = cameras(
+    results = cameras(
         {"azure_kinect_nfov": azure, "kinect_v2": v2, "realsense_l515": l515}, **changes
     )
-    answer = judged(found)
+    answer = judged(results)
     assert answer is not None
     return answer
 
@@ -52,17 +52,17 @@ def unsure(camera: str):
     sure = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (5, 4), "realsense_l515": (5, 4)})
     name = set_up_name(camera, 1.0)
     half = World(repeats=12, rate=lambda hole, frames: 0.5 if hole == 3 else float(hole >= 4))
-    rest = joined(*(_without(sure, name), placed(tables(half, (1, 50), name), camera, 1.0)))
-    return judged(rest)
+    varied = joined(*(_without(sure, name), placed(tables(half, (1, 50), name), camera, 1.0)))
+    return judged(varied)
 
 
-def _without(found, name):
+def _without(results, name):
     from dataclasses import replace
 
     parts = ("holes", "runs", "probes", "variants", "noise")
     return replace(
-        found,
-        **{part: getattr(found, part)[getattr(found, part).variant != name] for part in parts},
+        results,
+        **{part: getattr(results, part)[getattr(results, part).variant != name] for part in parts},
     )
 
 
@@ -76,50 +76,54 @@ def test_an_undecided_hole_of_another_camera_leaves_the_claim_undecided():
 def test_an_undecided_hole_that_can_change_nothing_does_not_matter():
     # Azure finds 3 to 11 at 0.5 m; at 1 m it is behind L515 whatever becomes of v2's undecided
     # hole
-    found = cameras({"azure_kinect_nfov": (3, 5), "kinect_v2": (5, 5), "realsense_l515": (5, 4)})
+    results = cameras({"azure_kinect_nfov": (3, 5), "kinect_v2": (5, 5), "realsense_l515": (5, 4)})
     name = set_up_name("kinect_v2", 1.0)
     half = World(repeats=12, rate=lambda hole, frames: 0.5 if hole == 4 else float(hole >= 5))
-    found = joined(_without(found, name), placed(tables(half, (1, 50), name), "kinect_v2", 1.0))
-    assert judged(found).verdict == "not borne out"
+    results = joined(_without(results, name), placed(tables(half, (1, 50), name), "kinect_v2", 1.0))
+    assert judged(results).verdict == "not borne out"
 
 
 def test_two_units_or_units_that_differ_leave_the_claim_undecided():
-    found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
-    few = judged(found, units=2)
-    assert few.verdict == "undecided" and few.evidence.startswith("Only 2 of each camera's units")
+    results = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
+    verdict_of_two = judged(results, units=2)
+    assert verdict_of_two.verdict == "undecided" and verdict_of_two.evidence.startswith(
+        "Only 2 of each camera's units"
+    )
     # a variation of the L515 at 0.5 m finds as many holes as the Azure Kinect
     better = tables(
         World(repeats=12, rate=lambda hole, frames: float(hole >= 3)), (1, 50), "another beam"
     )
     varied = joined(
-        found, placed(better, "realsense_l515", 0.5, of=set_up_name("realsense_l515", 0.5))
+        results, placed(better, "realsense_l515", 0.5, of=set_up_name("realsense_l515", 0.5))
     )
     assert judged(varied).verdict == "undecided"
 
 
 def test_a_variation_by_another_camera_takes_no_units_away():
     """A fourth camera file with one unit, as a variation that stands for one of the three."""
-    found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
+    results = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
     summary = summarise_holes(
         pd.concat(
             [
-                found.holes.assign(**{UNIT: unit, "variant": found.holes["variant"] + f", {unit}"})
+                results.holes.assign(
+                    **{UNIT: unit, "variant": results.holes["variant"] + f", {unit}"}
+                )
                 for unit in range(3)
             ]
         ),
         AXES,
     )
     fourth = summary[(summary[UNIT] == 0) & (summary[AXES[0]] == "realsense_l515")]
-    both = pd.concat(
+    with_fourth = pd.concat(
         [summary, fourth.assign(**{AXES[0]: "realsense_l515_lines"})], ignore_index=True
     )
-    assert claim_c11(both, AXES) == claim_c11(summary, AXES)
-    assert claim_c11(both, AXES).verdict == "borne out"
+    assert claim_c11(with_fourth, AXES) == claim_c11(summary, AXES)
+    assert claim_c11(with_fourth, AXES).verdict == "borne out"
 
 
 def test_not_judged_without_the_three_cameras_or_without_fifty_frames():
-    found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
-    summary = summarise_holes(found.holes, AXES[:2])
+    results = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
+    summary = summarise_holes(results.holes, AXES[:2])
     assert claim_c11(summary[summary["source.camera.name"] != "kinect_v2"], AXES[:2]) is None
     assert claim_c11(summary, ["source.target.distance_m"]) is None
     answer = claim_c11(summary[summary.frames == 1], AXES[:2])
@@ -128,8 +132,10 @@ def test_not_judged_without_the_three_cameras_or_without_fifty_frames():
 
 
 def test_set_ups_side_by_side():
-    found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
-    compared = compare_set_ups(found, summarise_holes(found.holes, AXES[:2]), set_ups_of(found))
+    results = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
+    compared = compare_set_ups(
+        results, summarise_holes(results.holes, AXES[:2]), set_ups_of(results)
+    )
     assert len(compared) == 3 * 2 * 2
     row = compared[
         (compared["variant"] == set_up_name("kinect_v2", 1.0)) & (compared["frames"] == 50)

@@ -17,19 +17,21 @@ from tests.support.synthetic_perspectives import MapWorld, name_of, perspectives
 UNIT_AXIS = pd.DataFrame([{"path": CAMERA_UNIT, "name": "unit", "unit": ""}])
 
 
-def verdict(claim, found):
-    summary = summarise_holes(found.holes, list(found.axes["path"]))
+def verdict(claim, results):
+    summary = summarise_holes(results.holes, list(results.axes["path"]))
     with patch.dict(
         VIEW_CLAIMS, {claim: VIEW_CLAIMS[claim]}, clear=True
     ):  # the others would take most of the time
-        (one,) = score_views(map_cases(found, summary))
-    return one
+        (scored,) = score_views(map_cases(results, summary))
+    return scored
 
 
 def test_every_claim_is_judged_in_order():
-    found = worlds(MapWorld())
-    summary = summarise_holes(found.holes, list(found.axes["path"]))
-    assert [score_view.claim for score_view in score_views(map_cases(found, summary))] == list(VIEW_CLAIMS)
+    results = worlds(MapWorld())
+    summary = summarise_holes(results.holes, list(results.axes["path"]))
+    assert [scored.claim for scored in score_views(map_cases(results, summary))] == list(
+        VIEW_CLAIMS
+    )
 
 
 def worlds(world, **settings):
@@ -42,26 +44,27 @@ def worlds(world, **settings):
     return perspectives(world, **chosen)
 
 
-def in_units(found, units=3):
+def in_units(results, units=3):
     """The same tables for several units of the camera, all alike."""
-    alike = []
+    units_tables = []
     for unit in range(1, units + 1):
-        named = {
-            name: getattr(found, name)
+        unit_tables = {
+            name: getattr(results, name)
             for name in ("holes", "runs", "probes", "variants", "noise", "registrations")
         }
-        for name, table in named.items():
+        for name, table in unit_tables.items():
             table = table.assign(**{CAMERA_UNIT: unit})
             for column in {"variant", "reference"} & set(table):
                 table[column] = table[column].where(
                     table[column] == "", table[column] + f", unit={unit}"
                 )
-            named[name] = table
-        alike.append(named)
-    whole = {
-        name: pd.concat([each[name] for each in alike], ignore_index=True) for name in alike[0]
+            unit_tables[name] = table
+        units_tables.append(unit_tables)
+    columns = {
+        name: pd.concat([unit_part[name] for unit_part in units_tables], ignore_index=True)
+        for name in units_tables[0]
     }
-    return replace(found, **whole, axes=pd.concat([found.axes, UNIT_AXIS], ignore_index=True))
+    return replace(results, **columns, axes=pd.concat([results.axes, UNIT_AXIS], ignore_index=True))
 
 
 def registered(icp, cpd, **others):
@@ -153,7 +156,7 @@ def test_c8_tells_the_crossing_and_what_is_lost():
 
 
 def slam(noise_mm, size_mm, place_mm, first=6):
-    found = worlds(MapWorld(surface_mm=lambda *which: 0.2))
+    results = worlds(MapWorld(surface_mm=lambda *which: 0.2))
     world = MapWorld(
         surface_mm=lambda *which: noise_mm,
         size_bias_mm=lambda *which: 0.0,
@@ -162,7 +165,7 @@ def slam(noise_mm, size_mm, place_mm, first=6):
         first=lambda *which: first,
     )
     return with_variation(
-        found, world, "hand-held", (24, "odometry", "volume"), (1,), of=name_of(2, "cpd", "grid")
+        results, world, "hand-held", (24, "odometry", "volume"), (1,), of=name_of(2, "cpd", "grid")
     )
 
 
@@ -206,15 +209,15 @@ def mapped(noise, size, first=4, exposures=None):
         size_std_mm=0.1,
         first=lambda views, method, merge, frames: first if many(views, merge) else 4,
     )
-    found = worlds(
+    results = worlds(
         world, counts=(1, 9), methods=("marks",), merges=("grid", "fusion"), frames=(50,)
     )
     if exposures is None:
-        return found
+        return results
     rival = MapWorld(
         surface_mm=lambda *which: exposures, size_bias_mm=lambda *which: 1.0 + size, size_std_mm=0.1
     )
-    return with_variation(found, rival, "as many exposures", (1, "marks", "grid"), (450,))
+    return with_variation(results, rival, "as many exposures", (1, "marks", "grid"), (450,))
 
 
 @pytest.mark.parametrize(
@@ -249,12 +252,12 @@ def test_h1_says_against_what_it_was_held():
 def test_equal_exposures_are_found_within_the_table_too():
     # five views of 10 frames against one of 50
     world = MapWorld(surface_mm=lambda views, method, merge, frames: 0.2 / views)
-    found = worlds(
+    results = worlds(
         world, counts=(1, 5), methods=("marks",), merges=("grid", "fusion"), frames=(10, 50)
     )
     assert (
         "5 views (marks, fusion) of 10 frames against one of 50 frames"
-        in verdict("H1", found).evidence
+        in verdict("H1", results).evidence
     )
 
 

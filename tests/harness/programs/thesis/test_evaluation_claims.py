@@ -15,14 +15,15 @@ from scipy.stats import spearmanr
 from harness.evaluation.profile import hole_shape, hole_shapes
 from harness.programs.thesis.claims import (
     RULES,
-    Verdict,
     decide,
     falling_rank,
+    p_text,
     scatter_ratio,
     score_claims,
 )
 from harness.records.examples import ExampleCloud, HoleInView
 from harness.records.trials import CLAIMS, hole_list
+from harness.report.claims import Verdict
 from tests.support.synthetic_tables import World, example, joined, tables
 
 
@@ -32,8 +33,8 @@ def verdict(
     with patch.dict(
         RULES, {claim: RULES[claim]}, clear=True
     ):  # the others would take most of the time
-        (found,) = score_claims(tables(world, frames=frames))
-    return found
+        (judged,) = score_claims(tables(world, frames=frames))
+    return judged
 
 
 def rate(many: float, few: float, of: int) -> World:
@@ -132,23 +133,51 @@ def test_nothing_found_is_no_evidence() -> None:
 
 
 def test_another_target_is_not_the_thesis() -> None:
-    other = tables(frames=(1, 50))
-    other = dataclasses.replace(other, holes=other.holes[other.holes["hole"] != "3"])
-    scored = {v.claim: v for v in score_claims(other)}
+    other_target = tables(frames=(1, 50))
+    other_target = dataclasses.replace(
+        other_target, holes=other_target.holes[other_target.holes["hole"] != "3"]
+    )
+    scored = {v.claim: v for v in score_claims(other_target)}
     assert scored["C1"].verdict == "undecided"
     assert "eleven" in scored["C1"].evidence
 
 
 def test_evidence_carries_the_numbers() -> None:
-    more = verdict("C1b", rate(42 / 50, 0.0, of=3))
-    assert "More than the thesis: 3" in more.evidence
-    assert "42 of 50 (3)" in more.evidence
+    answer = verdict("C1b", rate(42 / 50, 0.0, of=3))
+    assert "More than the thesis: 3" in answer.evidence
+    assert "42 of 50 (3)" in answer.evidence
     assert (
         "hole 4 +2.0 (1.5 to 2.5)"
         in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
     )
     assert "that it falls with the diameter" in verdict("C4").evidence
     assert "ratio of the variances of position and size 4.00" in verdict("C5").evidence
+
+
+@pytest.mark.parametrize(
+    ("bias_mm", "std_mm", "agreeing"),
+    [
+        # the largest hole is the reference, so seven positions are compared
+        (1.3, 0.8, "7 of 7"),  # within a graduation of 1.59 mm, but not within a deviation
+        (1.9, 0.8, "0 of 7"),
+        (1.9, 2.8, "7 of 7"),  # within a deviation, but not within a graduation
+    ],
+)
+def test_positions_agree_within_the_larger_of_scatter_and_graduation(
+    bias_mm: float, std_mm: float, agreeing: str
+) -> None:
+    world = World(place_bias_mm=bias_mm, place_std_mm=std_mm)
+    assert verdict("C5", world).evidence.startswith(f"{agreeing} mean positions agree")
+
+
+def test_four_holes_are_enough_to_rank() -> None:
+    """The only order of four that falls throughout has a chance of 1 in 24."""
+    four = World(rate=lambda hole, frames: float(hole >= 8))
+    answer = verdict("C4", four)
+    assert answer.verdict == "borne out"
+    assert "over 4 holes (one-sided p = 0.042 that it falls" in answer.evidence
+    three = World(rate=lambda hole, frames: float(hole >= 9))
+    assert verdict("C4", three).evidence == "Only 3 holes are found with 50 frames."
 
 
 def test_sizes_are_held_against_the_scatter_between_units_too() -> None:
@@ -159,10 +188,12 @@ def test_sizes_are_held_against_the_scatter_between_units_too() -> None:
     ]
     for number, part in enumerate(parts[1:], 2):
         part.variants["settings"] = json.dumps({"source.camera.unit_seed": number})
-    other = tables(
+    other_distance = tables(
         World(size_bias_mm=lambda _: 30.0), frames=(50,), variant="nearer"
     )  # no unit: left out
-    evidence = next(v.evidence for v in score_claims(joined(*parts, other)) if v.claim == "C3")
+    evidence = next(
+        v.evidence for v in score_claims(joined(*parts, other_distance)) if v.claim == "C3"
+    )
     assert "Between 3 units: hole 4 +1.9," in evidence  # 1.0 mm in the mean, by 0.53 mm
     assert "Between units: not judged" in verdict("C3").evidence
 
@@ -180,20 +211,27 @@ def test_rank_test_is_the_exact_permutation_test() -> None:
     y = rng.normal(size=6)
     rho, p = falling_rank(x, y)
     assert rho == pytest.approx(spearmanr(x, y).statistic)
-    every = [spearmanr(x, np.array(order)).statistic for order in permutations(y)]
-    assert p == pytest.approx(np.mean(np.array(every) <= rho + 1e-12))
+    correlations = [spearmanr(x, np.array(order)).statistic for order in permutations(y)]
+    assert p == pytest.approx(np.mean(np.array(correlations) <= rho + 1e-12))
     assert falling_rank(np.arange(4.0), -np.arange(4.0)) == (
         pytest.approx(-1),
         pytest.approx(1 / 24),
     )
     assert falling_rank(np.arange(4.0), np.ones(4)) == (0.0, 1.0)
+    # seven falling pairs have a chance of 1 in 5,040, of which texts tell that it is small
+    assert (p_text(1 / 5040), p_text(0.0014)) == ("< 0.001", "= 0.001")
 
 
 def test_scatter_ratio_by_hand() -> None:
-    place = [1.0, 3.0, 5.0, np.nan]
+    offsets_mm = [1.0, 3.0, 5.0, np.nan]
     size = [1.0, 2.0, 3.0, 9.0]
     rows = pd.DataFrame(
-        {"repeat": range(4), "hole": "5", "extent_offset_mm": place, "extent_diameter_mm": size}
+        {
+            "repeat": range(4),
+            "hole": "5",
+            "extent_offset_mm": offsets_mm,
+            "extent_diameter_mm": size,
+        }
     )
     assert scatter_ratio(rows, "extent_offset_mm", "extent_diameter_mm")[0] == pytest.approx(4.0)
     rows["extent_diameter_mm"] = 2.0

@@ -12,8 +12,8 @@ from harness.evaluation.summary import summarise_holes
 from harness.experiment.load import load_experiment
 from harness.programs.thesis.answers import THESIS
 from harness.programs.thesis.inference import KIND, SET_UP, borne_out_if, posterior_of
-from harness.report.page import Layout, set_ups_html
 from harness.report.sections import About
+from harness.report.set_ups_page import Layout, set_ups_html
 from tests.support.synthetic_tables import World, joined, provenance, tables
 
 AXES = {
@@ -24,7 +24,7 @@ PATHS = list(AXES)
 
 
 @pytest.fixture(scope="module")
-def found():
+def results():
     """22 set-ups; those 4 mm deep find hole 3 and all larger ones in every repeat, the others as
     the thesis did."""
     everything = World(repeats=4, rate=lambda hole, frames: float(hole >= 3))
@@ -33,12 +33,12 @@ def found():
         for distance in AXES[PATHS[1]]:
             world = World(repeats=4) if depth == 2.0 else everything
             part = tables(world, (1, 50), f"{depth} at {distance:.2f}")
-            place = {PATHS[0]: depth, PATHS[1]: distance}
+            settings = {PATHS[0]: depth, PATHS[1]: distance}
             placed = {
-                name: getattr(part, name).assign(**place)
+                name: getattr(part, name).assign(**settings)
                 for name in ("holes", "runs", "probes", "noise")
             }
-            variants = part.variants.assign(is_variation=False, reference="", **place)
+            variants = part.variants.assign(is_variation=False, reference="", **settings)
             parts.append(replace(part, variants=variants, **placed))
     names = [
         {"path": path, "name": name, "unit": ""}
@@ -47,10 +47,10 @@ def found():
     return replace(joined(*parts), axes=pd.DataFrame(names))
 
 
-def test_the_posterior_by_hand(found):
+def test_the_posterior_by_hand(results):
     """A hole found 4 of 4 times has 0.9; other set-ups miss by hole 3 with 50 frames and by 3 and
     4 with one frame."""
-    table = posterior_of(summarise_holes(found.holes, PATHS), PATHS)
+    table = posterior_of(summarise_holes(results.holes, PATHS), PATHS)
     set_ups = table[table["axis"] == SET_UP]
     assert len(set_ups) == 22 and set_ups["posterior_share"].sum() == pytest.approx(1)
     right = 0.9**22
@@ -64,25 +64,25 @@ def test_the_posterior_by_hand(found):
         "The thesis' outcome is borne out if blind depth is 2 mm (of 22 set-ups;"
     )
     assert "probability of 0.098" in sentence
-    alike = table.assign(posterior_share=table["prior_share"])
-    assert "no particular fact holds" in borne_out_if(alike)
+    certain_of_nothing = table.assign(posterior_share=table["prior_share"])
+    assert "no particular fact holds" in borne_out_if(certain_of_nothing)
 
 
-def test_a_depth_of_blind_holes_says_nothing_of_through_holes(found):
+def test_a_depth_of_blind_holes_says_nothing_of_through_holes(results):
     """Only set-ups 2 mm deep agree. If they are the through-holes, whose depth is no depth,
     nothing is said of it."""
-    summary = summarise_holes(found.holes, PATHS)
+    summary = summarise_holes(results.holes, PATHS)
     shallow = summary[PATHS[0]] == 2.0
-    for agree, others in (("blind", "through"), ("through", "blind")):
-        kinds = shallow.map({True: agree, False: others})
+    for agree, other_kind in (("blind", "through"), ("through", "blind")):
+        kinds = shallow.map({True: agree, False: other_kind})
         table = posterior_of(summary.assign(**{KIND: kinds}), [*PATHS, KIND])
         depths = table[table["axis"] == "blind depth of blind holes"]
         assert depths["value"].tolist() == ["2 mm" if agree == "blind" else "4 mm"]
         assert (depths[["prior_share", "posterior_share"]] == 1).all(axis=None)
-    near = summary.assign(
+    kinds_by_distance = summary.assign(
         **{KIND: (summary[PATHS[1]] < 0.555).map({True: "blind", False: "through"})}
     )
-    table = posterior_of(near, [*PATHS, KIND])
+    table = posterior_of(kinds_by_distance, [*PATHS, KIND])
     depths = table[table["axis"] == "blind depth of blind holes"]
     right = 0.9**22
     wrong = 0.9**19 * 0.1**3
@@ -97,15 +97,15 @@ def test_a_depth_of_blind_holes_says_nothing_of_through_holes(found):
     assert "hole kind is through (of 22" in borne_out_if(without)
 
 
-def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(found):
-    summary = summarise_holes(found.holes, PATHS)
+def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(results):
+    summary = summarise_holes(results.holes, PATHS)
     assert posterior_of(summary[summary["frames"] == 50], PATHS) is None
     assert posterior_of(summary[summary[PATHS[0]] == 2.0], PATHS) is None
 
 
 @pytest.mark.usefixtures("unsaved")
-def test_the_page_begins_with_the_sentence(found):
-    page = set_ups_html(found, [], About(provenance(), "", "Inference", THESIS))
+def test_the_page_begins_with_the_sentence(results):
+    page = set_ups_html(results, [], About(provenance(), "", "Inference", THESIS))
     answer = page.split('<p class="answer">')[1]
     assert (
         answer.startswith("The thesis&#39; outcome is borne out if")
@@ -113,17 +113,19 @@ def test_the_page_begins_with_the_sentence(found):
     )
 
 
-def test_set_ups_that_fill_no_grid_stand_one_below_the_other(found):
+def test_set_ups_that_fill_no_grid_stand_one_below_the_other(results):
     # as many as there are distances, but not one of each
-    some = replace(found, variants=found.variants.iloc[[*range(10), 11]])
-    layout = Layout.of(some)
+    scattered = replace(results, variants=results.variants.iloc[[*range(10), 11]])
+    layout = Layout.of(scattered)
     assert layout.columns == () and len(layout.rows) == 11
 
 
 def test_set_ups_are_drawn_at_random_and_alike_ones_once():
-    few = load_experiment("experiments/thesis_inference.yaml", [f"draws={20}"])
-    more = load_experiment("experiments/thesis_inference.yaml", [f"draws={24}"])
-    names = [{point.variant for point in each.points} for each in (few, more)]
+    fewer = load_experiment("experiments/thesis_inference.yaml", [f"draws={20}"])
+    further_draws = load_experiment("experiments/thesis_inference.yaml", [f"draws={24}"])
+    names = [
+        {point.variant for point in experiment.points} for experiment in (fewer, further_draws)
+    ]
     assert names[0] < names[1] and 20 < len(names[1]) <= 24
-    assert len(few.points) == 2 * len(names[0])
-    assert {point.config.capture.frames for point in few.points} == {1, 50}
+    assert len(fewer.points) == 2 * len(names[0])
+    assert {point.config.capture.frames for point in fewer.points} == {1, 50}
