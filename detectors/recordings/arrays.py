@@ -425,7 +425,10 @@ def _apart(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _named_array(
-    name: str, arrays: Arrays, usual: Sequence[str], selector: str | None
+    name: str,
+    arrays: Arrays,
+    usual: Sequence[str],
+    selector: str | None,
 ) -> tuple[str, np.ndarray]:
     """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else
     the only one."""
@@ -469,7 +472,9 @@ def _likely_key(name: str, arrays: Arrays, usual: Sequence[str], contents: str) 
 
 
 def _axes(
-    name: str, shape: tuple[int, ...], lens: Lens | None
+    name: str,
+    shape: tuple[int, ...],
+    lens: Lens | None,
 ) -> tuple[bool, tuple[int, int, int], bool]:
     """Return (holds points, (n, h, w), has a pixel grid) of an array's shape."""
     dimensions = len(shape)
@@ -569,7 +574,11 @@ def _height_unit_m(relief: float, side_m: float) -> float | None:
 
 
 def _map_frames(
-    path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float
+    path: Path,
+    load: ArraysLoader,
+    array: str | None,
+    pitch_m: float,
+    scale_m: float,
 ) -> Iterator[Frame]:
     """Yield the map as a frame. If ``scale_m`` is below 0, heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)

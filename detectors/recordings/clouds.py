@@ -64,7 +64,10 @@ def open_clouds(paths: Sequence[Path], options: CaptureOptions, name: str) -> Re
 
 
 def _frames(
-    paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: float
+    paths: tuple[Path, ...],
+    reader: Any,
+    lens: Lens | None,
+    scale_m: float,
 ) -> Iterator[Frame]:
     """Yield one cloud per file, (h, w), or (1, n) without a grid. ``lens`` only tells if a list
     fills a pixel grid."""

@@ -114,7 +114,9 @@ def _colour_pictures(root: Path, depths: Sequence[Path]) -> list[Path]:
 
 
 def _colours_of(
-    depths: Sequence[Path], pictures: Sequence[Path], tolerance: float
+    depths: Sequence[Path],
+    pictures: Sequence[Path],
+    tolerance: float,
 ) -> list[Path | None]:
     """Return the colour picture of each depth picture: the same number in its name, or the nearest
     time stamp within the tolerance."""
@@ -180,7 +182,9 @@ def open_depth_list(
 
 
 def _frames(
-    depths: Sequence[Path], colours: Sequence[Path | None], scale_m: float
+    depths: Sequence[Path],
+    colours: Sequence[Path | None],
+    scale_m: float,
 ) -> Iterator[Frame]:
     """Yield one frame per file. Raises UserError if a file is missing, truncated or not 16-bit
     grey."""

@@ -123,7 +123,10 @@ def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None)
 
 
 def colour_on_depth(
-    z_m: np.ndarray, slopes: np.ndarray, colour: ColourCamera, picture: np.ndarray
+    z_m: np.ndarray,
+    slopes: np.ndarray,
+    colour: ColourCamera,
+    picture: np.ndarray,
 ) -> np.ndarray:
     """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour
     is missing. Not modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect).
@@ -340,7 +343,10 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
 
 
 def _motion_warnings(
-    phone: _Phone, frames: slice | None, lens: Lens, median_m: float
+    phone: _Phone,
+    frames: slice | None,
+    lens: Lens,
+    median_m: float,
 ) -> tuple[str, ...]:
     """Warn if the poses of the selected frames differ by more than `BLUR_PX` on the target."""
     chosen = frames or slice(None)
@@ -500,7 +506,11 @@ def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _plane(
-    path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tuple[int, int]
+    path: Path,
+    archive: zipfile.ZipFile,
+    name: str,
+    kind: str,
+    size: tuple[int, int],
 ) -> np.ndarray:
     """Unpack an entry by Apple's LZFSE into numbers (h, w). Raises UserError unless it gives
     exactly as many."""

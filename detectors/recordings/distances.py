@@ -338,7 +338,11 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
 
 
 def _weight(
-    unit: str, foreground: float, median: float, size: tuple[int, int] | None, divisor: int
+    unit: str,
+    foreground: float,
+    median: float,
+    size: tuple[int, int] | None,
+    divisor: int,
 ) -> float:
     """Return the weight of a reading. ``foreground``, ``median``: quantiles of the stored numbers.
     ``size``: of an image of integers, None for floating point. ``divisor``: of all numbers."""

@@ -73,7 +73,10 @@ def depth_mode_of_size(width: int, height: int) -> str | None:
 
 
 def colour_camera(
-    name: str, cameras: dict[str, Any], width: int, height: int
+    name: str,
+    cameras: dict[str, Any],
+    width: int,
+    height: int,
 ) -> ColourCamera | None:
     """Return the colour camera in the mode of this image's size, None without one. Raises
     UserError without a lens."""
@@ -380,7 +383,9 @@ def _plain_yaml(text: str) -> str:
 
 
 def mappings(
-    data: dict[str, Any], name: str = "", level: int = 0
+    data: dict[str, Any],
+    name: str = "",
+    level: int = 0,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield a mapping and those within it, up to `NESTED` levels, each with its path of keys."""
     yield name, data

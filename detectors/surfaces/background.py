@@ -109,7 +109,9 @@ class _Cells:
 
     def image(self, values: np.ndarray, empty: float = np.nan) -> np.ndarray:
         """Return cells' values (c,) on their grid."""
-        image = np.full((self.row.max() + 1, self.column.max() + 1), empty)
+        rows = self.row.max() + 1
+        columns = self.column.max() + 1
+        image = np.full((rows, columns), empty)
         image[self.row, self.column] = values
         return image
 
@@ -206,7 +208,10 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def _of_few_points(
-    points: np.ndarray, mask: np.ndarray, config: SurfaceConfig, central: bool
+    points: np.ndarray,
+    mask: np.ndarray,
+    config: SurfaceConfig,
+    central: bool,
 ) -> Background:
     """Return the stated surface, or a plane, behind points (n, 3) that are too few to judge it."""
     if config.shape not in STATED:
@@ -343,7 +348,9 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
 
 @numba.njit(cache=True, nogil=True)
 def _group_medians(
-    values: np.ndarray, group: np.ndarray, groups: int
+    values: np.ndarray,
+    group: np.ndarray,
+    groups: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the median of each group's finite values, and their median distance from it over
     0.6745; else NaN."""
@@ -382,7 +389,9 @@ def _median(values: np.ndarray) -> float:
                 j -= gap
             values[j] = value
         gap //= 2
-    return 0.5 * (values[(len(values) - 1) // 2] + values[len(values) // 2])
+    lower = values[(len(values) - 1) // 2]
+    upper = values[len(values) // 2]
+    return 0.5 * (lower + upper)
 
 
 def _cell_noise(image: np.ndarray) -> tuple[float, float]:
@@ -454,7 +463,9 @@ def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
     of a tile or to the least scale."""
     if config.scale_mm is not None:
         return [2 * config.scale_mm * MM / cells.side_m]
-    wavelengths: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
+    rows = int(np.ptp(cells.row)) + 1
+    columns = int(np.ptp(cells.column)) + 1
+    wavelengths: list[float] = [max(rows, columns)]
     shortest = max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m)
     while wavelengths[-1] / 1.6 >= shortest:
         wavelengths.append(wavelengths[-1] / 1.6)
@@ -462,7 +473,11 @@ def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
 
 
 def _fitted(
-    cells: _Cells, name: str, fit_to: Any, wavelength: float | None, widened: bool = False
+    cells: _Cells,
+    name: str,
+    fit_to: Any,
+    wavelength: float | None,
+    widened: bool = False,
 ) -> _Shape | None:
     """Fit with bisquare weights, ``widened`` by the flanks of dents; None if the fit misses a
     fiftieth of the cells."""
@@ -511,8 +526,10 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
         if fit is not None and inside.any():
             error[inside] = cells.points[inside, 2] - fit(cells.points[inside])
     error[~np.isfinite(error)] = 1e3
-    _, tile = np.unique(down * (across.max() + 1) + across, return_inverse=True)
-    return _group_medians(np.abs(error), tile, int(tile.max()) + 1)[0]
+    keys = down * (across.max() + 1) + across
+    _, tile = np.unique(keys, return_inverse=True)
+    medians, _ = _group_medians(np.abs(error), tile, int(tile.max()) + 1)
+    return medians
 
 
 def _simplest(errors: list[np.ndarray], worth: float) -> int:
@@ -531,7 +548,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     """Return a warning if structure remains that could be mistaken for damage, else "", and its
     size."""
     error = cells.points[:, 2] - fit(cells.points)
-    image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
+    is_used = np.isfinite(error) & (cells.weights > 0)
+    image = cells.image(np.where(is_used, error, np.nan))
     noise, correlation = _cell_noise(image)
     pixel = cells.pixel_noise
     # compact findings differ from their neighbourhood's median; structure is the neighbourhood
@@ -548,7 +566,8 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     share = float(beyond.sum() / max(enough.sum(), 1))
     # connected cells that lie far off: damage is seldom so large
     parts = cv2.connectedComponentsWithStats((valid & ~used).astype(np.uint8))[2]
-    off = float(parts[1:, cv2.CC_STAT_AREA].max(initial=0) / max(valid.sum(), 1))
+    areas = parts[1:, cv2.CC_STAT_AREA]
+    off = float(areas.max(initial=0) / max(valid.sum(), 1))
     warning = ""
     if off >= MISFIT_FROM:
         warning = (

@@ -58,7 +58,9 @@ def free_form(
 
 def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
     """Return (n, 2) x/z and y/z, or x and y where rays are parallel."""
-    return points[:, :2] / points[:, 2:] if central else points[:, :2]
+    if central:
+        return points[:, :2] / points[:, 2:]
+    return points[:, :2]
 
 
 @numba.njit(**PLAIN)
@@ -109,13 +111,18 @@ def _normal_bands(
     entries = (width + rows - columns) * size + columns
     squares = weighted[:, a] * values[:, b]
     banded = np.bincount(entries.ravel(), squares.ravel(), (width + 1) * size)
-    right = np.bincount(numbers.ravel(), (weighted * z[:, None]).ravel(), size)
+    pulls = weighted * z[:, None]
+    right = np.bincount(numbers.ravel(), pulls.ravel(), size)
     return banded.reshape(width + 1, size), right
 
 
 @numba.njit(error_model="numpy", **PLAIN)
 def _spline_sums(
-    points: np.ndarray, central: bool, low: np.ndarray, spacing: float, coefficients: np.ndarray
+    points: np.ndarray,
+    central: bool,
+    low: np.ndarray,
+    spacing: float,
+    coefficients: np.ndarray,
 ) -> np.ndarray:
     """Return the splines' sum (n,) by coefficients (rows, columns) at points (n, 3)."""
     out = np.empty(len(points))
@@ -147,6 +154,8 @@ def _penalty(rows: int, columns: int) -> sparse.coo_array:
 
     penalty = 0
     for order, factor in enumerate((1.0, 3.0, 3.0, 1.0)):
-        mixed = sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr")
+        down = squared(rows, order)
+        across = squared(columns, 3 - order)
+        mixed = sparse.kron(down, across, format="csr")
         penalty = penalty + factor * sparse.csr_array(mixed)
     return sparse.coo_array(sparse.triu(penalty))

@@ -40,7 +40,9 @@ def front_of(reference: ReferenceConfig) -> tuple[np.ndarray, np.ndarray]:
     triangle faces the front."""
     mesh = read_mesh(reference.file)
     corners = front_first(mesh, reference.unit, reference.front)[np.asarray(mesh.faces)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    first_side = corners[:, 1] - corners[:, 0]
+    second_side = corners[:, 2] - corners[:, 0]
+    normals = np.cross(first_side, second_side)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     if not (normals[:, 2] > 0).any():
         fix = "state its front, or turn its faces outwards"
@@ -60,8 +62,7 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
     poses = [_fitted(front, corners[ahead], normals[ahead], sample, turn) for turn in range(4)]
     T_part_camera, off_m, error_m = min(poses, key=lambda pose: pose[1])
 
-    flat = points / points[:, 2:] if central else points
-    pitch = float(np.sqrt(np.prod(np.ptp(flat[:, :2], axis=0)) / len(flat)))
+    pitch = _spacing(points / points[:, 2:] if central else points)
 
     def met(rays: np.ndarray) -> np.ndarray:
         """Return z where rays meet the part: from the lens through (n, 2) at z = 1, or along z at
@@ -91,7 +92,9 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
         side = EDGE_PX * pitch
         bends = []
         for shift in ([side, 0], [0, side]):
-            bends.append(met(rays + np.array(shift)) + met(rays - np.array(shift)) - 2 * z)
+            after = met(rays + np.array(shift))
+            before = met(rays - np.array(shift))
+            bends.append(after + before - 2 * z)
         limit = BENT * pitch * (np.abs(z) if central else 1.0)
         return np.where(np.abs(bends).max(axis=0) < limit, z, np.nan)
 
@@ -101,6 +104,12 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
         f"{error_m / MM:.2g} mm (standard error)"
     )
     return text, z_at
+
+
+def _spacing(points: np.ndarray) -> float:
+    """Return the side of a square with one of the points (n, 3), in x and y."""
+    extent = np.ptp(points[:, :2], axis=0)
+    return float(np.sqrt(np.prod(extent) / len(points)))
 
 
 def _scene(corners: np.ndarray) -> Any:
@@ -113,16 +122,23 @@ def _scene(corners: np.ndarray) -> Any:
 
 
 def _fitted(
-    scene: Any, corners: np.ndarray, normals: np.ndarray, points: np.ndarray, turn: int
+    scene: Any,
+    corners: np.ndarray,
+    normals: np.ndarray,
+    points: np.ndarray,
+    turn: int,
 ) -> tuple[np.ndarray, float, float]:
     """Return T_part_camera, found from one rotation by a multiple of 90 degrees; the median
     distance of the points (n, 3) from the part's planes; and the standard error of its position
     along them, if the points are independent."""
-    c, s = np.rint([np.cos(turn * np.pi / 2), np.sin(turn * np.pi / 2)])
+    angle = turn * np.pi / 2
+    c, s = np.rint([np.cos(angle), np.sin(angle)])
+    roll = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ T[:3, :3]
-    T[:3, 3] = np.median(corners.reshape(-1, 3), axis=0) - T[:3, :3] @ np.median(points, axis=0)
-    pitch_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
+    T[:3, :3] = roll @ T[:3, :3]
+    part_middle = np.median(corners.reshape(-1, 3), axis=0)
+    T[:3, 3] = part_middle - T[:3, :3] @ np.median(points, axis=0)
+    pitch_m = _spacing(points)
     for step in range(4 * STEPS):
         by_planes = step >= 3 * STEPS
         moved = transform_points(T, points)

@@ -103,7 +103,12 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
         core = cores == number
         free = valid & grown(core, reach) & (core | (cores == 0))
         mask[:] = core | (components(free, right, down)[0] == 1)
-    local = _Smooth(points.reshape(-1, 3), smooth.reshape(-1, 3), normals.reshape(-1, 3), central)
+    local = _Smooth(
+        points_m=points.reshape(-1, 3),
+        means_m=smooth.reshape(-1, 3),
+        normals=normals.reshape(-1, 3),
+        central=central,
+    )
     contact_m = max(CONTACT_MM * MM, CONTACT_SIGMAS * noise_m)
     masks = _joined(masks, cores, local, contact_m, math.radians(crease_deg / 2.0))
     _share_contested(masks, cores, local)
@@ -143,7 +148,9 @@ def _step_noise_m(cloud: Cloud) -> float:
 def _pitch_m(points: np.ndarray) -> float:
     """Return the lateral distance of neighbours in the nearest tenth of the view; 0 if unknown."""
     rows = points[::4]
-    steps = np.hypot(np.diff(rows[..., 0], axis=1), np.diff(rows[..., 1], axis=1))
+    across = np.diff(rows[..., 0], axis=1)
+    up = np.diff(rows[..., 1], axis=1)
+    steps = np.hypot(across, up)
     steps = steps[np.isfinite(steps) & (steps > 0)]
     return quantile_of(steps, 0.1) if len(steps) else 0.0
 
@@ -172,7 +179,10 @@ def _before_lens(points: np.ndarray) -> bool:
 
 @numba.njit(**PLAIN)
 def links(
-    points_m: np.ndarray, tilt: float, noise_m: float, central: bool
+    points_m: np.ndarray,
+    tilt: float,
+    noise_m: float,
+    central: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and
     its lower neighbour (h, w). ``central``: distances across are measured between the two rays at
@@ -256,13 +266,15 @@ class _Smooth(NamedTuple):
         normals = self.normals[seeds]
         height = ((self.means_m[seeds] - points) * normals).sum(axis=1)
         rays = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
-        return np.abs(height) / np.maximum(np.abs((normals * rays).sum(axis=1)), 1e-3)
+        cosines = np.abs((normals * rays).sum(axis=1))
+        return np.abs(height) / np.maximum(cosines, 1e-3)
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
     """Return the number of candidates: cores that are large enough, and wider than the ramp of a
     smoothed edge."""
-    large = int((sizes >= max(LEAST_PX, int(LEAST_SHARE * cores.size))).sum())
+    least_px = max(LEAST_PX, int(LEAST_SHARE * cores.size))
+    large = int((sizes >= least_px).sum())
     kept = []
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
         core = cores == number
@@ -282,7 +294,11 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
 
 
 def _joined(
-    masks: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
+    masks: np.ndarray,
+    cores: np.ndarray,
+    smooth: _Smooth,
+    apart_m: float,
+    turn: float,
 ) -> np.ndarray:
     """Return ``masks`` with surfaces merged, also in ``cores``, if their rims share pixels and
     their planes agree."""
@@ -301,7 +317,8 @@ def _joined(
             if np.median(misses) <= apart_m and np.median(cosines) >= math.cos(turn):
                 stays[stays == stays[j]] = stays[i]
     kept = np.unique(stays)
-    numbers = np.zeros(max(len(masks), int(cores.max(initial=0))) + 1, dtype=cores.dtype)
+    count = max(len(masks), int(cores.max(initial=0)))
+    numbers = np.zeros(count + 1, dtype=cores.dtype)
     numbers[1 : len(masks) + 1] = np.searchsorted(kept, stays) + 1
     cores[:] = numbers[cores]
     return np.array([masks[stays == label].any(axis=0) for label in kept])
@@ -404,7 +421,8 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     distances = cKDTree(plan).query(sample, k=min(2, len(plan)))[0]
     to_nearest = distances.reshape(len(sample), -1)[:, -1]
     spacing = max(float(np.quantile(to_nearest, 0.9)), 1e-9)
-    side = max(CELL_SPACINGS * spacing, float(np.ptp(plan, axis=0).max()) / MAX_RASTER)
+    extent = float(np.ptp(plan, axis=0).max())
+    side = max(CELL_SPACINGS * spacing, extent / MAX_RASTER)
     while True:
         columns, rows = np.floor((plan - plan.min(axis=0)) / side).astype(int).T
         if _is_filled(rows, columns):

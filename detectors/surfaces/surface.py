@@ -183,7 +183,10 @@ class Surface:
 
 
 def fit_surface(
-    x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: SurfaceConfig
+    x_m: np.ndarray,
+    y_m: np.ndarray,
+    z_m: np.ndarray,
+    config: SurfaceConfig,
 ) -> Surface:
     """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute
     residuals, bisquare within 0.05 standard errors of the fixed point of all points.
@@ -232,7 +235,9 @@ def fit_surface(
 
 
 def _solved(
-    basis: np.ndarray, z: np.ndarray, weight: np.ndarray | None = None
+    basis: np.ndarray,
+    z: np.ndarray,
+    weight: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p,
     p), or None."""
@@ -266,7 +271,10 @@ def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray,
 
 
 def _lar(
-    basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray = KNEES
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    knees: np.ndarray = KNEES,
 ) -> Solution:
     """Find the L1 solution by smoothing (Madsen and Nielsen 1993)."""
     c = start
@@ -278,7 +286,8 @@ def _lar(
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
     r = z - c @ basis
-    scale = max(median_of(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)])), TINY_M)
+    sample = r[:: max(1, len(r) // SAMPLE_POINTS)]
+    scale = max(median_of(np.abs(sample)), TINY_M)
     for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
         reach = max(margin * scale, 10.0 * knee)
@@ -290,7 +299,8 @@ def _lar(
             new = _smoothed_descent(rows, z[inliers], far_pull, c, knee, enough)
             after = z - new @ basis
             # a far point may have crossed the surface or come within its knee
-            if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
+            is_near = (r * after <= 0.0) | (np.abs(after) < knee)
+            if not (far & is_near).any():
                 break
             reach *= 3.0
         c = new
@@ -298,7 +308,8 @@ def _lar(
         margin = min(margin, 5.0 * knee / scale)
         sizes = np.abs(r)
         inside = sizes[sizes <= knee]
-        gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
+        excess = float((inside - inside**2 / knee).sum())
+        gap = excess / max(float(sizes.sum()), TINY_M)
         if gap <= GAP_CONVERGED:
             break
     return c, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
@@ -306,7 +317,10 @@ def _lar(
 
 @numba.njit(**PLAIN)
 def _huber(
-    rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float
+    rows: np.ndarray,
+    z: np.ndarray,
+    c: np.ndarray,
+    knee: float,
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the sum of Huber's function over its knee, its negative gradient (p,), the inner
     normal matrix's lower half."""
@@ -404,14 +418,19 @@ def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: 
 
 
 def _reweighted(
-    basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, steps: int, note: str
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray | None,
+    steps: int,
+    note: str,
 ) -> Solution:
     """Reweight least squares until it moves little, at most ``steps`` times."""
     plain = _solved(basis, z)
     assert plain is not None
     c = plain[0] if start is None else start
     terms = len(basis)
-    leverage = ((np.linalg.inv(plain[1]) @ basis) ** 2).sum(axis=0)
+    whitened = np.linalg.inv(plain[1]) @ basis
+    leverage = (whitened**2).sum(axis=0)
     adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
     # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each term
     rank = min(terms - 1 + (len(z) - terms + 1) // 2, len(z) - 1)
@@ -459,8 +478,10 @@ def _concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -
         grams = (chosen @ products).reshape(-1, terms, terms)
         right = (chosen * z) @ basis.T
         c = np.linalg.solve(grams + len(z) * ridge, right[..., None])[..., 0]
-    smallest = np.partition((z - c @ basis) ** 2, kept - 1, axis=1)[:, :kept]
-    return np.asarray(c[np.argsort(smallest.sum(axis=1), kind="stable")])
+    squares = (z - c @ basis) ** 2
+    smallest = np.partition(squares, kept - 1, axis=1)[:, :kept]
+    order = np.argsort(smallest.sum(axis=1), kind="stable")
+    return np.asarray(c[order])
 
 
 Fit = Callable[[np.ndarray], np.ndarray]
@@ -494,8 +515,8 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
     algebraic fit (1991), then Gauss-Newton. None if it has no single sheet. ``central``: rays
     leave the origin, else along z."""
     middle = np.average(points, axis=0, weights=weights)
-    spread = np.average(((points - middle) ** 2).sum(axis=1), weights=weights)
-    size = float(np.sqrt(spread)) or 1.0
+    squares = ((points - middle) ** 2).sum(axis=1)
+    size = float(np.sqrt(np.average(squares, weights=weights))) or 1.0
     rays = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     if central:
         rays = points / points[:, 2:]
@@ -534,7 +555,8 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
         with np.errstate(invalid="ignore", divide="ignore"):
             root = sheet * np.sqrt(b * b - 4 * a * k)
             # the form without cancellation
-            return np.where(b * sheet > 0, 2 * k / (-b - root), (-b + root) / (2 * a))
+            stable = 2 * k / (-b - root)
+            return np.where(b * sheet > 0, stable, (-b + root) / (2 * a))
 
     return z_at
 
@@ -545,7 +567,18 @@ def _quadric_terms(places: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np
     x, y, z = places.T
     dx, dy, dz = rays.T
     zero = np.zeros_like(x)
-    terms = [x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, zero + 1.0]
+    terms = [
+        x * x,
+        y * y,
+        z * z,
+        x * y,
+        x * z,
+        y * z,
+        x,
+        y,
+        z,
+        zero + 1.0,
+    ]
     slopes = [
         2 * x * dx,
         2 * y * dy,

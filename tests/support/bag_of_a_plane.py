@@ -78,20 +78,17 @@ def cloud(
     for i, axis in enumerate("xyz"):
         values[axis] = grid[..., i]
     if rgb is not None:
-        r, g, b = (rgb[..., i].astype(np.uint32).reshape(height, width) for i in range(3))
+        r, g, b = rgb.astype(np.uint32).reshape(height, width, 3).transpose(2, 0, 1)
         # alpha 255: as a float these bytes are a NaN wherever red is above 127
         values["rgb"] = 0xFF000000 | r << 16 | g << 8 | b
     rows = values.view(np.uint8).reshape(height, width * step)
     data = np.concatenate([rows, np.full((height, row_padding), 171, np.uint8)], axis=1).ravel()
     field = types_of().types["sensor_msgs/msg/PointField"]
-    declared = [
-        packed_as if name == "rgb" else kind_ for name, kind_ in zip(names, types, strict=True)
-    ]
-    fields = [
-        field(name=n, offset=o, datatype=CODES[t], count=1)
-        for n, o, t in zip(names, offsets, declared, strict=True)
-        if n != leave_out
-    ]
+    fields = []
+    for name, offset, declared in zip(names, offsets, types, strict=True):
+        if name != leave_out:
+            code = CODES[packed_as if name == "rgb" else declared]
+            fields.append(field(name=name, offset=offset, datatype=code, count=1))
     return types_of().types[CLOUD](
         header=header(),
         height=height,
@@ -264,24 +261,23 @@ def write_bag(
     compression: CompressionMode = CompressionMode.NONE,
 ) -> Path:
     """A bag of (topic, type, message), a thirtieth of a second apart."""
-    writer = Writer(
-        folder, version=8, storage_plugin=StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
-    )
+    storage = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    writer = Writer(folder, version=8, storage_plugin=storage)
     writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connections: dict[str, Any] = {}
         for i, (topic, kind, message) in enumerate(messages):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=types_of())
-            writer.write(
-                connections[topic], 10**9 + i * 33_333_333, types_of().serialize_cdr(message, kind)
-            )
+            content = types_of().serialize_cdr(message, kind)
+            writer.write(connections[topic], 10**9 + i * 33_333_333, content)
     return folder
 
 
 def clouds(frames: int, topic: str = "/points2") -> list[tuple[str, str, Any]]:
     """The plane's first frames with their colours."""
-    return [
-        (topic, CLOUD, cloud(plane.points_m(plane.depth_mm(i, noise_mm=0.6)), rgb=plane.rgb(i)))
-        for i in range(frames)
-    ]
+    messages = []
+    for i in range(frames):
+        points = plane.points_m(plane.depth_mm(i, noise_mm=0.6))
+        messages.append((topic, CLOUD, cloud(points, rgb=plane.rgb(i))))
+    return messages

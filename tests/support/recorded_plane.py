@@ -116,13 +116,12 @@ def write_points(
     before: str = "",
 ) -> Path:
     """A point a line, with something ``before`` and after its three numbers."""
-    rows = (
-        separator.join(f"{x:.9f}".replace(".", decimal) for x in point)
-        for point in points.reshape(-1, 3).tolist()
-    )
-    path.write_text(
-        head + "".join(f"{before}{separator if before else ''}{row}{ending}\n" for row in rows)
-    )
+    start = f"{before}{separator}" if before else ""
+    lines = []
+    for point in points.reshape(-1, 3).tolist():
+        row = separator.join(f"{x:.9f}".replace(".", decimal) for x in point)
+        lines.append(f"{start}{row}{ending}\n")
+    path.write_text(head + "".join(lines))
     return path
 
 
@@ -139,10 +138,8 @@ def write_stray(folder: Path, frames: int, step_m: float = 0.0) -> Path:
     lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
     for i in range(frames):
         cv2.imwrite(str(folder / "depth" / f"{i:06d}.png"), depth_mm(i))
-        cv2.imwrite(
-            str(folder / "confidence" / f"{i:06d}.png"),
-            np.full((LENS.height, LENS.width), 2, np.uint8),
-        )
+        sure = np.full((LENS.height, LENS.width), 2, np.uint8)
+        cv2.imwrite(str(folder / "confidence" / f"{i:06d}.png"), sure)
         lines.append(f"{i / 60}, {i:06d}, {i * step_m}, 0, 0, 0, 0, 0, 1")
     (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
     return folder
@@ -160,9 +157,8 @@ def write_r3d(path: Path, frames: int, step_m: float = 0.0) -> Path:
         for i in range(frames):
             depth = np.where(depth_mm(i) == 0, np.nan, depth_mm(i) / 1e3).astype("<f4")
             archive.writestr(f"rgbd/{i}.depth", liblzfse.compress(depth.tobytes()))
-            archive.writestr(
-                f"rgbd/{i}.conf", liblzfse.compress(np.full(depth.shape, 2, np.uint8).tobytes())
-            )
+            sure = np.full(depth.shape, 2, np.uint8)
+            archive.writestr(f"rgbd/{i}.conf", liblzfse.compress(sure.tobytes()))
     return path
 
 
@@ -181,9 +177,8 @@ def write_opaque_mat(path: Path) -> Path:
     reference = element(6, words(13, 0)) + element(5, words(6, 1)) + element(1, b"")
     reference += element(6, words(0xDD000000, 2, 1, 1, 1, 1))
     names = element(1, b"pc") + element(1, b"MCOS") + element(1, b"pointCloud")
-    path.write_bytes(
-        header + element(14, element(6, words(17, 0)) + names + element(14, reference))
-    )
+    content = element(6, words(17, 0)) + names + element(14, reference)
+    path.write_bytes(header + element(14, content))
     return path
 
 
@@ -238,10 +233,10 @@ def write_mkv(
         for i, pictures in enumerate(frames):
             for title, picture in pictures.items():
                 form = "gray16le" if picture.ndim == 2 else "rgb24"
-                image = av.VideoFrame.from_ndarray(picture, format=form).reformat(
-                    format=streams[title].pix_fmt
-                )
-                image.pts, image.time_base = i, Fraction(1, 5)
+                image = av.VideoFrame.from_ndarray(picture, format=form)
+                image = image.reformat(format=streams[title].pix_fmt)
+                image.pts = i
+                image.time_base = Fraction(1, 5)
                 container.mux(streams[title].encode(image))
         for stream in streams.values():
             container.mux(stream.encode())

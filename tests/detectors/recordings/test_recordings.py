@@ -44,8 +44,9 @@ def tum(tmp: Path) -> Recording:
     for name in ("depth", "rgb"):
         (tmp / name).mkdir()
     cv2.imwrite(str(tmp / "depth" / "1305031102.160407.png"), STORED * 5)
-    cv2.imwrite(str(tmp / "rgb" / "1305031102.175304.png"), plane.rgb()[..., ::-1])
-    cv2.imwrite(str(tmp / "rgb" / "1305031102.211214.png"), plane.rgb(9)[..., ::-1])
+    path = tmp / "rgb"
+    cv2.imwrite(str(path / "1305031102.175304.png"), plane.rgb()[..., ::-1])
+    cv2.imwrite(str(path / "1305031102.211214.png"), plane.rgb(9)[..., ::-1])
     (tmp / "depth.txt").write_text("# timestamp filename\n")
     return open_capture([tmp], intrinsics=plane.write_lens(tmp / "freiburg.json"))
 
@@ -59,48 +60,57 @@ def sdk_names(tmp: Path) -> Recording:
 
 
 def file_list(tmp: Path) -> Recording:
-    cv2.imwrite(str(tmp / "a.png"), STORED)
-    return open_capture([tmp / "a.png"], lens=plane.LENS)
+    path = tmp / "a.png"
+    cv2.imwrite(str(path), STORED)
+    return open_capture([path], lens=plane.LENS)
 
 
 def npy_depth(tmp: Path) -> Recording:
-    np.save(tmp / "d.npy", STORED[None])
-    return open_capture([tmp / "d.npy"], lens=plane.LENS)
+    path = tmp / "d.npy"
+    np.save(path, STORED[None])
+    return open_capture([path], lens=plane.LENS)
 
 
 def npz_metres(tmp: Path) -> Recording:
-    np.savez(tmp / "d.npz", depth=(STORED / 1e3).astype(np.float32), rgb=plane.rgb())
-    return open_capture([tmp / "d.npz"], lens=plane.LENS)
+    path = tmp / "d.npz"
+    np.savez(path, depth=(STORED / 1e3).astype(np.float32), rgb=plane.rgb())
+    return open_capture([path], lens=plane.LENS)
 
 
 def npy_as_networks_take_it(tmp: Path) -> Recording:
-    np.save(tmp / "d.npy", np.stack([STORED] * 2)[:, None])
-    return open_capture([tmp / "d.npy"], lens=plane.LENS)
+    path = tmp / "d.npy"
+    np.save(path, np.stack([STORED] * 2)[:, None])
+    return open_capture([path], lens=plane.LENS)
 
 
 def npz_with_its_matrix_and_times(tmp: Path) -> Recording:
-    np.savez(tmp / "d.npz", K=plane.LENS.matrix, depth_image=STORED, stamps=np.arange(3.0))
-    return open_capture([tmp / "d.npz"], lens=plane.LENS)
+    path = tmp / "d.npz"
+    np.savez(path, K=plane.LENS.matrix, depth_image=STORED, stamps=np.arange(3.0))
+    return open_capture([path], lens=plane.LENS)
 
 
 def npy_points(tmp: Path) -> Recording:
-    np.save(tmp / "p.npy", TRUE_M)
-    return open_capture([tmp / "p.npy"])
+    path = tmp / "p.npy"
+    np.save(path, TRUE_M)
+    return open_capture([path])
 
 
 def mat_grid(tmp: Path) -> Recording:
-    scipy.io.savemat(tmp / "c.mat", {"Location": TRUE_M, "Color": plane.rgb(), "note": "plate"})
-    return open_capture([tmp / "c.mat"])
+    path = tmp / "c.mat"
+    scipy.io.savemat(path, {"Location": TRUE_M, "Color": plane.rgb(), "note": "plate"})
+    return open_capture([path])
 
 
 def mat_frames_last(tmp: Path) -> Recording:
-    scipy.io.savemat(tmp / "c.mat", {"Location": np.stack([TRUE_M] * 5, axis=-1)})
-    return open_capture([tmp / "c.mat"])
+    path = tmp / "c.mat"
+    scipy.io.savemat(path, {"Location": np.stack([TRUE_M] * 5, axis=-1)})
+    return open_capture([path])
 
 
 def mat_lists_on_a_lens(tmp: Path) -> Recording:
-    scipy.io.savemat(tmp / "c.mat", {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
-    return open_capture([tmp / "c.mat"], lens=plane.LENS)
+    path = tmp / "c.mat"
+    scipy.io.savemat(path, {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
+    return open_capture([path], lens=plane.LENS)
 
 
 def pcd(tmp: Path) -> Recording:
@@ -126,13 +136,15 @@ def csv_with_names_and_commas(tmp: Path) -> Recording:
 
 
 def raw_numbers(tmp: Path) -> Recording:
-    (tmp / "d.bin").write_bytes(b"head" + STORED.astype(">u2").tobytes() * 2)
-    return open_capture([tmp / "d.bin"], lens=plane.LENS, raw="96x72:>u2:4")
+    path = tmp / "d.bin"
+    path.write_bytes(b"head" + STORED.astype(">u2").tobytes() * 2)
+    return open_capture([path], lens=plane.LENS, raw="96x72:>u2:4")
 
 
 def chosen_array(tmp: Path) -> Recording:
-    np.savez(tmp / "d.npz", first=STORED * 0 + 9, second=np.stack([STORED * 0, STORED]))
-    return open_capture([tmp / "d.npz"], lens=plane.LENS, array="second:1")
+    path = tmp / "d.npz"
+    np.savez(path, first=STORED * 0 + 9, second=np.stack([STORED * 0, STORED]))
+    return open_capture([path], lens=plane.LENS, array="second:1")
 
 
 def stray_scanner(tmp: Path) -> Recording:
@@ -164,7 +176,8 @@ FORMATS = (
 
 @pytest.mark.parametrize("opened", FORMATS, ids=lambda f: f.__name__)
 def test_every_format_gives_the_points_that_were_written(
-    opened: Callable[[Path], Recording], tmp_path: Path
+    opened: Callable[[Path], Recording],
+    tmp_path: Path,
 ) -> None:
     recording = opened(tmp_path)
     frame = next(recording.frames())
@@ -183,14 +196,17 @@ def test_every_format_gives_the_points_that_were_written(
     "opened", (open3d, tum, sdk_names, npz_metres, mat_grid), ids=lambda f: f.__name__
 )
 def test_colour_lies_on_the_depth_pixels(
-    opened: Callable[[Path], Recording], tmp_path: Path
+    opened: Callable[[Path], Recording],
+    tmp_path: Path,
 ) -> None:
     np.testing.assert_array_equal(next(opened(tmp_path).frames()).rgb, plane.rgb())
 
 
 @pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
 def test_a_cloud_keeps_colour_and_may_lack_a_grid(
-    write: Callable[..., Path], suffix: str, tmp_path: Path
+    write: Callable[..., Path],
+    suffix: str,
+    tmp_path: Path,
 ) -> None:
     recording = open_capture([write(tmp_path / f"c.{suffix}", TRUE_M, False)])
     frame = next(recording.frames())
@@ -202,8 +218,9 @@ def test_a_cloud_keeps_colour_and_may_lack_a_grid(
 
 
 def test_lists_of_points_without_a_lens_have_no_grid(tmp_path: Path) -> None:
-    scipy.io.savemat(tmp_path / "c.mat", {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
-    recording = open_capture([tmp_path / "c.mat"])
+    path = tmp_path / "c.mat"
+    scipy.io.savemat(path, {"Location": np.stack([TRUE_M.reshape(-1, 3)] * 2)})
+    recording = open_capture([path])
     assert not recording.organised
     assert len(list(recording.frames())) == 2
 
@@ -368,7 +385,8 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
         ),
         (
             '{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576,'
-            ' "k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.02, "camera_model": "OPENCV", "frames": []}',
+            ' "k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.02,'
+            ' "camera_model": "OPENCV", "frames": []}',
             (0.1, 0.2, 0.01, 0.02, 0, 0, 0, 0),
         ),
         (
@@ -384,7 +402,9 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
     ),
 )
 def test_lenses_as_other_programs_write_them(
-    tmp_path: Path, text: str, distortion: tuple[float, ...]
+    tmp_path: Path,
+    text: str,
+    distortion: tuple[float, ...],
 ) -> None:
     path = tmp_path / "lens.txt"
     path.write_text(text)
@@ -447,8 +467,9 @@ def test_frames_along_the_last_axis(tmp_path: Path) -> None:
             assert np.allclose(
                 frame.z_m, np.where(stored > 0, stored / 1e3, np.nan), equal_nan=True
             )
-    np.save(tmp_path / "points.npy", plane.points_m(frames[0]))
-    assert next(open_capture([tmp_path / "points.npy"]).frames()).xy_m is not None
+    path = tmp_path / "points.npy"
+    np.save(path, plane.points_m(frames[0]))
+    assert next(open_capture([path]).frames()).xy_m is not None
 
 
 def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
@@ -485,9 +506,10 @@ def test_the_walls_need_a_lens_and_leave_their_mask_out(shared_data: Path) -> No
 def test_pixels_without_a_ray_are_outside_the_mask(tmp_path: Path) -> None:
     """With k1 = -0.5 the distorted radius r - r^3 / 2 never exceeds 0.544: pixels beyond see
     nothing."""
-    np.save(tmp_path / "d.npy", np.full((101, 101), 1000, np.uint16))
+    path = tmp_path / "d.npy"
+    np.save(path, np.full((101, 101), 1000, np.uint16))
     lens = Lens(101, 101, 60.0, 60.0, 50.0, 50.0, (-0.5, *[0.0] * 7))
-    recording = open_capture([tmp_path / "d.npy"], lens=lens)
+    recording = open_capture([path], lens=lens)
     frame = next(recording.frames())
     v, u = np.mgrid[:101, :101]
     radius = np.hypot(u - 50, v - 50) / 60.0
@@ -519,7 +541,10 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
     ),
 )
 def test_lists_of_points_in_every_dialect(
-    tmp_path: Path, head: str, separator: str, ending: str
+    tmp_path: Path,
+    head: str,
+    separator: str,
+    ending: str,
 ) -> None:
     path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, separator, ending)
     recording = open_capture([path])
@@ -592,7 +617,8 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unpictured")
 def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     v, u = np.mgrid[:150, :200]
     noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=u.shape), (0, 0), 1.0)

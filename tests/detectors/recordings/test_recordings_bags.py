@@ -172,7 +172,9 @@ def test_the_digest_covers_the_messages_and_the_metadata(tmp_path: Path) -> None
     ),
 )
 def test_compressed_chunks_and_messages_are_unpacked(
-    tmp_path: Path, mcap: bool, compression: CompressionMode
+    tmp_path: Path,
+    mcap: bool,
+    compression: CompressionMode,
 ) -> None:
     folder = bags.write_bag(tmp_path / "bag", bags.clouds(2), mcap=mcap, compression=compression)
     stored = [np.nan_to_num(frame.z_m) for frame in open_capture([folder]).frames()]
@@ -249,7 +251,10 @@ LENS_TOPIC = "/camera/depth/camera_info"
     packed=st.sampled_from(("", "png", "rvl")),
 )
 def test_every_encoding_of_one_depth_image_is_one_image(
-    encoding: str, big: bool, padding: int, packed: str
+    encoding: str,
+    big: bool,
+    padding: int,
+    packed: str,
 ) -> None:
     if packed:
         stored = stored_depth("m", bags.packed_depth(STORED, encoding, packed))
@@ -397,7 +402,10 @@ def test_depth_images_without_their_lens_are_refused(tmp_path: Path) -> None:
     byte=st.integers(0, 255),
 )
 def test_a_damaged_compressed_image_is_read_or_told(
-    form: str, cut: float, share: float, byte: int
+    form: str,
+    cut: float,
+    share: float,
+    byte: int,
 ) -> None:
     message = bags.packed_depth(STORED, "16UC1", form)
     data = message.data.copy()
@@ -421,7 +429,9 @@ def test_a_truncated_bag_of_ros_1_is_named(tmp_path: Path, part: float) -> None:
 @settings(max_examples=12, deadline=None)
 @given(share=st.floats(0, 1), byte=st.integers(1, 255))
 def test_a_changed_byte_of_ros_1_is_read_or_told(
-    tmp_path_factory: pytest.TempPathFactory, share: float, byte: int
+    tmp_path_factory: pytest.TempPathFactory,
+    share: float,
+    byte: int,
 ) -> None:
     path = bags.write_ros1(tmp_path_factory.mktemp("ros1") / "a.bag", bags.clouds(1))
     content = bytearray(path.read_bytes())
@@ -435,7 +445,9 @@ def test_a_changed_byte_of_ros_1_is_read_or_told(
 
 @pytest.mark.parametrize("compression", (pytest.param("bz2", marks=pytest.mark.slow), "lz4"))
 def test_a_chunk_of_ros_1_may_not_fill_the_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    compression: str,
 ) -> None:
     zeros = bags.image()
     zeros.data = np.zeros(BOMB_BYTES, np.uint8)
@@ -456,8 +468,9 @@ def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
     )
     assert "no topic points; its topics: /picture" in refusal(bag, topic="points")
     assert "/picture message 0: holds 'mono8' pictures, not depth" in refusal(bag, topic="picture")
-    np.save(tmp_path / "d.npy", plane.depth_mm())
-    assert "is not a ROS bag" in refusal(tmp_path / "d.npy", topic="points2", lens=plane.LENS)
+    path = tmp_path / "d.npy"
+    np.save(path, plane.depth_mm())
+    assert "is not a ROS bag" in refusal(path, topic="points2", lens=plane.LENS)
 
 
 @pytest.mark.parametrize("mcap", (False, True))
@@ -519,7 +532,10 @@ def test_a_truncated_file_is_named(tmp_path: Path, mcap: bool, part: float) -> N
 @settings(max_examples=12, deadline=None)
 @given(share=st.floats(0, 1), byte=st.integers(1, 255), mcap=st.booleans())
 def test_a_changed_byte_is_read_or_told(
-    tmp_path_factory: pytest.TempPathFactory, share: float, byte: int, mcap: bool
+    tmp_path_factory: pytest.TempPathFactory,
+    share: float,
+    byte: int,
+    mcap: bool,
 ) -> None:
     folder = bags.write_bag(tmp_path_factory.mktemp("bags") / "bag", bags.clouds(1), mcap=mcap)
     file = folder / f"bag.{'mcap' if mcap else 'db3'}"
@@ -537,7 +553,9 @@ def test_a_changed_byte_is_read_or_told(
 
 @pytest.mark.parametrize("mode", (CompressionMode.STORAGE, CompressionMode.MESSAGE))
 def test_a_chunk_or_message_may_not_fill_the_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    mode: CompressionMode,
 ) -> None:
     zeros = bags.image()
     zeros.data = np.zeros(BOMB_BYTES, np.uint8)
@@ -566,7 +584,8 @@ def test_a_chunk_that_unpacks_to_another_size_than_it_states_is_refused(tmp_path
 
 
 def test_a_message_may_not_be_larger_than_a_cloud(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(bag_reader, "MAX_MESSAGE_BYTES", 2**17)
     for mode in (CompressionMode.NONE, CompressionMode.MESSAGE):

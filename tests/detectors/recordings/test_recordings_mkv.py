@@ -51,7 +51,10 @@ def test_the_nfov_lens_by_hand() -> None:
     ),
 )
 def test_modes_look_along_the_same_rays(
-    mode: str, second_mode: str, scale: int, shift: tuple[int, int]
+    mode: str,
+    second_mode: str,
+    scale: int,
+    shift: tuple[int, int],
 ) -> None:
     """A pixel of a crop, or the middle of four binned pixels, sees what it sees on the whole
     sensor."""
@@ -104,7 +107,9 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
     ),
 )
 def test_a_calibration_that_is_not_understood_is_refused(
-    path: tuple[str, ...], value: object, message: str
+    path: tuple[str, ...],
+    value: object,
+    message: str,
 ) -> None:
     data = json.loads(plane.calibration().rstrip(b"\0"))
     camera = data["CalibrationInformation"]["Cameras"][0]
@@ -171,10 +176,11 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
         tmp_path / "r.mkv", [{"DEPTH": DEPTH}] * 3, attached=plane.calibration()
     )
     content = intact.read_bytes()
+    path = tmp_path / "cut.mkv"
     for part in (0.0, 0.001, 0.3, 0.7, 0.99):
-        (tmp_path / "cut.mkv").write_bytes(content[: int(part * len(content))])
-        assert "cut.mkv" in refusal(tmp_path / "cut.mkv")
-        assert "truncated" in refusal(tmp_path / "cut.mkv")
+        path.write_bytes(content[: int(part * len(content))])
+        assert "cut.mkv" in refusal(path)
+        assert "truncated" in refusal(path)
     assert "no DEPTH track (its tracks: IR)" in refusal(
         plane.write_mkv(tmp_path / "ir.mkv", [{"IR": DEPTH}])
     )

@@ -44,21 +44,24 @@ def cut(path: Path, part: float) -> Path:
 
 
 def test_a_missing_path_is_named(tmp_path: Path) -> None:
-    message = refusal(tmp_path / "nowhere")
-    assert str(tmp_path / "nowhere") in message
+    path = tmp_path / "nowhere"
+    message = refusal(path)
+    assert str(path) in message
     assert ".mkv" in message
 
 
 def test_an_unknown_kind_of_file_lists_the_known_ones(tmp_path: Path) -> None:
-    (tmp_path / "scan.las").write_bytes(b"LASF")
-    message = refusal(tmp_path / "scan.las")
+    path = tmp_path / "scan.las"
+    path.write_bytes(b"LASF")
+    message = refusal(path)
     assert "'.las'" in message
     assert all(kind in message for kind in (".png", ".ply", ".npz", ".mat", ".mkv"))
 
 
 def test_a_mixed_list_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", STORED)
-    message = refusal(png(tmp_path / "a.png"), tmp_path / "a.npy", lens=plane.LENS)
+    path = tmp_path / "a.npy"
+    np.save(path, STORED)
+    message = refusal(png(tmp_path / "a.png"), path, lens=plane.LENS)
     assert ".npy, .png" in message
 
 
@@ -76,9 +79,10 @@ def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:
     bag = bags.write_bag(tmp_path / "left", bags.clouds(1))
     second = tmp_path / "other.mkv"
     second.touch()
-    plane.write_open3d_folder(tmp_path / "right", 1)
+    path = tmp_path / "right"
+    plane.write_open3d_folder(path, 1)
     message = refusal(tmp_path)
-    assert f"to do: name one of {bag}, {second}, {tmp_path / 'right'}" in message
+    assert f"to do: name one of {bag}, {second}, {path}" in message
     assert ".npz" in message
 
 
@@ -104,15 +108,18 @@ def test_a_damaged_picture_is_named(tmp_path: Path) -> None:
     ((np.zeros((72, 96), np.uint8), "8 bits"), (np.ones((72, 96, 3), np.uint16), "RGB")),
 )
 def test_a_picture_that_is_no_depth_image_is_named(
-    tmp_path: Path, stored: np.ndarray, picture_kind: str
+    tmp_path: Path,
+    stored: np.ndarray,
+    picture_kind: str,
 ) -> None:
     png(tmp_path / "1.png")
-    png(tmp_path / "2.png", stored)
+    path = tmp_path / "2.png"
+    png(path, stored)
     message = refusal(tmp_path, lens=plane.LENS)
     assert "2.png" in message
     assert picture_kind in message
     assert "16-bit" in message
-    assert "2.png" in refusal(tmp_path / "2.png", lens=plane.LENS)
+    assert "2.png" in refusal(path, lens=plane.LENS)
 
 
 def test_sizes_that_differ_name_both_pictures(tmp_path: Path) -> None:
@@ -134,8 +141,9 @@ def test_frames_without_one_valid_pixel_are_refused(tmp_path: Path) -> None:
     png(tmp_path / "1.png", STORED * 0)
     png(tmp_path / "2.png", STORED * 0)
     assert "no valid pixel in 2 frames" in refusal(tmp_path, lens=plane.LENS)
-    np.save(tmp_path / "nan.npy", np.full((72, 96), np.nan))
-    assert "no valid pixel in 1 frame" in refusal(tmp_path / "nan.npy", lens=plane.LENS)
+    path = tmp_path / "nan.npy"
+    np.save(path, np.full((72, 96), np.nan))
+    assert "no valid pixel in 1 frame" in refusal(path, lens=plane.LENS)
 
 
 def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:
@@ -154,10 +162,14 @@ def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:
     ),
 )
 def test_a_wrong_unit_is_noticed_and_the_right_one_offered(
-    tmp_path: Path, stored: np.ndarray, unit: str, advice: str
+    tmp_path: Path,
+    stored: np.ndarray,
+    unit: str,
+    advice: str,
 ) -> None:
-    np.save(tmp_path / "d.npy", stored)
-    message = refusal(tmp_path / "d.npy", lens=plane.LENS, unit=unit)
+    path = tmp_path / "d.npy"
+    np.save(path, stored)
+    message = refusal(path, lens=plane.LENS, unit=unit)
     assert "wrong unit" in message
     assert advice in message
 
@@ -194,16 +206,21 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
     ),
 )
 def test_an_array_that_is_no_capture_is_refused(
-    tmp_path: Path, array: np.ndarray, message: str
+    tmp_path: Path,
+    array: np.ndarray,
+    message: str,
 ) -> None:
-    np.save(tmp_path / "a.npy", array)
-    assert message in refusal(tmp_path / "a.npy", lens=plane.LENS)
+    path = tmp_path / "a.npy"
+    np.save(path, array)
+    assert message in refusal(path, lens=plane.LENS)
 
 
 @pytest.mark.parametrize("planes", ("x y z", "red green blue depth", "depth confidence"))
 @pytest.mark.parametrize("axis", (0, -1))
 def test_planes_that_are_no_frames_of_one_scene_are_refused(
-    tmp_path: Path, planes: str, axis: int
+    tmp_path: Path,
+    planes: str,
+    axis: int,
 ) -> None:
     x, y, z = np.moveaxis(np.nan_to_num(plane.points_m(STORED)), -1, 0)
     red, green, blue = np.random.default_rng(3).random((3, *z.shape))
@@ -219,14 +236,13 @@ def test_planes_that_are_no_frames_of_one_scene_are_refused(
     }
     names = planes.split()
     number = names.index("z" if "z" in names else "depth")
-    np.save(tmp_path / "a.npy", np.stack([values[name] for name in names], axis=axis))
+    path = tmp_path / "a.npy"
+    np.save(path, np.stack([values[name] for name in names], axis=axis))
     if (planes, axis) != ("x y z", -1):  # these are points
-        message = refusal(tmp_path / "a.npy", lens=plane.LENS)
+        message = refusal(path, lens=plane.LENS)
         assert f"{len(names)} planes" in message
         assert "--array :N" in message
-        frame = next(
-            open_capture([tmp_path / "a.npy"], lens=plane.LENS, array=f":{number}").frames()
-        )
+        frame = next(open_capture([path], lens=plane.LENS, array=f":{number}").frames())
         np.testing.assert_allclose(np.nan_to_num(frame.z_m), z, rtol=1e-6)
 
 
@@ -320,8 +336,9 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
     ),
 )
 def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "a.xyz").write_text(text)
-    assert re.search(message, refusal(tmp_path / "a.xyz"))
+    path = tmp_path / "a.xyz"
+    path.write_text(text)
+    assert re.search(message, refusal(path))
 
 
 def test_a_height_map_that_is_none_is_explained(tmp_path: Path) -> None:
@@ -339,7 +356,8 @@ def test_a_height_map_that_is_none_is_explained(tmp_path: Path) -> None:
 
 
 def test_a_faulty_capture_of_a_phone_is_explained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = plane.write_stray(tmp_path / "stray", 1)
     matrix = folder / "camera_matrix.csv"
@@ -374,8 +392,9 @@ def test_a_saved_point_cloud_object_gets_the_line_that_exports_it(tmp_path: Path
 
 def test_a_v73_file_is_told_how_to_be_saved(tmp_path: Path) -> None:
     head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(100)
-    (tmp_path / "a.mat").write_bytes(head)
-    message = refusal(tmp_path / "a.mat")
+    path = tmp_path / "a.mat"
+    path.write_bytes(head)
+    message = refusal(path)
     assert "-v7.3" in message
     assert "'-v7'" in message
 

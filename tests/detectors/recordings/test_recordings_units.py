@@ -32,7 +32,10 @@ def noisy(distance_m: float, unit_m: float, seed: int = 0) -> np.ndarray:
 
 
 def opened(
-    folder: Path, stored: np.ndarray, unit: str | None = None, lens: Lens | None = plane.LENS
+    folder: Path,
+    stored: np.ndarray,
+    unit: str | None = None,
+    lens: Lens | None = plane.LENS,
 ) -> Recording:
     folder.mkdir(exist_ok=True)
     cv2.imwrite(str(folder / "1.png"), stored.astype(np.uint16))
@@ -57,7 +60,8 @@ def opened(
     ),
 )
 def test_a_code_for_no_return_is_told_by_its_place_among_the_distances(
-    codes: tuple[float, ...], dtype: type
+    codes: tuple[float, ...],
+    dtype: type,
 ) -> None:
     stored = noisy(0.7, 1e-3).astype(dtype).ravel()
     assert no_return_codes(stored) == ()
@@ -118,10 +122,13 @@ def test_a_cloud_that_looks_backwards_is_turned_and_said(tmp_path: Path) -> None
     ),
 )
 def test_the_unit_is_told_by_the_data_and_printed(
-    tmp_path: Path, stored: np.ndarray, unit_mm: float
+    tmp_path: Path,
+    stored: np.ndarray,
+    unit_mm: float,
 ) -> None:
-    np.save(tmp_path / "d.npy", stored)
-    recording = open_capture([tmp_path / "d.npy"], lens=plane.LENS)
+    path = tmp_path / "d.npy"
+    np.save(path, stored)
+    recording = open_capture([path], lens=plane.LENS)
     assert recording.unit_text.startswith(f"depth unit {unit_mm:.4g} mm, from ")
     assert np.nanmedian(next(recording.frames()).z_m) == pytest.approx(0.7, rel=0.02)
     usual = 1000.0 if stored.dtype.kind == "f" else 1.0
@@ -130,11 +137,12 @@ def test_the_unit_is_told_by_the_data_and_printed(
 
 @pytest.mark.parametrize("unit_m", (2.5e-4, 1e-4))
 def test_where_two_units_are_plausible_it_asks(tmp_path: Path, unit_m: float) -> None:
+    path = tmp_path / "c"
     with pytest.raises(UserError, match="nothing states the unit") as caught:
-        opened(tmp_path / "c", noisy(0.9, unit_m))
+        opened(path, noisy(0.9, unit_m))
     assert f"--unit {1 / unit_m:.0f}/m (0.9 m)" in str(caught.value)
     assert "--unit mm (" in str(caught.value)
-    recording = opened(tmp_path / "c", noisy(0.9, unit_m), unit=f"{1 / unit_m:.0f}/m")
+    recording = opened(path, noisy(0.9, unit_m), unit=f"{1 / unit_m:.0f}/m")
     assert recording.warnings == ()
     assert f"from --unit {1 / unit_m:.0f}/m" in recording.unit_text
 
@@ -160,21 +168,26 @@ def test_a_camera_with_millimetres_is_believed_within_its_reach_only(tmp_path: P
     ),
 )
 def test_a_file_beside_the_pictures_states_the_unit(
-    tmp_path: Path, key: str, value: object, unit_mm: float
+    tmp_path: Path,
+    key: str,
+    value: object,
+    unit_mm: float,
 ) -> None:
-    (tmp_path / "c").mkdir()
-    (tmp_path / "c" / "metadata.json").write_text(json.dumps({"serial": "f1", key: value}))
-    recording = opened(tmp_path / "c", noisy(0.9, unit_mm / 1e3))
+    path = tmp_path / "c"
+    path.mkdir()
+    (path / "metadata.json").write_text(json.dumps({"serial": "f1", key: value}))
+    recording = opened(path, noisy(0.9, unit_mm / 1e3))
     assert recording.unit_text == f"depth unit {unit_mm:g} mm, from metadata.json"
     assert not recording.warnings
     assert np.nanmedian(next(recording.frames()).z_m) == pytest.approx(0.9, rel=0.02)
 
 
 def test_inches_are_asked_for_and_read(tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", noisy(1.1, 1e-5) / 2540)
+    path = tmp_path / "d.npy"
+    np.save(path, noisy(1.1, 1e-5) / 2540)
     with pytest.raises(UserError, match=r"--unit in \(1\.1 m\)"):
-        open_capture([tmp_path / "d.npy"], lens=plane.LENS)
-    z_m = next(open_capture([tmp_path / "d.npy"], lens=plane.LENS, unit="in").frames()).z_m
+        open_capture([path], lens=plane.LENS)
+    z_m = next(open_capture([path], lens=plane.LENS, unit="in").frames()).z_m
     assert np.nanmedian(z_m) == pytest.approx(1.1, rel=0.02)
 
 
@@ -188,14 +201,12 @@ def test_lengths_along_the_rays_are_told_from_z(tmp_path: Path) -> None:
 
 
 def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "d.npy"
     np.save(
-        tmp_path / "d.npy",
+        path,
         np.stack([noisy(0.7, 1e-3, seed) for seed in (1, 1, 2)]).astype(np.uint16),
     )
-    assert (
-        "first two frames are equal"
-        in open_capture([tmp_path / "d.npy"], lens=plane.LENS).warnings[0]
-    )
+    assert "first two frames are equal" in open_capture([path], lens=plane.LENS).warnings[0]
 
 
 # ---- named cameras and lenses of other sizes
@@ -211,7 +222,11 @@ def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
     ),
 )
 def test_a_named_camera_knows_its_modes_and_its_unit(
-    tmp_path: Path, name: str, size: tuple[int, int], mode: str, unit_mm: float
+    tmp_path: Path,
+    name: str,
+    size: tuple[int, int],
+    mode: str,
+    unit_mm: float,
 ) -> None:
     recording = opened(
         tmp_path / "c", np.full(size[::-1], round(900 / unit_mm)), lens=lens_named(name)
@@ -251,9 +266,10 @@ def test_modes_look_along_the_directions_of_the_factory_calibration() -> None:
 
 def test_a_lens_of_larger_images_of_the_same_shape_is_scaled_and_said(tmp_path: Path) -> None:
     text = {"width": 192, "height": 144, "fx": 300.0, "fy": 302.0, "cx": 94.5, "cy": 72.5}
-    (tmp_path / "c").mkdir()
-    (tmp_path / "c" / "intrinsic.json").write_text(json.dumps(text))
-    recording = opened(tmp_path / "c", noisy(0.7, 1e-3), lens=None)
+    path = tmp_path / "c"
+    path.mkdir()
+    (path / "intrinsic.json").write_text(json.dumps(text))
+    recording = opened(path, noisy(0.7, 1e-3), lens=None)
     assert recording.lens == plane.LENS
     assert "scaled to 96 x 72" in recording.warnings[0]
 
@@ -283,7 +299,10 @@ def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: 
     ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10)),
 )
 def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
-    side: int, finer: int, least: int, largest: int
+    side: int,
+    finer: int,
+    least: int,
+    largest: int,
 ) -> None:
     rng = np.random.default_rng(3)
     frames = []

@@ -45,7 +45,10 @@ def npy_header(shape: str, dtype: str = "<u2") -> bytes:
 
 
 def npz(
-    path: Path, content: bytes, stated: int | None = None, method: int = zipfile.ZIP_DEFLATED
+    path: Path,
+    content: bytes,
+    stated: int | None = None,
+    method: int = zipfile.ZIP_DEFLATED,
 ) -> Path:
     """An archive with one entry; ``stated`` replaces its size in the list of contents."""
     with zipfile.ZipFile(path, "w", method) as archive:
@@ -123,8 +126,9 @@ def test_other_archives(tmp_path):
     ],
 )
 def test_hostile_npy(tmp_path, content):
-    (tmp_path / "a.npy").write_bytes(content)
-    assert str(tmp_path / "a.npy") in capture_refusal(tmp_path / "a.npy")
+    path = tmp_path / "a.npy"
+    path.write_bytes(content)
+    assert str(path) in capture_refusal(path)
 
 
 def test_a_frame_of_too_many_pixels(tmp_path):
@@ -163,21 +167,24 @@ def mat_variable(rows: int, columns: int, stated: int, numbers: bytes = b"") -> 
     ],
 )
 def test_hostile_matlab_files(tmp_path, content, message):
-    (tmp_path / "a.mat").write_bytes(MAT_HEAD + content)
-    assert message in capture_refusal(tmp_path / "a.mat")
+    path = tmp_path / "a.mat"
+    path.write_bytes(MAT_HEAD + content)
+    assert message in capture_refusal(path)
 
 
 def test_a_compressed_matlab_bomb(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "READING_BYTES", 64 << 20)
     packed = zlib.compress(mat_variable(4096, 4096, 128 << 20, bytes(128 << 20)))
-    (tmp_path / "a.mat").write_bytes(MAT_HEAD + struct.pack("<II", 15, len(packed)) + packed)
-    assert "not enough memory for the size that it states" in capture_refusal(tmp_path / "a.mat")
+    path = tmp_path / "a.mat"
+    path.write_bytes(MAT_HEAD + struct.pack("<II", 15, len(packed)) + packed)
+    assert "not enough memory for the size that it states" in capture_refusal(path)
 
 
 def test_cells_beside_numbers_are_left_unread(tmp_path):
     cells = np.array([[1, 2], ["a", {"b": 1}]], object)
-    scipy.io.savemat(tmp_path / "a.mat", {"depth": STORED, "notes": cells}, do_compression=True)
-    assert open_capture([tmp_path / "a.mat"], lens=plane.LENS).region.shape == STORED.shape
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"depth": STORED, "notes": cells}, do_compression=True)
+    assert open_capture([path], lens=plane.LENS).region.shape == STORED.shape
 
 
 def test_cells_in_cells_in_a_mat_file_are_not_followed(tmp_path: Path) -> None:
@@ -193,8 +200,9 @@ def test_cells_in_cells_in_a_mat_file_are_not_followed(tmp_path: Path) -> None:
         size += len(level) + len(name)
         heads.append(struct.pack("<II", 14, size) + level + name)
         size += 8
-    (tmp_path / "a.mat").write_bytes(MAT_HEAD + b"".join(reversed(heads)) + inner)
-    assert "holds no numeric array" in capture_refusal(tmp_path / "a.mat")
+    path = tmp_path / "a.mat"
+    path.write_bytes(MAT_HEAD + b"".join(reversed(heads)) + inner)
+    assert "holds no numeric array" in capture_refusal(path)
 
 
 # ---- phones and lists of points
@@ -214,10 +222,11 @@ def plane_archive(path: Path, metadata: bytes) -> Path:
 
 
 def test_a_list_of_points_that_is_too_long(tmp_path):
-    with (tmp_path / "a.xyz").open("wb") as file:
+    path = tmp_path / "a.xyz"
+    with path.open("wb") as file:
         file.write(b"1 2 3\n")
         file.truncate(10 << 30)
-    assert "has more than 256 MiB" in capture_refusal(tmp_path / "a.xyz")
+    assert "has more than 256 MiB" in capture_refusal(path)
 
 
 # ---- pictures
@@ -297,12 +306,17 @@ XYZ = ("property float x", "property float y", "property float z")
     ],
 )
 def test_hostile_ply(tmp_path, content, message):
-    (tmp_path / "a.ply").write_bytes(content)
-    assert message in capture_refusal(tmp_path / "a.ply")
+    path = tmp_path / "a.ply"
+    path.write_bytes(content)
+    assert message in capture_refusal(path)
 
 
 def pcd(
-    width: object, height: object, data: str = "binary", size: str = "4 4 4", count: str = "1 1 1"
+    width: object,
+    height: object,
+    data: str = "binary",
+    size: str = "4 4 4",
+    count: str = "1 1 1",
 ) -> bytes:
     lines = (
         "VERSION 0.7",
@@ -337,8 +351,9 @@ def pcd(
     ],
 )
 def test_hostile_pcd(tmp_path, content, message):
-    (tmp_path / "a.pcd").write_bytes(content)
-    assert message in capture_refusal(tmp_path / "a.pcd")
+    path = tmp_path / "a.pcd"
+    path.write_bytes(content)
+    assert message in capture_refusal(path)
 
 
 # ---- recordings
@@ -353,8 +368,9 @@ def test_hostile_pcd(tmp_path, content, message):
 )
 def test_a_playlist_called_mkv_opens_nothing_else(tmp_path, content):
     plane.write_mkv(tmp_path / "other.mkv", [{"DEPTH": STORED}], attached=plane.calibration())
-    (tmp_path / "a.mkv").write_bytes(content)
-    assert "a.mkv" in capture_refusal(tmp_path / "a.mkv")
+    path = tmp_path / "a.mkv"
+    path.write_bytes(content)
+    assert "a.mkv" in capture_refusal(path)
 
 
 def test_a_name_that_is_a_protocol_is_a_file(tmp_path, monkeypatch):

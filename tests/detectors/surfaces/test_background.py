@@ -74,7 +74,10 @@ def cloud_of(z: np.ndarray, points_m: np.ndarray | None = None) -> Cloud:
 
 
 def measured(
-    z: np.ndarray, seed: int = 0, correlated_px: float = 0.0, damage: tuple = DAMAGE
+    z: np.ndarray,
+    seed: int = 0,
+    correlated_px: float = 0.0,
+    damage: tuple = DAMAGE,
 ) -> np.ndarray:
     """The surface with damage and noise."""
     noisy_z = z.copy()
@@ -106,7 +109,9 @@ def found(z: np.ndarray, **settings: object) -> Background:
 )
 @pytest.mark.parametrize("correlated_px", [0.0, 1.2])
 def test_the_simplest_shape_that_explains_the_cloud_is_taken(
-    z: np.ndarray, name: str, correlated_px: float
+    z: np.ndarray,
+    name: str,
+    correlated_px: float,
 ) -> None:
     answer = found(measured(z, correlated_px=correlated_px))
     assert answer.notes["shape"] == name

@@ -88,7 +88,9 @@ def stood(turn_deg: tuple[float, float, float], quarter: int = 0) -> np.ndarray:
     ],
 )
 def test_a_part_is_found_where_it_lies(
-    tmp_path: Path, turn_deg: tuple[float, float, float], quarter: int
+    tmp_path: Path,
+    turn_deg: tuple[float, float, float],
+    quarter: int,
 ) -> None:
     path = casting(tmp_path / "casting.stl")
     reference = ReferenceConfig(file=str(path))

@@ -25,7 +25,9 @@ def truth(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def cloud(
-    n: int, seed: int = 0, sigma_m: float = 3e-4
+    n: int,
+    seed: int = 0,
+    sigma_m: float = 3e-4,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     random = np.random.default_rng(seed)
     x = random.uniform(-0.2, 0.3, n)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from scipy.stats import spearmanr
 
-from harness.evaluation.profile import hole_shape, hole_shapes
+from harness.evaluation.profile import HoleShape, hole_shape, hole_shapes
 from harness.programs.thesis.claims import (
     RULES,
     decide,
@@ -118,6 +118,39 @@ def test_c6_is_undecided_without_a_cloud_or_with_mixed_holes() -> None:
     assert next(v for v in scored if v.claim == "C6").verdict == "undecided"
 
 
+@pytest.mark.parametrize(
+    ("bowls", "cylinders", "unclear", "answer"),
+    [
+        (5, 0, 3, "borne out"),
+        (4, 0, 4, "undecided"),
+        (7, 1, 0, "undecided"),
+        (0, 5, 3, "not borne out"),
+        (0, 4, 4, "undecided"),
+        (1, 7, 0, "undecided"),
+    ],
+)
+def test_c6_needs_most_holes_and_no_other(
+    bowls: int, cylinders: int, unclear: int, answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    misfits = [(0.1, 1.0)] * bowls + [(1.0, 0.1)] * cylinders + [(1.0, 1.0)] * unclear
+    shapes = [
+        HoleShape(
+            hole=str(number),
+            pixels=20,
+            bowl_rms_mm=bowl_mm,
+            cylinder_rms_mm=cylinder_mm,
+            true_bowl_rms_mm=cylinder_mm,
+            true_cylinder_rms_mm=bowl_mm,
+        )
+        for number, (bowl_mm, cylinder_mm) in enumerate(misfits, start=1)
+    ]
+    monkeypatch.setattr("harness.programs.thesis.claims.hole_shapes", lambda cloud: shapes)
+    scored = score_claims(tables(frames=(50,)), examples=[example(50)])
+    c6 = next(v for v in scored if v.claim == "C6")
+    assert c6.verdict == answer
+    assert c6.evidence.endswith(f"closer to a bowl in {cylinders} of 8 holes.")
+
+
 @pytest.mark.parametrize("claim", ["C1", "C3", "C4", "C5"])
 def test_missing_counts_are_undecided_and_say_why(claim: str) -> None:
     answer = verdict(claim, frames=(1, 10))
@@ -158,16 +191,24 @@ def test_evidence_carries_the_numbers() -> None:
     ("bias_mm", "std_mm", "agreeing"),
     [
         # the largest hole is the reference, so seven positions are compared
-        (1.3, 0.8, "7 of 7"),  # within a graduation of 1.59 mm, but not within a deviation
-        (1.9, 0.8, "0 of 7"),
-        (1.9, 2.8, "7 of 7"),  # within a deviation, but not within a graduation
+        (
+            1.3,
+            0.8,
+            "7 of 7 mean positions agree;",
+        ),  # within a graduation of 1.59 mm, but not within a deviation
+        (1.9, 0.8, "0 of 7 mean positions agree (except 4–10);"),
+        (
+            1.9,
+            2.8,
+            "7 of 7 mean positions agree;",
+        ),  # within a deviation, but not within a graduation
     ],
 )
 def test_positions_agree_within_the_larger_of_scatter_and_graduation(
     bias_mm: float, std_mm: float, agreeing: str
 ) -> None:
     world = World(place_bias_mm=bias_mm, place_std_mm=std_mm)
-    assert verdict("C5", world).evidence.startswith(f"{agreeing} mean positions agree")
+    assert verdict("C5", world).evidence.startswith(agreeing)
 
 
 def test_four_holes_are_enough_to_rank() -> None:
@@ -218,6 +259,8 @@ def test_rank_test_is_the_exact_permutation_test() -> None:
         pytest.approx(1 / 24),
     )
     assert falling_rank(np.arange(4.0), np.ones(4)) == (0.0, 1.0)
+    # of more than 8 pairs, 20,000 random orders and the given one
+    assert falling_rank(np.arange(9.0), -np.arange(9.0))[1] == pytest.approx(1 / 20_001)
     # seven falling pairs have a chance of 1 in 5,040, of which texts tell that it is small
     assert (p_text(1 / 5040), p_text(0.0014)) == ("< 0.001", "= 0.001")
 
