@@ -23,7 +23,7 @@ PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is simulated for each kind of measurement."""
+    """Numbers of frames and units that are simulated for each kind of measurement."""
 
     noise_frames: int
     """Frames for the noise of single pixels."""
