@@ -175,7 +175,7 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
     drops = measured.dropouts
     edge = measured.edge
     yield Stated(
-        "", "wavelength_nm", 850.0, f"selects the albedo of simulated surfaces; {UNKNOWN}", "M"
+        "", "wavelength_nm", 850.0, f"selects the albedo of simulated surfaces; {UNKNOWN}", tag="M"
     )
     for key, value in (
         ("offset_mm", 0.0),
@@ -184,13 +184,13 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
         ("drift_ramp", 0.0),
     ):
         yield Stated(
-            "unit", key, value, f"constant error and drift after power-on are {UNKNOWN}", "M"
+            "unit", key, value, f"constant error and drift after power-on are {UNKNOWN}", tag="M"
         )
     if measured.has_amplitude:
         yield Stated("light", "amplitude_at_1m", law.light_at_1m, source)
     else:
-        yield Stated("light", "amplitude_at_1m", 1.0, "amplitudes are not recorded", "M")
-    yield Stated("light", "albedo", albedo, "assumed of the recorded surface", "M")
+        yield Stated("light", "amplitude_at_1m", 1.0, "amplitudes are not recorded", tag="M")
+    yield Stated("light", "albedo", albedo, "assumed of the recorded surface", tag="M")
     yield Stated("noise", "range_mm", law.range_m / MM, source)
     yield Stated("noise", "sigma_mm", law.sigma_m / MM, source)
     for key, value, error in zip(
@@ -199,7 +199,7 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
         if np.isfinite(error):
             yield Stated("noise", key, value, f"standard error {error:.2g}; {source}")
         else:
-            yield Stated("noise", key, value, f"assumed: {UNKNOWN}", "M")
+            yield Stated("noise", key, value, f"assumed: {UNKNOWN}", tag="M")
     pattern_mm = 0.0
     doubt = "not determined without a flat surface"
     if pattern is not None:
@@ -222,8 +222,8 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
         f"of {int(drops.pixels.sum())} pixels on surfaces; {source}",
     )
     if edge is None:
-        yield Stated("edge", "gap_px", 0.0, f"edges are {UNKNOWN}", "M")
-        yield Stated("edge", "blur_px", 0.0, f"edges are {UNKNOWN}", "M")
+        yield Stated("edge", "gap_px", 0.0, f"edges are {UNKNOWN}", tag="M")
+        yield Stated("edge", "blur_px", 0.0, f"edges are {UNKNOWN}", tag="M")
     else:
         of_edges = f"{edge.lines} lines of pixels across edges; {source}"
         is_blurred = edge.flying_px > 0.05
@@ -235,10 +235,10 @@ def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterato
         "least_step_mm",
         20.0,
         "smaller steps are assumed to lose no return; not measured",
-        "M",
+        tag="M",
     )
-    yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {UNKNOWN}", "M")
-    yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {UNKNOWN}", "M")
+    yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {UNKNOWN}", tag="M")
+    yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {UNKNOWN}", tag="M")
 
 
 # ---------------------------------------------------------------- a known camera's model, refitted

@@ -119,7 +119,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         # a camera with another image size cannot be refitted
         with_lens(options.like, captures[0].lens)
     measured = characteristics(captures, poses)
-    rate = Stated("unit", "frames_per_second", 30.0, "assumed", "M")
+    rate = Stated("unit", "frames_per_second", 30.0, "assumed", tag="M")
     if options.rate:
         rate = rate._replace(value=options.rate, source="stated by the user", tag="U")
     elif options.like:

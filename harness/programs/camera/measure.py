@@ -97,15 +97,16 @@ class StillCapture:
         return float(stats.theilslopes(self.offsets_m)[0]) * (len(self.z_m) - 1)
 
     @cached_property
-    def apart_m(self) -> np.ndarray:
-        """Displacement (n,) of the frames without the drift."""
-        without_drift_m = self.offsets_m - self.drift_m * np.linspace(0, 1, len(self.z_m))
-        return np.asarray(without_drift_m - np.median(without_drift_m))
+    def without_drift_m(self) -> np.ndarray:
+        """Displacement (n,) of the frames without the drift, relative to its median."""
+        drift_m = self.drift_m * np.linspace(0, 1, len(self.z_m))
+        shift_m = self.offsets_m - drift_m
+        return np.asarray(shift_m - np.median(shift_m))
 
     @cached_property
     def kept(self) -> np.ndarray:
         """The frames that do not jump, (n,) bool."""
-        size_m = np.abs(self.apart_m)
+        size_m = np.abs(self.without_drift_m)
         return size_m <= max(JUMP_M, JUMP_SIGMAS * 1.4826 * float(np.median(size_m)))
 
     @cached_property
@@ -631,12 +632,14 @@ class Characteristics:
     @property
     def jumps_m(self) -> np.ndarray:
         """Displacement (k,) of the frames that jump."""
-        return np.concatenate([np.abs(capture.apart_m[~capture.kept]) for capture in self.captures])
+        return np.concatenate(
+            [np.abs(capture.without_drift_m[~capture.kept]) for capture in self.captures]
+        )
 
     @property
     def jitter_m(self) -> float:
         """Standard deviation of the displacement of the other frames."""
-        variances = [capture.apart_m[capture.kept].var(ddof=1) for capture in self.captures]
+        variances = [capture.without_drift_m[capture.kept].var(ddof=1) for capture in self.captures]
         return float(np.sqrt(np.mean(variances)))
 
     @cached_property

@@ -23,7 +23,7 @@ PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is simulated for each kind of measurement."""
+    """Numbers of frames and units that are simulated for each kind of measurement."""
 
     noise_frames: int
     """Frames for the noise of single pixels."""
@@ -73,9 +73,10 @@ class Bench:
         unit = SimulatedUnit(self.camera, config, view)
         cut = unit.cut
         taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)
-        true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
+        slopes = view.slopes[cut]
+        true_z_m = view.range_m[cut] / np.sqrt(1 + (slopes**2).sum(axis=-1))
         z_m = np.stack([frame.z_m for frame in taken.frames()]).astype(float)
-        return FrameStack(z_m, true_z_m, view.slopes[cut], unit.region)
+        return FrameStack(z_m, true_z_m, slopes, unit.region)
 
 
 @dataclass(frozen=True)

@@ -94,12 +94,14 @@ class Image:
         T_board_image = invert(self.T_image_board)
         rays = self.rays @ T_board_image[:3, :3].T
         start = T_board_image[:3, 3]
-        return np.asarray((start[:2] - rays[..., :2] * (start[2] / rays[..., 2:])) / MM)
+        length = start[2] / rays[..., 2:]
+        return np.asarray((start[:2] - rays[..., :2] * length) / MM)
 
     def resampled(self, z_m: np.ndarray, camera: AnyCamera) -> np.ndarray:
         """Return frames (n, h, w) of the depth camera, aligned to this image, with z in whole
         steps of its output."""
-        plane = np.concatenate([self.plan_mm * MM, np.zeros((*self.lens.whole.shape, 1))], axis=-1)
+        on_face = np.zeros((*self.lens.whole.shape, 1))
+        plane = np.concatenate([self.plan_mm * MM, on_face], axis=-1)
         in_depth = transform_points(invert(self.T_image_depth) @ self.T_image_board, plane)
         u, v = np.moveaxis(camera.nominal_lens.project(in_depth).astype(np.float32), -1, 0)
         depth_per_z = (
@@ -201,7 +203,8 @@ def _cut_around(image: Image, centre_mm: np.ndarray) -> tuple[slice, slice] | No
         return None
     if rows.max() == height - 1 or columns.max() == width - 1:
         return None
-    return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    row_slice = slice(rows.min(), rows.max() + 1)
+    return row_slice, slice(columns.min(), columns.max() + 1)
 
 
 def _residual_mm(plan_mm: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -225,7 +228,8 @@ def _angles_deg(target: TargetConfig) -> np.ndarray:
     """Return the angle (n,) of each hole from the depth camera's axis."""
     on_board_m = np.array([[*hole.centre_m, 0.0] for hole in target.holes])
     centres_m = transform_points(target.pose.T_camera_board, on_board_m)
-    return np.degrees(np.arctan2(np.linalg.norm(centres_m[:, :2], axis=-1), centres_m[:, 2]))
+    from_axis_m = np.linalg.norm(centres_m[:, :2], axis=-1)
+    return np.degrees(np.arctan2(from_axis_m, centres_m[:, 2]))
 
 
 def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
@@ -233,7 +237,8 @@ def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
     count = np.isfinite(z_m).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.nansum(z_m, axis=0) / count
-        variance = np.nansum((z_m - z) ** 2, axis=0) / np.where(count > 1, count - 1, np.nan)
+        degrees = np.where(count > 1, count - 1, np.nan)
+        variance = np.nansum((z_m - z) ** 2, axis=0) / degrees
     return Cloud(
         points_m=image.rays * z[..., None],
         reason=(count == 0).astype(np.uint8),

@@ -32,18 +32,17 @@ def tiff_floats(path: Path) -> np.ndarray:
     for k in range(struct.unpack_from(f"{order}H", content, first)[0]):
         tag, kind, count = struct.unpack_from(f"{order}HHI", content, first + 2 + 12 * k)
         size = {3: 2, 4: 4}.get(kind, 1) * count
-        at = (
-            first + 10 + 12 * k
-            if size <= 4
-            else struct.unpack_from(f"{order}I", content, first + 10 + 12 * k)[0]
-        )
+        value_start = first + 10 + 12 * k
+        if size > 4:
+            (value_start,) = struct.unpack_from(f"{order}I", content, value_start)
         if kind in (3, 4):
             tags[tag] = struct.unpack_from(
-                f"{order}{count}{'H' if kind == 3 else 'I'}", content, at
+                f"{order}{count}{'H' if kind == 3 else 'I'}", content, value_start
             )
-    assert (
-        tags[259] == (1,) and tags[258] == (32,) * 3 and tags[339] == (3,) * 3 and tags[277] == (3,)
-    )
+    assert tags[259] == (1,)
+    assert tags[258] == (32,) * 3
+    assert tags[339] == (3,) * 3
+    assert tags[277] == (3,)
     strips = zip(tags[273], tags[279], strict=True)
     pixel_bytes = b"".join(content[start : start + length] for start, length in strips)
     return np.frombuffer(pixel_bytes, f"{order}f4").reshape(tags[257][0], tags[256][0], 3)
@@ -59,7 +58,8 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
         ("train", "good"), ("validation", "good"), ("test", "good"), ("test", "through")
     }  # fmt: skip
     colours = [part for part in parts if part[2] == "rgb"]
-    assert len(colours) == 10 == len(names_in(folder)) and len(pictures) == 2 * 10 + 5
+    assert len(colours) == 10 == len(names_in(folder))
+    assert len(pictures) == 2 * 10 + 5
     for split, label, _, file in colours:
         label_folder = folder / "tiny" / split / label
         stem = Path(file).stem
@@ -67,9 +67,12 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
         name = f"tiny/{split}/{label}/{stem}"
         arrays = arrays_of(folder, name)
         np.testing.assert_array_equal(points, np.nan_to_num(arrays["points_m"]))
-        assert 0.6 < np.median(points[arrays["inspected"], 2]) < 0.8 and np.isfinite(points).all()
+        assert 0.6 < np.median(points[arrays["inspected"], 2]) < 0.8
+        assert np.isfinite(points).all()
         colour = cv2.imread(str(label_folder / "rgb" / file), cv2.IMREAD_UNCHANGED)
-        assert colour.shape == points.shape and colour.dtype == np.uint8 and np.ptp(colour) > 100
+        assert colour.shape == points.shape
+        assert colour.dtype == np.uint8
+        assert np.ptp(colour) > 100
         assert (label_folder / "gt" / file).exists() == (split == "test")
         if split == "test":
             mask = cv2.imread(str(label_folder / "gt" / file), cv2.IMREAD_UNCHANGED)
@@ -91,9 +94,8 @@ def test_anomalib_reads_it_unchanged(home):
             stem = Path(item.image_path).stem
             points = tiff_floats(folder / "xyz" / f"{stem}.tiff")
             np.testing.assert_array_equal(np.moveaxis(np.asarray(item.depth_map), 0, -1), points)
-            assert np.asarray(item.image).shape == (3, *points.shape[:2]) and item.gt_label == (
-                folder.name != "good"
-            )
+            assert np.asarray(item.image).shape == (3, *points.shape[:2])
+            assert item.gt_label == (folder.name != "good")
             if split == "test":
                 mask = arrays_of(home / "set", f"tiny/{split}/{folder.name}/{stem}")["damage"] > 0
                 np.testing.assert_array_equal(np.asarray(item.gt_mask, bool).squeeze(), mask)
@@ -102,7 +104,8 @@ def test_anomalib_reads_it_unchanged(home):
 def test_coco_masks_are_the_damages(home):
     folder = home / "set"
     data = json.loads((folder / "coco" / "tiny_test.json").read_text())
-    assert data["categories"] == [{"id": 1, "name": "through"}] and len(data["images"]) == 5
+    assert data["categories"] == [{"id": 1, "name": "through"}]
+    assert len(data["images"]) == 5
     assert not json.loads((folder / "coco" / "tiny_train.json").read_text())["annotations"]
     names = {image["id"]: image["file_name"] for image in data["images"]}
     for annotation in data["annotations"]:
@@ -122,11 +125,9 @@ def test_coco_masks_are_the_damages(home):
             columns.max() + 1 - columns.min(),
             rows.max() + 1 - rows.min(),
         ]
-        assert (
-            annotation["bbox"] == box
-            and annotation["area"] == len(rows)
-            and (folder / names[annotation["image_id"]]).exists()
-        )
+        assert annotation["bbox"] == box
+        assert annotation["area"] == len(rows)
+        assert (folder / names[annotation["image_id"]]).exists()
     assert len(data["annotations"]) == 4 * 2
 
 
@@ -147,10 +148,8 @@ def test_truth_depth_and_validity_agree_with_the_cloud(home):
     mask = cv2.imread(str(board_folder / f"{'mask'}.png"), cv2.IMREAD_UNCHANGED)
     z_m = arrays["points_m"][..., 2]
     np.testing.assert_array_equal(valid > 0, np.isfinite(z_m))
-    assert (
-        np.abs(depth[valid > 0] / 5000 - z_m[valid > 0]).max() <= 1.01e-4
-        and not depth[valid == 0].any()
-    )
+    assert np.abs(depth[valid > 0] / 5000 - z_m[valid > 0]).max() <= 1.01e-4
+    assert not depth[valid == 0].any()
     bright = intensity / 65535 * truth["intensity_at_65535"]
     assert (
         np.abs(bright - np.minimum(arrays["intensity"], truth["intensity_at_65535"])).max()
@@ -176,10 +175,8 @@ def test_no_unit_and_no_board_is_in_two_splits(home):
         truth = truth_of(folder, name)
         units.setdefault("/".join(name.split("/")[1:3]), set()).add(truth["unit_seed"])
         poses.add(str(truth["T_camera_board"]))
-    assert (
-        len(poses) == 10
-        and sum(map(len, units.values())) == len(set().union(*units.values())) == 3 + 2 + 1 + 2
-    )
+    assert len(poses) == 10
+    assert sum(map(len, units.values())) == len(set().union(*units.values())) == 3 + 2 + 1 + 2
     assert (
         "No unit of the camera captures boards of two splits" in (folder / "README.md").read_text()
     )
@@ -233,6 +230,5 @@ def test_a_folder_with_other_files_is_left_alone(home, tmp_path, capsys):
         "--serial",
     ]
     assert dataset.main([str(home / "tiny.yaml"), *arguments]) == 2
-    assert "is not empty" in capsys.readouterr().err and [*tmp_path.iterdir()] == [
-        tmp_path / "mine.txt"
-    ]
+    assert "is not empty" in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == [tmp_path / "mine.txt"]

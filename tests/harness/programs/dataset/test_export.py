@@ -109,7 +109,8 @@ def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The message of a run that must end with exit code 2."""
     assert export.main([str(argument) for argument in arguments]) == 2
     message = capsys.readouterr().err
-    assert message.startswith("error: ") and "Traceback" not in message
+    assert message.startswith("error: ")
+    assert "Traceback" not in message
     return message
 
 
@@ -161,11 +162,12 @@ def test_written_read_back_and_detected_is_equal_bit_for_bit(
             expected.lens,
             expected.n_frames,
         )
-        (detections, measured), (found_there, measured_there) = detected(expected), detected(got)
-        assert len(detections) == 1 and [detection.score for detection in detections] == [
-            detection.score for detection in found_there
-        ]
-        assert repr(measured) == repr(measured_there)
+        detections, measured = detected(expected)
+        detections_read, measured_read = detected(got)
+        assert len(detections) == 1
+        scores = [detection.score for detection in detections]
+        assert scores == [detection.score for detection in detections_read]
+        assert repr(measured) == repr(measured_read)
         assert measured[0].model_diameter_m == pytest.approx(0.012, rel=0.1)
 
 
@@ -188,7 +190,8 @@ def test_the_program_finds_the_same_in_either_storage(
         assert detect.main([str(bag), *reading]) == 0
     first = (tmp_path / f"found_{'ros2'}" / "findings.csv").read_text()
     second = (tmp_path / f"found_{'mcap'}" / "findings.csv").read_text()
-    assert first == second and len(first.splitlines()) == 2
+    assert first == second
+    assert len(first.splitlines()) == 2
 
 
 def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path]) -> None:
@@ -217,7 +220,8 @@ def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path])
     )
     info = got[1][2]
     cloud = got[2][2]
-    assert cloud.header.stamp == info.header.stamp and cloud.header.frame_id == pose.child_frame_id
+    assert cloud.header.stamp == info.header.stamp
+    assert cloud.header.frame_id == pose.child_frame_id
     lens = camera_of(CAMERA).nominal_lens
     assert info.distortion_model == "rational_polynomial"
     np.testing.assert_array_equal(info.d, lens.distortion)
@@ -225,7 +229,8 @@ def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path])
     assert [(f.name, f.offset, f.datatype) for f in cloud.fields] == [
         (name, 4 * i, 7) for i, name in enumerate(("x", "y", "z", "rgb", "intensity"))
     ]
-    assert not cloud.is_dense and (cloud.height, cloud.width) == (576, 640)
+    assert not cloud.is_dense
+    assert (cloud.height, cloud.width) == (576, 640)
 
 
 def test_the_truth_and_the_nominal_poses_stand_beside(
@@ -250,11 +255,9 @@ def test_the_truth_and_the_nominal_poses_stand_beside(
     for name in ("truth.json", "nominal_poses.json", "provenance.json"):
         assert json.loads((out / name).read_text())["results_version"] == RESULTS_VERSION
     facts = json.loads((out / "provenance.json").read_text())
-    assert (
-        facts["seed"] == 3
-        and facts["rounding_step_mm"] == 1.0
-        and "--format ros2" in facts["command"]
-    )
+    assert facts["seed"] == 3
+    assert facts["rounding_step_mm"] == 1.0
+    assert "--format ros2" in facts["command"]
     # the declaration beside it exports the same again
     again = exported(
         out / "experiment.yaml", tmp_path / "again", "ros2", "--views", "2", "--frames", "1"
@@ -317,10 +320,11 @@ def test_the_ground_truth_carries_the_camera_to_the_board(exports: dict[str, Pat
     rows = np.loadtxt(exports["tum"] / "groundtruth.txt")
     truth = json.loads((exports["tum"] / "truth.json").read_text())
     assert rows.shape == (3 * FRAMES, 8)
-    for row, told in zip(rows, np.repeat(truth["views"], FRAMES), strict=True):
-        np.testing.assert_allclose(row[1:4], np.array(told["T_board_camera"])[:3, 3], atol=1e-9)
-        turned = Rotation.from_quat(row[4:]).as_matrix()
-        np.testing.assert_allclose(turned, np.array(told["T_board_camera"])[:3, :3], atol=1e-8)
+    for row, view_truth in zip(rows, np.repeat(truth["views"], FRAMES), strict=True):
+        T_board_camera = np.array(view_truth["T_board_camera"])
+        np.testing.assert_allclose(row[1:4], T_board_camera[:3, 3], atol=1e-9)
+        rotation = Rotation.from_quat(row[4:]).as_matrix()
+        np.testing.assert_allclose(rotation, T_board_camera[:3, :3], atol=1e-8)
 
 
 def test_a_sequence_read_back_lies_on_the_planes(
@@ -330,27 +334,22 @@ def test_a_sequence_read_back_lies_on_the_planes(
     0.07 mm. One view only: all frames of a sequence are read as one capture."""
     out = exported(experiment, tmp_path / "out", "tum", "--views", "1")
     recording = open_capture([out])
-    assert (
-        recording.z_step_m == 1e-3
-        and recording.lens is not None
-        and not any(recording.lens.distortion)
-    )
+    assert recording.z_step_m == 1e-3
+    assert recording.lens is not None
+    assert not any(recording.lens.distortion)
     cloud = average(recording, AverageConfig())
-    whole = average(simulated(view, 0), AverageConfig())
+    simulated_cloud = average(simulated(view, 0), AverageConfig())
     pixels = np.round(camera_of(CAMERA).nominal_lens.project(cloud.points_m[cloud.valid])).astype(
         int
     )
-    cut = whole.region
-    inside = (
-        (pixels[:, 0] >= cut.col0)
-        & (pixels[:, 0] < cut.col1)
-        & (pixels[:, 1] >= cut.row0)
-        & (pixels[:, 1] < cut.row1)
-    )
+    cut = simulated_cloud.region
+    inside_columns = (pixels[:, 0] >= cut.col0) & (pixels[:, 0] < cut.col1)
+    inside_rows = (pixels[:, 1] >= cut.row0) & (pixels[:, 1] < cut.row1)
+    inside = inside_columns & inside_rows
     assert inside.mean() > 0.97
     rows = pixels[inside, 1] - cut.row0
     columns = pixels[inside, 0] - cut.col0
-    expected = whole.points_m[rows, columns]
+    expected = simulated_cloud.points_m[rows, columns]
     off = cloud.points_m[cloud.valid][inside] - expected
     pitch_m = 0.72 / camera_of(CAMERA).nominal_lens.fx
     close_to_back = np.abs(off[:, 2]) < 2e-7
@@ -362,16 +361,18 @@ def test_a_sequence_read_back_lies_on_the_planes(
     "lens", (Lens(90, 70, 80.0, 81.0, 44.0, 35.0), Lens(90, 70, 80.0, 81.0, 44.0, 35.0, (0.1,) * 8))
 )
 def test_the_nearest_pixel_is_within_half_a_pixel_of_the_ray(lens: Lens) -> None:
-    numbered = tum.undistorted(
-        lens, np.arange(1, 70 * 90 + 1, dtype=np.uint16).reshape(70, 90)
-    ).astype(int)
-    inside, (rows, columns) = numbered > 0, np.divmod(numbered - 1, 90)
+    numbers = np.arange(1, 70 * 90 + 1, dtype=np.uint16).reshape(70, 90)
+    numbered = tum.undistorted(lens, numbers).astype(int)
+    inside = numbered > 0
+    rows, columns = np.divmod(numbered - 1, 90)
     pinhole = Lens(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
     rays = np.concatenate([pinhole.region_slopes(pinhole.whole), np.ones((70, 90, 1))], axis=-1)
     off = np.abs(lens.project(rays) - np.stack([columns, rows], axis=-1))[inside]
-    assert off.max() <= 0.5 + 1e-4 and inside.any()
+    assert off.max() <= 0.5 + 1e-4
+    assert inside.any()
     if not any(lens.distortion):
-        assert inside.all() and off.max() < 1e-4
+        assert inside.all()
+        assert off.max() < 1e-4
 
 
 def test_depth_units() -> None:
@@ -394,13 +395,15 @@ def test_the_quaternion_turns_as_the_matrix_does() -> None:
     axis = np.array([x, y, z])
     turned = vector + 2 * np.cross(axis, np.cross(axis, vector) + w * vector)
     np.testing.assert_allclose(turned, transform_points(T_a_b, vector), atol=1e-14)
-    assert w >= 0 and x * x + y * y + z * z + w * w == pytest.approx(1, abs=1e-14)
+    assert w >= 0
+    assert x * x + y * y + z * z + w * w == pytest.approx(1, abs=1e-14)
 
 
 def test_views_follow_each_other_in_time(view: NoiseFreeView) -> None:
     views = in_turn([simulated(view, i) for i in range(3)], [np.eye(4)] * 3, FRAMES, 30.0)
     stamps = [view.stamp_ns(frame) for view in views for frame in range(FRAMES)]
-    assert stamps == sorted(set(stamps)) and [view.name for view in views] == [
+    assert stamps == sorted(set(stamps))
+    assert [view.name for view in views] == [
         "view_00",
         "view_01",
         "view_02",

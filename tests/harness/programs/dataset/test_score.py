@@ -80,16 +80,16 @@ def test_areas_are_those_of_scikit_learn(folder, maps, tmp_path):
         boards.append((board_map[inspected].max(), "/good/" not in name))
     flat = np.concatenate(scores)
     truth = np.concatenate(damaged)
-    found = pd.read_csv(tmp_path / "out" / "scores.csv").iloc[0]
-    assert found["pixel_auroc"] == pytest.approx(roc_auc_score(truth, flat), abs=2e-6)
-    assert found["board_auroc"] == pytest.approx(
+    row = pd.read_csv(tmp_path / "out" / "scores.csv").iloc[0]
+    assert row["pixel_auroc"] == pytest.approx(roc_auc_score(truth, flat), abs=2e-6)
+    assert row["board_auroc"] == pytest.approx(
         roc_auc_score([d for _, d in boards], [s for s, _ in boards]), abs=2e-6
     )
     across, up, _ = roc_curve(
         truth, flat, sample_weight=np.concatenate(weights), drop_intermediate=False
     )
     fine = np.linspace(0, 0.3, 300_001)
-    assert found["au_pro"] == pytest.approx(auc(fine, np.interp(fine, across, up)) / 0.3, abs=1e-5)
+    assert row["au_pro"] == pytest.approx(auc(fine, np.interp(fine, across, up)) / 0.3, abs=1e-5)
 
 
 def test_a_hit_is_a_finding_above_the_threshold_of_the_good_boards(folder, maps, tmp_path):
@@ -100,7 +100,9 @@ def test_a_hit_is_a_finding_above_the_threshold_of_the_good_boards(folder, maps,
         for name in names_in(folder)
         if "/validation/" in name
     ]
-    assert record.threshold in quiet and record.calibration_runs == 2 and record.detector == "noise"
+    assert record.threshold in quiet
+    assert record.calibration_runs == 2
+    assert record.detector == "noise"
     assert (
         len(record.inspected.hit) == 8 and record.inspected.hit.all()
     )  # six deviations over a threshold of some four
@@ -135,11 +137,10 @@ def test_wrong_sets_of_maps_are_refused_at_once(folder, maps, tmp_path, capsys):
     message = capsys.readouterr().err
     assert "1 maps are missing: tiny/test/good/0000" in message
     assert "1 maps are not for a board of validation or test: tiny/test/good/0009" in message
-    assert "0000 (3 x 4 instead of" in message and "0001 (no finite number at" in message
-    assert (
-        "0002 (cannot be read as an array of numbers)" in message
-        and not (tmp_path / "out").exists()
-    )
+    assert "0000 (3 x 4 instead of" in message
+    assert "0001 (no finite number at" in message
+    assert "0002 (cannot be read as an array of numbers)" in message
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unfinished_data_set_is_refused(folder, maps, tmp_path, capsys):

@@ -53,7 +53,9 @@ def test_the_truth_holds_what_was_designed(gauge_folder: Path):
     (board,) = read_gauge(gauge_folder / "gauge.json").boards
     sizes = np.array([hole.diameter_mm for hole in board.holes])
     assert len(sizes) == 24
-    assert set((sizes * 2 % 1).tolist()) == {0.0} and sizes.min() >= 2 and sizes.max() <= 12
+    assert set((sizes * 2 % 1).tolist()) == {0.0}
+    assert sizes.min() >= 2
+    assert sizes.max() <= 12
     assert ((sizes > 4) & (sizes < 8)).sum() >= 8  # where the guessed curve rises
     centres_mm = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes])
     distances_mm = np.linalg.norm(centres_mm[:, None] - centres_mm[None], axis=-1) + 1e3 * np.eye(
@@ -187,7 +189,8 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
     ]
     assert gauge.main(["read", *arguments, "--out", str(tmp_path / "found")]) == 0
     printed = capsys.readouterr().out
-    assert "4 marks" in printed and "0 false calls" in printed
+    assert "4 marks" in printed
+    assert "0 false calls" in printed
     lines = (tmp_path / "found" / "gauge.csv").read_text().splitlines()
     rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
     assert [row["target"] for row in rows] == [f"board-1:{n}" for n in range(1, 25)]
@@ -195,11 +198,9 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
         assert row["found"] == ("hit" if hole.diameter_mm > NEVER_FOUND_MM else "miss"), row
         if row["found"] == "hit":
             assert float(row["offset_mm"]) < 1.0
-        assert (
-            row["detector"].startswith("matched ")
-            and float(row["threshold"]) > 3
-            and row["hit_radius_mm"] == "12"
-        )
+        assert row["detector"].startswith("matched ")
+        assert float(row["threshold"]) > 3
+        assert row["hit_radius_mm"] == "12"
     table = str(tmp_path / "found" / "gauge.csv")
     asked = ["--size", "diameter_mm", "--hit", "found", "--target", "target", "--unit", "mm"]
     assert pod.main([table, *asked, "--out", str(tmp_path / "pod")]) == 0
@@ -254,7 +255,8 @@ def seen_by(
     cut = unit.region.within(camera.nominal_lens.whole)
     depth = np.zeros(window.shape, np.uint16)
     colour = np.full((*window.shape, 3), 90, np.uint8)
-    depth[cut], colour[cut] = np.rint(np.nan_to_num(frame.z_m) / MM), picture(truth, place_mm)
+    depth[cut] = np.rint(np.nan_to_num(frame.z_m) / MM)
+    colour[cut] = picture(truth, place_mm)
     for name, image in (("depth", depth), ("color", colour)):
         (folder / "seen" / name).mkdir(parents=True)
         cv2.imwrite(str(folder / "seen" / name / "0.png"), image)
@@ -275,25 +277,21 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         "source.target.distance_m=0.5",
         "detector.name=local",
         f"detector.settings={json.dumps(judged)}",
-    ]
-    changes += [
         f"threshold={{k: {THRESHOLD}}}",
         "matching.radius_mm=12.0",
         "source.target.material.grain_contrast=0.0",
-    ]
-    changes += [
         "study.boards=16",
         "study.hole_free_boards=4",
         "capture.frames=1",
         "source.target.room=null",
+        f"source.target.edge_mm={2 * gauge.EDGE_MM}",
+        "source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}",
+        f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}",
     ]
-    changes.append(f"source.target.edge_mm={2 * gauge.EDGE_MM}")
-    changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
-    changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
     arguments = [text for change in changes for text in ("--set", change)]
     assert sweep.main([str(experiment), *arguments, "--out", str(tmp_path / "study")]) == 0
     study = tmp_path / "study" / "detection_limit" / "latest"
-    simulated, real = (limit_of(set_up) for set_up in read_record(study).set_ups)
+    simulated, real = [limit_of(set_up) for set_up in read_record(study).set_ups]
     truth_mm = real.statement.a90
     assert simulated.statement.bound.value < truth_mm
 
@@ -349,10 +347,8 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         assert mapod["counted_otherwise"] == ""
         assert truth_mm <= last["a90_95"] < 2 * truth_mm
         assert truth_mm <= mapod["a90_95"] < 2 * truth_mm
-        assert (
-            simulated.statement.a90 < last["a90"]
-            and simulated.statement.bound.value < mapod["a90_95"]
-        )
+        assert simulated.statement.a90 < last["a90"]
+        assert simulated.statement.bound.value < mapod["a90_95"]
 
 
 @pytest.mark.parametrize(

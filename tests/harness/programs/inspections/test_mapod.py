@@ -45,7 +45,8 @@ def test_many_real_targets_overrule_the_simulation(log_size: bool):
 
 def test_without_real_targets_the_prior_remains():
     before = campaign(np.array([5.0]), np.array([True]), simulated()).steps()[0]
-    assert before.board == "none" and before.targets == 0
+    assert before.board == "none"
+    assert before.targets == 0
     assert before.a50 == pytest.approx(5.0, rel=0.05)
     assert before.a90_95 > 1.5 * before.a90
 
@@ -66,12 +67,14 @@ def test_agreement_is_as_rare_as_it_says():
 
 def test_a_rise_steeper_than_the_simulated_one_is_credited_only_within_the_study_s_uncertainty():
     size = np.linspace(1.0, 12.0, 60)
-    certain, hardly_known = (
-        campaign(
-            size, size > 5.0, replace(simulated(), covariance=np.diag([1e-6, sigma**2]))
-        ).steps()[-1]
-        for sigma in (1e-3, 0.6 * simulated().sigma)
-    )
+    curve = simulated()
+
+    def last_step(sigma: float):
+        uncertain = replace(curve, covariance=np.diag([1e-6, sigma**2]))
+        return campaign(size, size > 5.0, uncertain).steps()[-1]
+
+    certain = last_step(1e-3)
+    hardly_known = last_step(0.6 * curve.sigma)
     assert hardly_known.a90 - hardly_known.a50 < 1.4 < 1.8 < certain.a90 - certain.a50
 
 
@@ -85,9 +88,8 @@ def test_the_limit_covers_the_truth_whatever_the_camera(curve: PodCurve):
     cases = list(product((1.0, 1.25, 1.5, 2.0), (0.6, 1.0, 1.6)))
     rows = coverage(curve, cases, 24, campaigns=100)
     print("\n".join(map(str, rows)))
-    assert (
-        min(row.covered for row in rows) >= 0.93 and np.mean([row.covered for row in rows]) >= 0.97
-    )
+    assert min(row.covered for row in rows) >= 0.93
+    assert np.mean([row.covered for row in rows]) >= 0.97
     assert np.median([row.median / row.measured for row in rows]) < 1.0
 
 
@@ -110,8 +112,11 @@ def test_the_program_corrects_a_study(
     assert pod.main([*arguments, *prior]) == 0
     mapod = json.loads((tmp_path / "out" / "mapod.json").read_text())
     printed = capsys.readouterr().out
-    assert printed.startswith("warning:") and "real.csv does not state" in printed.splitlines()[0]
-    assert "simulated" in printed and "measured" in printed and "combined" in printed
+    assert printed.startswith("warning:")
+    assert "real.csv does not state" in printed.splitlines()[0]
+    assert "simulated" in printed
+    assert "measured" in printed
+    assert "combined" in printed
     assert [step["board"] for step in mapod["after_each_board"]] == ["none", "A", "B"]
     assert [step["targets"] for step in mapod["after_each_board"]] == [0, 12, 24]
     assert mapod["a90_95"] > truth.size_at(0.9) > mapod["simulated"]["a90"]
@@ -133,7 +138,8 @@ def test_the_program_corrects_a_study(
         table.write_text("\n".join([head, *(f"{row},{counted}" for row in rows)]) + "\n")
         assert pod.main([*arguments, *prior]) == 0
         first = capsys.readouterr().out.splitlines()[0]
-        assert first.startswith("warning:") == bool(word) and word in first
+        assert first.startswith("warning:") == bool(word)
+        assert word in first
         assert (
             word in json.loads((tmp_path / "out" / "mapod.json").read_text())["counted_otherwise"]
         )

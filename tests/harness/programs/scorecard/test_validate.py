@@ -139,7 +139,8 @@ def test_all_mistakes_are_told_at_once(tmp_path):
     text = GOOD.replace("azure_kinect_nfov", "azur", 1).replace("above: 0.5", "under: 0.5")
     with pytest.raises(UserError) as caught:
         read_figures(written(tmp_path, text))
-    assert "`figures.0.camera`" in str(caught.value) and "unknown key `under`" in str(caught.value)
+    assert "`figures.0.camera`" in str(caught.value)
+    assert "unknown key `under`" in str(caught.value)
 
 
 @given(
@@ -191,13 +192,14 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
         tmp_path, GOOD.replace("calibration: true", "calibration: false\n    kind: code", 1)
     )
     check, reality = read_figures(path)
-    assert check.limits == pytest.approx((0.83, 0.95)) and check.use == "code"
+    assert check.limits == pytest.approx((0.83, 0.95))
+    assert check.use == "code"
     value = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.2}", 1)
     _, wide = read_figures(written(tmp_path, value))
-    assert wide.limits == pytest.approx((0.3, 0.7)) and wide.use == "blind"
-    assert reality.limits == (0.5, float("inf")) and Score(
-        reality, Reading(0.4)
-    ).ratio == pytest.approx(0.8)
+    assert wide.limits == pytest.approx((0.3, 0.7))
+    assert wide.use == "blind"
+    assert reality.limits == (0.5, float("inf"))
+    assert Score(reality, Reading(0.4)).ratio == pytest.approx(0.8)
     score = Score(wide, Reading(0.35))
     assert score.verdict == "pass (tolerance)"
     assert "1 of 1 values within 25 % (1 by a wider tolerance" in program._answer([score])
@@ -221,7 +223,9 @@ def test_the_table_tells_value_interval_published_and_source(tmp_path):
         "[M] a",
     ):
         assert words in lines[1]
-    assert "above 0.5" in lines[2] and "1.40" in lines[2] and "blind" in lines[2]
+    assert "above 0.5" in lines[2]
+    assert "1.40" in lines[2]
+    assert "blind" in lines[2]
 
 
 @pytest.mark.parametrize(
@@ -281,7 +285,8 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
     assert all(line.startswith("measured ") for line in printed.err.splitlines())
     page = (out / "scorecard.html").read_text()
     assert f'<meta name="generator" content="{GENERATOR}">' in page
-    assert page.count("<svg") == 1 and "http" not in page.replace("http://www.w3.org", "")
+    assert page.count("<svg") == 1
+    assert "http" not in page.replace("http://www.w3.org", "")
     scores = list(csv.DictReader((out / "scorecard.csv").open()))
     assert [row["name"] for row in scores] == ["wall", "neighbours"]
     assert float(scores[0]["low"]) < float(scores[0]["simulated"]) < float(scores[0]["high"])
@@ -295,7 +300,8 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
     )
     assert main(options) == 1
     printed = capsys.readouterr()
-    assert "wall (temporal deviation" in printed.err and "neighbours (" not in printed.err
+    assert "wall (temporal deviation" in printed.err
+    assert "neighbours (" not in printed.err
 
     figures.write_text(GOOD.replace("source: a filter", "source: a filter\n    fails: it did once"))
     assert main(options) == 0

@@ -168,9 +168,9 @@ def test_two_planes_are_found_with_their_pixels():
     z[:5] = np.nan
     planes = find_planes(z, slopes, 8e-3, least_px=1000)
     assert len(planes) == 2
-    (wall, _), (near, on_board) = planes
+    (wall, _), (front, on_board) = planes
     assert (wall.distance_m, wall.slope_x) == pytest.approx((1.6, -0.4), abs=1e-3)
-    assert (near.distance_m, near.slope_x) == pytest.approx((0.9, 0.1), abs=1e-3)
+    assert (front.distance_m, front.slope_x) == pytest.approx((0.9, 0.1), abs=1e-3)
     assert (on_board == board)[5:].mean() > 0.999
     again = find_planes(z, slopes, 8e-3, least_px=1000)
     assert all((first[1] == second[1]).all() for first, second in zip(planes, again, strict=True))
@@ -233,7 +233,8 @@ def test_an_edge_within_a_pixel_mixes_phasors_by_area():
     mixed = 0.75 * alone[0][:, :, column] + 0.25 * alone[1][:, :, column]
     assert np.abs(view.phasor[:, :, column] / mixed - 1).max() < 0.05
     assert view.coverage[:, column] == pytest.approx(0.75, abs=1 / 12)
-    assert (view.surface[:, : column - 1] == 1).all() and (view.surface[:, column:] == 0).all()
+    assert (view.surface[:, : column - 1] == 1).all()
+    assert (view.surface[:, column:] == 0).all()
 
 
 def test_the_shadow_is_as_wide_as_the_emitter_says():
@@ -246,7 +247,8 @@ def test_the_shadow_is_as_wide_as_the_emitter_says():
     front = Plane(0.75)
     back = Plane(0.95)
     lit = plane_view(PINHOLE, REGION, 0.95, 0.6).intensity
-    lens, (e_x, _, e_z) = PINHOLE.nominal_lens, PINHOLE.optics.emitter_m
+    lens = PINHOLE.nominal_lens
+    e_x, _, e_z = PINHOLE.optics.emitter_m
     edge = 0.5 / lens.fx
     x_edge = edge * 0.75
     x_end = x_edge + (x_edge - e_x) * 0.2 / (0.75 - e_z)
@@ -295,5 +297,6 @@ def test_a_shadow_is_a_gap_of_its_width(bench):
     v2 = Bench("kinect_v2", bench.effort)
     lit = value(v2, "edge_gap_px", step_mm=500, shadow=False)
     shadowed = value(v2, "edge_gap_px", step_mm=500, shadow=True)
-    assert lit < 0.5 and 10.6 < shadowed < 15.6
+    assert lit < 0.5
+    assert 10.6 < shadowed < 15.6
     assert value(bench, "edge_gap_px", step_mm=20) == 0

@@ -28,8 +28,9 @@ source:
     name: custom
     board: {width_mm: 700.0, height_mm: 500.0, thickness_mm: 12.0}
     drill: {diameter_mm: 6.0}
-    holes: [{id: 1, centre_mm: [-45, -30]}, {id: 2, centre_mm: [0, -30]}, {id: 3, centre_mm: [45, -30]},
-            {id: 4, centre_mm: [-45, 15]}, {id: 5, centre_mm: [0, 15]}, {id: 6, centre_mm: [45, 15]}]
+    holes: [{id: 1, centre_mm: [-45, -30]}, {id: 2, centre_mm: [0, -30]},
+            {id: 3, centre_mm: [45, -30]}, {id: 4, centre_mm: [-45, 15]},
+            {id: 5, centre_mm: [0, 15]}, {id: 6, centre_mm: [45, 15]}]
     material: {albedo_850: 0.5, grain_contrast: 0.0}
     pose: {distance_m: 0.3, tilt_x_deg: 5.0, tilt_y_deg: 4.0, offset_x_mm: 10.0}
   camera: {name: azure_kinect_nfov_binned, effects: {frame_jumps: false}}
@@ -63,15 +64,15 @@ def recorded(tmp_path_factory) -> Path:
     PNGs; the second frame is displaced by 17 mm."""
     home = tmp_path_factory.mktemp("plate")
     (home / "known.yaml").write_text(BOARD)
-    (point,) = (p for p in load_experiment(home / "known.yaml").points if p.label.endswith("6.0"))
+    points = load_experiment(home / "known.yaml").points
+    (point,) = [point for point in points if point.label.endswith("6.0")]
     source = point.config.source
     config = source.camera.model_copy(update={"unit_seed": 9})
     camera = camera_of(config)
     view, _ = cached_view(source.target, camera.optics, source.render, home / "renders")
     (home / "depth").mkdir()
-    for number, frame in enumerate(
-        SimulatedUnit(camera, config, view).capture(6, 77, "real").frames()
-    ):
+    capture = SimulatedUnit(camera, config, view).capture(6, 77, "real")
+    for number, frame in enumerate(capture.frames()):
         image = 1e3 * aligned(frame.z_m, camera, camera.colour.T_colour_depth)
         image = np.where(image > 0, image + 17 * (number == 1), 0)
         assert cv2.imwrite(str(home / "depth" / f"{number}.png"), np.round(image).astype(np.uint16))

@@ -45,7 +45,7 @@ def rows_of(out: Path) -> list[dict[str, str]]:
 
 
 def pick(rows: list[dict[str, str]], figure: str, where: str = "") -> tuple[float, float]:
-    (row,) = (r for r in rows if r["figure"] == figure and where in r["where"])
+    (row,) = [row for row in rows if row["figure"] == figure and where in row["where"]]
     return float(row["measured"]), float(row["simulated"])
 
 
@@ -70,11 +70,9 @@ def step(tmp_path_factory) -> list[dict[str, str]]:
     ]
     assert main(options) == 0
     page = (folder / "out" / "capture.html").read_text()
-    assert (
-        "<svg" in page
-        and "gap at an edge" in page
-        and f'<meta name="generator" content="{GENERATOR}">' in page
-    )
+    assert "<svg" in page
+    assert "gap at an edge" in page
+    assert f'<meta name="generator" content="{GENERATOR}">' in page
     provenance = json.loads((folder / "out" / "provenance.json").read_text())
     assert (provenance["camera"], provenance["results_version"]) == (
         "azure_kinect_nfov",
@@ -136,7 +134,8 @@ def test_a_mask_leaves_pixels_out(tmp_path):
 def refused(options: list[str], capsys) -> str:
     assert main(options) == 2
     message = capsys.readouterr().err
-    assert message.startswith("error: ") and "Traceback" not in message
+    assert message.startswith("error: ")
+    assert "Traceback" not in message
     return message
 
 
@@ -158,10 +157,8 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
     for number in range(4):
         cv2.imwrite(str(small / f"{number}.png"), np.full((160, 200), 900 + number % 2, np.uint16))
     message = refused(["--capture", str(small), "--intrinsics", str(lens)], capsys)
-    assert (
-        "no simulated camera has 200 x 160 pixels" in message
-        and "azure_kinect_nfov 640 x 576" in message
-    )
+    assert "no simulated camera has 200 x 160 pixels" in message
+    assert "azure_kinect_nfov 640 x 576" in message
     message = refused(
         ["--capture", str(small), "--intrinsics", str(lens), "--camera", "azure_kinect_nfov"],
         capsys,
@@ -171,7 +168,8 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
         ["--capture", str(capture), "--intrinsics", "azure_kinect_nfov", "--mask", str(lens)],
         capsys,
     )
-    assert "is not a readable image" in message and "neither PNG nor JPEG" in message
+    assert "is not a readable image" in message
+    assert "neither PNG nor JPEG" in message
 
 
 def test_nothing_flat_is_refused(tmp_path, capsys):
