@@ -75,17 +75,15 @@ def test_the_rate_of_false_calls_has_a_default_and_is_written_out(tmp_path):
 
 
 def test_more_boards_are_another_study_of_the_same_boards(tmp_path):
-    experiment = load_experiment(written(tmp_path), ["study.boards=" + "4"])
-    experiment = load_experiment(written(tmp_path), ["study.boards=" + "6"])
-    assert experiment.digest != experiment.digest
-    assert [point.digest for point in experiment.points] == [
-        point.digest for point in experiment.points
-    ]
-    a = plan_of(experiment, tmp_path).groups[0].then
-    b = plan_of(experiment, tmp_path).groups[0].then
-    assert {job.path for batch in a for job in batch.renders} < {
-        job.path for batch in b for job in batch.renders
-    }
+    smaller = load_experiment(written(tmp_path), ["study.boards=4"])
+    larger = load_experiment(written(tmp_path), ["study.boards=6"])
+    assert smaller.digest != larger.digest
+    assert [point.digest for point in smaller.points] == [point.digest for point in larger.points]
+    smaller_batches = plan_of(smaller, tmp_path).groups[0].then
+    larger_batches = plan_of(larger, tmp_path).groups[0].then
+    smaller_paths = {job.path for batch in smaller_batches for job in batch.renders}
+    larger_paths = {job.path for batch in larger_batches for job in batch.renders}
+    assert smaller_paths < larger_paths
 
 
 def test_boards_differ_by_purpose_and_number_and_hole_free_ones_show_no_damage(tmp_path):
