@@ -61,7 +61,11 @@ class BetweenViews:
 
 
 def between_views(
-    heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
+    heights: np.ndarray,
+    sensor: np.ndarray,
+    explained: np.ndarray,
+    looks_px: np.ndarray,
+    repeated: bool,
 ) -> BetweenViews:
     """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances
     that the ``sensor`` and ``other`` (lens, registration) explain; and the direction ``looks_px``
@@ -69,51 +73,56 @@ def between_views(
     variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
     chosen = several[:: max(1, len(several) // CELLS)]
-    values = (heights, sensor, other, looks_px)
-    flat, sensor, other, looks = (v.reshape(len(v), -1, *v.shape[3:])[:, chosen] for v in values)
+    values = (heights, sensor, explained, looks_px)
+    flat, sensor, explained, looks = (
+        v.reshape(len(v), -1, *v.shape[3:])[:, chosen] for v in values
+    )
     i, j = np.triu_indices(len(heights), 1)
-    both = np.isfinite(flat[i] - flat[j])
-    if both.sum() < PER_CLASS:
+    overlapping = np.isfinite(flat[i] - flat[j])
+    if overlapping.sum() < PER_CLASS:
         return BetweenViews()
-    apart = np.linalg.norm(looks[i] - looks[j], axis=-1)[both]
+    distances_px = np.linalg.norm(looks[i] - looks[j], axis=-1)[overlapping]
     columns = (
-        apart,
-        (flat[i] - flat[j])[both] ** 2,
-        *(0.5 * (v[i] + v[j])[both] for v in (sensor, other)),
+        distances_px,
+        (flat[i] - flat[j])[overlapping] ** 2,
+        *(0.5 * (v[i] + v[j])[overlapping] for v in (sensor, explained)),
     )
     parts = np.array_split(
-        np.argsort(apart, kind="stable"), min(CLASSES, max(1, len(apart) // PER_CLASS))
+        np.argsort(distances_px, kind="stable"),
+        min(CLASSES, max(1, len(distances_px) // PER_CLASS)),
     )
     distance, square, of_sensor, of_other = (
         np.array([np.median(c[part]) for part in parts]) for c in columns
     )
     half_square = np.maximum(0.5 * square / MEDIAN_SQUARE, 1e-16)
     # k - 1 of the k (k - 1) / 2 differences of k views are independent
-    error = half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(apart) / len(parts))
-    known = (half_square - of_other - (of_sensor if repeated else 0.0)) / error
+    error = (
+        half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(distances_px) / len(parts))
+    )
+    target = (half_square - of_other - (of_sensor if repeated else 0.0)) / error
     first = (np.ones_like(distance) if repeated else of_sensor) / error
-    level, sill, length, exponent = _law(first, 1.0 / error, distance, known, repeated)
+    level, sill, length, exponent = _law(first, 1.0 / error, distance, target, repeated)
     if repeated:
         return BetweenViews(level, sill, length, exponent)
     return BetweenViews(0.0, sill, length, exponent, min(max(level, 0.01), 1.0))
 
 
 def _law(
-    first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
+    first: np.ndarray, unit: np.ndarray, distance: np.ndarray, target: np.ndarray, may_vanish: bool
 ) -> tuple[float, float, float, float]:
     """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the
     law with the least chi square plus Schwarz's penalty: none (if it ``may_vanish``), ``first``
     alone, or both terms."""
     penalty = float(np.log(max(len(distance), 2)))
-    (level,), misfit = nnls(first[:, None], known)
+    (level,), misfit = nnls(first[:, None], target)
     best = (float(misfit) ** 2 + penalty, float(level), 0.0, 1.0, 1.0)
-    if may_vanish and known @ known <= best[0]:
-        best = (float(known @ known), 0.0, 0.0, 1.0, 1.0)
+    if may_vanish and target @ target <= best[0]:
+        best = (float(target @ target), 0.0, 0.0, 1.0, 1.0)
     for exponent, length in product(
         EXPONENTS, np.geomspace(1.0, max(1.0, float(distance.max())), LENGTHS)
     ):
         rise = 1.0 - np.exp(-((distance / length) ** exponent))
-        (level, sill), misfit = nnls(np.column_stack([first, rise * unit]), known)
+        (level, sill), misfit = nnls(np.column_stack([first, rise * unit]), target)
         if misfit**2 + 4.0 * penalty < best[0]:
             best = (
                 float(misfit) ** 2 + 4.0 * penalty,
@@ -146,7 +155,7 @@ class SurfaceMap:
 def combine(
     heights: np.ndarray,
     sensor: np.ndarray,
-    other: np.ndarray,
+    explained: np.ndarray,
     looks_px: np.ndarray,
     repeated: bool,
     cell_m: float,
@@ -155,30 +164,30 @@ def combine(
     is the inverse of its own variance. (The best weights under the covariance can be negative,
     which fails at a hole seen by only some views.) The variance of the mean includes the
     covariance of views."""
-    between = between_views(heights, sensor, other, looks_px, repeated)
+    between = between_views(heights, sensor, explained, looks_px, repeated)
     temporal = between.noise_share * sensor
-    own = temporal + other + between.own_m2
-    rejected = _outliers(heights, own + between.pattern_m2)
+    own_m2 = temporal + explained + between.own_m2
+    rejected = _outliers(heights, own_m2 + between.pattern_m2)
     used = np.isfinite(heights) & ~rejected
-    known = used.any(axis=0)
-    weights = np.where(used, 1.0 / (own + between.pattern_m2), 0.0)
+    covered = used.any(axis=0)
+    weights = np.where(used, 1.0 / (own_m2 + between.pattern_m2), 0.0)
     with np.errstate(invalid="ignore"):
         shares = np.nan_to_num(weights / weights.sum(axis=0))
     squares = shares**2
     shared = between.pattern_m2 * squares.sum(axis=0)
     if between.pattern_m2 > 0:
         for i, j in combinations(range(len(heights)), 2):
-            apart = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
+            separation = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
             shared += (
                 2.0
                 * between.pattern_m2
                 * shares[i]
                 * shares[j]
-                * np.exp(-(apart**between.exponent))
+                * np.exp(-(separation**between.exponent))
             )
-    height = np.where(known, np.where(used, shares * heights, 0.0).sum(axis=0), np.nan)
-    alone = np.where(known, np.where(used, squares * own, 0.0).sum(axis=0), np.nan)
-    by_frames = np.where(known, np.where(used, squares * temporal, 0.0).sum(axis=0), np.nan)
+    height = np.where(covered, np.where(used, shares * heights, 0.0).sum(axis=0), np.nan)
+    alone = np.where(covered, np.where(used, squares * own_m2, 0.0).sum(axis=0), np.nan)
+    by_frames = np.where(covered, np.where(used, squares * temporal, 0.0).sum(axis=0), np.nan)
     return SurfaceMap(
         cell_m, height, alone + shared, by_frames, used, shares, int(rejected.sum()), between
     )
@@ -195,10 +204,12 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)
     k, row, column = np.nonzero(several & (deviation > limit))
     padded = np.pad(heights, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
-    near = np.stack(
+    neighbourhood = np.stack(
         [padded[k, row + down, column + right] for down in range(3) for right in range(3)]
     )
-    rejected[k, row, column] = near[4] - pixel_medians(near) > limit[k, row, column]
+    rejected[k, row, column] = (
+        neighbourhood[4] - pixel_medians(neighbourhood) > limit[k, row, column]
+    )
     return rejected
 
 
@@ -256,24 +267,24 @@ def fuse(
         by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
         look_px = in_view[..., :2] / in_view[..., 2:] / views[0].slope_step
         observed.append((values[..., 0], by_sensor, by_others, look_px, values[..., 2:]))
-    heights, sensor, other, looks_px, more = (
-        np.stack(each) for each in zip(*observed, strict=True)
+    heights, sensor, explained, looks_px, extras = (
+        np.stack(observations) for observations in zip(*observed, strict=True)
     )
-    found = combine(heights, sensor, other, looks_px, repeated, grid.step)
+    fused = combine(heights, sensor, explained, looks_px, repeated, grid.step)
 
     clouds = [view.cloud for view in views]
-    samples = np.round(np.where(found.seen_by, more[..., 0], 0.0).sum(axis=0)).astype(np.int32)
-    means = (found.shares[..., None] * np.nan_to_num(more)).sum(axis=0)
-    known = np.isfinite(found.height_m)
-    shares = found.shares.sum(axis=(1, 2)) / found.shares.sum()
+    samples = np.round(np.where(fused.seen_by, extras[..., 0], 0.0).sum(axis=0)).astype(np.int32)
+    means = (fused.shares[..., None] * np.nan_to_num(extras)).sum(axis=0)
+    covered = np.isfinite(fused.height_m)
+    shares = fused.shares.sum(axis=(1, 2)) / fused.shares.sum()
     pixel_m = np.sqrt(shares @ np.stack([view.pixel_m for view in placed]) ** 2)
-    points[..., 2] += found.height_m
-    points[~known] = np.nan
+    points[..., 2] += fused.height_m
+    points[~covered] = np.nan
     merged = Cloud(
         points_m=points,
-        reason=np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8),
+        reason=np.where(covered, Reason.VALID, Reason.NO_RETURN).astype(np.uint8),
         count=samples,
-        variance_m2=found.temporal_m2 * samples,
+        variance_m2=fused.temporal_m2 * samples,
         region=Region(0, grid.shape[0], 0, grid.shape[1]),
         z_step_m=0.0,
         n_frames=sum(cloud.n_frames for cloud in clouds),
@@ -282,15 +293,15 @@ def fuse(
         else np.round(means[..., 1:4]).astype(np.uint8),
         amplitude=None
         if any(c.amplitude is None for c in clouds)
-        else np.where(known, means[..., 4], np.nan),
-        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        else np.where(covered, means[..., 4], np.nan),
+        left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
         projection="parallel",
-        mean_variance_m2=found.variance_m2 if len(views) > 1 else None,
+        mean_variance_m2=fused.variance_m2 if len(views) > 1 else None,
         map_views=MapViews(
             np.stack([view.T_map_view for view in placed]), shares, (pixel_m[0], pixel_m[1])
         ),
     )
-    return merged, T_reference_map, found, _notes(views, found)
+    return merged, T_reference_map, fused, _notes(views, fused)
 
 
 def _roughness(view: placing.PlacedView) -> np.ndarray:
@@ -301,8 +312,8 @@ def _roughness(view: placing.PlacedView) -> np.ndarray:
     if not (view.chosen.cloud.count[inside] > 1).any():
         x, y = view.places_m[inside].T
         z = view.deviation_m[inside]
-        every = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
-        rough[inside] = z - fit_surface(x[every], y[every], z[every], SurfaceConfig()).evaluate(
+        stride = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
+        rough[inside] = z - fit_surface(x[stride], y[stride], z[stride], SurfaceConfig()).evaluate(
             x, y
         )
     return rough
@@ -323,8 +334,10 @@ def _neighbour_correlation(view: placing.PlacedView) -> float:
 
 def _median(values: np.ndarray) -> float:
     """Return the median of an even sample of the finite values; NaN if there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known[:: max(1, len(known) // SMOOTH_POINTS)])) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    return (
+        float(np.median(finite[:: max(1, len(finite) // SMOOTH_POINTS)])) if len(finite) else np.nan
+    )
 
 
 def _registration_variance(
@@ -342,8 +355,8 @@ def _registration_variance(
     return np.asarray(np.maximum(spread, 0.0))
 
 
-def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str, ...]:
-    between = found.between
+def _notes(views: Sequence[placing.ChosenView], surface_map: SurfaceMap) -> tuple[str, ...]:
+    between = surface_map.between
     notes = [
         "one view: its variance excludes errors that are constant in a view (pattern, wiggling)"
     ]
@@ -358,9 +371,9 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
         notes.append(
             f"views without a covariance count among those differences: {', '.join(without)}"
         )
-    if found.rejected:
+    if surface_map.rejected:
         notes.append(
-            f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations "
+            f"{surface_map.rejected} of {int(surface_map.seen_by.sum()) + surface_map.rejected} observations "
             "were outliers"
         )
     return tuple(notes)
@@ -379,10 +392,10 @@ def depth_noise(
     q = (cloud.points_m**2).sum(axis=-1) ** 2
     valid = cloud.valid
     if cloud.amplitude is not None:
-        known = valid & (np.nan_to_num(cloud.amplitude) > 0)
-        if known.sum() >= 0.9 * valid.sum():
-            q = 1.0 / np.where(known, cloud.amplitude, np.nan) ** 2
-            q[valid & ~known] = np.median(q[known])
+        with_amplitude = valid & (np.nan_to_num(cloud.amplitude) > 0)
+        if with_amplitude.sum() >= 0.9 * valid.sum():
+            q = 1.0 / np.where(with_amplitude, cloud.amplitude, np.nan) ** 2
+            q[valid & ~with_amplitude] = np.median(q[with_amplitude])
     used = inside & (cloud.count > 1) & np.isfinite(cloud.variance_m2)
     repeated = bool(used.sum() >= PER_BIN)
     if repeated:
@@ -411,12 +424,12 @@ def depth_noise(
             np.column_stack([middle, np.ones(len(parts))]) / height[:, None], np.ones(len(parts))
         )[0]
     frame = slope * q / typical + constant
-    left = 0.0
+    rounding_m2 = 0.0
     if cloud.z_step_m > 0 and repeated:
         # any average keeps an error of rounding that no scatter shows; if frames repeat exactly,
         # it is the whole error
-        left = rounding_left_m2(
+        rounding_m2 = rounding_left_m2(
             cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0)
         )
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.maximum(frame / cloud.count + left, LEAST_M2), repeated
+        return np.maximum(frame / cloud.count + rounding_m2, LEAST_M2), repeated

@@ -65,12 +65,12 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
     order = np.flatnonzero(facing)[np.lexsort(points[facing].T[::-1])]
     n = len(order)
     variances = np.concatenate([view.cloud.variance_m2[view.inside] for view in views])
-    known = variances[np.isfinite(variances)]
+    finite = variances[np.isfinite(variances)]
     merged = Cloud(
         points_m=points[order][None],
         reason=np.zeros((1, n), dtype=np.uint8),
         count=np.ones((1, n), dtype=np.int32),
-        variance_m2=np.full((1, n), float(np.median(known)) if len(known) else np.nan),
+        variance_m2=np.full((1, n), float(np.median(finite)) if len(finite) else np.nan),
         region=Region(0, 1, 0, n),
         z_step_m=max(cloud.z_step_m for cloud in clouds),
         n_frames=min(cloud.n_frames for cloud in clouds),
@@ -78,7 +78,7 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
         rgb=None
         if rgb is None
         else np.round(255.0 * np.clip(rgb[order], 0.0, 1.0)).astype(np.uint8)[None],
-        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
     )
     note = f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
     return merged, (
@@ -142,16 +142,16 @@ def _crossings(
             blocks = field.compute_unique_block_coordinates(depth, *camera, *limits)
             field.integrate(blocks, depth, *colour, *camera, *limits)
         try:
-            found = field.extract_point_cloud(0.5)
+            crossings = field.extract_point_cloud(0.5)
         except RuntimeError as error:
             # Open3D cannot make a cloud without points
-            what = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
+            problem = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
             raise UserError(
-                what, fix="choose smaller voxels, check the crop, or merge in another way"
+                problem, fix="choose smaller voxels, check the crop, or merge in another way"
             ) from error
-        points = found.point["positions"].numpy().astype(np.float64)
-        normals = found.point["normals"].numpy().astype(np.float64)
-        return points, normals, found.point.colors.numpy().copy() if coloured else None
+        points = crossings.point["positions"].numpy().astype(np.float64)
+        normals = crossings.point["normals"].numpy().astype(np.float64)
+        return points, normals, crossings.point.colors.numpy().copy() if coloured else None
 
 
 def _facing(
@@ -204,20 +204,20 @@ class Mapped:
         merged = self.merged
         count = merged.cloud.valid.size
         if merged.surface_map is not None:
-            seen = merged.surface_map.seen_by.reshape(-1, count)
-            return np.where(seen.sum(axis=0) == 1, seen.argmax(axis=0), SEVERAL)
+            seen_by = merged.surface_map.seen_by.reshape(-1, count)
+            return np.where(seen_by.sum(axis=0) == 1, seen_by.argmax(axis=0), SEVERAL)
         points = merged.cloud.points_m.reshape(-1, 3)
-        known = np.isfinite(points).all(axis=1)
+        finite = np.isfinite(points).all(axis=1)
         pairs = zip(self.views, self.registrations, strict=True)
         used = (
             transform_points(T.T_reference_view, view.points_m)
             for view, T in pairs
             if T.view in merged.views_used
         )
-        distances = np.stack([cKDTree(placed).query(points[known])[0] for placed in used])
-        least, second = np.sort(np.vstack([distances, np.full(known.sum(), np.inf)]), axis=0)[:2]
+        distances = np.stack([cKDTree(placed).query(points[finite])[0] for placed in used])
+        least, second = np.sort(np.vstack([distances, np.full(finite.sum(), np.inf)]), axis=0)[:2]
         indices = np.full(count, SEVERAL)
-        indices[known] = np.where(second <= 2 * least, SEVERAL, distances.argmin(axis=0))
+        indices[finite] = np.where(second <= 2 * least, SEVERAL, distances.argmin(axis=0))
         return indices
 
 
@@ -293,12 +293,12 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         corner = np.min([low for low, high in overlaps if (low <= high).all()], axis=0)
         boxes = np.floor((points[shared] - corner) / step_m)
         if boxes.max() >= MAX_BOXES:
-            what = (
+            problem = (
                 f"{np.ptp(points[shared], axis=0).max():.3g} m hold too many boxes of "
                 f"{step_m * 1e3:.3g} mm"
             )
             fix = "crop the views to the target, or raise merge.step_mm"
-            raise UserError(what, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
+            raise UserError(problem, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
         x, y, z = boxes.astype(np.int64).T
         keys = (x << 42) | (y << 21) | z
         order = np.argsort(keys, kind="stable")
@@ -322,7 +322,7 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         amplitude=None
         if any(c.amplitude is None for c in clouds)
         else (sums[:, 6] / n[:, 0])[None],
-        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
     )
 
 

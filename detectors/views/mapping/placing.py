@@ -53,9 +53,9 @@ class Raster:
     def at_cells(self, values: np.ndarray) -> np.ndarray:
         """Return samples' values (n,) or (n, c) at the cells, (h, w) or (h, w, c); NaN where the
         cell is unknown."""
-        found = np.asarray(self.weights @ values.astype(np.float64))
-        found[self.weights.getnnz(axis=1) == 0] = np.nan
-        return found.reshape(*self.shape, *values.shape[1:])
+        means = np.asarray(self.weights @ values.astype(np.float64))
+        means[self.weights.getnnz(axis=1) == 0] = np.nan
+        return means.reshape(*self.shape, *values.shape[1:])
 
     @property
     def concentration(self) -> np.ndarray:
@@ -67,7 +67,7 @@ class Raster:
 
 
 def raster_between(
-    places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid
+    sample_xy: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid
 ) -> Raster:
     """Return the `Raster` of a grid over the ``valid`` samples at ``places`` (v, u, 2), on a pixel
     grid or not (v = 1). Cells larger than ``spacing``, that of the samples, are divided into
@@ -75,11 +75,13 @@ def raster_between(
     parts = max(1, round(grid.step / spacing))
     step = grid.step / parts
     corner = np.array([grid.x0, grid.y0]) - 0.5 * (grid.step - step)
-    flat = np.ascontiguousarray((places.reshape(-1, 2) - corner) / step)
+    flat = np.ascontiguousarray((sample_xy.reshape(-1, 2) - corner) / step)
     h, w = grid.shape
     corners = np.full((h * parts, w * parts, 3), -1)
     shares = np.zeros((h * parts, w * parts, 3))
-    _fill(flat, _of_grid(valid) if organised else _of_points(places[0], valid[0]), corners, shares)
+    _fill(
+        flat, _of_grid(valid) if organised else _of_points(sample_xy[0], valid[0]), corners, shares
+    )
     rows, columns = np.nonzero(corners[..., 0] >= 0)
     cells = rows // parts * w + columns // parts
     covered = np.bincount(cells, minlength=h * w)[cells]
@@ -117,38 +119,40 @@ def _of_grid(valid: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack(corners, axis=1)[used] for used, *corners in kinds])
 
 
-def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _of_points(sample_xy: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return triangles (t, 3) of indices of samples (n, 2) without a grid: Delaunay triangles with
     short edges."""
-    known = np.flatnonzero(valid)
-    triangles = known[Delaunay(places[known]).simplices.astype(np.int64)]
-    lengths = np.linalg.norm(places[triangles] - places[np.roll(triangles, 1, axis=1)], axis=-1)
+    valid_indices = np.flatnonzero(valid)
+    triangles = valid_indices[Delaunay(sample_xy[valid_indices]).simplices.astype(np.int64)]
+    lengths = np.linalg.norm(
+        sample_xy[triangles] - sample_xy[np.roll(triangles, 1, axis=1)], axis=-1
+    )
     return triangles[(lengths <= LONGEST_EDGE * np.median(lengths)).all(axis=1)]
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(
-    places: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares: np.ndarray
+    sample_xy: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares: np.ndarray
 ) -> None:
     """Give each triangle (t, 3) the cells that no earlier triangle has; ``places`` (n, 2) in
     cells."""
     h, w = corners.shape[:2]
     for t in range(len(triangles)):
         a, b, c = triangles[t]
-        ax, ay = places[a]
-        bx, by = places[b]
-        cx, cy = places[c]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        ax, ay = sample_xy[a]
+        bx, b_y = sample_xy[b]
+        cx, cy = sample_xy[c]
+        area = (bx - ax) * (cy - ay) - (b_y - ay) * (cx - ax)
         if not abs(area) > 1e-12:
             continue
-        left = max(0, int(np.ceil(min(ax, bx, cx) - SLACK)))
+        first_column = max(0, int(np.ceil(min(ax, bx, cx) - SLACK)))
         right = min(w - 1, int(np.floor(max(ax, bx, cx) + SLACK)))
-        top = max(0, int(np.ceil(min(ay, by, cy) - SLACK)))
-        bottom = min(h - 1, int(np.floor(max(ay, by, cy) + SLACK)))
+        top = max(0, int(np.ceil(min(ay, b_y, cy) - SLACK)))
+        bottom = min(h - 1, int(np.floor(max(ay, b_y, cy) + SLACK)))
         for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
+            for column in range(first_column, right + 1):
                 of_b = ((column - ax) * (cy - ay) - (row - ay) * (cx - ax)) / area
-                of_c = ((bx - ax) * (row - ay) - (by - ay) * (column - ax)) / area
+                of_c = ((bx - ax) * (row - ay) - (b_y - ay) * (column - ax)) / area
                 of_a = 1.0 - of_b - of_c
                 if corners[row, column, 0] < 0 and min(of_a, of_b, of_c) >= -SLACK:
                     corners[row, column, 0], corners[row, column, 1], corners[row, column, 2] = (
@@ -272,25 +276,25 @@ def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> Pl
     part = deviation / rays[:, 2]
     moved = points - part[:, None] * rays
     part += (moved[:, 2] - surface.evaluate(moved[:, 0], moved[:, 1])) / rays[:, 2]
-    places = np.full((*inside.shape, 2), np.nan)
+    places_m = np.full((*inside.shape, 2), np.nan)
     deviations = np.full(inside.shape, np.nan)
-    places[inside] = (points - part[:, None] * rays)[:, :2]
+    places_m[inside] = (points - part[:, None] * rays)[:, :2]
     deviations[inside] = deviation
     if view.cloud.organised and min(inside.shape) > 1:
-        by_u = places[:-1, 1:] - places[:-1, :-1]
-        by_v = places[1:, :-1] - places[:-1, :-1]
-        known = np.isfinite(by_u + by_v).all(axis=-1)
-        if known.any():
-            by_u = _some(by_u[known], FIT_POINTS)
-            by_v = _some(by_v[known], FIT_POINTS)
+        by_u = places_m[:-1, 1:] - places_m[:-1, :-1]
+        by_v = places_m[1:, :-1] - places_m[:-1, :-1]
+        finite = np.isfinite(by_u + by_v).all(axis=-1)
+        if finite.any():
+            by_u = _some(by_u[finite], FIT_POINTS)
+            by_v = _some(by_v[finite], FIT_POINTS)
             sides = np.sqrt(np.median(by_u**2, axis=0) + np.median(by_v**2, axis=0))
             areas = np.abs(by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0])
             return PlacedView(
-                view, T_map_view, places, deviations, sides, float(np.sqrt(np.median(areas)))
+                view, T_map_view, places_m, deviations, sides, float(np.sqrt(np.median(areas)))
             )
-    extent = np.nanmax(places, axis=(0, 1)) - np.nanmin(places, axis=(0, 1))
+    extent = np.nanmax(places_m, axis=(0, 1)) - np.nanmin(places_m, axis=(0, 1))
     pitch = float(np.sqrt(extent.prod() / inside.sum()))
-    return PlacedView(view, T_map_view, places, deviations, np.array([pitch, pitch]), pitch)
+    return PlacedView(view, T_map_view, places_m, deviations, np.array([pitch, pitch]), pitch)
 
 
 def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
@@ -303,13 +307,15 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     last = np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
-        what = (
+        problem = (
             f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of "
             f"{step * 1e3:.3g} mm"
         )
         fix = "crop the views to the target, or give a larger merge.cell_mm"
         raise UserError(
-            f"{what} would have {columns * rows:.3g}", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix
+            f"{problem} would have {columns * rows:.3g}",
+            legal=f"up to {MAX_CELLS:.2g} cells",
+            fix=fix,
         )
     return CellGrid(
         float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns))

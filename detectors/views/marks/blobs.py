@@ -76,14 +76,14 @@ def stand_out(
         axis=1,
     )
     darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
-    apart = (offset / darkness[:, None])[::stride]
+    sample = (offset / darkness[:, None])[::stride]
     p = features.shape[1]
     # covariance (p, p) of the bulk about the backdrop, scaled like the innermost part of a
     # Gaussian
-    scatter = np.diag([max(sigma_of(each), 1e-6) ** 2 for each in apart.T])
+    scatter = np.diag([max(sigma_of(component), 1e-6) ** 2 for component in sample.T])
     for _ in range(STEPS):
-        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(scatter), apart)
-        core = apart[square <= np.quantile(square, CORE)]
+        square = np.einsum("ni,ij,nj->n", sample, np.linalg.inv(scatter), sample)
+        core = sample[square <= np.quantile(square, CORE)]
         scatter = core.T @ core / len(core) / CORE_SHRINKS[p] + 1e-12 * np.eye(p)
     scatter += np.median(rounding) * np.eye(p)
     contrast = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(scatter), offset))
@@ -169,10 +169,10 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
     taken = np.zeros(inside.size, dtype=bool)
     kept = []
     for blob in sorted(blobs, key=lambda b: -float(b.weights.sum())):
-        own = blob.pixels[blob.weights > 0.5]
-        if not taken[own].any():
+        core_pixels = blob.pixels[blob.weights > 0.5]
+        if not taken[core_pixels].any():
             kept.append(blob)
-        taken[own] = True
+        taken[core_pixels] = True
     return kept
 
 
@@ -187,24 +187,24 @@ def _window(
     """Return the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on
     both sides of its border, and a function that makes a blob of the group once it is known
     whether rims are mixed."""
-    left, top, width, height, area = (int(value) for value in box)
+    left_px, top, width, height, area = (int(value) for value in box)
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
     row = max(top - margin, 0)
-    column = max(left - margin, 0)
-    cut = (slice(row, top + height + margin), slice(column, left + width + margin))
+    column = max(left_px - margin, 0)
+    cut = (slice(row, top + height + margin), slice(column, left_px + width + margin))
     assert cloud.rgb is not None
     target = inside[cut]
-    others = coloured[cut]
-    group = (labels[cut] == label) & others
+    candidates = coloured[cut]
+    group = (labels[cut] == label) & candidates
     core = _eroded(group)
     core = core if core.sum() >= LEAST_PIXELS else group
-    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
+    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~candidates
     if ring.sum() < LEAST_PIXELS:  # the target's own colour is not visible around it
         return np.zeros(0), lambda mixed: None
     rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
-    other = np.median(rgb[ring], axis=0)
-    span = np.median(rgb[core], axis=0) - other
-    share = (rgb - other) @ span / max(float(span @ span), 1e-12)
+    backdrop = np.median(rgb[ring], axis=0)
+    span = np.median(rgb[core], axis=0) - backdrop
+    share = (rgb - backdrop) @ span / max(float(span @ span), 1e-12)
     # mosaic and JPEG make neighbours share colour: the scatter of equivalent independent pixels
     strays = float(
         np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2)))
@@ -220,20 +220,20 @@ def _window(
         None if too few."""
         weights = group.astype(float)
         if mixed:
-            near = grown(group, RIM_PX) & target & ~(others & ~group)
-            weights = np.where(near, np.clip(share, 0.0, 1.0), 0.0)
+            reach = grown(group, RIM_PX) & target & ~(candidates & ~group)
+            weights = np.where(reach, np.clip(share, 0.0, 1.0), 0.0)
         v, u = np.nonzero((weights > 0.5) & target)
         if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
             return None
         # whether the group may continue where the target has no points
         around = grown(group, 1) & ~group
-        alike = np.linalg.norm(rgb - other - span, axis=-1) < ALIKE * np.linalg.norm(span)
-        on = around & alike & ~target
+        same_colour = np.linalg.norm(rgb - backdrop - span, axis=-1) < ALIKE * np.linalg.norm(span)
+        beyond_target = around & same_colour & ~target
         last_row = inside.shape[0] - 1 - row
         last_column = inside.shape[1] - 1 - column
         doubt = ""
-        if on.sum() > max(2.0, CUT_SHARE * around.sum()):
-            by_crop = (on & cloud.valid[cut]).sum() > on.sum() / 2
+        if beyond_target.sum() > max(2.0, CUT_SHARE * around.sum()):
+            by_crop = (beyond_target & cloud.valid[cut]).sum() > beyond_target.sum() / 2
             doubt = "cut by the crop's edge" if by_crop else "without range in parts of it"
         elif u.min() == -column or v.min() == -row or u.max() == last_column or v.max() == last_row:
             doubt = "cut by the picture's edge"
@@ -248,13 +248,13 @@ def _window(
             )
         else:
             covariance = region_covariance_px2(grid)
-        own, around = (
+        blob_pixels, around = (
             (v + row) * inside.shape[1] + u + column
             for v, u in ((used_v, used_u), np.nonzero(target))
         )
         # a count is added to each colour, so that black has a logarithm
-        contrast = np.log((other + span + 1.0) / (other + 1.0))
-        return Blob(own, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
+        contrast = np.log((backdrop + span + 1.0) / (backdrop + 1.0))
+        return Blob(blob_pixels, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
 
     return share[rim], settled
 

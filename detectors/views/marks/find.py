@@ -76,8 +76,8 @@ class Patch:
         from the largest of scatter about the plane, the frames' noise and a map's variance;
         `CORRELATED_PIXELS` share it."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
-        known = frames[np.isfinite(frames)]
-        variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
+        finite = frames[np.isfinite(frames)]
+        variance = max(self.sigma_m**2, float(finite.mean()) if len(finite) else 0.0)
         if cloud.mean_variance_m2 is not None:
             stated = cloud.mean_variance_m2.ravel()[pixels]
             variance = max(
@@ -140,9 +140,9 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     pixels = blob.pixels
     weights = blob.weights
     points = cloud.points_m.reshape(-1, 3)[pixels]
-    own = weights > 0.5
+    core = weights > 0.5
     # the mean height of those points within four scales of the median
-    height = patch.above_m(points[own])
+    height = patch.above_m(points[core])
     middle = median_of(height)
     scale = max(sigma_of(height - middle), LEAST_SCALE_M)
     kept = height[np.abs(height - middle) <= 4.0 * scale]
@@ -156,7 +156,7 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
         0
     ].T
     covariance = (
-        settled.range_covariance_m2(centre, cloud, pixels[own])
+        settled.range_covariance_m2(centre, cloud, pixels[core])
         + jacobian @ blob.grid_covariance @ jacobian.T
     )
     scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
@@ -188,19 +188,19 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
     grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    corners_px, found, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
-    codes = [] if found is None else [int(code) for code in found.ravel()]
+    dictionary_words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    corners_px, ids, _ = cv2.aruco.ArucoDetector(dictionary_words, parameters).detectMarkers(grey)
+    codes = [] if ids is None else [int(code) for code in ids.ravel()]
     # corners (4, 2) in pixels of the grid, the centre of the first being (0, 0)
     tags = [
         (code, tag.reshape(4, 2).astype(float)) for code, tag in zip(codes, corners_px, strict=True)
     ]
     tags.sort(key=lambda tag: (tag[0], tag[1].tolist()))
-    each = [
+    candidates = [
         _coded_mark(cloud, inside, code, corners, codes.count(code) > 1) for code, corners in tags
     ]
-    marks = tuple(mark for mark in each if mark is not None)
-    off = len(each) - len(marks)
+    marks = tuple(mark for mark in candidates if mark is not None)
+    off = len(candidates) - len(marks)
     pixels = _pixels_of(marks)
     notes = (f"{off} tags lie off the target, or have no range",) if off else ()
     return MarkSet(marks, pixels, problem_of(marks, f"searched for tags of {dictionary}"), notes)
@@ -223,24 +223,31 @@ def _coded_mark(
     rays = points[:, :2] / points[:, 2:] if cloud.projection == "central" else points[:, :2]
     coefficients = np.linalg.lstsq(_quadratic((grid - middle) / half), rays, rcond=1e-10)[0]
     wanted = np.concatenate([corners, corners.mean(axis=0) + HALF_STEPS])
-    found = _quadratic((wanted - middle) / half) @ coefficients
-    on_plane = patch.cut(np.column_stack([found, np.ones(len(found))]), cloud.projection)
-    places = on_plane[:4]
+    fitted = _quadratic((wanted - middle) / half) @ coefficients
+    on_plane = patch.cut(np.column_stack([fitted, np.ones(len(fitted))]), cloud.projection)
+    corner_places = on_plane[:4]
     steps = np.stack([on_plane[4] - on_plane[5], on_plane[6] - on_plane[7]], axis=1)
-    centre = places.mean(axis=0)
+    centre = corner_places.mean(axis=0)
     covariance = steps @ steps.T * CORNER_PX**2 / 4 + patch.range_covariance_m2(
         centre, cloud, pixels
     )
-    seen = len(pixels) / int(area.sum())
+    coverage = len(pixels) / int(area.sum())
     without = 1.0 - cloud.valid[area > 0].mean()
     doubt = ""
     if twice:
         doubt = f"code {code} is seen more than once"
-    elif seen < WHOLE and without > 1.0 - WHOLE:
+    elif coverage < WHOLE and without > 1.0 - WHOLE:
         doubt = f"{100 * without:.0f} % of it has no range"
-    elif seen < WHOLE:
-        doubt = f"{100 * (1 - seen):.0f} % of it is beyond the crop's edge"
-    area_m2 = float(np.linalg.norm(np.cross(places[2] - places[0], places[3] - places[1]))) / 2
+    elif coverage < WHOLE:
+        doubt = f"{100 * (1 - coverage):.0f} % of it is beyond the crop's edge"
+    area_m2 = (
+        float(
+            np.linalg.norm(
+                np.cross(corner_places[2] - corner_places[0], corner_places[3] - corner_places[1])
+            )
+        )
+        / 2
+    )
     return Mark(centre, (covariance + covariance.T) / 2, patch.normal, pixels, area_m2, code, doubt)
 
 
@@ -314,14 +321,14 @@ def find_marks(
         return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
     # lightness is tried if chromaticity gives too few marks or hardly any contrast: black and
     # white have the light's chromaticity, and black hardly any
-    found, margin = _standing_out(cloud, inside, chromaticity)
-    if len(found.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
-        return found
+    marks, margin = _standing_out(cloud, inside, chromaticity)
+    if len(marks.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
+        return marks
     lighter, lighter_margin = _standing_out(cloud, inside, lightness)
     if len(lighter.trusted) < LEAST_MARKS or (
-        len(found.trusted) >= LEAST_MARKS and margin >= lighter_margin
+        len(marks.trusted) >= LEAST_MARKS and margin >= lighter_margin
     ):
-        return found
+        return marks
     return replace(lighter, notes=(*lighter.notes, "the marks were found by their lightness"))
 
 
@@ -337,11 +344,11 @@ def _standing_out(
         *feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2]
     )
     coloured = above_half(margin > 1.0, contrast)
-    found = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
-    pixels = [mark.pixels for mark in found.trusted]
+    marks = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
+    pixels = [mark.pixels for mark in marks.trusted]
     median = float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
     # a hole through which another colour shows is not a fiducial
-    return replace(found, points=_pixels_of(found.marks)), median
+    return replace(marks, points=_pixels_of(marks.marks)), median
 
 
 def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
@@ -380,12 +387,12 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
         if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(
             s.area_m2 for s in colour
         ):
-            whole = [s for s in flat if not s.blob.doubt]
+            complete = [s for s in flat if not s.blob.doubt]
             usual_m = None
-            if len(whole) >= 3:
+            if len(complete) >= 3:
                 # half of the spots' area is in larger spots, so that chips count little
-                sizes = np.array([s.sizes_m for s in whole])
-                areas = [s.area_m2 for s in whole]
+                sizes = np.array([s.sizes_m for s in complete])
+                areas = [s.area_m2 for s in complete]
                 usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
             groups.append(
                 (
@@ -394,16 +401,16 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
                 )
             )
     enough = [
-        vivid for vivid, found in groups if sum(not mark.doubt for mark in found) >= LEAST_MARKS
+        vivid for vivid, marks in groups if sum(not mark.doubt for mark in marks) >= LEAST_MARKS
     ]
     marks = []
-    for vivid, found in groups:
+    for vivid, colour_marks in groups:
         doubt = ""
         if vivid < WEAK_SHARE * max(enough, default=0.0):
             doubt = "its colour contrast is weak compared with the others"
-        elif enough and sum(not mark.doubt for mark in found) < LEAST_MARKS:
+        elif enough and sum(not mark.doubt for mark in colour_marks) < LEAST_MARKS:
             doubt = f"fewer than {LEAST_MARKS} marks have its colour; enough have another"
-        marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
+        marks += [replace(mark, doubt=mark.doubt or doubt) for mark in colour_marks]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
     holes = len(spots) - len(marks)
     notes = (

@@ -46,10 +46,10 @@ class CodedMarks(Config):
     def _known(cls, name: str) -> str:
         import cv2
 
-        known = sorted(word for word in dir(cv2.aruco) if word.startswith("DICT_"))
-        if name not in known:
+        dictionaries = sorted(word for word in dir(cv2.aruco) if word.startswith("DICT_"))
+        if name not in dictionaries:
             raise ValueError(
-                f"OpenCV has no dictionary of codes '{name}'; it has {', '.join(known)}"
+                f"OpenCV has no dictionary of codes '{name}'; it has {', '.join(dictionaries)}"
             )
         return name
 
@@ -97,16 +97,18 @@ def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
     trusted = [mark for mark in marks if not mark.doubt]
     if len(trusted) >= LEAST_MARKS:
         return off_line_problem(trusted)
-    found = f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
+    counted = (
+        f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
+    )
     doubts = ", ".join(sorted({mark.doubt for mark in marks if mark.doubt}))
     in_doubt = f"{len(marks) - len(trusted)} more in doubt: {doubts}" if doubts else ""
-    return "; ".join(text for text in (found, in_doubt, missing) if text)
+    return "; ".join(text for text in (counted, in_doubt, missing) if text)
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:
     """Return a sentence, with the distance from the line, if the marks lie on a line; else ""."""
-    places = np.stack([mark.centre_m for mark in marks])
-    sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
+    centres = np.stack([mark.centre_m for mark in marks])
+    sizes = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))
     if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
         return ""

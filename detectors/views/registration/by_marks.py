@@ -84,11 +84,14 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
             ),
         )
     where = placement.T_to_from, covariance, placement.centre_m
-    found = registered.Registration(
+    registration = registered.Registration(
         view.view.name, "marks", *where, residual, failure=problem, notes=notes
     )
     return replace(
-        found, pairs=len(fixed), iterations=placement.iterations, converged=placement.converged
+        registration,
+        pairs=len(fixed),
+        iterations=placement.iterations,
+        converged=placement.converged,
     )
 
 
@@ -101,10 +104,10 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
         return None
     squares = []
     for i, (fixed_mark, moved_mark) in enumerate(zip(fixed, moved, strict=True)):
-        rest = fixed[:i] + fixed[i + 1 :]
-        if off_line_problem(rest):
+        remaining = fixed[:i] + fixed[i + 1 :]
+        if off_line_problem(remaining):
             return None
-        T_reference_view = _placed(rest, moved[:i] + moved[i + 1 :], 0.0).T_to_from
+        T_reference_view = _placed(remaining, moved[:i] + moved[i + 1 :], 0.0).T_to_from
         squares.append(
             np.sum(
                 (transform_points(T_reference_view, moved_mark.centre_m) - fixed_mark.centre_m) ** 2
@@ -119,9 +122,9 @@ def _matched(
     """Return the pairs of trusted marks of both views, the reason why they must not be used (or
     ""), and notes."""
     problem = "; ".join(
-        f"{each.view.name}: {each.marks.problem}"
-        for each in (reference, view)
-        if each.marks.problem
+        f"{prepared.view.name}: {prepared.marks.problem}"
+        for prepared in (reference, view)
+        if prepared.marks.problem
     )
     if problem:
         return (), (), problem, ()
@@ -185,18 +188,28 @@ class JointState:
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or
         of their indices."""
-        poses, surface, marks, own = np.split(
+        poses, surface, marks, view_terms = np.split(
             values, np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size])
         )
-        return poses.reshape(-1, 6), surface, marks.reshape(-1, 2), own.reshape(-1, len(TERMS))
+        return (
+            poses.reshape(-1, 6),
+            surface,
+            marks.reshape(-1, 2),
+            view_terms.reshape(-1, len(TERMS)),
+        )
 
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
         """Return the state after a motion of all unknowns; poses move about the frame's origin."""
-        poses, surface, marks, own = self.split(motion)
+        poses, surface, marks, view_terms = self.split(motion)
         turned = (moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))
         T = np.stack([self.T[0], *turned])
         return JointState(
-            T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m
+            T,
+            self.surface + surface,
+            self.own + view_terms,
+            self.marks_m + marks,
+            shared_m,
+            self.half_m,
         )
 
     def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -229,7 +242,7 @@ class JointState:
         size = 6 * (len(self.T) - 1) + len(TERMS) * (len(self.T) + 1) + self.marks_m.size
         matrix = np.zeros((size, size))
         right = np.zeros(size)
-        poses, surface, marks, own = self.split(np.arange(size))
+        poses, surface, marks, view_terms = self.split(np.arange(size))
 
         def add(
             columns: np.ndarray, rows: np.ndarray, residual: np.ndarray, weight: np.ndarray
@@ -243,20 +256,25 @@ class JointState:
             pose, moves = (poses[v - 1], 6) if v else (np.empty(0, dtype=int), 0)
             residual, basis, by_pose, weight = self.across(view, v)
             rows = np.concatenate([-basis, -basis, by_pose[:, :moves]], axis=1)
-            add(np.concatenate([surface, own[v], pose]), rows, residual, weight)
+            add(np.concatenate([surface, view_terms[v], pose]), rows, residual, weight)
             turn = self.T[v][:2, :3]
             for mark, label in view.marks:
-                place = transform_points(self.T[v], mark.centre_m)
-                within = displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
+                centre = transform_points(self.T[v], mark.centre_m)
+                within = displacement_jacobian(centre[None], np.zeros(3))[0, :2, :moves]
                 rows = np.concatenate([-np.eye(2), within], axis=1)
                 weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
                 add(
                     np.concatenate([marks[label], pose]),
                     rows,
-                    place[:2] - self.marks_m[label],
+                    centre[:2] - self.marks_m[label],
                     weight,
                 )
-            add(own[v], np.eye(len(TERMS)), self.own[v], np.full(len(TERMS), self.shared_m**-2))
+            add(
+                view_terms[v],
+                np.eye(len(TERMS)),
+                self.own[v],
+                np.full(len(TERMS), self.shared_m**-2),
+            )
         return matrix, right
 
 
@@ -264,13 +282,15 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
     """Register all views but the first to the first, jointly. ``covariance``: each view's
     marginal. ``residual_m``: across the surface, of the points that count. A view whose marks fail
     keeps that failure."""
-    found = [register_by_marks(views[0], view) for view in views[1:]]
-    usable = [i for i, each in enumerate(found) if not each.failure]
+    registrations = [register_by_marks(views[0], view) for view in views[1:]]
+    usable = [i for i, registration in enumerate(registrations) if not registration.failure]
     if usable:
-        adjusted = _adjust([views[0], *(views[i + 1] for i in usable)], [found[i] for i in usable])
+        adjusted = _adjust(
+            [views[0], *(views[i + 1] for i in usable)], [registrations[i] for i in usable]
+        )
         for i, registration in zip(usable, adjusted, strict=True):
-            found[i] = registration
-    return [replace(each, method="joint") for each in found]
+            registrations[i] = registration
+    return [replace(registration, method="joint") for registration in registrations]
 
 
 def _adjust(
@@ -278,7 +298,7 @@ def _adjust(
 ) -> list[registered.Registration]:
     """Return registrations of views 1.., adjusted from those by their marks, none of which
     failed."""
-    T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
+    T_reference = [np.eye(4), *(registration.T_reference_view for registration in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera
     sampling = registered.sampling_of(views[0])
@@ -289,17 +309,17 @@ def _adjust(
         [along, np.cross(sampling.normal, along), sampling.normal]
     )
     T_surface_reference[:3, 3] = -T_surface_reference[:3, :3] @ sampling.centre_m
-    T = np.stack([T_surface_reference @ each for each in T_reference])
+    T = np.stack([T_surface_reference @ T_reference_view for T_reference_view in T_reference])
     half_m = np.maximum(np.abs(transform_points(T[0], views[0].points_m)[:, :2]).max(axis=0), 1e-6)
     x, y, z = np.concatenate(
-        [transform_points(T[v], each.points_m) for v, each in enumerate(data)]
+        [transform_points(T[v], part.points_m) for v, part in enumerate(data)]
     ).T
-    places = transform_points(T[0], np.stack([mark.centre_m for mark in views[0].marks.trusted]))[
+    marks_m = transform_points(T[0], np.stack([mark.centre_m for mark in views[0].marks.trusted]))[
         :, :2
     ]
-    noise = float(np.median([each.noise_m for each in data]))
+    noise = float(np.median([part.noise_m for part in data]))
     state = JointState(
-        T, np.zeros(len(TERMS)), np.zeros((len(data), len(TERMS))), places, noise, half_m
+        T, np.zeros(len(TERMS)), np.zeros((len(data), len(TERMS))), marks_m, noise, half_m
     )
     start = fit_surface(x, y, z, SurfaceConfig(degree=DEGREE)).evaluate(x, y)
     state = replace(state, surface=np.linalg.lstsq(state.basis(x, y), start, rcond=None)[0])
@@ -319,21 +339,21 @@ def _adjust(
         state = state.moved(motion, shared)
     covariance = np.linalg.inv(state.equations(data)[0])
     T_reference_surface = invert(T_surface_reference)
-    both = np.kron(np.eye(2), T_reference_surface[:3, :3])
+    turn = np.kron(np.eye(2), T_reference_surface[:3, :3])
     note = (
         f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the "
         "covariance includes it"
     )
     lost = "" if converged else f"did not converge in {steps} steps of the joint adjustment"
     adjusted = []
-    for v, found in enumerate(marked, start=1):
+    for v, registration in enumerate(marked, start=1):
         residual, _, _, weight = state.across(data[v], v)
         residual_m = float(np.sqrt(np.average(residual**2, weights=weight)))
         pose = slice(6 * (v - 1), 6 * v)
-        spread = both @ covariance[pose, pose] @ both.T
+        spread = turn @ covariance[pose, pose] @ turn.T
         where = T_reference_surface @ state.T[v], spread, T_reference_surface[:3, 3]
         joint = registered.Registration(
-            found.view, found.method, *where, residual_m, pairs=len(data[v].marks)
+            registration.view, registration.method, *where, residual_m, pairs=len(data[v].marks)
         )
         adjusted.append(
             replace(
@@ -341,7 +361,7 @@ def _adjust(
                 iterations=steps,
                 converged=converged,
                 failure=lost,
-                notes=(*found.notes, note),
+                notes=(*registration.notes, note),
             )
         )
     return adjusted

@@ -49,9 +49,9 @@ def register_by_icp(
 ) -> registered.Registration:
     """Return the registration of a view to the reference by ICP of their fiducial clouds or
     targets."""
-    fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
-    if few:
-        return registered.failed(view, "icp", start, few, *notes)
+    fixed, moving, start, notes, shortage = registered.clouds_of(reference, view, config.points)
+    if shortage:
+        return registered.failed(view, "icp", start, shortage, *notes)
     sampling = registered.sampling_of(view)
     tree = cKDTree(fixed)
     T = np.eye(4) if start is None else start
@@ -62,35 +62,37 @@ def register_by_icp(
         last = np.full(2, np.inf)
         for _ in range(STAGE_ITERATIONS):
             moved = transform_points(T, moving)
-            apart, paired = _pairs(tree, moved, limit_m)
+            distances, paired = _pairs(tree, moved, limit_m)
             if paired.sum() < 3:
                 failure = (
                     f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the "
                     "reference's"
                 )
                 return registered.failed(view, "icp", start, failure, *notes)
-            change = kabsch(moved[paired], (moved - apart)[paired], np.ones(paired.sum()))
+            change = kabsch(moved[paired], (moved - distances)[paired], np.ones(paired.sum()))
             T = change @ T
             step_m = registered.moved_m(change, moved)
             iterations += 1
-            now = np.array([paired.mean(), np.sqrt(np.mean(apart[paired] ** 2))])
+            now = np.array([paired.mean(), np.sqrt(np.mean(distances[paired] ** 2))])
             if np.abs(now - last).max() < LEAST_CHANGE:
                 break
             last = now
-    left, _, right = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = left @ right
+    u, _, right = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = u @ right
     moved = transform_points(T, moving)
-    apart, paired = _pairs(tree, moved, limit_m)
+    distances, paired = _pairs(tree, moved, limit_m)
     covariance = _covariance(tree, moved, limit_m, sampling.pitch_m)
-    residual_m = float(np.sqrt(np.sum(apart**2) / max(paired.sum(), 1)))
-    found = registered.Registration(
+    residual_m = float(np.sqrt(np.sum(distances**2) / max(paired.sum(), 1)))
+    registration = registered.Registration(
         view.view.name, "icp", T, covariance, moved.mean(axis=0), residual_m
     )
     failure = registered.still_moving(step_m, sampling.pitch_m)
     failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
     converged = bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m)
-    found = replace(found, pairs=int(paired.sum()), iterations=iterations, converged=converged)
-    return replace(found, failure=failure, notes=notes)
+    registration = replace(
+        registration, pairs=int(paired.sum()), iterations=iterations, converged=converged
+    )
+    return replace(registration, failure=failure, notes=notes)
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
@@ -137,9 +139,11 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
     for i in range(6):
         for j in range(i + 1):
             part = 0.5 if i == j else 1.0
-            both = part * (steps[i] + steps[j])
+            product = part * (steps[i] + steps[j])
             across = part * (steps[i] - steps[j])
-            mixed = half_cost(both) + half_cost(-both) - half_cost(across) - half_cost(-across)
+            mixed = (
+                half_cost(product) + half_cost(-product) - half_cost(across) - half_cost(-across)
+            )
             curvature[i, j] = curvature[j, i] = mixed / (4 * part**2 * sizes[i] * sizes[j])
     return registered.clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
 
@@ -208,8 +212,8 @@ def coherent_point_drift(
         mean_x = weight @ fixed / matched
         mean_y = total[:3, 3] / matched
         cross = fixed.T @ moments[:, :3, 3] - matched * np.outer(mean_x, mean_y)
-        left, _, right = np.linalg.svd(cross)
-        d_turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        u, _, right = np.linalg.svd(cross)
+        d_turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ right)]) @ right
         d_shift = mean_x - d_turn @ mean_y
         spread_x = float(weight @ np.sum(fixed**2, axis=1)) - matched * float(mean_x @ mean_x)
         spread_y = float(np.trace(total[:3, :3])) - matched * float(mean_y @ mean_y)
@@ -242,9 +246,9 @@ def register_by_cpd(
     """Return the registration of a view to the reference by coherent point drift of their fiducial
     clouds or targets. At the limit of iterations it fails only if its last step still moved the
     points."""
-    fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
-    if few:
-        return registered.failed(view, "cpd", start, few, *notes)
+    fixed, moving, start, notes, shortage = registered.clouds_of(reference, view, config.points)
+    if shortage:
+        return registered.failed(view, "cpd", start, shortage, *notes)
     drift = coherent_point_drift(fixed, moving, config, start)
     pitch = registered.sampling_of(view).pitch_m
     covariance = drift_covariance(
@@ -255,11 +259,16 @@ def register_by_cpd(
     if not drift.converged:
         notes += (f"stopped after {drift.iterations} iterations, the limit in the settings",)
     where = drift.T_fixed_moving, covariance, fixed.mean(axis=0)
-    found = registered.Registration(view.view.name, "cpd", *where, drift.sigma_m * np.sqrt(3.0))
-    found = replace(
-        found, pairs=round(drift.matched), iterations=drift.iterations, converged=drift.converged
+    registration = registered.Registration(
+        view.view.name, "cpd", *where, drift.sigma_m * np.sqrt(3.0)
     )
-    return replace(found, failure=failure, notes=notes)
+    registration = replace(
+        registration,
+        pairs=round(drift.matched),
+        iterations=drift.iterations,
+        converged=drift.converged,
+    )
+    return replace(registration, failure=failure, notes=notes)
 
 
 def drift_covariance(
@@ -287,10 +296,10 @@ def drift_covariance(
     parts[:3] -= parts[3]
     complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
     information = complete - (within - scores.T @ scores)
-    both = 1 + len(fixed_m) / len(moved_m)
+    error_factor = 1 + len(fixed_m) / len(moved_m)
     return (
         registered.clustered_sandwich(information, scores - scores.mean(axis=0), fixed_m, pitch_m)
-        * both
+        * error_factor
     )
 
 
@@ -302,8 +311,8 @@ def posterior_moments(
     Gaussians' factor. ``background``: the uniform component as in equation 6 of Myronenko & Song:
     (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's weight is divided out, so that
     nothing underflows at w = 0."""
-    places = np.column_stack([moving, np.ones(len(moving))])
-    products = np.einsum("mi,mj->mij", places, places).reshape(-1, 16)
+    design = np.column_stack([moving, np.ones(len(moving))])
+    products = np.einsum("mi,mj->mij", design, design).reshape(-1, 16)
     moments = []
     objective = 0.0
     for part in np.array_split(fixed, 1 + len(fixed) * len(moving) // PAIRS_AT_ONCE):
@@ -328,17 +337,17 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     are NaN. Every view needs colour, a pixel grid and a lens."""
     T = np.eye(4)
     lost = ""
-    found = []
+    registrations = []
     # one pinhole camera for all: the first lens's focal lengths, and room for every target's
     # points
     first = views[0].view.cloud.lens
     assert first is not None
-    places = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (
+    plane_px = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (
         first.fx,
         first.fy,
     )
-    low = np.floor(places.min(axis=0)) - 1
-    width, height = (np.ceil(places.max(axis=0)) + 2 - low).astype(int).tolist()
+    low = np.floor(plane_px.min(axis=0)) - 1
+    width, height = (np.ceil(plane_px.max(axis=0)) + 2 - low).astype(int).tolist()
     lens = width, height, first.fx, first.fy, -float(low[0]), -float(low[1])
     canvas = Lens(*lens)
     with open3d_on_one_thread() as o3d:
@@ -367,13 +376,13 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
                         "view before it"
                     )
             if lost:
-                found.append(registered.failed(view, "odometry", None, lost))
+                registrations.append(registered.failed(view, "odometry", None, lost))
                 continue
             T = T @ step
-            found.append(
+            registrations.append(
                 registered.Registration(view.view.name, "odometry", T, pairs=pairs, notes=(DRIFTS,))
             )
-    return found
+    return registrations
 
 
 def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:

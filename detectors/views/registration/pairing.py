@@ -119,9 +119,9 @@ def pair_marks(
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
         least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
-        what = f"of {counts}, no {least} have matching distances"
+        reason = f"of {counts}, no {least} have matching distances"
         return Pairing(
-            NO_PAIRS, f"{what}: the targets differ, or other objects were taken for marks"
+            NO_PAIRS, f"{reason}: the targets differ, or other objects were taken for marks"
         )
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
@@ -138,20 +138,22 @@ def pair_marks(
         ]
     )
     odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
-    first, *rest = np.argsort(-odds, kind="stable").tolist()
+    first, *runners_up = np.argsort(-odds, kind="stable").tolist()
     pairs = np.array(
         [(mark, solution) for mark, solution in enumerate(solutions[first][0]) if solution >= 0],
         dtype=np.int64,
     )
     pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
-    if not rest or odds[first] - odds[rest[0]] >= CLEAR_ODDS:
+    if not runners_up or odds[first] - odds[runners_up[0]] >= CLEAR_ODDS:
         return Pairing(pairs)
-    both = f"{number[first]} and {number[rest[0]]}"
-    problem = f"the marks lie symmetrically: two placements bring {both} of them together, and "
+    candidates = f"{number[first]} and {number[runners_up[0]]}"
+    problem = (
+        f"the marks lie symmetrically: two placements bring {candidates} of them together, and "
+    )
     if T_reference_view_guess is None:
         return Pairing(pairs, problem + "there is no guess to choose by")
     between = (
-        f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} "
+        f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[runners_up[0]] / MM:.0f} "
         "mm from the other"
     )
     return Pairing(pairs, problem + between)
@@ -166,11 +168,11 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     ).reshape(-1, 2)
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
     notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
-    few = (
+    shortage = (
         f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
         f"the view {shown[1]}"
     )
-    return Pairing(pairs, few if len(common) < LEAST_MARKS else "", notes)
+    return Pairing(pairs, shortage if len(common) < LEAST_MARKS else "", notes)
 
 
 class _Side:
@@ -181,11 +183,11 @@ class _Side:
         self.places = np.stack([mark.centre_m for mark in marks])
         self.normals = np.stack([mark.normal for mark in marks])
         covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
-        apart = self.places[:, None] - self.places[None]
-        self.distances = np.linalg.norm(apart, axis=-1)
-        along = apart / np.maximum(self.distances, 1e-12)[..., None]
-        own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
-        self.variances, self.worst = own + own.T, np.linalg.eigvalsh(covariances)[:, -1]
+        offsets = self.places[:, None] - self.places[None]
+        self.distances = np.linalg.norm(offsets, axis=-1)
+        along = offsets / np.maximum(self.distances, 1e-12)[..., None]
+        variances = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
+        self.variances, self.worst = variances + variances.T, np.linalg.eigvalsh(covariances)[:, -1]
 
     def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of
@@ -204,64 +206,72 @@ Solution = tuple[tuple[int, ...], np.ndarray, float]
 over its variance."""
 
 
-def _solutions(few: _Side, many: _Side) -> list[Solution]:
+def _solutions(fewer_side: _Side, larger_side: _Side) -> list[Solution]:
     """Return the placements that match over half of the smaller set and at most `FEWER` pairs less
     than the best."""
-    n = len(few.places)
+    n = len(fewer_side.places)
     least = max(LEAST_MARKS, n // 2 + 1)
     # every set of more than half of the marks contains one of these pairs: disjoint ones, longest
     # first, and for an odd number the last mark with both marks of the first pair
     pairs: list[tuple[int, int]] = []
     free = set(range(n))
-    for i, j in sorted(combinations(range(n), 2), key=lambda pair: (-few.distances[pair], pair)):
+    for i, j in sorted(
+        combinations(range(n), 2), key=lambda pair: (-fewer_side.distances[pair], pair)
+    ):
         if i in free and j in free:
             pairs.append((i, j))
             free -= {i, j}
     pairs += [(mark, last) for last in free for mark in pairs[0]]
-    found: dict[tuple[int, ...], Solution] = {}
+    solutions: dict[tuple[int, ...], Solution] = {}
     best = least
     for i, j in pairs:
-        for solution in _holding(few, many, i, j, least):
-            found.setdefault(solution[0], solution)
+        for solution in _holding(fewer_side, larger_side, i, j, least):
+            solutions.setdefault(solution[0], solution)
             best = max(best, n - solution[0].count(-1))
-    near = [solution for solution in found.values() if n - solution[0].count(-1) >= best - FEWER]
+    credible = [
+        solution for solution in solutions.values() if n - solution[0].count(-1) >= best - FEWER
+    ]
     # leave out solutions that place the marks like a better one, to within half the distance
     # between neighbours
-    limit = (few.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
+    limit = (fewer_side.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
     kept: list[Solution] = []
-    for solution in sorted(near, key=lambda s: (s[0].count(-1), s[2], s[0])):
-        placed = transform_points(solution[1], few.places)
+    for solution in sorted(credible, key=lambda s: (s[0].count(-1), s[2], s[0])):
+        placed = transform_points(solution[1], fewer_side.places)
         if all(
-            np.linalg.norm(placed - transform_points(T, few.places), axis=1).max() > limit
+            np.linalg.norm(placed - transform_points(T, fewer_side.places), axis=1).max() > limit
             for _, T, _ in kept
         ):
             kept.append(solution)
     return kept
 
 
-def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Solution]:
+def _holding(fewer_side: _Side, larger_side: _Side, i: int, j: int, least: int) -> list[Solution]:
     """Return the solutions with at least ``least`` pairs in which marks i and j of the smaller set
     have partners."""
-    apart = np.abs(many.distances - few.distances[i, j])
-    fits = apart < DISTANCE_SIGMAS * np.sqrt(few.variances[i, j] + many.variances)
-    a, b = np.nonzero(fits & ~np.eye(len(apart), dtype=bool))
+    mismatch = np.abs(larger_side.distances - fewer_side.distances[i, j])
+    fits = mismatch < DISTANCE_SIGMAS * np.sqrt(fewer_side.variances[i, j] + larger_side.variances)
+    a, b = np.nonzero(fits & ~np.eye(len(mismatch), dtype=bool))
     if len(a) == 0:
         return []
     # partners (k, n) that lie as far from both partners (k,) of the pair as they should ...
-    consistent = np.ones((len(a), len(few.places), len(many.places)), dtype=bool)
+    consistent = np.ones((len(a), len(fewer_side.places), len(larger_side.places)), dtype=bool)
     for mark, partner in ((i, a), (j, b)):
-        off = np.abs(few.distances[mark][None, :, None] - many.distances[partner][:, None, :])
-        variance = few.variances[mark][None, :, None] + many.variances[partner][:, None, :]
+        off = np.abs(
+            fewer_side.distances[mark][None, :, None] - larger_side.distances[partner][:, None, :]
+        )
+        variance = (
+            fewer_side.variances[mark][None, :, None] + larger_side.variances[partner][:, None, :]
+        )
         # a mark's distance to itself is exactly 0 on both sides
         consistent &= off <= DISTANCE_SIGMAS * np.sqrt(variance)
     # ... on the side of the line through them that the normals indicate: the mirror image beyond
     # it lies two heights away; half a height allows for normals wrong by 30 degrees
-    (axes,), (middle,) = few.frames(np.array([i]), np.array([j]))
-    axes_there, middle_there = many.frames(a, b)
-    local = (few.places - middle) @ axes
+    (axes,), (middle,) = fewer_side.frames(np.array([i]), np.array([j]))
+    axes_there, middle_there = larger_side.frames(a, b)
+    local = (fewer_side.places - middle) @ axes
     expected = np.einsum("kij,nj->kni", axes_there, local) + middle_there[:, None, :]
-    off = np.linalg.norm(expected[:, :, None, :] - many.places[None, None], axis=-1)
-    worst = few.worst[:, None] + many.worst[None]
+    off = np.linalg.norm(expected[:, :, None, :] - larger_side.places[None, None], axis=-1)
+    worst = fewer_side.worst[:, None] + larger_side.worst[None]
     consistent &= off < 0.5 * np.linalg.norm(local[:, 1:], axis=-1)[
         :, None
     ] + DISTANCE_SIGMAS * np.sqrt(worst)
@@ -272,14 +282,22 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
         # transform
         if len(partner) == 0:
             return []
-        weights = np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
-        T = kabsch(np.broadcast_to(few.places, (*partner.shape, 3)), many.places[partner], weights)
-        placed = np.einsum("kij,nj->kni", T[:, :3, :3], few.places) + T[:, None, :3, 3]
-        square = ((placed[:, :, None, :] - many.places[None, None]) ** 2).sum(axis=-1) / worst
+        weights = np.where(
+            partner >= 0, 1.0 / (fewer_side.worst[None] + larger_side.worst[partner]), 0.0
+        )
+        T = kabsch(
+            np.broadcast_to(fewer_side.places, (*partner.shape, 3)),
+            larger_side.places[partner],
+            weights,
+        )
+        placed = np.einsum("kij,nj->kni", T[:, :3, :3], fewer_side.places) + T[:, None, :3, 3]
+        square = ((placed[:, :, None, :] - larger_side.places[None, None]) ** 2).sum(
+            axis=-1
+        ) / worst
         partner = _mutual(np.where(square < FIT_CHI2, square, np.inf))
-        own = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
+        squares = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
         count = (partner >= 0).sum(axis=1)
-        misfit = np.where(partner >= 0, own, 0.0).sum(axis=1) / np.maximum(count, 1)
+        misfit = np.where(partner >= 0, squares, 0.0).sum(axis=1) / np.maximum(count, 1)
         T = T[count >= least]
         partner = partner[count >= least]
         misfit = misfit[count >= least]

@@ -91,20 +91,22 @@ def _agreement(
     noise = float(np.hypot(sampling.noise_m, of_view.noise_m))
     beside = np.zeros(1, bool)
     together = np.zeros(1, bool)
-    apart = float("nan")
+    apart_m = float("nan")
     marks_m = float("nan")
     fiducial = transform_points(T_reference_view, view.mark_points_m)
     if len(points) >= 3 and view.inside.any():
         # the reference's surface at a point is the plane through its 25 nearest points
         placed = transform_points(T_reference_view, registered.thinned(view.points_m))
         count = min(CORRELATED_PIXELS, len(points))
-        near = points[cKDTree(points).query(placed, k=count)[1]].reshape(len(placed), count, 3)
-        normals = registered.local_normals(near)
-        across = np.einsum("ni,ni->n", placed - near.mean(axis=1), normals)
-        along = np.linalg.norm(placed - across[:, None] * normals - near[:, 0], axis=1)
+        neighbours = points[cKDTree(points).query(placed, k=count)[1]].reshape(
+            len(placed), count, 3
+        )
+        normals = registered.local_normals(neighbours)
+        across = np.einsum("ni,ni->n", placed - neighbours.mean(axis=1), normals)
+        along = np.linalg.norm(placed - across[:, None] * normals - neighbours[:, 0], axis=1)
         beside = along <= pitch
         together = beside & (np.abs(across) <= max(pitch, 3 * noise))
-        apart = sigma_of(across[beside]) if beside.any() else apart
+        apart_m = sigma_of(across[beside]) if beside.any() else apart_m
         if min(len(fiducial), len(marks)) >= 3:
             distances = np.sort(cKDTree(marks).query(fiducial)[0])[
                 : max(int(TRIMMED * len(fiducial)), 1)
@@ -118,7 +120,7 @@ def _agreement(
     marks_scatter = FALSE_ALARM_SIGMAS / float(np.sqrt(2 * registered.independent(len(fiducial))))
     shares = float(beside.mean()), float(together.mean())
     return Agreement(
-        *shares, apart, marks_m, pitch, noise, pitch / float(np.sqrt(6)), scatter, marks_scatter
+        *shares, apart_m, marks_m, pitch, noise, pitch / float(np.sqrt(6)), scatter, marks_scatter
     )
 
 
@@ -155,7 +157,7 @@ def judge(
     error_m = float(np.hypot(within, across))
     limit_m = max(UNDETERMINED_PITCHES * sampling.pitch_m, BLUR_M)
     undetermined = ""
-    apart = _apart(agreement)
+    separation = _apart(agreement)
     if error_m > limit_m:
         undetermined = (
             "not determined: the points let the target slide or rotate (they lie on a line, or "
@@ -168,9 +170,11 @@ def judge(
         undetermined += f" the map (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(
-            judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else []))
+            judged,
+            failure=undetermined,
+            notes=(*judged.notes, *([separation] if separation else [])),
         )
-    failure = "; ".join(reason for reason in (undetermined, apart) if reason)
+    failure = "; ".join(reason for reason in (undetermined, separation) if reason)
     return (
         replace(judged, failure=failure)
         if failure
@@ -253,8 +257,8 @@ def _widened(
     # an error within the plane has two axes to share its mean square
     covariance[3:, 3:] += more_across**2 * along + 0.5 * more_within**2 * (np.eye(3) - along)
     parts = [
-        f"{m / MM:.2g} mm {way}"
-        for m, way in ((more_across, "across"), (more_within, "along"))
+        f"{m / MM:.2g} mm {direction}"
+        for m, direction in ((more_across, "across"), (more_within, "along"))
         if m
     ]
     note = (
@@ -280,17 +284,20 @@ def register(
     if len(views) == 1:
         return (of_reference,)
     if config.method in PAIRWISE:
-        found = [_pair(views[0], view, config) for view in views[1:]]
+        registrations = [_pair(views[0], view, config) for view in views[1:]]
     else:
         started = perf_counter()
-        found = (
+        registrations = (
             register_by_odometry(views) if config.method == "odometry" else register_jointly(views)
         )
-        share = (perf_counter() - started) / len(found)
-        found = [replace(each, seconds=share) for each in found]
+        share = (perf_counter() - started) / len(registrations)
+        registrations = [replace(registration, seconds=share) for registration in registrations]
     return (
         of_reference,
-        *(judge(each, views[0], view) for each, view in zip(found, views[1:], strict=True)),
+        *(
+            judge(registration, views[0], view)
+            for registration, view in zip(registrations, views[1:], strict=True)
+        ),
     )
 
 
@@ -302,7 +309,7 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
         guess = view.view.T_reference_view_guess
         no_grid = not cloud.organised or cloud.lens is None
         by_points = "registration.method: icp or cpd with points: target"
-        for lacks, what, fix in (
+        for lacks, requirement, fix in (
             (
                 by_colour and cloud.rgb is None,
                 "colour for every point",
@@ -321,7 +328,8 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
         ):
             if lacks:
                 raise UserError(
-                    f"{view.view.name}: registration by {config.method} needs {what}", fix=fix
+                    f"{view.view.name}: registration by {config.method} needs {requirement}",
+                    fix=fix,
                 )
 
 
@@ -331,15 +339,15 @@ def _pair(
     """Return the registration of a view to the reference, not judged yet."""
     started = perf_counter()
     if isinstance(config, IcpRegistration):
-        found = register_by_icp(reference, view, config)
+        registration = register_by_icp(reference, view, config)
     elif isinstance(config, CpdRegistration):
-        found = register_by_cpd(reference, view, config)
+        registration = register_by_cpd(reference, view, config)
     elif config.method == "marks":
-        found = register_by_marks(reference, view)
+        registration = register_by_marks(reference, view)
     else:
         # the quality of the guess is unknown
         guess = registered.guess_of(reference, view)
-        found = registered.Registration(
+        registration = registered.Registration(
             view.view.name, "nominal", np.eye(4) if guess is None else guess
         )
-    return replace(found, seconds=perf_counter() - started)
+    return replace(registration, seconds=perf_counter() - started)

@@ -100,9 +100,9 @@ def clustered_sandwich(
     cubes = np.floor(
         (points_m - points_m.min(axis=0)) / max(CLUSTER_PITCHES * pitch_m, 1e-9)
     ).astype(np.int64)
-    _, which = np.unique(cubes, axis=0, return_inverse=True)
-    summed = np.zeros((int(which.max()) + 1, 6))
-    np.add.at(summed, which.ravel(), scores * unit)
+    _, cluster = np.unique(cubes, axis=0, return_inverse=True)
+    summed = np.zeros((int(cluster.max()) + 1, 6))
+    np.add.at(summed, cluster.ravel(), scores * unit)
     if len(summed) < 7 or not np.isfinite(values).all() or values[0] <= 1e-9 * max(values[-1], 0.0):
         return UNKNOWN_COVARIANCE.copy()
     # the scores sum to zero at the optimum, which removes the scatter of one cube
@@ -167,9 +167,9 @@ def plane_through(points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return centre, normal if normal @ centre <= 0 else -normal
 
 
-def thinned(points_m: np.ndarray, most: int = THINNED_POINTS) -> np.ndarray:
-    """Return at most ``most`` of points (n, 3), evenly strided in the order of the grid."""
-    return points_m[:: max(1, -(-len(points_m) // most))]
+def thinned(points_m: np.ndarray, limit: int = THINNED_POINTS) -> np.ndarray:
+    """Return at most ``limit`` of points (n, 3), evenly strided in the order of the grid."""
+    return points_m[:: max(1, -(-len(points_m) // limit))]
 
 
 def clouds_of(
@@ -178,22 +178,23 @@ def clouds_of(
     """Return the points to register, of the fiducials or of the whole target: the reference's and
     the view's, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4); a note without one; and
     why they cannot be registered, else ""."""
-    both = [
-        each.mark_points_m if points == "marks" else each.points_m for each in (reference, view)
+    clouds = [
+        prepared.mark_points_m if points == "marks" else prepared.points_m
+        for prepared in (reference, view)
     ]
-    fixed, moving = (thinned(each, MAX_POINTS) for each in both)
+    fixed, moving = (thinned(cloud, MAX_POINTS) for cloud in clouds)
     guess = guess_of(reference, view)
     notes = (
         () if guess is not None else ("no guess: registration started from the reference's pose",)
     )
-    few = ""
+    shortage = ""
     if min(len(fixed), len(moving)) < 3:
-        few = (
+        shortage = (
             f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: "
             f"{len(fixed)} in the"
         )
-        few += f" reference and {len(moving)} in the view, 3 needed in each"
-    return fixed, moving, guess, notes, few
+        shortage += f" reference and {len(moving)} in the view, 3 needed in each"
+    return fixed, moving, guess, notes, shortage
 
 
 def independent(points: int) -> float:
@@ -240,14 +241,16 @@ def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
         return 0.0, 0.0
     # neighbours along the surface: in space, noise would select them
     arm = points_m - points_m.mean(axis=0)
-    places = arm @ np.linalg.eigh(arm.T @ arm)[1][:, 1:]
+    plan = arm @ np.linalg.eigh(arm.T @ arm)[1][:, 1:]
     count = min(CORRELATED_PIXELS, len(points_m))
-    distances, nearest = cKDTree(places).query(thinned(places), k=count)
+    distances, nearest = cKDTree(plan).query(thinned(plan), k=count)
     pitch = float(np.median(distances[:, 1]))
     if count < 4:
         return pitch, 0.0
-    near = points_m[nearest]
-    across = np.einsum("ij,ij->i", thinned(points_m) - near.mean(axis=1), local_normals(near))
+    neighbours = points_m[nearest]
+    across = np.einsum(
+        "ij,ij->i", thinned(points_m) - neighbours.mean(axis=1), local_normals(neighbours)
+    )
     return pitch, sigma_of(across) / np.sqrt(1 - 3 / count)
 
 

@@ -45,15 +45,15 @@ def noisy(poses: list[np.ndarray], seed: int, plane: Plane, **kwargs: object) ->
     ]
 
 
-def deviations(found: Merged, plane: Plane, enough_views: int) -> np.ndarray:
+def deviations(merged: Merged, plane: Plane, enough_views: int) -> np.ndarray:
     """Of cells that enough views see, less a common plane's worth of nothing: the plane is known."""
-    cells = found.surface_map.seen_by.sum(axis=0) >= enough_views
-    return plane_height(found.cloud.points_m, found.T_reference_cloud, plane)[cells]
+    cells = merged.surface_map.seen_by.sum(axis=0) >= enough_views
+    return plane_height(merged.cloud.points_m, merged.T_reference_cloud, plane)[cells]
 
 
-def interior(found: Merged) -> np.ndarray:
+def interior(merged: Merged) -> np.ndarray:
     """(h, w) bool: seen by all views."""
-    return found.surface_map.seen_by.sum(axis=0) == len(found.views_used)
+    return merged.surface_map.seen_by.sum(axis=0) == len(merged.views_used)
 
 
 # ---------------------------------------------------------------- frame and exactness
@@ -305,22 +305,24 @@ def test_what_a_cell_knows_of_its_views() -> None:
 # ---------------------------------------------------------------- outliers
 
 
-def spoiled(at: tuple[slice, slice], by_m: float, which: tuple[int, ...], count: int = 5) -> Merged:
+def spoiled(
+    cells: tuple[slice, slice], by_m: float, view_numbers: tuple[int, ...], count: int = 5
+) -> Merged:
     poses = arc(count, 6.0)
     rng = np.random.default_rng(8)
     views = []
     for i, T in enumerate(poses):
         error = np.zeros((120, 160))
-        if i in which:
-            error[at] = by_m
+        if i in view_numbers:
+            error[cells] = by_m
         views.append(
             seen(Plane(), T, rng, noise_m=NOISE_M, frames=10, name=f"v{i}", pattern_m=error)
         )
     return fused(views, poses)
 
 
-def worst(found: Merged) -> float:
-    return float(np.abs(deviations(found, Plane(), 5)).max())
+def worst(merged: Merged) -> float:
+    return float(np.abs(deviations(merged, Plane(), 5)).max())
 
 
 def test_a_flying_pixel_is_rejected() -> None:

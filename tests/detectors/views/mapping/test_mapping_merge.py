@@ -385,8 +385,8 @@ def test_noise_law_without_amplitude_goes_with_range_to_the_fourth() -> None:
     view = seen(Plane(0.0, 50.0), np.eye(4))
     distance = np.linalg.norm(view.view.cloud.points_m, axis=-1)
     sigma = 0.5 * MM * (distance / 0.7) ** 2
-    found = noisy_cloud(None, sigma, 20, 2).view.cloud
-    cloud = replace(found, points_m=view.view.cloud.points_m)
+    noisy = noisy_cloud(None, sigma, 20, 2).view.cloud
+    cloud = replace(noisy, points_m=view.view.cloud.points_m)
     mean, _ = depth_noise(cloud, view.inside, np.full(sigma.shape, np.nan))
     np.testing.assert_allclose(np.sqrt(20 * mean) / sigma, 1.0, atol=0.06)
 

@@ -228,17 +228,17 @@ def test_the_odd_one_out_is_in_doubt():
 
 
 @pytest.mark.parametrize(
-    ("places", "said"),
+    ("spots", "message"),
     [
         (TAPES[:2], "2 marks found, 3 needed"),
         (TAPES[:0], "0 marks found, 3 needed"),
         (np.array([[-0.2, 0.0], [0.0, 0.0], [0.15, 0.0]]), "lie on a line"),
     ],
 )
-def test_what_is_missing_is_said(places, said):
-    cloud = marked_cloud(board_pose(), strips(places), rng=random_stream(9, "missing"))
+def test_what_is_missing_is_said(spots, message):
+    cloud = marked_cloud(board_pose(), strips(spots), rng=random_stream(9, "missing"))
     for config in (ColourMarks(), RedMarks()):
-        assert said in find_marks(cloud, everywhere(cloud), config).problem
+        assert message in find_marks(cloud, everywhere(cloud), config).problem
 
 
 def test_no_colour_and_no_target_are_said():

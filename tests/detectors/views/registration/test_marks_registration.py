@@ -243,8 +243,10 @@ def test_a_guess_of_the_reference_itself_is_taken_into_account():
 
 def test_other_targets_moved_marks_and_lines_fail():
     reference = view_of("a", marks_at(RECTANGLE, FIRST), np.eye(4))
-    other = np.array([[0.0, 0.0, 0.0], [0.1, 0.02, 0.0], [0.17, -0.03, 0.0], [0.05, 0.07, 0.0]])
-    failed = register_by_marks(reference, view_of("b", marks_at(other, SECOND), GUESS))
+    another_target = np.array(
+        [[0.0, 0.0, 0.0], [0.1, 0.02, 0.0], [0.17, -0.03, 0.0], [0.05, 0.07, 0.0]]
+    )
+    failed = register_by_marks(reference, view_of("b", marks_at(another_target, SECOND), GUESS))
     assert "matching distances" in failed.failure
     np.testing.assert_array_equal(failed.T_reference_view, GUESS)
     assert np.isnan(failed.covariance).all()
@@ -283,8 +285,8 @@ def test_codes_decide_alone():
     by_marks = register_by_marks(reference, view)
     assert by_marks.failure == ""
     assert error_m(by_marks.T_reference_view) < 2e-3
-    others = view_of("b", marks_at(RECTANGLE[order], SECOND, rng, [15, 4, 23, 42]))
-    assert register_by_marks(reference, others).failure == (
+    recoded = view_of("b", marks_at(RECTANGLE[order], SECOND, rng, [15, 4, 23, 42]))
+    assert register_by_marks(reference, recoded).failure == (
         "2 codes in common, 3 needed: the reference shows 4, 8, 15, 16, the view 4, 15, 23, 42"
     )
     twice = pair_marks(

@@ -158,11 +158,11 @@ def test_only_the_turn_of_the_guess_matters():
     moving = transform_points(transform((60, 0, 0), (0, 0, 0)), cloud(100))
     start = transform((-55, 3, 0), (0.0, 0.0, 0.0))
     far = transform((0, 0, 0), (3.0, -2.0, 1.0)) @ start
-    near = coherent_point_drift(fixed, moving, EXACT, start).T_fixed_moving
+    from_guess = coherent_point_drift(fixed, moving, EXACT, start).T_fixed_moving
     np.testing.assert_allclose(
-        coherent_point_drift(fixed, moving, EXACT, far).T_fixed_moving, near, atol=1e-9
+        coherent_point_drift(fixed, moving, EXACT, far).T_fixed_moving, from_guess, atol=1e-9
     )
-    np.testing.assert_allclose(transform_points(near, moving), fixed, atol=1e-5)
+    np.testing.assert_allclose(transform_points(from_guess, moving), fixed, atol=1e-5)
 
 
 def test_equal_clouds_end_at_once_and_stay():

@@ -41,8 +41,8 @@ SLOW_CPD = pytest.param(
 )  # test_registration_cpd has its own
 
 
-def prepared(made) -> list[PreparedView]:
-    return [each.prepared for each in made]
+def prepared(boards) -> list[PreparedView]:
+    return [board.prepared for board in boards]
 
 
 def changed(view: PreparedView, **cloud) -> PreparedView:
@@ -60,13 +60,17 @@ def test_good_views_are_registered_and_nothing_is_said(config):
     reference, *result = register(prepared(created), config)
     np.testing.assert_array_equal(reference.T_reference_view, np.eye(4))
     assert reference.overlap == 1.0 and not reference.covariance.any()
-    for each, view, expected in zip(result, created[1:], ("view 1", "view 2"), strict=True):
-        assert (each.view, each.method, each.failure) == (expected, config.method, "")
-        within, across = target_error_m(each, created[0], view)
+    for registration, view, expected in zip(result, created[1:], ("view 1", "view 2"), strict=True):
+        assert (registration.view, registration.method, registration.failure) == (
+            expected,
+            config.method,
+            "",
+        )
+        within, across = target_error_m(registration, created[0], view)
         assert (
             within < (2.0 if config.method == "icp" else 0.5) * PITCH_M and across < 0.3 * PITCH_M
         )
-        assert each.overlap > 0.9 and each.seconds > 0
+        assert registration.overlap > 0.9 and registration.seconds > 0
 
 
 def test_one_view_is_its_own_reference():
@@ -82,8 +86,8 @@ def test_no_views_are_refused():
 # ------------------------------------------------------------ failures, in words
 
 
-def only_failure(made, config: AnyRegistration) -> str:
-    return register(prepared(made), config)[1].failure
+def only_failure(boards, config: AnyRegistration) -> str:
+    return register(prepared(boards), config)[1].failure
 
 
 def test_views_that_do_not_overlap():
@@ -104,20 +108,22 @@ def test_other_marks_on_the_other_target():
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M)
     remaining = tuple((x * 0.5, y * 0.6) for x, y in TAPES_M)
     guess = POSES[0] @ np.linalg.inv(POSES[1])
-    other = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=remaining)
+    moved_marks = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=remaining)
     assert "do not coincide" in only_failure(
-        [reference, other], IcpRegistration()
-    ) or "no pairs" in only_failure([reference, other], IcpRegistration())
-    assert "do not coincide" in only_failure([reference, other], CpdRegistration())
-    assert only_failure([reference, other], PlainRegistration(method="marks"))
+        [reference, moved_marks], IcpRegistration()
+    ) or "no pairs" in only_failure([reference, moved_marks], IcpRegistration())
+    assert "do not coincide" in only_failure([reference, moved_marks], CpdRegistration())
+    assert only_failure([reference, moved_marks], PlainRegistration(method="marks"))
 
 
 def test_a_target_of_another_shape_lies_apart():
     bent = np.zeros((4, 4))
     bent[2, 0] = 0.012
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M)
-    other = board_view(POSES[1], POSES[0] @ np.linalg.inv(POSES[1]), noise_m=NOISE_M, smooth_m=bent)
-    result = register(prepared([reference, other]), CpdRegistration())[1]
+    bent_view = board_view(
+        POSES[1], POSES[0] @ np.linalg.inv(POSES[1]), noise_m=NOISE_M, smooth_m=bent
+    )
+    result = register(prepared([reference, bent_view]), CpdRegistration())[1]
     assert "apart" in result.failure and "different targets" in result.failure
 
 
@@ -185,15 +191,15 @@ def test_a_wrong_guess_turns_the_board_about():
     twins = ((-0.1, 0.06), (0.1, 0.06), (-0.1, -0.06), (0.1, -0.06))
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M, tapes_m=twins)
     guess = POSES[0] @ np.linalg.inv(POSES[1])
-    other = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=twins)
+    twin_view = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=twins)
     half_turn = POSES[0] @ np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(POSES[1])
     turned = register(
-        [reference.prepared, replace_guess(other.prepared, half_turn)], CpdRegistration()
+        [reference.prepared, replace_guess(twin_view.prepared, half_turn)], CpdRegistration()
     )[1]
     # the twin fits as well, and nothing in the clouds tells: what the guess says is what is
     # believed
-    assert not turned.failure and target_error_m(turned, reference, other)[0] > 0.1
-    judged = judge(turned, reference.prepared, other.prepared)
+    assert not turned.failure and target_error_m(turned, reference, twin_view)[0] > 0.1
+    judged = judge(turned, reference.prepared, twin_view.prepared)
     assert judged.failure.startswith("is 180 degrees and ")
 
 
