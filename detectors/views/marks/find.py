@@ -42,13 +42,16 @@ LEAST_SCALE_M = 1e-6
 
 @dataclass(frozen=True)
 class Patch:
-    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m``, and the deviation of one point's
-    z about it."""
+    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m`` through points of a cloud."""
 
     slope_x: float
+    """Change of z along x."""
     slope_y: float
+    """Change of z along y."""
     offset_m: float
+    """z at x = y = 0."""
     sigma_m: float
+    """Standard deviation of one point's z about the plane."""
 
     @property
     def normal(self) -> np.ndarray:
@@ -80,33 +83,40 @@ class Patch:
         variance = max(self.sigma_m**2, float(finite.mean()) if len(finite) else 0.0)
         if cloud.mean_variance_m2 is not None:
             stated = cloud.mean_variance_m2.ravel()[pixels]
-            variance = max(
-                variance, float(np.nanmean(stated)) if np.isfinite(stated).any() else 0.0
-            )
-        ray = centre_m / centre_m[2] if cloud.projection == "central" else np.array([0.0, 0.0, 1.0])
+            if np.isfinite(stated).any():
+                variance = max(variance, float(np.nanmean(stated)))
+            ray = np.array([0.0, 0.0, 1.0])
+            if cloud.projection == "central":
+                ray = centre_m / centre_m[2]
         # if the plane is shifted along z by d, a ray meets it d n_z / n.ray farther along
         along = ray * self.normal[2] / (self.normal @ ray)
-        return np.asarray(
-            variance * min(1.0, CORRELATED_PIXELS / len(pixels)) * np.outer(along, along)
-        )
+        share = min(1.0, CORRELATED_PIXELS / len(pixels))
+        return np.asarray(variance * share * np.outer(along, along))
 
 
 @dataclass(frozen=True)
 class Spot:
-    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``,
-    ``pitch_m`` between pixels, and ``behind_m``: its distance behind its surroundings, with
-    standard deviation. ``sizes_m`` (3,): sides of the rectangle with its second moments, and the
-    mean breadth over the length, which gaps reduce."""
+    """A blob's place in space, camera frame."""
 
     blob: Blob
+    """Its pixels."""
     centre_m: np.ndarray
+    """(3,): its centroid on the surface."""
     covariance_m2: np.ndarray
+    """(3, 3): of the centroid."""
     normal: np.ndarray
+    """(3,): of the surface, towards the camera."""
     area_m2: float
+    """Area on the surface."""
     sizes_m: np.ndarray
+    """(3,): sides of the rectangle with its second moments, longer first, and the mean breadth
+    over the length, which gaps reduce."""
     pitch_m: float
+    """Distance between pixels."""
     behind_m: float
+    """Its distance behind its surroundings."""
     behind_sigma_m: float
+    """Standard deviation of that distance."""
 
     @property
     def is_hole(self) -> bool:
@@ -127,11 +137,13 @@ def fit_patch(points_m: np.ndarray) -> Patch | None:
     ).tolist()
     # points off the plane on only one side have shifted it, but not rotated it
     off = z - plane.evaluate(x, y)
-    off = off[
-        np.abs(off - median_of(off)) <= 3.0 * max(sigma_of(off - median_of(off)), LEAST_SCALE_M)
-    ]
+    centred = off - median_of(off)
+    off = off[np.abs(centred) <= 3.0 * max(sigma_of(centred), LEAST_SCALE_M)]
     return Patch(
-        at_x - level, at_y - level, level + float(off.mean()), max(float(off.std()), LEAST_SCALE_M)
+        slope_x=at_x - level,
+        slope_y=at_y - level,
+        offset_m=level + float(off.mean()),
+        sigma_m=max(float(off.std()), LEAST_SCALE_M),
     )
 
 
@@ -150,25 +162,31 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     sigma = float(max(kept.std(), scale))
     settled = replace(patch, offset_m=patch.offset_m + behind, sigma_m=sigma)
     on_plane = settled.cut(points, cloud.projection)
-    covers = weights * (on_plane[:, 2] ** 3 if cloud.projection == "central" else 1.0)
+    covers = weights
+    if cloud.projection == "central":
+        covers = weights * on_plane[:, 2] ** 3
     centre = np.average(on_plane, axis=0, weights=covers)
-    jacobian = np.linalg.lstsq(blob.grid - blob.grid.mean(axis=0), on_plane - centre, rcond=None)[
-        0
-    ].T
-    covariance = (
-        settled.range_covariance_m2(centre, cloud, pixels[core])
-        + jacobian @ blob.grid_covariance @ jacobian.T
-    )
+    grid = blob.grid - blob.grid.mean(axis=0)
+    jacobian = np.linalg.lstsq(grid, on_plane - centre, rcond=None)[0].T
+    by_range = settled.range_covariance_m2(centre, cloud, pixels[core])
+    covariance = by_range + jacobian @ blob.grid_covariance @ jacobian.T
     scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
     _, minor, major = np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(scatter), 0.0))
     pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
     # the scatter of a flat mark: the different depths in a hole must not hide that it is a hole
     behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
     area = pixel_area * float(weights.sum())
-    pitch = float(np.sqrt(pixel_area))
-    covariance = (covariance + covariance.T) / 2
-    sizes = np.array([major, minor, area / major])
-    return Spot(blob, centre, covariance, settled.normal, area, sizes, pitch, behind, behind_sigma)
+    return Spot(
+        blob=blob,
+        centre_m=centre,
+        covariance_m2=(covariance + covariance.T) / 2,
+        normal=settled.normal,
+        area_m2=area,
+        sizes_m=np.array([major, minor, area / major]),
+        pitch_m=float(np.sqrt(pixel_area)),
+        behind_m=behind,
+        behind_sigma_m=behind_sigma,
+    )
 
 
 CORNER_PX = 0.25
@@ -228,9 +246,8 @@ def _coded_mark(
     corner_places = on_plane[:4]
     steps = np.stack([on_plane[4] - on_plane[5], on_plane[6] - on_plane[7]], axis=1)
     centre = corner_places.mean(axis=0)
-    covariance = steps @ steps.T * CORNER_PX**2 / 4 + patch.range_covariance_m2(
-        centre, cloud, pixels
-    )
+    by_corners = steps @ steps.T * CORNER_PX**2 / 4
+    covariance = by_corners + patch.range_covariance_m2(centre, cloud, pixels)
     coverage = len(pixels) / int(area.sum())
     without = 1.0 - cloud.valid[area > 0].mean()
     doubt = ""
@@ -240,15 +257,17 @@ def _coded_mark(
         doubt = f"{100 * without:.0f} % of it has no range"
     elif coverage < WHOLE:
         doubt = f"{100 * (1 - coverage):.0f} % of it is beyond the crop's edge"
-    area_m2 = (
-        float(
-            np.linalg.norm(
-                np.cross(corner_places[2] - corner_places[0], corner_places[3] - corner_places[1])
-            )
-        )
-        / 2
+    first_diagonal = corner_places[2] - corner_places[0]
+    second_diagonal = corner_places[3] - corner_places[1]
+    return Mark(
+        centre_m=centre,
+        covariance_m2=(covariance + covariance.T) / 2,
+        normal=patch.normal,
+        pixels=pixels,
+        area_m2=float(np.linalg.norm(np.cross(first_diagonal, second_diagonal))) / 2,
+        code=code,
+        doubt=doubt,
     )
-    return Mark(centre, (covariance + covariance.T) / 2, patch.normal, pixels, area_m2, code, doubt)
 
 
 def _quadratic(uv: np.ndarray) -> np.ndarray:
@@ -307,27 +326,24 @@ def find_marks(
         limit = mean + config.deviations * spread
         coloured = np.zeros(inside.shape, dtype=bool)
         coloured[inside] = red > limit
-        missing = (
-            f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and "
-            f"{config.deviations:g} standard"
-        )
-        missing += f" deviations of {spread:.0f}"
         if not cloud.organised:
-            return MarkSet(
-                (),
-                np.flatnonzero(coloured),
-                "marks need a pixel grid, which this cloud does not have",
+            problem = "marks need a pixel grid, which this cloud does not have"
+            return MarkSet((), np.flatnonzero(coloured), problem)
+        missing = ""
+        if not coloured.any():
+            missing = (
+                f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and "
+                f"{config.deviations:g} standard deviations of {spread:.0f}"
             )
-        return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
+        return _marks(cloud, inside, coloured, missing)
     # lightness is tried if chromaticity gives too few marks or hardly any contrast: black and
     # white have the light's chromaticity, and black hardly any
     marks, margin = _standing_out(cloud, inside, chromaticity)
-    if len(marks.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
+    enough = len(marks.trusted) >= LEAST_MARKS
+    if enough and margin >= CLEAR_MARGIN:
         return marks
     lighter, lighter_margin = _standing_out(cloud, inside, lightness)
-    if len(lighter.trusted) < LEAST_MARKS or (
-        len(marks.trusted) >= LEAST_MARKS and margin >= lighter_margin
-    ):
+    if len(lighter.trusted) < LEAST_MARKS or (enough and margin >= lighter_margin):
         return marks
     return replace(lighter, notes=(*lighter.notes, "the marks were found by their lightness"))
 
@@ -340,19 +356,23 @@ def _standing_out(
     assert cloud.rgb is not None
     contrast = np.zeros(inside.shape)
     margin = np.zeros(inside.shape)
-    contrast[inside], margin[inside] = stand_out(
-        *feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2]
-    )
+    values, rounding = feature(cloud.rgb[inside])
+    xy = cloud.points_m[inside][:, :2]
+    contrast[inside], margin[inside] = stand_out(values, rounding, xy)
     coloured = above_half(margin > 1.0, contrast)
     marks = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
     pixels = [mark.pixels for mark in marks.trusted]
-    median = float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
+    median = 0.0
+    if pixels:
+        median = float(np.median(margin.ravel()[np.concatenate(pixels)]))
     # a hole through which another colour shows is not a fiducial
     return replace(marks, points=_pixels_of(marks.marks)), median
 
 
 def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *(mark.pixels for mark in marks)]))
+    """Return the flat indices of all pixels of the marks, rising."""
+    pixels = [mark.pixels for mark in marks]
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *pixels]))
 
 
 def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
@@ -372,9 +392,8 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     for spot in sorted(spots, key=lambda s: (-s.area_m2, int(s.blob.pixels[0]))):
         for group in colours:
             contrast = group[0].blob.contrast
-            if np.linalg.norm(spot.blob.contrast - contrast) < SAME_COLOUR * np.linalg.norm(
-                contrast
-            ):
+            difference = np.linalg.norm(spot.blob.contrast - contrast)
+            if difference < SAME_COLOUR * np.linalg.norm(contrast):
                 group.append(spot)
                 break
         else:
@@ -383,26 +402,23 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     for colour in colours:
         # if most of a colour's area lies behind, its flat-looking spots are holes too small to
         # look deep
-        flat = [s for s in colour if not s.is_hole]
-        if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(
-            s.area_m2 for s in colour
-        ):
-            complete = [s for s in flat if not s.blob.doubt]
-            usual_m = None
-            if len(complete) >= 3:
-                # half of the spots' area is in larger spots, so that chips count little
-                sizes = np.array([s.sizes_m for s in complete])
-                areas = [s.area_m2 for s in complete]
-                usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
-            groups.append(
-                (
-                    float(np.linalg.norm(flat[0].blob.contrast)),
-                    [_mark(s, usual_m, n_target) for s in flat],
-                )
-            )
-    enough = [
-        vivid for vivid, marks in groups if sum(not mark.doubt for mark in marks) >= LEAST_MARKS
-    ]
+        flat = [spot for spot in colour if not spot.is_hole]
+        hole_area = sum(spot.area_m2 for spot in colour if spot.is_hole)
+        if not flat or 2.0 * hole_area > sum(spot.area_m2 for spot in colour):
+            continue
+        complete = [spot for spot in flat if not spot.blob.doubt]
+        usual_m = None
+        if len(complete) >= 3:
+            # half of the spots' area is in larger spots, so that chips count little
+            sizes = np.array([spot.sizes_m for spot in complete])
+            areas = [spot.area_m2 for spot in complete]
+            usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
+        vivid = float(np.linalg.norm(flat[0].blob.contrast))
+        groups.append((vivid, [_mark(spot, usual_m, n_target) for spot in flat]))
+    enough = []
+    for vivid, colour_marks in groups:
+        if sum(not mark.doubt for mark in colour_marks) >= LEAST_MARKS:
+            enough.append(vivid)
     marks = []
     for vivid, colour_marks in groups:
         doubt = ""
@@ -413,11 +429,11 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in colour_marks]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
     holes = len(spots) - len(marks)
-    notes = (
-        (f"{holes} spots of another colour lie behind the surface and count as holes, not marks",)
-        if holes
-        else ()
-    )
+    notes = tuple[str, ...]()
+    if holes:
+        notes = (
+            f"{holes} spots of another colour lie behind the surface and count as holes, not marks",
+        )
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 
 
@@ -427,18 +443,27 @@ def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
     doubt = spot.blob.doubt
     sizes_m = spot.sizes_m
     pixels = spot.blob.pixels[spot.blob.weights > 0.5]
+    share = len(pixels) / n_target
     if doubt:
         pass
-    elif (share := len(pixels) / n_target) > LARGEST_SHARE:
+    elif share > LARGEST_SHARE:
         doubt = f"{100 * share:.0f} % of the target: a part of it rather than a mark"
     elif -spot.behind_m > max(RAISED_SHARE * sizes_m[1], BEHIND_SIGMAS * spot.behind_sigma_m):
         doubt = f"it stands {-spot.behind_m / MM:.0f} mm in front of the surface"
     elif usual_m is not None:
-        unlike = np.abs(sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
-        (length, breadth, _), (usual_length, usual_breadth, _) = sizes_m / MM, usual_m / MM
-        if unlike.any():
+        tolerance = UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
+        if (np.abs(sizes_m - usual_m) > tolerance).any():
+            length, breadth, _ = sizes_m / MM
+            usual_length, usual_breadth, _ = usual_m / MM
             doubt = (
                 f"unlike the others: {length:.0f} x {breadth:.0f} mm, not {usual_length:.0f} x "
                 f"{usual_breadth:.0f}"
             )
-    return Mark(spot.centre_m, spot.covariance_m2, spot.normal, pixels, spot.area_m2, doubt=doubt)
+    return Mark(
+        centre_m=spot.centre_m,
+        covariance_m2=spot.covariance_m2,
+        normal=spot.normal,
+        pixels=pixels,
+        area_m2=spot.area_m2,
+        doubt=doubt,
+    )
