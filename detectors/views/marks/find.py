@@ -85,9 +85,9 @@ class Patch:
             stated = cloud.mean_variance_m2.ravel()[pixels]
             if np.isfinite(stated).any():
                 variance = max(variance, float(np.nanmean(stated)))
-            ray = np.array([0.0, 0.0, 1.0])
-            if cloud.projection == "central":
-                ray = centre_m / centre_m[2]
+        ray = np.array([0.0, 0.0, 1.0])
+        if cloud.projection == "central":
+            ray = centre_m / centre_m[2]
         # if the plane is shifted along z by d, a ray meets it d n_z / n.ray farther along
         along = ray * self.normal[2] / (self.normal @ ray)
         share = min(1.0, CORRELATED_PIXELS / len(pixels))

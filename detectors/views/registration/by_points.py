@@ -15,7 +15,7 @@ only the target: on a turntable the room does not move with the target. No loop 
 is kept."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -83,16 +83,22 @@ def register_by_icp(
     distances, paired = _pairs(tree, moved, limit_m)
     covariance = _covariance(tree, moved, limit_m, sampling.pitch_m)
     residual_m = float(np.sqrt(np.sum(distances**2) / max(paired.sum(), 1)))
-    registration = registered.Registration(
-        view.view.name, "icp", T, covariance, moved.mean(axis=0), residual_m
-    )
     failure = registered.still_moving(step_m, sampling.pitch_m)
-    failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
-    converged = bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m)
-    registration = replace(
-        registration, pairs=int(paired.sum()), iterations=iterations, converged=converged
+    if not failure and not np.isfinite(covariance).all():
+        failure = registered.SLIDES
+    return registered.Registration(
+        view=view.view.name,
+        method="icp",
+        T_reference_view=T,
+        covariance=covariance,
+        centre_m=moved.mean(axis=0),
+        residual_m=residual_m,
+        pairs=int(paired.sum()),
+        iterations=iterations,
+        converged=bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m),
+        failure=failure,
+        notes=notes,
     )
-    return replace(registration, failure=failure, notes=notes)
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
@@ -110,7 +116,8 @@ def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, 
     have a partner."""
     distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
     paired = np.isfinite(distances)
-    return np.where(paired[:, None], moved_m - tree.data[np.where(paired, nearest, 0)], 0.0), paired
+    partners = tree.data[np.where(paired, nearest, 0)]
+    return np.where(paired[:, None], moved_m - partners, 0.0), paired
 
 
 def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) -> np.ndarray:
@@ -122,7 +129,8 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
     of many near minima. NaN if a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
     jacobian = displacement_jacobian(arm, np.zeros(3))
-    scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
+    off, _ = _pairs(tree, moved_m, limit_m)
+    scores = np.einsum("nij,ni->nj", jacobian, off)
 
     def half_cost(motion: np.ndarray) -> float:
         # a point without a partner counts as one at the limit
@@ -156,17 +164,22 @@ PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of coherent point drift. ``T_fixed_moving``: (4, 4). ``sigma_m``: the Gaussians'
-    width. ``matched``: expected number of fixed points that are not outliers. ``step_m``: how far
-    the last iteration moved the points. ``background``: a share, as in `posterior_moments`."""
+    """The result of coherent point drift."""
 
     T_fixed_moving: np.ndarray
+    """(4, 4): rigid."""
     sigma_m: float
+    """Width of the Gaussians."""
     matched: float
+    """Expected number of fixed points that are not outliers."""
     iterations: int
+    """Number of iterations."""
     converged: bool
+    """Whether they ended by the tolerance or because the clouds coincide."""
     step_m: float
+    """How far the last iteration moved the points."""
     background: float
+    """The uniform component, as in `posterior_moments`."""
 
 
 def coherent_point_drift(
@@ -199,9 +212,8 @@ def coherent_point_drift(
         and variance > LEAST_VARIANCE
     ):
         iterations += 1
-        moments, objective = posterior_moments(
-            fixed, moving, variance, outliers * (2 * np.pi * variance) ** 1.5
-        )
+        background = outliers * (2 * np.pi * variance) ** 1.5
+        moments, objective = posterior_moments(fixed, moving, variance, background)
         objective += 1.5 * len(fixed) * np.log(variance)
         change = abs((objective - last) / objective)
         last = objective
@@ -230,13 +242,13 @@ def coherent_point_drift(
     background = outliers * (2 * np.pi * variance) ** 1.5
     converged = bool(change <= config.tolerance or variance <= LEAST_VARIANCE)
     return Drift(
-        T @ start,
-        float(np.sqrt(variance)) * scale,
-        matched,
-        iterations,
-        converged,
-        step,
-        background,
+        T_fixed_moving=T @ start,
+        sigma_m=float(np.sqrt(variance)) * scale,
+        matched=matched,
+        iterations=iterations,
+        converged=converged,
+        step_m=step,
+        background=background,
     )
 
 
@@ -251,24 +263,27 @@ def register_by_cpd(
         return registered.failed(view, "cpd", start, shortage, *notes)
     drift = coherent_point_drift(fixed, moving, config, start)
     pitch = registered.sampling_of(view).pitch_m
-    covariance = drift_covariance(
-        fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch
-    )
-    failure = "" if drift.converged else registered.still_moving(drift.step_m, pitch)
-    failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
+    moved = transform_points(drift.T_fixed_moving, moving)
+    covariance = drift_covariance(fixed, moved, drift, pitch)
+    failure = ""
     if not drift.converged:
+        failure = registered.still_moving(drift.step_m, pitch)
         notes += (f"stopped after {drift.iterations} iterations, the limit in the settings",)
-    where = drift.T_fixed_moving, covariance, fixed.mean(axis=0)
-    registration = registered.Registration(
-        view.view.name, "cpd", *where, drift.sigma_m * np.sqrt(3.0)
-    )
-    registration = replace(
-        registration,
+    if not failure and not np.isfinite(covariance).all():
+        failure = registered.SLIDES
+    return registered.Registration(
+        view=view.view.name,
+        method="cpd",
+        T_reference_view=drift.T_fixed_moving,
+        covariance=covariance,
+        centre_m=fixed.mean(axis=0),
+        residual_m=drift.sigma_m * np.sqrt(3.0),
         pairs=round(drift.matched),
         iterations=drift.iterations,
         converged=drift.converged,
+        failure=failure,
+        notes=notes,
     )
-    return replace(registration, failure=failure, notes=notes)
 
 
 def drift_covariance(
@@ -288,7 +303,8 @@ def drift_covariance(
     # the score of a pair is J'(x - y) / variance = (y x x, x - y) / variance, linear in (y, 1)
     linear = np.zeros((len(x), 6, 4))
     linear[:, :3, :3] = np.swapaxes(np.cross(np.eye(3)[None], x[:, None]), 1, 2)
-    linear[:, 3:, :3], linear[:, 3:, 3] = -np.eye(3), x
+    linear[:, 3:, :3] = -np.eye(3)
+    linear[:, 3:, 3] = x
     scores = np.einsum("nij,nj->ni", linear, moments[:, :, 3]) / variance
     within = (linear @ moments @ np.swapaxes(linear, 1, 2)).sum(axis=0) / variance**2
     # the complete information is the weighted sum of J'J, with J linear in (y, 1) too
@@ -297,10 +313,9 @@ def drift_covariance(
     complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
     information = complete - (within - scores.T @ scores)
     error_factor = 1 + len(fixed_m) / len(moved_m)
-    return (
-        registered.clustered_sandwich(information, scores - scores.mean(axis=0), fixed_m, pitch_m)
-        * error_factor
-    )
+    centred = scores - scores.mean(axis=0)
+    covariance = registered.clustered_sandwich(information, centred, fixed_m, pitch_m)
+    return covariance * error_factor
 
 
 def posterior_moments(
@@ -348,11 +363,19 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     )
     low = np.floor(plane_px.min(axis=0)) - 1
     width, height = (np.ceil(plane_px.max(axis=0)) + 2 - low).astype(int).tolist()
-    lens = width, height, first.fx, first.fy, -float(low[0]), -float(low[1])
-    canvas = Lens(*lens)
+    canvas = Lens(
+        width=width,
+        height=height,
+        fx=first.fx,
+        fy=first.fy,
+        cx=-float(low[0]),
+        cy=-float(low[1]),
+    )
     with open3d_on_one_thread() as o3d:
         methods = o3d.pipelines.odometry
-        camera = o3d.camera.PinholeCameraIntrinsic(*lens)
+        camera = o3d.camera.PinholeCameraIntrinsic(
+            width, height, canvas.fx, canvas.fy, canvas.cx, canvas.cy
+        )
         option = methods.OdometryOption(
             depth_diff_max=DEPTH_DIFFERENCE_M, depth_min=0.0, depth_max=1e3
         )

@@ -27,18 +27,23 @@ SMALL_STEP_M = 1e-10
 
 @dataclass(frozen=True)
 class Placement:
-    """``T_to_from`` (4, 4): rigid. ``covariance`` (6, 6): of a small error (w, t), by which a
-    point p of the target frame is off by w x (p - ``centre_m``) + t. ``residuals_m`` (n, 3):
-    mapped points minus their partners. ``chi2``: their sum of squares in units of the covariances,
-    with 3 n - 6 degrees of freedom."""
+    """The most probable rigid transform of points onto their partners."""
 
     T_to_from: np.ndarray
+    """(4, 4): rigid."""
     covariance: np.ndarray
+    """(6, 6): of a small error (w, t), by which a point p of the target frame is off by
+    w x (p - ``centre_m``) + t, radians and metres."""
     centre_m: np.ndarray
+    """(3,): centre of the small rotation."""
     residuals_m: np.ndarray
+    """(n, 3): mapped points minus their partners."""
     chi2: float
+    """Their sum of squares in units of the covariances, with 3 n - 6 degrees of freedom."""
     iterations: int
+    """Number of Gauss-Newton steps."""
     converged: bool
+    """Whether these steps came to an end."""
 
 
 def place(
@@ -49,6 +54,7 @@ def place(
     a line)."""
 
     def state(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals (n, 3) and the inverses (n, 3, 3) of their covariances."""
         spread = to_spread_m2 + T[:3, :3] @ from_spread_m2 @ T[:3, :3].T
         return transform_points(T, from_m) - to_m, np.linalg.inv(spread)
 
@@ -62,15 +68,22 @@ def place(
         residuals, weight = state(T)
         jacobian = displacement_jacobian(residuals + to_m, centre)
         information = np.einsum("nki,nkl,nlj->ij", jacobian, weight, jacobian)
-        motion = -np.linalg.solve(
-            information, np.einsum("nki,nkl,nl->i", jacobian, weight, residuals)
-        )
+        gradient = np.einsum("nki,nkl,nl->i", jacobian, weight, residuals)
+        motion = -np.linalg.solve(information, gradient)
         T = moved_by(motion, centre) @ T
         converged = bool(np.abs(jacobian @ motion).max() < SMALL_STEP_M)
     residuals, weight = state(T)
     chi2 = float(np.einsum("ni,nij,nj->", residuals, weight, residuals))
     covariance = np.linalg.inv(information)
-    return Placement(T, (covariance + covariance.T) / 2, centre, residuals, chi2, steps, converged)
+    return Placement(
+        T_to_from=T,
+        covariance=(covariance + covariance.T) / 2,
+        centre_m=centre,
+        residuals_m=residuals,
+        chi2=chi2,
+        iterations=steps,
+        converged=converged,
+    )
 
 
 SHARED_M = 1.0 * MM
@@ -95,12 +108,14 @@ NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 @dataclass(frozen=True)
 class Pairing:
-    """``pairs`` (n, 2): indices into the reference's and the view's marks, in the reference's
-    order. ``problem``: why they must not be used, else empty. ``notes``: further remarks."""
+    """The marks of two views that belong together."""
 
     pairs: np.ndarray
+    """(n, 2): indices into the reference's and the view's marks, in the reference's order."""
     problem: str = ""
+    """Why they must not be used, else empty."""
     notes: tuple[str, ...] = ()
+    """Further remarks."""
 
 
 def pair_marks(
@@ -119,10 +134,11 @@ def pair_marks(
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
         least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
-        reason = f"of {counts}, no {least} have matching distances"
-        return Pairing(
-            NO_PAIRS, f"{reason}: the targets differ, or other objects were taken for marks"
+        problem = (
+            f"of {counts}, no {least} have matching distances: the targets differ, or other "
+            "objects were taken for marks"
         )
+        return Pairing(NO_PAIRS, problem)
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
         placed = [
@@ -130,20 +146,16 @@ def pair_marks(
         ]
         off = np.stack(placed) - transform_points(T_reference_view_guess, theirs.places)
         away = np.sqrt((off**2).sum(axis=-1).mean(axis=-1))
-    number = [sum(mark >= 0 for mark in partner) for partner, _, _ in solutions]
-    fit = np.array(
-        [
-            n * (PAIR_WORTH - 0.5 * misfit)
-            for n, (_, _, misfit) in zip(number, solutions, strict=True)
-        ]
-    )
+    number = [len(partners) - partners.count(-1) for partners, _, _ in solutions]
+    misfit = np.array([misfit for _, _, misfit in solutions])
+    fit = np.array(number) * (PAIR_WORTH - 0.5 * misfit)
     odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
     first, *runners_up = np.argsort(-odds, kind="stable").tolist()
-    pairs = np.array(
-        [(mark, solution) for mark, solution in enumerate(solutions[first][0]) if solution >= 0],
-        dtype=np.int64,
-    )
-    pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
+    partner = np.array(solutions[first][0], dtype=np.int64)
+    matched = np.flatnonzero(partner >= 0)
+    pairs = np.stack([matched, partner[matched]], axis=1)
+    if swapped:
+        pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])]
     if not runners_up or odds[first] - odds[runners_up[0]] >= CLEAR_ODDS:
         return Pairing(pairs)
     candidates = f"{number[first]} and {number[runners_up[0]]}"
@@ -153,41 +165,50 @@ def pair_marks(
     if T_reference_view_guess is None:
         return Pairing(pairs, problem + "there is no guess to choose by")
     between = (
-        f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[runners_up[0]] / MM:.0f} "
-        "mm from the other"
+        f"the guess lies between: {away[first] / MM:.0f} mm from one, "
+        f"{away[runners_up[0]] / MM:.0f} mm from the other"
     )
     return Pairing(pairs, problem + between)
 
 
 def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
-    ours, theirs = ([int(mark.code or 0) for mark in marks] for marks in (reference, view))
+    ours = [int(mark.code or 0) for mark in reference]
+    theirs = [int(mark.code or 0) for mark in view]
     twice = sorted({code for codes in (ours, theirs) for code in codes if codes.count(code) > 1})
     common = [code for code in ours if code in theirs and code not in twice]
-    pairs = np.array(
-        [(ours.index(code), theirs.index(code)) for code in common], dtype=np.int64
-    ).reshape(-1, 2)
+    indices = [(ours.index(code), theirs.index(code)) for code in common]
+    pairs = np.array(indices, dtype=np.int64).reshape(-1, 2)
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
-    notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
-    shortage = (
-        f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
-        f"the view {shown[1]}"
-    )
-    return Pairing(pairs, shortage if len(common) < LEAST_MARKS else "", notes)
+    notes = tuple[str, ...]()
+    if twice:
+        notes = (f"codes seen more than once in a view, not used: {shown[2]}",)
+    shortage = ""
+    if len(common) < LEAST_MARKS:
+        shortage = (
+            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
+            f"the view {shown[1]}"
+        )
+    return Pairing(pairs, shortage, notes)
 
 
 class _Side:
-    """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n) with
-    ``variances`` (n, n), and ``worst`` (n,), each place's variance in its worst direction."""
+    """The n marks of one view."""
 
     def __init__(self, marks: Sequence[Mark]) -> None:
         self.places = np.stack([mark.centre_m for mark in marks])
+        """(n, 3): their centres."""
         self.normals = np.stack([mark.normal for mark in marks])
+        """(n, 3): of the surface there."""
         covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
         offsets = self.places[:, None] - self.places[None]
         self.distances = np.linalg.norm(offsets, axis=-1)
+        """(n, n): between the marks."""
         along = offsets / np.maximum(self.distances, 1e-12)[..., None]
         variances = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
-        self.variances, self.worst = variances + variances.T, np.linalg.eigvalsh(covariances)[:, -1]
+        self.variances = variances + variances.T
+        """(n, n): of the distances."""
+        self.worst = np.linalg.eigvalsh(covariances)[:, -1]
+        """(n,): variance of each place in its worst direction."""
 
     def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of
@@ -215,9 +236,10 @@ def _solutions(fewer_side: _Side, larger_side: _Side) -> list[Solution]:
     # first, and for an odd number the last mark with both marks of the first pair
     pairs: list[tuple[int, int]] = []
     free = set(range(n))
-    for i, j in sorted(
+    longest_first = sorted(
         combinations(range(n), 2), key=lambda pair: (-fewer_side.distances[pair], pair)
-    ):
+    )
+    for i, j in longest_first:
         if i in free and j in free:
             pairs.append((i, j))
             free -= {i, j}
@@ -233,14 +255,12 @@ def _solutions(fewer_side: _Side, larger_side: _Side) -> list[Solution]:
     ]
     # leave out solutions that place the marks like a better one, to within half the distance
     # between neighbours
-    limit = (fewer_side.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
+    limit = fewer_side.distances[~np.eye(n, dtype=bool)].min() / 2
     kept: list[Solution] = []
     for solution in sorted(credible, key=lambda s: (s[0].count(-1), s[2], s[0])):
         placed = transform_points(solution[1], fewer_side.places)
-        if all(
-            np.linalg.norm(placed - transform_points(T, fewer_side.places), axis=1).max() > limit
-            for _, T, _ in kept
-        ):
+        offsets = [placed - transform_points(T, fewer_side.places) for _, T, _ in kept]
+        if all(np.linalg.norm(offset, axis=1).max() > limit for offset in offsets):
             kept.append(solution)
     return kept
 
@@ -272,9 +292,8 @@ def _holding(fewer_side: _Side, larger_side: _Side, i: int, j: int, least: int) 
     expected = np.einsum("kij,nj->kni", axes_there, local) + middle_there[:, None, :]
     off = np.linalg.norm(expected[:, :, None, :] - larger_side.places[None, None], axis=-1)
     worst = fewer_side.worst[:, None] + larger_side.worst[None]
-    consistent &= off < 0.5 * np.linalg.norm(local[:, 1:], axis=-1)[
-        :, None
-    ] + DISTANCE_SIGMAS * np.sqrt(worst)
+    height = np.linalg.norm(local[:, 1:], axis=-1)[:, None]
+    consistent &= off < 0.5 * height + DISTANCE_SIGMAS * np.sqrt(worst)
     partner = _mutual(np.where(consistent, off, np.inf))
     partner = partner[(partner >= 0).sum(axis=1) >= least]
     for _ in range(2):
@@ -282,25 +301,21 @@ def _holding(fewer_side: _Side, larger_side: _Side, i: int, j: int, least: int) 
         # transform
         if len(partner) == 0:
             return []
-        weights = np.where(
-            partner >= 0, 1.0 / (fewer_side.worst[None] + larger_side.worst[partner]), 0.0
-        )
-        T = kabsch(
-            np.broadcast_to(fewer_side.places, (*partner.shape, 3)),
-            larger_side.places[partner],
-            weights,
-        )
+        precision = 1.0 / (fewer_side.worst[None] + larger_side.worst[partner])
+        weights = np.where(partner >= 0, precision, 0.0)
+        from_m = np.broadcast_to(fewer_side.places, (*partner.shape, 3))
+        T = kabsch(from_m, larger_side.places[partner], weights)
         placed = np.einsum("kij,nj->kni", T[:, :3, :3], fewer_side.places) + T[:, None, :3, 3]
-        square = ((placed[:, :, None, :] - larger_side.places[None, None]) ** 2).sum(
-            axis=-1
-        ) / worst
+        offset = placed[:, :, None, :] - larger_side.places[None, None]
+        square = (offset**2).sum(axis=-1) / worst
         partner = _mutual(np.where(square < FIT_CHI2, square, np.inf))
         squares = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
         count = (partner >= 0).sum(axis=1)
         misfit = np.where(partner >= 0, squares, 0.0).sum(axis=1) / np.maximum(count, 1)
-        T = T[count >= least]
-        partner = partner[count >= least]
-        misfit = misfit[count >= least]
+        enough = count >= least
+        T = T[enough]
+        partner = partner[enough]
+        misfit = misfit[enough]
     return [
         (tuple(row), transform, value)
         for row, transform, value in zip(partner.tolist(), T, misfit, strict=True)
