@@ -4,7 +4,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
-def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def kabsch(
+    from_m: np.ndarray,
+    to_m: np.ndarray,
+    weights: np.ndarray,
+) -> np.ndarray:
     """Return the proper least-squares rigid transforms (..., 4, 4) of points (..., n, 3) onto
     (..., n, 3), with ``weights`` (..., n) of 0 or more. The rotation of points on a line about it
     is undetermined and arbitrary."""

@@ -120,7 +120,11 @@ def between_views(
 
 
 def _law(
-    first: np.ndarray, unit: np.ndarray, distance: np.ndarray, target: np.ndarray, may_vanish: bool
+    first: np.ndarray,
+    unit: np.ndarray,
+    distance: np.ndarray,
+    target: np.ndarray,
+    may_vanish: bool,
 ) -> tuple[float, float, float, float]:
     """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the
     law with the least chi square plus Schwarz's penalty: none (if it ``may_vanish``), ``first``
@@ -332,7 +336,9 @@ def fuse(
         projection="parallel",
         mean_variance_m2=fused.variance_m2 if len(views) > 1 else None,
         map_views=MapViews(
-            np.stack([view.T_map_view for view in placed]), shares, (pixel_m[0], pixel_m[1])
+            np.stack([view.T_map_view for view in placed]),
+            shares,
+            (pixel_m[0], pixel_m[1]),
         ),
     )
     return merged, T_reference_map, fused, _notes(views, fused)
@@ -377,7 +383,10 @@ def _median(values: np.ndarray) -> float:
 
 
 def _registration_variance(
-    view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
+    view: placing.ChosenView,
+    points_m: np.ndarray,
+    along: np.ndarray,
+    T_reference_map: np.ndarray,
 ) -> np.ndarray:
     """Return the variance (h, w) that the registration gives to displacements w x (p - centre) + t
     of points (h, w, 3) along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0
@@ -417,7 +426,9 @@ def _notes(views: Sequence[placing.ChosenView], surface_map: SurfaceMap) -> tupl
 
 
 def depth_noise(
-    cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray
+    cloud: Cloud,
+    inside: np.ndarray,
+    deviation_m: np.ndarray,
 ) -> tuple[np.ndarray, bool]:
     """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if
     it comes from the sample variances of repeated frames inside the target. The law is v = k q + c

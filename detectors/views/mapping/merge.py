@@ -127,7 +127,12 @@ def _crossings(
             return geometry.Image(core.Tensor(np.ascontiguousarray(values)))
 
         field = geometry.VoxelBlockGrid(
-            names, [core.float32] * len(names), channels, voxel, BLOCK, BLOCKS_AT_FIRST
+            names,
+            [core.float32] * len(names),
+            channels,
+            voxel,
+            BLOCK,
+            BLOCKS_AT_FIRST,
         )
         for view in views:
             z, rgb, matrix = _undistorted(view)
@@ -157,7 +162,10 @@ def _crossings(
 
 
 def _facing(
-    views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarray, pitch_m: float
+    views: Sequence[ChosenView],
+    points_m: np.ndarray,
+    normals: np.ndarray,
+    pitch_m: float,
 ) -> np.ndarray:
     """Return (n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface
     of all targets."""
@@ -235,7 +243,9 @@ def prepare(view: View, config: MappingConfig) -> PreparedView:
 
 
 def merge(
-    views: Sequence[PreparedView], registrations: Sequence[Registration], config: AnyMerge
+    views: Sequence[PreparedView],
+    registrations: Sequence[Registration],
+    config: AnyMerge,
 ) -> Merged:
     """Merge the views, or the single view, whose registration did not fail. Raises UserError if no
     view is left, or if the settings ask for too many cells."""

@@ -71,7 +71,11 @@ class Raster:
 
 
 def raster_between(
-    sample_xy: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid
+    sample_xy: np.ndarray,
+    valid: np.ndarray,
+    organised: bool,
+    spacing: float,
+    grid: CellGrid,
 ) -> Raster:
     """Return the `Raster` of a grid over the ``valid`` samples at ``places`` (v, u, 2), on a pixel
     grid or not (v = 1). Cells larger than ``spacing``, that of the samples, are divided into
@@ -136,7 +140,10 @@ def _of_points(sample_xy: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _fill(
-    sample_xy: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares: np.ndarray
+    sample_xy: np.ndarray,
+    triangles: np.ndarray,
+    corners: np.ndarray,
+    shares: np.ndarray,
 ) -> None:
     """Give each triangle (t, 3) the cells that no earlier triangle has; ``places`` (n, 2) in
     cells."""
@@ -271,7 +278,11 @@ def common_surface(views: Sequence[ChosenView], T_reference_map: np.ndarray) -> 
     return fit_surface(x, y, z, SurfaceConfig())
 
 
-def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> PlacedView:
+def place(
+    view: ChosenView,
+    T_reference_map: np.ndarray,
+    surface: Surface,
+) -> PlacedView:
     """Follow each pixel's ray from its point to the surface in two steps; the remaining error is
     the squared slope of the surface times the deviation (0.3 % of it at 3 degrees). Pixel sizes
     are medians; without a grid, points count as if on a square grid. A pixel is the parallelogram
@@ -339,5 +350,8 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
             fix=fix,
         )
     return CellGrid(
-        float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns))
+        float(first[0] * step),
+        float(first[1] * step),
+        float(step),
+        (int(rows), int(columns)),
     )

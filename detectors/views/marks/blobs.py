@@ -61,7 +61,9 @@ def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stand_out(
-    features: np.ndarray, rounding: np.ndarray, xy: np.ndarray
+    features: np.ndarray,
+    rounding: np.ndarray,
+    xy: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (n,) of pixels from the target's own colour: in deviations of its
     scatter (the contrast), and in units of the threshold (the margin). ``features`` (n, p), p 1 or
@@ -162,7 +164,11 @@ class Blob:
     """That it is cut, else empty."""
 
 
-def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
+def find_blobs(
+    cloud: Cloud,
+    inside: np.ndarray,
+    coloured: np.ndarray,
+) -> list[Blob]:
     """Return the connected groups of ``coloured`` (h, w) pixels, largest first; single missing
     pixels do not separate them. Whether rims have mixed colours is a property of the camera, so it
     is decided for all groups together."""
@@ -279,7 +285,11 @@ def _window(
     return share[rim], settled
 
 
-def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _evenly_lit(
+    rgb: np.ndarray,
+    ring: np.ndarray,
+    group: np.ndarray,
+) -> np.ndarray:
     """Return colours (h, w, 3) as if the light at the group's middle fell everywhere: each channel
     is divided by a plane fitted to the ring. Otherwise uneven light along a group would weight its
     two ends differently."""

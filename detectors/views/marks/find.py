@@ -73,7 +73,10 @@ class Patch:
         return np.asarray(points_m * scale[:, None])
 
     def range_covariance_m2(
-        self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray
+        self,
+        centre_m: np.ndarray,
+        cloud: Cloud,
+        pixels: np.ndarray,
     ) -> np.ndarray:
         """Return the covariance (3, 3) of a centre (3,) on the plane from its pixels' mean z (n,):
         from the largest of scatter about the plane, the frames' noise and a map's variance;
@@ -147,7 +150,11 @@ def fit_patch(points_m: np.ndarray) -> Patch | None:
     )
 
 
-def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
+def place_spot(
+    cloud: Cloud,
+    blob: Blob,
+    patch: Patch,
+) -> Spot:
     """Return the place of a blob whose surroundings lie on a plane."""
     pixels = blob.pixels
     weights = blob.weights
@@ -199,7 +206,11 @@ doubt."""
 HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 
 
-def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
+def coded_marks(
+    cloud: Cloud,
+    inside: np.ndarray,
+    dictionary: str,
+) -> MarkSet:
     """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one
     code are in doubt."""
     assert cloud.rgb is not None
@@ -225,7 +236,11 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
 
 
 def _coded_mark(
-    cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool
+    cloud: Cloud,
+    inside: np.ndarray,
+    code: int,
+    corners: np.ndarray,
+    twice: bool,
 ) -> Mark | None:
     """Return the tag as a mark; None if it lies off the target or has no range."""
     area = np.zeros(inside.shape, dtype=np.uint8)
@@ -301,7 +316,9 @@ LARGEST_SHARE = 0.15
 
 
 def find_marks(
-    cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks
+    cloud: Cloud,
+    inside: np.ndarray,
+    config: RedMarks | ColourMarks | CodedMarks,
 ) -> MarkSet:
     """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. It raises for
     no picture; a set that cannot support a registration says so in its ``problem``."""
@@ -349,7 +366,9 @@ def find_marks(
 
 
 def _standing_out(
-    cloud: Cloud, inside: np.ndarray, feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    cloud: Cloud,
+    inside: np.ndarray,
+    feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
 ) -> tuple[MarkSet, float]:
     """Find the marks by one feature of the colours; return them and the median margin of the
     trusted marks' pixels."""
@@ -375,7 +394,12 @@ def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
     return np.unique(np.concatenate([np.zeros(0, np.int64), *pixels]))
 
 
-def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
+def _marks(
+    cloud: Cloud,
+    inside: np.ndarray,
+    coloured: np.ndarray,
+    missing: str,
+) -> MarkSet:
     """Return the marks among coloured pixels, in the order of their pixels; ``missing`` says why
     there are not more."""
     points_m = cloud.points_m.reshape(-1, 3)
@@ -437,7 +461,11 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 
 
-def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
+def _mark(
+    spot: Spot,
+    usual_m: np.ndarray | None,
+    n_target: int,
+) -> Mark:
     """Return the spot as a mark, with its doubt. ``usual_m`` (3,): usual sizes. ``n_target``: the
     target's pixels."""
     doubt = spot.blob.doubt

@@ -57,7 +57,10 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         placement = _placed(fixed, moved, 0.0)
     except np.linalg.LinAlgError:
         return registered.failed(
-            view, "marks", guess, problem or "the matched marks do not determine the rotation"
+            view,
+            "marks",
+            guess,
+            problem or "the matched marks do not determine the rotation",
         )
     half_freedom = (3 * len(fixed) - 6) / 2
     residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
@@ -129,7 +132,11 @@ def _matched(
     return tuple(fixed[k] for k in i), tuple(moved[k] for k in j), pairing.problem, pairing.notes
 
 
-def _placed(fixed: Sequence[Mark], moved: Sequence[Mark], shared_m: float) -> Placement:
+def _placed(
+    fixed: Sequence[Mark],
+    moved: Sequence[Mark],
+    shared_m: float,
+) -> Placement:
     """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis
     of each mark."""
     extra = shared_m**2 * np.eye(3)
@@ -216,7 +223,9 @@ class JointState:
     def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return the (n, 10) terms of the cubic."""
         products = np.polynomial.chebyshev.chebvander2d(
-            x_m / self.half_m[0], y_m / self.half_m[1], [DEGREE, DEGREE]
+            x_m / self.half_m[0],
+            y_m / self.half_m[1],
+            [DEGREE, DEGREE],
         )
         return np.asarray(products[:, [i * (DEGREE + 1) + j for i, j in TERMS]])
 
@@ -246,7 +255,10 @@ class JointState:
         poses, surface, marks, view_terms = self.split(np.arange(size))
 
         def add(
-            columns: np.ndarray, rows: np.ndarray, residual: np.ndarray, weight: np.ndarray
+            columns: np.ndarray,
+            rows: np.ndarray,
+            residual: np.ndarray,
+            weight: np.ndarray,
         ) -> None:
             weighted = rows * weight[:, None] if weight.ndim == 1 else weight @ rows
             matrix[np.ix_(columns, columns)] += rows.T @ weighted

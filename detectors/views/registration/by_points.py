@@ -45,7 +45,9 @@ CONVERGED_PITCHES = 0.05
 
 
 def register_by_icp(
-    reference: PreparedView, view: PreparedView, config: IcpRegistration
+    reference: PreparedView,
+    view: PreparedView,
+    config: IcpRegistration,
 ) -> registered.Registration:
     """Return the registration of a view to the reference by ICP of their fiducial clouds or
     targets."""
@@ -111,7 +113,11 @@ def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
     return tuple(limits)
 
 
-def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(
+    tree: Any,
+    moved_m: np.ndarray,
+    limit_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return vectors (n, 3) to the partners, zero without one, and the mask (n,) of points that
     have a partner."""
     distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
@@ -120,7 +126,12 @@ def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, 
     return np.where(paired[:, None], moved_m - partners, 0.0), paired
 
 
-def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) -> np.ndarray:
+def _covariance(
+    tree: Any,
+    moved_m: np.ndarray,
+    limit_m: float,
+    pitch_m: float,
+) -> np.ndarray:
     """Return the covariance (6, 6) of the pose, as in `Registration`, about the moved points'
     centroid: H^-1 S H^-1. H is the cost's curvature with new pairs, by differences over one pitch
     (Bengtsson & Baerveldt, Robotics and Autonomous Systems 44:29, 2003); with fixed pairs, the
@@ -253,7 +264,9 @@ def coherent_point_drift(
 
 
 def register_by_cpd(
-    reference: PreparedView, view: PreparedView, config: CpdRegistration
+    reference: PreparedView,
+    view: PreparedView,
+    config: CpdRegistration,
 ) -> registered.Registration:
     """Return the registration of a view to the reference by coherent point drift of their fiducial
     clouds or targets. At the limit of iterations it fails only if its last step still moved the
@@ -287,7 +300,10 @@ def register_by_cpd(
 
 
 def drift_covariance(
-    fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float
+    fixed_m: np.ndarray,
+    moved_m: np.ndarray,
+    drift: Drift,
+    pitch_m: float,
 ) -> np.ndarray:
     """Return the covariance (6, 6) of the pose, as in `Registration`, about the fixed cloud's
     centroid: H^-1 S H^-1. H is the observed information (Louis, JRSS B 44:226, 1982); S is the
@@ -319,7 +335,10 @@ def drift_covariance(
 
 
 def posterior_moments(
-    fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
+    fixed: np.ndarray,
+    moving: np.ndarray,
+    variance: float,
+    background: float,
 ) -> tuple[np.ndarray, float]:
     """Return posterior sums (n, 4, 4) of (y, 1)(y, 1)' over the moving points y (m, 3) for each
     fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the
@@ -374,17 +393,29 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     with open3d_on_one_thread() as o3d:
         methods = o3d.pipelines.odometry
         camera = o3d.camera.PinholeCameraIntrinsic(
-            width, height, canvas.fx, canvas.fy, canvas.cx, canvas.cy
+            width,
+            height,
+            canvas.fx,
+            canvas.fy,
+            canvas.cx,
+            canvas.cy,
         )
         option = methods.OdometryOption(
-            depth_diff_max=DEPTH_DIFFERENCE_M, depth_min=0.0, depth_max=1e3
+            depth_diff_max=DEPTH_DIFFERENCE_M,
+            depth_min=0.0,
+            depth_max=1e3,
         )
         term = methods.RGBDOdometryJacobianFromHybridTerm()
         images = [_image(o3d, view, canvas) for view in views]
         for before, now, view in zip(images, images[1:], views[1:], strict=False):
             if not lost:
                 success, step, information = methods.compute_rgbd_odometry(
-                    now, before, camera, np.eye(4), term, option
+                    now,
+                    before,
+                    camera,
+                    np.eye(4),
+                    term,
+                    option,
                 )
                 # the information's last diagonal element is the sum of 1 over pairs
                 pairs = (
@@ -408,7 +439,11 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     return registrations
 
 
-def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
+def _image(
+    o3d: Any,
+    view: PreparedView,
+    canvas: Lens,
+) -> Any:
     """Return the view's target as Open3D's intensity and depth on the canvas, both without
     distortion."""
     cloud = view.view.cloud

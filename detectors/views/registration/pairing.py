@@ -47,7 +47,10 @@ class Placement:
 
 
 def place(
-    from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_spread_m2: np.ndarray
+    from_m: np.ndarray,
+    from_spread_m2: np.ndarray,
+    to_m: np.ndarray,
+    to_spread_m2: np.ndarray,
 ) -> Placement:
     """Find the most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3,
     3), n >= 3. Raises numpy.linalg.LinAlgError if the points leave it undetermined (two, or all on
@@ -119,7 +122,9 @@ class Pairing:
 
 
 def pair_marks(
-    reference: Sequence[Mark], view: Sequence[Mark], T_reference_view_guess: np.ndarray | None
+    reference: Sequence[Mark],
+    view: Sequence[Mark],
+    T_reference_view_guess: np.ndarray | None,
 ) -> Pairing:
     """Match the marks of two views by the placement that is best in number of pairs, fit and
     closeness to the guess."""
@@ -265,7 +270,13 @@ def _solutions(fewer_side: _Side, larger_side: _Side) -> list[Solution]:
     return kept
 
 
-def _holding(fewer_side: _Side, larger_side: _Side, i: int, j: int, least: int) -> list[Solution]:
+def _holding(
+    fewer_side: _Side,
+    larger_side: _Side,
+    i: int,
+    j: int,
+    least: int,
+) -> list[Solution]:
     """Return the solutions with at least ``least`` pairs in which marks i and j of the smaller set
     have partners."""
     mismatch = np.abs(larger_side.distances - fewer_side.distances[i, j])
@@ -276,12 +287,10 @@ def _holding(fewer_side: _Side, larger_side: _Side, i: int, j: int, least: int) 
     # partners (k, n) that lie as far from both partners (k,) of the pair as they should ...
     consistent = np.ones((len(a), len(fewer_side.places), len(larger_side.places)), dtype=bool)
     for mark, partner in ((i, a), (j, b)):
-        off = np.abs(
-            fewer_side.distances[mark][None, :, None] - larger_side.distances[partner][:, None, :]
-        )
-        variance = (
-            fewer_side.variances[mark][None, :, None] + larger_side.variances[partner][:, None, :]
-        )
+        expected = fewer_side.distances[mark][None, :, None]
+        off = np.abs(expected - larger_side.distances[partner][:, None, :])
+        variance = fewer_side.variances[mark][None, :, None]
+        variance = variance + larger_side.variances[partner][:, None, :]
         # a mark's distance to itself is exactly 0 on both sides
         consistent &= off <= DISTANCE_SIGMAS * np.sqrt(variance)
     # ... on the side of the line through them that the normals indicate: the mirror image beyond

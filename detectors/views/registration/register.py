@@ -131,7 +131,9 @@ def _agreement(
 
 
 def judge(
-    registration: registered.Registration, reference: PreparedView, view: PreparedView
+    registration: registered.Registration,
+    reference: PreparedView,
+    view: PreparedView,
 ) -> registered.Registration:
     """Return the registration with its overlap and, if it cannot be trusted, a ``failure`` or
     note."""
@@ -180,7 +182,9 @@ def judge(
 
 
 def _jump(
-    registration: registered.Registration, reference: PreparedView, view: PreparedView
+    registration: registered.Registration,
+    reference: PreparedView,
+    view: PreparedView,
 ) -> str:
     """Return the reason why a pose is too far from its guess to be credible; empty if it is
     credible."""
@@ -234,7 +238,11 @@ def _widened(
     covariance explains, is added to the shift, across the surface and within it. An offset of a
     whole view does not show."""
 
-    def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
+    def beyond_m(
+        measured_m: float,
+        explained_m: float,
+        scatter: float,
+    ) -> float:
         if not measured_m > explained_m * (1 + scatter):
             return 0.0
         return float(np.sqrt(measured_m**2 - explained_m**2))
@@ -326,7 +334,9 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
 
 
 def _pair(
-    reference: PreparedView, view: PreparedView, config: AnyRegistration
+    reference: PreparedView,
+    view: PreparedView,
+    config: AnyRegistration,
 ) -> registered.Registration:
     """Return the registration of a view to the reference, not judged yet."""
     started = perf_counter()
@@ -340,6 +350,8 @@ def _pair(
         # the quality of the guess is unknown
         guess = registered.guess_of(reference, view)
         registration = registered.Registration(
-            view.view.name, "nominal", np.eye(4) if guess is None else guess
+            view.view.name,
+            "nominal",
+            np.eye(4) if guess is None else guess,
         )
     return replace(registration, seconds=perf_counter() - started)

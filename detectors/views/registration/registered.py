@@ -87,7 +87,9 @@ def guess_of(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
 
 
 def predicted_error_m(
-    registration: Registration, points_m: np.ndarray, normal: np.ndarray
+    registration: Registration,
+    points_m: np.ndarray,
+    normal: np.ndarray,
 ) -> tuple[float, float]:
     """Return the root mean square target registration error over points (n, 3) of the reference
     frame that the covariance predicts, in the plane normal to the unit vector ``normal`` (3,) and
@@ -100,7 +102,10 @@ def predicted_error_m(
 
 
 def clustered_sandwich(
-    curvature: np.ndarray, scores: np.ndarray, points_m: np.ndarray, pitch_m: float
+    curvature: np.ndarray,
+    scores: np.ndarray,
+    points_m: np.ndarray,
+    pitch_m: float,
 ) -> np.ndarray:
     """Return the covariance (6, 6) H^-1 S H^-1; S is the sum over cubes of points (n, 3) of the
     outer square of their summed scores (n, 6). ``curvature`` H (6, 6) and ``scores`` belong to the
@@ -199,7 +204,9 @@ def thinned(points_m: np.ndarray, limit: int = THINNED_POINTS) -> np.ndarray:
 
 
 def clouds_of(
-    reference: PreparedView, view: PreparedView, points: Literal["marks", "target"]
+    reference: PreparedView,
+    view: PreparedView,
+    points: Literal["marks", "target"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
     """Return the points to register, of the fiducials or of the whole target: the reference's and
     the view's, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4); a note without one; and

@@ -101,7 +101,9 @@ def test_tags_that_are_cut_or_lack_range_are_in_doubt():
     v, u = np.divmod(complete[7].pixels, 400)
     points[v.min() : int(np.quantile(v, 0.2)), u.min() : u.max() + 1] = np.nan
     marks = find_marks(
-        replace(cloud, points_m=points), inside & np.isfinite(points[..., 2]), CodedMarks()
+        replace(cloud, points_m=points),
+        inside & np.isfinite(points[..., 2]),
+        CodedMarks(),
     )
     doubts = {mark.code: mark.doubt for mark in marks.marks}
     assert doubts[3].endswith("beyond the crop's edge")

@@ -43,7 +43,11 @@ def two_lamps(scaled: np.ndarray) -> np.ndarray:
     return 0.7 * np.stack([1.2 - 0.5 * u, np.ones_like(u), 0.9 + 0.4 * u], axis=-1)
 
 
-def photographed(cloud: Cloud, rng: np.random.Generator, quality: int = 80) -> Cloud:
+def photographed(
+    cloud: Cloud,
+    rng: np.random.Generator,
+    quality: int = 80,
+) -> Cloud:
     assert cloud.rgb is not None
     noisy = np.clip(np.rint(cloud.rgb + 3.0 * rng.standard_normal(cloud.rgb.shape)), 0, 255).astype(
         np.uint8
@@ -135,7 +139,12 @@ def test_holes_that_show_a_backing_of_another_colour_are_no_marks(backing):
     ],
 )
 @pytest.mark.slow  # a Monte Carlo campaign
-def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg, half_size):
+def test_the_stated_covariance_is_that_of_the_errors(
+    sigma_m,
+    samples,
+    turn_deg,
+    half_size,
+):
     rng = random_stream(4, "covariance", sigma_m, samples)
     squares = []
     across = []
@@ -144,7 +153,11 @@ def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg,
         T = board_pose(*rng.uniform(-15, 15, 2), rng.uniform(-turn_deg, turn_deg))
         T[:3, 3] += rng.uniform(-2e-3, 2e-3, 3)
         cloud = marked_cloud(
-            T, strips(half_size=half_size), rng=rng, samples=samples, sigma_m=sigma_m
+            T,
+            strips(half_size=half_size),
+            rng=rng,
+            samples=samples,
+            sigma_m=sigma_m,
         )
         for mark in find_marks(cloud, everywhere(cloud), ColourMarks()).trusted:
             position = transform_points(invert(T), mark.centre_m)
@@ -195,7 +208,9 @@ def test_a_mark_cut_by_the_crop_or_the_picture_is_in_doubt_and_the_rest_is_not()
         **{name: getattr(cloud, name)[:, columns[3] :] for name in ("points_m", "reason", "count")},
     )
     edge = replace(
-        edge, variance_m2=cloud.variance_m2[:, columns[3] :], rgb=cloud.rgb[:, columns[3] :]
+        edge,
+        variance_m2=cloud.variance_m2[:, columns[3] :],
+        rgb=cloud.rgb[:, columns[3] :],
     )  # type: ignore[index]
     doubts = [mark.doubt for mark in find_marks(edge, everywhere(edge), ColourMarks()).marks]
     assert doubts.count("cut by the picture's edge") == 2
@@ -204,7 +219,7 @@ def test_a_mark_cut_by_the_crop_or_the_picture_is_in_doubt_and_the_rest_is_not()
 def test_a_mark_without_range_in_a_part_is_in_doubt():
     cloud = marked_cloud(board_pose(0.0, 0.0), strips(), rng=random_stream(7, "no range"))
     assert cloud.rgb is not None
-    v, u = (axis[0] for axis in np.nonzero((cloud.rgb == RED).all(axis=-1)))
+    v, u = np.argwhere((cloud.rgb == RED).all(axis=-1))[0]
     points = cloud.points_m.copy()
     points[v : v + 5, u : u + 12] = np.nan
     lost = replace(cloud, points_m=points)
@@ -254,7 +269,8 @@ def test_no_colour_and_no_target_are_said():
 
 def test_the_same_cloud_gives_the_same_bits():
     cloud = marked_cloud(board_pose(), strips(wood=WOOD), rng=random_stream(11, "twice"), samples=2)
-    first, second = (find_marks(cloud, everywhere(cloud), ColourMarks()) for _ in range(2))
+    first = find_marks(cloud, everywhere(cloud), ColourMarks())
+    second = find_marks(cloud, everywhere(cloud), ColourMarks())
     for a, b in zip(first.marks, second.marks, strict=True):
         np.testing.assert_array_equal(a.centre_m, b.centre_m)
         np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)

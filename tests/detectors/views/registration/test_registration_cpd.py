@@ -37,14 +37,24 @@ def transform(
     return T
 
 
-def dense_posterior(fixed: np.ndarray, moving: np.ndarray, variance: float, w: float) -> np.ndarray:
+def dense_posterior(
+    fixed: np.ndarray,
+    moving: np.ndarray,
+    variance: float,
+    w: float,
+) -> np.ndarray:
     """Equation 6 of Myronenko & Song: (m, n), moving by fixed."""
     gauss = np.exp(-cdist(moving, fixed, "sqeuclidean") / (2 * variance))
     uniform = (2 * np.pi * variance) ** 1.5 * w / (1 - w) * len(moving) / len(fixed)
     return gauss / (gauss.sum(axis=0) + uniform)
 
 
-def dense_cpd(fixed: np.ndarray, moving: np.ndarray, w: float, iterations: int) -> np.ndarray:
+def dense_cpd(
+    fixed: np.ndarray,
+    moving: np.ndarray,
+    w: float,
+    iterations: int,
+) -> np.ndarray:
     """Figure 2 of the paper with s = 1, in the normalised units of the module under test."""
     middle = fixed.mean(axis=0)
     scale = np.sqrt(np.mean(np.sum((fixed - middle) ** 2, axis=1)))
@@ -101,7 +111,10 @@ def test_every_iteration_is_that_of_a_dense_implementation(w):
         result = coherent_point_drift(fixed, moving, config)
         assert result.iterations == iterations
         np.testing.assert_allclose(
-            result.T_fixed_moving, dense_cpd(fixed, moving, w, iterations), rtol=0, atol=1e-9
+            result.T_fixed_moving,
+            dense_cpd(fixed, moving, w, iterations),
+            rtol=0,
+            atol=1e-9,
         )
 
 
@@ -111,7 +124,11 @@ def test_every_iteration_is_that_of_a_dense_implementation(w):
     seed=st.integers(0, 5),
 )
 @settings(max_examples=8, deadline=None)
-def test_known_transforms_come_back_through_outliers(turn, shift, seed):
+def test_known_transforms_come_back_through_outliers(
+    turn,
+    shift,
+    seed,
+):
     T = transform(turn, shift)
     fixed = cloud(150, seed)
     moving = transform_points(np.linalg.inv(T), fixed)
@@ -160,14 +177,18 @@ def test_only_the_turn_of_the_guess_matters():
     far = transform((0, 0, 0), (3.0, -2.0, 1.0)) @ start
     from_guess = coherent_point_drift(fixed, moving, EXACT, start).T_fixed_moving
     np.testing.assert_allclose(
-        coherent_point_drift(fixed, moving, EXACT, far).T_fixed_moving, from_guess, atol=1e-9
+        coherent_point_drift(fixed, moving, EXACT, far).T_fixed_moving,
+        from_guess,
+        atol=1e-9,
     )
     np.testing.assert_allclose(transform_points(from_guess, moving), fixed, atol=1e-5)
 
 
 def test_equal_clouds_end_at_once_and_stay():
     result = coherent_point_drift(
-        cloud(50), cloud(50), CpdRegistration(outlier_ratio=0.0, max_iterations=1000)
+        cloud(50),
+        cloud(50),
+        CpdRegistration(outlier_ratio=0.0, max_iterations=1000),
     )
     assert result.converged
     np.testing.assert_allclose(result.T_fixed_moving, np.eye(4), atol=1e-9)
@@ -222,6 +243,9 @@ def test_points_all_over_a_flat_disc_hold_no_turn():
     moving = disc[1500:]
     drift = coherent_point_drift(fixed, moving, CpdRegistration())
     covariance = drift_covariance(
-        fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch_m=0.004
+        fixed,
+        transform_points(drift.T_fixed_moving, moving),
+        drift,
+        pitch_m=0.004,
     )
     assert np.isnan(covariance).all() or np.sqrt(covariance[2, 2]) > np.deg2rad(2)

@@ -20,14 +20,20 @@ POSES = [
 ]
 
 
-def across_error(registration: Registration, reference, view) -> float:
+def across_error(
+    registration: Registration,
+    reference,
+    view,
+) -> float:
     return target_error_m(registration, reference, view)[1]
 
 
 def test_without_noise_the_surfaces_meet_to_a_micrometre():
     created = views(POSES, guess_error=usual_error())
     for result, view in zip(
-        register_jointly([board.prepared for board in created]), created[1:], strict=True
+        register_jointly([board.prepared for board in created]),
+        created[1:],
+        strict=True,
     ):
         assert not result.failure and result.converged and result.method == "joint"
         assert across_error(result, created[0], view) < 2e-6
@@ -67,10 +73,14 @@ def smooth_error_repeats(repeats: int) -> np.ndarray:
             for i, T in enumerate(poses)
         ]
         for result, view in zip(
-            register_jointly([board.prepared for board in created]), created[1:], strict=True
+            register_jointly([board.prepared for board in created]),
+            created[1:],
+            strict=True,
         ):
             _, predicted = predicted_error_m(
-                result, created[0].prepared.points_m[::40], created[0].T_camera_board[:3, 2]
+                result,
+                created[0].prepared.points_m[::40],
+                created[0].T_camera_board[:3, 2],
             )
             squares.append((across_error(result, created[0], view) / predicted) ** 2)
     return np.array(squares)
@@ -91,7 +101,9 @@ def test_a_view_whose_marks_fail_takes_no_part():
     good = register_jointly([created[0].prepared, created[2].prepared])[0]
     spoilt = created[1].prepared
     hidden = PreparedView(
-        spoilt.view, spoilt.inside, MarkSet((), np.empty(0, int), "no mark found, 3 needed")
+        spoilt.view,
+        spoilt.inside,
+        MarkSet((), np.empty(0, int), "no mark found, 3 needed"),
     )
     failed, result = register_jointly([created[0].prepared, hidden, created[2].prepared])
     assert "no mark found" in failed.failure and failed.method == "joint"
@@ -104,7 +116,9 @@ def test_points_count_as_fewer_than_they_are():
     created = views(POSES[:2], noise_m=1e-3)
     result = register_jointly([board.prepared for board in created])[0]
     _, across = predicted_error_m(
-        result, created[0].prepared.points_m[::40], created[0].T_camera_board[:3, 2]
+        result,
+        created[0].prepared.points_m[::40],
+        created[0].T_camera_board[:3, 2],
     )
     pixels = created[0].prepared.inside.sum()
     # two views' noise, three unknowns of which each is known to sigma / sqrt(n)
