@@ -243,6 +243,69 @@ SAMPLED = 16_384
 LEAST_M2 = 1e-14
 
 
+@dataclass(frozen=True)
+class _Observation:
+    """What one view says about the cells (h, w) of a map."""
+
+    height_m: np.ndarray
+    """(h, w): deviation from the fitted surface along z; NaN where the view has none."""
+    sensor_m2: np.ndarray
+    """(h, w): variance of the height by the sensor's noise."""
+    explained_m2: np.ndarray
+    """(h, w): variance of the height by lens and registration."""
+    look_px: np.ndarray
+    """(h, w, 2): direction in which the view sees the cell, in pixels of the first view."""
+    extras: np.ndarray
+    """(h, w, 5): samples, red, green, blue, amplitude; NaN where unknown."""
+    repeated: bool
+    """Whether the sensor's variance comes from repeated frames."""
+
+
+def _observation(
+    view: placing.PlacedView,
+    grid: placing.CellGrid,
+    points: np.ndarray,
+    gradient: np.ndarray,
+    T_reference_map: np.ndarray,
+    slope_step: float,
+) -> _Observation:
+    """Return what a view says about the cells at ``points`` (h, w, 3) of the surface, whose height
+    changes by ``gradient`` (h, w, 3) times a small displacement. ``slope_step``: a pixel of the
+    first view."""
+    cloud = view.chosen.cloud
+    inside = view.chosen.inside
+    raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
+    variance, repeated = depth_noise(cloud, inside, _roughness(view))
+    slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
+    unknown = np.full(inside.shape, np.nan)
+    colour = [unknown] * 3
+    if cloud.rgb is not None:
+        colour = list(np.moveaxis(cloud.rgb, -1, 0))
+    amplitude = unknown
+    if cloud.amplitude is not None:
+        amplitude = cloud.amplitude
+    images = (view.deviation_m, variance * slope2, cloud.count, *colour, amplitude)
+    values = raster.at_cells(np.stack([image.ravel() for image in images], axis=-1))
+    rays = points - view.T_map_view[:3, 3]
+    per_range = (rays * gradient).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+    across = np.maximum((gradient**2).sum(axis=-1) - per_range**2, 0.0)
+    correlation = _neighbour_correlation(view)
+    kept = correlation + (1.0 - correlation) * raster.concentration
+    in_view = rays @ view.T_map_view[:3, :3]
+    by_sensor = values[..., 1] * kept * per_range**2
+    by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
+    by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
+    look_px = in_view[..., :2] / in_view[..., 2:] / slope_step
+    return _Observation(
+        height_m=values[..., 0],
+        sensor_m2=by_sensor,
+        explained_m2=by_others,
+        look_px=look_px,
+        extras=values[..., 2:],
+        repeated=repeated,
+    )
+
+
 def fuse(
     views: Sequence[placing.ChosenView], cell_m: float | None
 ) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
@@ -261,50 +324,18 @@ def fuse(
     gradient = surface.gradients(x, y, grid.step)
     points = np.stack([x, y, z], axis=-1)
 
-    heights = []
-    sensor = []
-    explained = []
-    looks_px = []
-    further_values = []
-    repeated = True
+    observations = []
     for view in placed:
-        cloud = view.chosen.cloud
-        inside = view.chosen.inside
-        raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
-        variance, by_frames = depth_noise(cloud, inside, _roughness(view))
-        repeated &= by_frames
-        slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
-        unknown = np.full(inside.shape, np.nan)
-        colour = [unknown] * 3
-        if cloud.rgb is not None:
-            colour = list(np.moveaxis(cloud.rgb, -1, 0))
-        amplitude = unknown
-        if cloud.amplitude is not None:
-            amplitude = cloud.amplitude
-        images = (view.deviation_m, variance * slope2, cloud.count, *colour, amplitude)
-        values = raster.at_cells(np.stack([image.ravel() for image in images], axis=-1))
-        rays = points - view.T_map_view[:3, 3]
-        per_range = (rays * gradient).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
-        across = np.maximum((gradient**2).sum(axis=-1) - per_range**2, 0.0)
-        correlation = _neighbour_correlation(view)
-        kept = correlation + (1.0 - correlation) * raster.concentration
-        in_view = rays @ view.T_map_view[:3, :3]
-        by_sensor = values[..., 1] * kept * per_range**2
-        by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
-        by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
-        look_px = in_view[..., :2] / in_view[..., 2:] / views[0].slope_step
-        heights.append(values[..., 0])
-        sensor.append(by_sensor)
-        explained.append(by_others)
-        looks_px.append(look_px)
-        further_values.append(values[..., 2:])
-    extras = np.stack(further_values)
+        observations.append(
+            _observation(view, grid, points, gradient, T_reference_map, views[0].slope_step)
+        )
+    extras = np.stack([observation.extras for observation in observations])
     fused = combine(
-        heights=np.stack(heights),
-        sensor=np.stack(sensor),
-        explained=np.stack(explained),
-        looks_px=np.stack(looks_px),
-        repeated=repeated,
+        heights=np.stack([observation.height_m for observation in observations]),
+        sensor=np.stack([observation.sensor_m2 for observation in observations]),
+        explained=np.stack([observation.explained_m2 for observation in observations]),
+        looks_px=np.stack([observation.look_px for observation in observations]),
+        repeated=all(observation.repeated for observation in observations),
         cell_m=grid.step,
     )
 

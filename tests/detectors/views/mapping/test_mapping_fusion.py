@@ -32,9 +32,9 @@ NOISE_M = 0.5 * MM
 
 
 def fused(views: list[PreparedView], poses: list[np.ndarray], **config: float) -> Merged:
-    registrations = [reference()] + [
-        registered(view.view.name, T) for view, T in zip(views[1:], poses[1:], strict=True)
-    ]
+    registrations = [reference()]
+    for view, T in zip(views[1:], poses[1:], strict=True):
+        registrations.append(registered(view.view.name, T))
     return merge(views, registrations, FusedMerge(**config))
 
 
@@ -67,16 +67,15 @@ def test_facing_plane_is_mapped_in_the_first_cameras_own_frame() -> None:
     result = fused([seen(Plane(), np.eye(4))], [np.eye(4)])
     np.testing.assert_allclose(result.T_reference_cloud, np.eye(4), atol=1e-12)
     assert result.surface_map.cell_m == pytest.approx(PITCH_M, rel=1e-12)
-    assert (
-        result.cloud.projection == "parallel"
-        and result.cloud.organised
-        and result.cloud.lens is None
-    )
+    assert result.cloud.projection == "parallel"
+    assert result.cloud.organised
+    assert result.cloud.lens is None
     valid = result.cloud.valid
     np.testing.assert_allclose(result.cloud.points_m[valid][:, 2], DISTANCE_M, atol=1e-12)
     # cells stand at whole multiples of the pitch, half a pixel off the pixels here: 119 x 159
     # between them
-    assert valid.all() and valid.shape == (119, 159)
+    assert valid.all()
+    assert valid.shape == (119, 159)
 
 
 def test_frame_stands_before_the_place_where_the_axis_meets_a_tilted_plane() -> None:
@@ -93,7 +92,8 @@ def test_frame_stands_before_the_place_where_the_axis_meets_a_tilted_plane() -> 
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)
     # x has no part of the camera's y but what orthogonality to z asks for
     assert T[:3, 0] @ np.cross(normal, [1.0, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
-    assert T[0, 0] > 0 and T[1, 1] > 0
+    assert T[0, 0] > 0
+    assert T[1, 1] > 0
 
 
 def test_axis_that_misses_the_target_puts_the_origin_before_its_middle() -> None:
@@ -316,7 +316,8 @@ def test_what_a_cell_knows_of_its_views() -> None:
     result = fused(views, poses)
     away = np.hypot(result.cloud.points_m[..., 0], result.cloud.points_m[..., 1])
     middle = np.unravel_index(np.nanargmin(away), away.shape)
-    assert result.surface_map.seen_by.sum(axis=0)[middle] == 3 and result.cloud.count[middle] == 21
+    assert result.surface_map.seen_by.sum(axis=0)[middle] == 3
+    assert result.cloud.count[middle] == 21
     cameras = result.cloud.map_views.T_cloud_cameras[:, :3, 3]
     np.testing.assert_allclose(
         np.rad2deg(np.arctan2(cameras[:, 0], DISTANCE_M - cameras[:, 2])),

@@ -81,7 +81,8 @@ def test_boxes_of_two_clouds_by_hand() -> None:
     ]
     assert sorted(map(tuple, np.round(points, 6))) == sorted(map(tuple, expected))
     np.testing.assert_array_equal(result.T_reference_cloud, np.eye(4))
-    assert not result.cloud.organised and result.cloud.lens is None
+    assert not result.cloud.organised
+    assert result.cloud.lens is None
     assert (result.cloud.z_step_m, result.cloud.n_frames) == (1e-3, 10)
 
 
@@ -177,7 +178,8 @@ def test_volume_of_a_plane_lies_on_it(distortion: tuple[float, ...]) -> None:
         [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)],
         VolumeMerge(),
     )
-    assert not result.cloud.organised and result.cloud.valid.all()
+    assert not result.cloud.organised
+    assert result.cloud.valid.all()
     height = plane_height(result.cloud.points_m[0], result.T_reference_cloud, plane)
     # depth is looked up up to a quarter of a pixel beside its place along each axis, at incidences
     # up to 35 degrees
@@ -227,7 +229,8 @@ def test_volume_keeps_face_and_floor_apart_from_the_walls_of_a_hole() -> None:
     floor = nearby & (points[:, 2] > 0.8 * hole.depth_m)
     on_wall = nearby & (points[:, 2] > 0.25 * hole.depth_m) & (points[:, 2] < 0.75 * hole.depth_m)
     # without the rule there are more points on the walls (391) than on the floor (375)
-    assert floor.sum() > 250 and on_wall.sum() < 0.1 * floor.sum()
+    assert floor.sum() > 250
+    assert on_wall.sum() < 0.1 * floor.sum()
 
 
 def test_volume_leaves_out_what_lies_outside_the_target() -> None:
@@ -282,7 +285,8 @@ def test_nothing_left_is_a_users_error_that_names_each_view() -> None:
     failed = registered("v1", np.eye(4), failure="no overlap")
     with pytest.raises(UserError, match="no view is left") as refusal:
         merge([nowhere, views[1]], [reference(), failed], FusedMerge())
-    assert "v0" in str(refusal.value) and "no overlap" in str(refusal.value)
+    assert "v0" in str(refusal.value)
+    assert "no overlap" in str(refusal.value)
 
 
 def test_frames_left_out_of_the_views_stay_named() -> None:
@@ -339,8 +343,10 @@ def test_cells_beyond_the_samples_are_unknown_and_one_invalid_corner_costs_a_tri
     result = raster_between(np.stack([u, v], axis=-1), valid, True, 0.5, grid).at_cells(
         np.arange(16.0)
     )
-    assert np.isnan(result[0]).all() and np.isnan(result[:, 0]).all()
-    assert np.isnan(result[1, 1]) and result[2, 2] == pytest.approx(0.75 * 5)
+    assert np.isnan(result[0]).all()
+    assert np.isnan(result[:, 0]).all()
+    assert np.isnan(result[1, 1])
+    assert result[2, 2] == pytest.approx(0.75 * 5)
 
 
 def test_concentration_is_the_variance_of_white_noise() -> None:

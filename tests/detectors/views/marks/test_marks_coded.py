@@ -116,7 +116,8 @@ def test_marks_need_a_pixel_grid():
     for config in (CodedMarks(), ColourMarks()):
         assert "no pixel grid" in find_marks(cloud, cloud.valid, config).problem
     of_red = find_marks(cloud, cloud.valid, RedMarks(deviations=0.1))
-    assert "need a pixel grid" in of_red.problem and of_red.points.size
+    assert "need a pixel grid" in of_red.problem
+    assert of_red.points.size
 
 
 def test_a_dictionary_that_opencv_lacks_is_refused_with_those_it_has():

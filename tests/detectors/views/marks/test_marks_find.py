@@ -22,9 +22,8 @@ def everywhere(cloud: Cloud) -> np.ndarray:
 
 def on_board_m(marks: MarkSet, T_camera_board: np.ndarray) -> np.ndarray:
     """(n, 3) centres of the trusted marks in the board's frame, by x, then y."""
-    positions = transform_points(
-        invert(T_camera_board), np.stack([mark.centre_m for mark in marks.trusted])
-    )
+    centres = np.stack([mark.centre_m for mark in marks.trusted])
+    positions = transform_points(invert(T_camera_board), centres)
     return positions[np.lexsort((positions[:, 1], positions[:, 0] > 0))]
 
 
@@ -49,13 +48,11 @@ def photographed(
     quality: int = 80,
 ) -> Cloud:
     assert cloud.rgb is not None
-    noisy = np.clip(np.rint(cloud.rgb + 3.0 * rng.standard_normal(cloud.rgb.shape)), 0, 255).astype(
-        np.uint8
-    )
+    noisy = np.rint(cloud.rgb + 3.0 * rng.standard_normal(cloud.rgb.shape))
+    noisy = np.clip(noisy, 0, 255).astype(np.uint8)
     _, packed = cv2.imencode(".jpg", noisy[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return replace(
-        cloud, rgb=np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
-    )
+    unpacked = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+    return replace(cloud, rgb=np.ascontiguousarray(unpacked[..., ::-1]))
 
 
 @pytest.mark.parametrize(
@@ -75,9 +72,8 @@ def photographed(
 def test_tape_of_any_colour_is_found_in_uneven_coloured_light_through_jpeg(colour, light):
     rng = random_stream(1, "tapes", str(colour), light.__name__)
     T = board_pose(5.0, -8.0, 2.0)
-    cloud = photographed(
-        marked_cloud(T, strips(colour=colour), rng=rng, samples=3, light=light), rng
-    )
+    sharp = marked_cloud(T, strips(colour=colour), rng=rng, samples=3, light=light)
+    cloud = photographed(sharp, rng)
     marks = find_marks(cloud, everywhere(cloud), ColourMarks())
     assert (marks.problem, len(marks.trusted)) == ("", 4), [mark.doubt for mark in marks.marks]
     # half a pixel is 0.7 mm
@@ -161,9 +157,8 @@ def test_the_stated_covariance_is_that_of_the_errors(
         )
         for mark in find_marks(cloud, everywhere(cloud), ColourMarks()).trusted:
             position = transform_points(invert(T), mark.centre_m)
-            error = T[:3, :3] @ (
-                position - EXPECTED[np.linalg.norm(EXPECTED - position, axis=1).argmin()]
-            )
+            nearest = np.linalg.norm(EXPECTED - position, axis=1).argmin()
+            error = T[:3, :3] @ (position - EXPECTED[nearest])
             squares.append(error @ np.linalg.solve(mark.covariance_m2, error) / 3)
             across.append(error @ T[:3, 2])
             stated.append(T[:3, 2] @ mark.covariance_m2 @ T[:3, 2])
@@ -183,12 +178,8 @@ def test_averaged_frames_and_stated_variances_count():
     )
     mark = find_marks(noisy, everywhere(noisy), ColourMarks()).trusted[0]
     n = len(mark.pixels)
-    along = (
-        mark.centre_m
-        / mark.centre_m[2]
-        * mark.normal[2]
-        / (mark.normal @ mark.centre_m / mark.centre_m[2])
-    )
+    ray = mark.centre_m / mark.centre_m[2]
+    along = ray * mark.normal[2] / (mark.normal @ ray)
     depth_part = mark.normal @ np.outer(along, along) @ mark.normal * (1e-3) ** 2 * 25 / n
     # across the plane pixelation has no part
     assert mark.normal @ mark.covariance_m2 @ mark.normal == pytest.approx(depth_part, rel=1e-6)

@@ -153,7 +153,8 @@ def test_the_background_is_that_of_the_last_iteration():
     drift = coherent_point_drift(fixed, truth, CpdRegistration(max_iterations=500, tolerance=1e-13))
     moved = transform_points(drift.T_fixed_moving, truth)
     moments, _ = posterior_moments(fixed, moved, drift.sigma_m**2, drift.background)
-    assert drift.converged and drift.matched < 359
+    assert drift.converged
+    assert drift.matched < 359
     np.testing.assert_allclose(float(moments[:, 3, 3].sum()), drift.matched, rtol=0, atol=1e-9)
 
 
@@ -200,7 +201,8 @@ def test_a_loose_tolerance_stops_early_and_a_tight_one_runs_on():
     moving = transform_points(transform((5, 0, 0), (0.01, 0, 0)), cloud(100) + noise)
     loose = coherent_point_drift(fixed, moving, CpdRegistration(tolerance=0.5))
     tight = coherent_point_drift(fixed, moving, CpdRegistration(tolerance=1e-12))
-    assert loose.converged and loose.iterations < 5 < tight.iterations
+    assert loose.converged
+    assert loose.iterations < 5 < tight.iterations
 
 
 @pytest.mark.slow

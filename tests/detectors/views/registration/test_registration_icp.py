@@ -56,8 +56,11 @@ def test_a_shaped_target_is_found_from_a_usual_guess():
     wrong = by_icp.T_reference_view @ np.linalg.inv(pose() @ np.linalg.inv(pose(5, -8)))
     moved = transform_points(wrong, by_icp.centre_m) - by_icp.centre_m
     turn = Rotation.from_matrix(wrong[:3, :3]).magnitude()
-    assert np.linalg.norm(moved) < 1.5e-3 and turn * 0.1 < 1.5e-3
-    assert not by_icp.failure and by_icp.converged and by_icp.pairs > 2400
+    assert np.linalg.norm(moved) < 1.5e-3
+    assert turn * 0.1 < 1.5e-3
+    assert not by_icp.failure
+    assert by_icp.converged
+    assert by_icp.pairs > 2400
 
 
 def test_flat_marks_come_as_near_as_point_to_point_can():
@@ -65,13 +68,15 @@ def test_flat_marks_come_as_near_as_point_to_point_can():
     reference, view = views(POSES, guess_error=usual_error(), noise_m=3e-4)
     by_icp = register_by_icp(reference.prepared, view.prepared, IcpRegistration())
     within, across = target_error_m(by_icp, reference, view)
-    assert within < 3e-3 and across < 0.2 * PITCH_M
+    assert within < 3e-3
+    assert across < 0.2 * PITCH_M
     predicted = predicted_error_m(
         by_icp,
         reference.prepared.points_m[::50],
         reference.T_camera_board[:3, 2],
     )
-    assert 0.05e-3 < predicted[0] < 2 * PITCH_M and 1e-6 < predicted[1] < 0.2 * PITCH_M
+    assert 0.05e-3 < predicted[0] < 2 * PITCH_M
+    assert 1e-6 < predicted[1] < 0.2 * PITCH_M
 
 
 def test_the_same_views_give_the_same_bits():

@@ -35,7 +35,9 @@ def test_without_noise_the_surfaces_meet_to_a_micrometre():
         created[1:],
         strict=True,
     ):
-        assert not result.failure and result.converged and result.method == "joint"
+        assert not result.failure
+        assert result.converged
+        assert result.method == "joint"
         assert across_error(result, created[0], view) < 2e-6
 
 
@@ -106,7 +108,8 @@ def test_a_view_whose_marks_fail_takes_no_part():
         MarkSet((), np.empty(0, int), "no mark found, 3 needed"),
     )
     failed, result = register_jointly([created[0].prepared, hidden, created[2].prepared])
-    assert "no mark found" in failed.failure and failed.method == "joint"
+    assert "no mark found" in failed.failure
+    assert failed.method == "joint"
     np.testing.assert_array_equal(result.T_reference_view, good.T_reference_view)
 
 

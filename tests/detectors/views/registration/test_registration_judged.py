@@ -23,7 +23,7 @@ from detectors.views.registration.settings import (
     IcpRegistration,
     PlainRegistration,
 )
-from detectors.views.view import PreparedView, View
+from detectors.views.view import PreparedView
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens
 from tests.support.board_views import TAPES_M, board_view, pose, target_error_m, usual_error, views
@@ -60,23 +60,24 @@ def test_good_views_are_registered_and_nothing_is_said(config):
     created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
     reference, *result = register(prepared(created), config)
     np.testing.assert_array_equal(reference.T_reference_view, np.eye(4))
-    assert reference.overlap == 1.0 and not reference.covariance.any()
+    assert reference.overlap == 1.0
+    assert not reference.covariance.any()
     for registration, view, expected in zip(result, created[1:], ("view 1", "view 2"), strict=True):
-        assert (registration.view, registration.method, registration.failure) == (
-            expected,
-            config.method,
-            "",
-        )
+        assert registration.view == expected
+        assert registration.method == config.method
+        assert registration.failure == ""
         within, across = target_error_m(registration, created[0], view)
-        assert (
-            within < (2.0 if config.method == "icp" else 0.5) * PITCH_M and across < 0.3 * PITCH_M
-        )
-        assert registration.overlap > 0.9 and registration.seconds > 0
+        limit = 2.0 if config.method == "icp" else 0.5
+        assert within < limit * PITCH_M
+        assert across < 0.3 * PITCH_M
+        assert registration.overlap > 0.9
+        assert registration.seconds > 0
 
 
 def test_one_view_is_its_own_reference():
     (only,) = register(prepared(views(POSES[:1])), CpdRegistration())
-    assert only.failure == "" and only.converged
+    assert only.failure == ""
+    assert only.converged
 
 
 def test_no_views_are_refused():
@@ -95,14 +96,11 @@ def test_views_that_do_not_overlap():
     away = np.eye(4)
     away[0, 3] = 0.29
     created = views(POSES[:2])
-    moved = View(
-        "view 1",
-        created[1].prepared.view.cloud,
-        away @ created[1].prepared.view.T_reference_view_guess,
-    )
-    side = PreparedView(moved, created[1].prepared.inside, created[1].prepared.marks)
+    view = created[1].prepared
+    side = replace_guess(view, away @ view.view.T_reference_view_guess)
     failure = register([created[0].prepared, side], PlainRegistration(method="nominal"))[1].failure
-    assert "the views do not overlap" in failure and "%" in failure
+    assert "the views do not overlap" in failure
+    assert "%" in failure
 
 
 def test_other_marks_on_the_other_target():
@@ -127,7 +125,8 @@ def test_a_target_of_another_shape_lies_apart():
         smooth_m=bent,
     )
     result = register(prepared([reference, bent_view]), CpdRegistration())[1]
-    assert "apart" in result.failure and "different targets" in result.failure
+    assert "apart" in result.failure
+    assert "different targets" in result.failure
 
 
 FINE = Lens(440, 320, 600.0, 600.0, 219.5, 159.5)
@@ -209,7 +208,8 @@ def test_a_wrong_guess_turns_the_board_about():
     )[1]
     # the twin fits as well, and nothing in the clouds tells: what the guess says is what is
     # believed
-    assert not turned.failure and target_error_m(turned, reference, twin_view)[0] > 0.1
+    assert not turned.failure
+    assert target_error_m(turned, reference, twin_view)[0] > 0.1
     judged = judge(turned, reference.prepared, twin_view.prepared)
     assert judged.failure.startswith("is 180 degrees and ")
 
@@ -222,10 +222,13 @@ def test_points_on_a_line_leave_a_turn_open():
     created = views(POSES[:2], noise_m=NOISE_M)
     result = register(prepared(created), PlainRegistration(method="marks"))[1]
     open_turn = np.diag([0.2**2, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
-    judged = judge(replace(result, covariance=open_turn), created[0].prepared, created[1].prepared)
-    assert "lie on a line" in judged.failure and "which would blur" in judged.failure
+    reference = created[0].prepared
+    view = created[1].prepared
+    judged = judge(replace(result, covariance=open_turn), reference, view)
+    assert "lie on a line" in judged.failure
+    assert "which would blur" in judged.failure
     slides = np.diag([1e-8, 1e-8, 1e-8, 0.01**2, 1e-8, 1e-8])
-    judged = judge(replace(result, covariance=slides), created[0].prepared, created[1].prepared)
+    judged = judge(replace(result, covariance=slides), reference, view)
     assert "not determined: the points let the target slide" in judged.failure
 
 
@@ -254,13 +257,15 @@ def test_one_bad_view_does_not_spoil_the_others():
     hidden = board_view(POSES[1], None, tapes_m=TAPES_M[:1]).prepared
     for config in BY_MARKS[:1] + BY_MARKS[2:]:
         _, bad, good = register([created[0].prepared, hidden, created[2].prepared], config)
-        assert "3 needed" in bad.failure and good.failure == ""
+        assert "3 needed" in bad.failure
+        assert good.failure == ""
 
 
 def test_what_nominal_leaves_is_noted_and_not_refused():
     created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
     result = register(prepared(created), PlainRegistration(method="nominal"))[1]
-    assert result.failure == "" and "apart" in result.notes[-1]
+    assert result.failure == ""
+    assert "apart" in result.notes[-1]
     np.testing.assert_array_equal(
         result.T_reference_view, created[1].prepared.view.T_reference_view_guess
     )
@@ -273,17 +278,20 @@ def test_what_nominal_leaves_is_noted_and_not_refused():
     "config", [*BY_MARKS, IcpRegistration(), PlainRegistration(method="odometry")]
 )
 def test_a_capture_without_colour_is_refused_where_colour_is_needed(config):
-    created = prepared(views(POSES[:2]))
+    reference, view = prepared(views(POSES[:2]))
+    colourless = changed(view, rgb=None)
     with pytest.raises(UserError, match=r"view 1: registration by \w+ needs colour"):
-        register([created[0], changed(created[1], rgb=None)], config)
+        register([reference, colourless], config)
 
 
 def test_odometry_needs_a_lens_and_nominal_a_guess():
-    created = prepared(views(POSES[:2]))
+    reference, view = prepared(views(POSES[:2]))
+    without_lens = changed(view, lens=None)
     with pytest.raises(UserError, match="needs a pixel grid and the lens"):
-        register([created[0], changed(created[1], lens=None)], PlainRegistration(method="odometry"))
+        register([reference, without_lens], PlainRegistration(method="odometry"))
+    without_guess = replace_guess(view, None)
     with pytest.raises(UserError, match="needs the nominal pose of every view"):
-        register([created[0], replace_guess(created[1], None)], PlainRegistration(method="nominal"))
+        register([reference, without_guess], PlainRegistration(method="nominal"))
 
 
 # ------------------------------------------------------------ the yardstick
