@@ -144,10 +144,11 @@ class Candidate:
         within ``apart_m``."""
         normal = self._plane[1][:, 0]
         middle = self._sample_m.mean(axis=0)
-        return all(
-            np.quantile(np.abs((surface._sample_m - middle) @ normal), 0.9) <= apart_m
-            for surface in (self, neighbour)
-        )
+        for surface in (self, neighbour):
+            off_m = np.abs((surface._sample_m - middle) @ normal)
+            if np.quantile(off_m, 0.9) > apart_m:
+                return False
+        return True
 
     @property
     def _facing(self) -> float:
@@ -224,10 +225,15 @@ class _Comparison:
 
     def __init__(self, surfaces: Surfaces, grid: Cloud) -> None:
         self.surfaces = surfaces
+        """The surfaces' pixels and outlines."""
         self.grid = grid
+        """The cloud, or its raster."""
         self.numbers = range(len(surfaces.own))
+        """Numbers of all surfaces."""
         self.described: list[Candidate] = []
+        """The surfaces as candidates, by number."""
         self.borders: list[dict[int, _Border]] = []
+        """By number, the borders of the surface's outline on others, by their numbers."""
         for number in self.numbers:
             filled = surfaces.filled[number]
             self.described.append(Candidate(surfaces.own[number], filled, filled, grid))
@@ -377,8 +383,7 @@ def _doubts_about_others(candidates: tuple[Candidate, ...], contact_m: float) ->
     if large >= CROWD:
         doubts.append(
             f"{large} other surfaces are half as large as target 1 or larger: the scene may "
-            "hold no"
-            " target"
+            "hold no target"
         )
     in_plane = [
         str(rank)

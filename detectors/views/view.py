@@ -39,4 +39,5 @@ class PreparedView:
     @property
     def mark_points_m(self) -> np.ndarray:
         """The fiducial cloud (m, 3): valid points of the fiducial colour."""
-        return np.asarray(self.view.cloud.points_m.reshape(-1, 3)[self.marks.points])
+        points = self.view.cloud.points_m.reshape(-1, 3)
+        return np.asarray(points[self.marks.points])

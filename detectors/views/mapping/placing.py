@@ -99,7 +99,8 @@ def raster_between(
     covered = covered[enough]
     values = shares[rows, columns] / covered[:, None]
     indices = np.repeat(cells, 3), corners[rows, columns].ravel()
-    return Raster(csr_matrix((values.ravel(), indices), shape=(h * w, len(flat))), grid.shape)
+    weights = csr_matrix((values.ravel(), indices), shape=(h * w, len(flat)))
+    return Raster(weights, grid.shape)
 
 
 def _of_grid(valid: np.ndarray) -> np.ndarray:
@@ -339,19 +340,19 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     last = np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
+        width, height = high - low
         problem = (
-            f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of "
-            f"{step * 1e3:.3g} mm"
+            f"a map of {width:.3g} x {height:.3g} m with cells of {step * 1e3:.3g} mm would have "
+            f"{columns * rows:.3g}"
         )
-        fix = "crop the views to the target, or give a larger merge.cell_mm"
         raise UserError(
-            f"{problem} would have {columns * rows:.3g}",
+            problem,
             legal=f"up to {MAX_CELLS:.2g} cells",
-            fix=fix,
+            fix="crop the views to the target, or give a larger merge.cell_mm",
         )
     return CellGrid(
-        float(first[0] * step),
-        float(first[1] * step),
-        float(step),
-        (int(rows), int(columns)),
+        x0=float(first[0] * step),
+        y0=float(first[1] * step),
+        step=float(step),
+        shape=(int(rows), int(columns)),
     )

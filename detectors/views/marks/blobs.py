@@ -50,7 +50,8 @@ def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     black has a share."""
     counts = rgb.astype(np.float64) + 0.5
     total = counts.sum(axis=1)
-    return counts[:, [0, 2]] / total[:, None], 1.0 / 12.0 / total**2
+    shares = counts[:, [0, 2]] / total[:, None]
+    return shares, 1.0 / 12.0 / total**2
 
 
 def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -306,7 +307,8 @@ def _evenly_lit(
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
     """Remove one pixel along the mask's border; the area beyond the window counts as outside."""
-    return shrunk(np.pad(mask, 1), 3)[1:-1, 1:-1]
+    padded = np.pad(mask, 1)
+    return shrunk(padded, 3)[1:-1, 1:-1]
 
 
 def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:

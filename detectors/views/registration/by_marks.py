@@ -291,8 +291,9 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
     registrations = [register_by_marks(views[0], view) for view in views[1:]]
     usable = [i for i, registration in enumerate(registrations) if not registration.failure]
     if usable:
-        chosen = [views[0]] + [views[i + 1] for i in usable]
-        adjusted = _adjust(chosen, [registrations[i] for i in usable])
+        chosen = [views[i + 1] for i in usable]
+        by_marks = [registrations[i] for i in usable]
+        adjusted = _adjust([views[0], *chosen], by_marks)
         for i, registration in zip(usable, adjusted, strict=True):
             registrations[i] = registration
     return [replace(registration, method="joint") for registration in registrations]

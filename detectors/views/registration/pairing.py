@@ -59,7 +59,8 @@ def place(
     def state(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the residuals (n, 3) and the inverses (n, 3, 3) of their covariances."""
         spread = to_spread_m2 + T[:3, :3] @ from_spread_m2 @ T[:3, :3].T
-        return transform_points(T, from_m) - to_m, np.linalg.inv(spread)
+        residuals = transform_points(T, from_m) - to_m
+        return residuals, np.linalg.inv(spread)
 
     trust = 1.0 / np.trace(from_spread_m2 + to_spread_m2, axis1=1, axis2=2)
     T = kabsch(from_m, to_m, trust)
@@ -222,7 +223,8 @@ class _Side:
         along /= np.linalg.norm(along, axis=-1, keepdims=True)
         normal = self.normals[i] + self.normals[j]
         normal -= (normal * along).sum(axis=-1, keepdims=True) * along
-        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        normal /= np.maximum(length, 1e-12)
         axes = np.stack([along, np.cross(normal, along), normal], axis=-1)
         return axes, (self.places[i] + self.places[j]) / 2
 
@@ -287,10 +289,10 @@ def _holding(
     # partners (k, n) that lie as far from both partners (k,) of the pair as they should ...
     consistent = np.ones((len(a), len(fewer_side.places), len(larger_side.places)), dtype=bool)
     for mark, partner in ((i, a), (j, b)):
-        expected = fewer_side.distances[mark][None, :, None]
-        off = np.abs(expected - larger_side.distances[partner][:, None, :])
-        variance = fewer_side.variances[mark][None, :, None]
-        variance = variance + larger_side.variances[partner][:, None, :]
+        expected_m = fewer_side.distances[mark][None, :, None]
+        off = np.abs(expected_m - larger_side.distances[partner][:, None, :])
+        expected_m2 = fewer_side.variances[mark][None, :, None]
+        variance = expected_m2 + larger_side.variances[partner][:, None, :]
         # a mark's distance to itself is exactly 0 on both sides
         consistent &= off <= DISTANCE_SIGMAS * np.sqrt(variance)
     # ... on the side of the line through them that the normals indicate: the mirror image beyond

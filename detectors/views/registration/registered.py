@@ -171,8 +171,10 @@ def sampling_of(view: PreparedView) -> Sampling:
         pitch, noise = _on_grid(cloud, view.inside)
     if not np.isfinite(pitch + noise):
         loose_pitch, loose_noise = _without_grid(points)
-        pitch = pitch if np.isfinite(pitch) else loose_pitch
-        noise = noise if np.isfinite(noise) else loose_noise
+        if not np.isfinite(pitch):
+            pitch = loose_pitch
+        if not np.isfinite(noise):
+            noise = loose_noise
     extent = 0.0
     if len(points):
         extent = float(np.linalg.norm(np.ptp(points, axis=0))) / 2
