@@ -139,15 +139,16 @@ class Candidate:
         length = int(np.count_nonzero(outline))
         return int(np.count_nonzero(outline & edge)) / max(length, 1)
 
-    def continues(self, other: Candidate, apart_m: float) -> bool:
+    def continues(self, neighbour: Candidate, apart_m: float) -> bool:
         """Return whether this flat surface and the other lie in one plane: 90 % of the points
         within ``apart_m``."""
         normal = self._plane[1][:, 0]
         middle = self._sample_m.mean(axis=0)
-        return all(
-            np.quantile(np.abs((surface._sample_m - middle) @ normal), 0.9) <= apart_m
-            for surface in (self, other)
-        )
+        for surface in (self, neighbour):
+            off_m = np.abs((surface._sample_m - middle) @ normal)
+            if np.quantile(off_m, 0.9) > apart_m:
+                return False
+        return True
 
     @property
     def _facing(self) -> float:
@@ -224,10 +225,15 @@ class _Comparison:
 
     def __init__(self, surfaces: Surfaces, grid: Cloud) -> None:
         self.surfaces = surfaces
+        """The surfaces' pixels and outlines."""
         self.grid = grid
+        """The cloud, or its raster."""
         self.numbers = range(len(surfaces.own))
+        """Numbers of all surfaces."""
         self.described: list[Candidate] = []
+        """The surfaces as candidates, by number."""
         self.borders: list[dict[int, _Border]] = []
+        """By number, the borders of the surface's outline on others, by their numbers."""
         for number in self.numbers:
             filled = surfaces.filled[number]
             self.described.append(Candidate(surfaces.own[number], filled, filled, grid))
@@ -243,10 +249,10 @@ class _Comparison:
         seeds = nearest.reshape(-1)
         outline = len(np.unique(seeds[ring]))
         borders = {}
-        for other in self.numbers:
-            pixels = ring[surfaces.own[other].reshape(-1)[ring]]
+        for neighbour in self.numbers:
+            pixels = ring[surfaces.own[neighbour].reshape(-1)[ring]]
             part = len(np.unique(seeds[pixels])) / max(outline, 1)
-            if other == number or part < BORDERING:
+            if neighbour == number or part < BORDERING:
                 continue
             steps_m = z_m[pixels] - z_m[seeds[pixels]]
             behind_m = steps_m[steps_m > surfaces.contact_m]
@@ -254,7 +260,7 @@ class _Comparison:
             back = float((steps_m < -surfaces.contact_m).mean())
             is_step = ahead >= STEP_PART and ahead > 2.0 * back
             height_m = float(np.median(behind_m)) if len(behind_m) else 0.0
-            borders[other] = _Border(part, is_step, height_m)
+            borders[neighbour] = _Border(part, is_step, height_m)
         return borders
 
     def encloses(self, outer: int, inner: int) -> bool:
@@ -263,21 +269,21 @@ class _Comparison:
         enclosed = np.count_nonzero(inner_pixels & self.surfaces.filled[outer])
         return bool(enclosed >= ENCLOSED * np.count_nonzero(inner_pixels))
 
-    def judged(self, number: int, other: int) -> tuple[float, str]:
+    def judged(self, number: int, rival: int) -> tuple[float, str]:
         """Return the probability that the surface rather than the other is the target, and the
         reason for a doubt."""
-        if number == other:
+        if number == rival:
             return 1.0, ""
-        in_front = self._in_front(number, other)
+        in_front = self._in_front(number, rival)
         if in_front is not None:
             return in_front
-        behind = self._in_front(other, number)
+        behind = self._in_front(rival, number)
         if behind is not None:
             probability, why = behind
             return 1.0 - probability, why
         # if the two only meet or are apart, weight, a frontal view and nearness decide
         this = self.described[number]
-        that = self.described[other]
+        that = self.described[rival]
         weight = this.weight / max(that.weight, 1e-9)
         cosine = math.cos(math.radians(this.tilt_deg))
         facing = cosine / max(math.cos(math.radians(that.tilt_deg)), 1e-2)
@@ -322,17 +328,17 @@ class _Comparison:
         outline = self.described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
-        for other in self.numbers:
-            border = self.borders[other].get(number)
-            if border is None or not border.is_step or not self.encloses(number, other):
+        for neighbour in self.numbers:
+            border = self.borders[neighbour].get(number)
+            if border is None or not border.is_step or not self.encloses(number, neighbour):
                 continue
-            this = self.described[other]
-            probability, _ = self.judged(other, number)
+            this = self.described[neighbour]
+            probability, _ = self.judged(neighbour, number)
             if probability >= 0.5 or border.behind_m > this.extent_m[0]:
                 nearest_m = this.depths_m[2] + border.behind_m / 2
                 nearer = self.grid.points_m[..., 2] < nearest_m
-                joined = surfaces.filled[other] | (nearer & ~surfaces.own[number])
-                standing = parts_with(joined, surfaces.own[other])
+                joined = surfaces.filled[neighbour] | (nearer & ~surfaces.own[number])
+                standing = parts_with(joined, surfaces.own[neighbour])
                 outline = outline & ~grown(standing, surfaces.reach_px)
         return outline
 
@@ -348,7 +354,7 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     numbers = comparison.numbers
     odds = []
     for number in numbers:
-        probabilities = [comparison.judged(number, other)[0] for other in numbers]
+        probabilities = [comparison.judged(number, rival)[0] for rival in numbers]
         odds.append(sum(math.log(probability) for probability in probabilities))
     order = sorted(numbers, key=lambda number: (-odds[number], number))
     candidates = tuple(
@@ -359,8 +365,8 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         return (), []
     doubts = []
     close = []
-    for rank, other in enumerate(order[1:], start=2):
-        probability, why = comparison.judged(order[0], other)
+    for rank, rival in enumerate(order[1:], start=2):
+        probability, why = comparison.judged(order[0], rival)
         if probability < DOUBTFUL_BELOW:
             close.append(f"{why} (--target {rank} takes the other)")
     if close:
@@ -377,8 +383,7 @@ def _doubts_about_others(candidates: tuple[Candidate, ...], contact_m: float) ->
     if large >= CROWD:
         doubts.append(
             f"{large} other surfaces are half as large as target 1 or larger: the scene may "
-            "hold no"
-            " target"
+            "hold no target"
         )
     in_plane = [
         str(rank)

@@ -4,16 +4,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
-def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def kabsch(
+    from_m: np.ndarray,
+    to_m: np.ndarray,
+    weights: np.ndarray,
+) -> np.ndarray:
     """Return the proper least-squares rigid transforms (..., 4, 4) of points (..., n, 3) onto
     (..., n, 3), with ``weights`` (..., n) of 0 or more. The rotation of points on a line about it
     is undetermined and arbitrary."""
     share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
     from_centre = (share * from_m).sum(axis=-2)
     to_centre = (share * to_m).sum(axis=-2)
-    spread = np.swapaxes(share * (from_m - from_centre[..., None, :]), -1, -2) @ (
-        to_m - to_centre[..., None, :]
-    )
+    from_arm = share * (from_m - from_centre[..., None, :])
+    to_arm = to_m - to_centre[..., None, :]
+    spread = np.swapaxes(from_arm, -1, -2) @ to_arm
     u, _, vt = np.linalg.svd(spread)
     signs = np.ones(spread.shape[:-1])
     signs[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
@@ -30,9 +34,12 @@ def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndar
     arm = np.asarray(points_m) - centre_m
     jacobian = np.zeros((len(arm), 3, 6))
     # w x r = -[r]x w
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = arm[:, 2], -arm[:, 1]
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -arm[:, 2], arm[:, 0]
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = arm[:, 1], -arm[:, 0]
+    jacobian[:, 0, 1] = arm[:, 2]
+    jacobian[:, 0, 2] = -arm[:, 1]
+    jacobian[:, 1, 0] = -arm[:, 2]
+    jacobian[:, 1, 2] = arm[:, 0]
+    jacobian[:, 2, 0] = arm[:, 1]
+    jacobian[:, 2, 1] = -arm[:, 0]
     jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
     return jacobian
 

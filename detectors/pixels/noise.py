@@ -113,10 +113,10 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
         return None
     side = (SCATTER_PX, SCATTER_PX)
     border = cv2.BORDER_CONSTANT
-    known = cv2.blur(has_scatter.astype(np.float64), side, borderType=border)
+    counts = cv2.blur(has_scatter.astype(np.float64), side, borderType=border)
     scatter = cv2.blur(np.where(has_scatter, cloud.variance_m2, 0.0), side, borderType=border)
-    mean = scatter / np.maximum(known, 1e-9)
-    variance = np.where(where & (known > 0), mean, np.nan) / cloud.n_frames
+    mean = scatter / np.maximum(counts, 1e-9)
+    variance = np.where(where & (counts > 0), mean, np.nan) / cloud.n_frames
     typical = median_of(variance[np.isfinite(variance)])
     return np.where(where & np.isnan(variance), typical, variance)
 
@@ -148,8 +148,8 @@ def _lags(noise_and_known: tuple[np.ndarray, np.ndarray] | None) -> list[int]:
     """Return the first unlike lags along rows and along columns; none without noise."""
     if noise_and_known is None:
         return []
-    noise, known = noise_and_known
-    return [_first_unlike_lag(noise, known), _first_unlike_lag(noise.T, known.T)]
+    noise, usable = noise_and_known
+    return [_first_unlike_lag(noise, usable), _first_unlike_lag(noise.T, usable.T)]
 
 
 def _window(picture: np.ndarray) -> np.ndarray | None:
@@ -158,8 +158,8 @@ def _window(picture: np.ndarray) -> np.ndarray | None:
     if rows.size < REACH_PIXELS:
         return None
     top = max(0, int(np.median(rows)) - REACH_WINDOW_PX // 2)
-    left = max(0, int(np.median(columns)) - REACH_WINDOW_PX // 2)
-    return picture[top : top + REACH_WINDOW_PX, left : left + REACH_WINDOW_PX]
+    first_column = max(0, int(np.median(columns)) - REACH_WINDOW_PX // 2)
+    return picture[top : top + REACH_WINDOW_PX, first_column : first_column + REACH_WINDOW_PX]
 
 
 def _noise_of_two(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -167,10 +167,10 @@ def _noise_of_two(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray] | Non
     window = _window(difference)
     if window is None:
         return None
-    known = np.isfinite(window)
-    largest = 8 * float(np.abs(window[known]).mean())
-    known &= np.abs(np.nan_to_num(window)) < largest
-    return _levelled(window, known, 2 * FARTHEST_LAG_PX + 1), known
+    usable = np.isfinite(window)
+    largest = 8 * float(np.abs(window[usable]).mean())
+    usable &= np.abs(np.nan_to_num(window)) < largest
+    return _levelled(window, usable, 2 * FARTHEST_LAG_PX + 1), usable
 
 
 def _noise_of_one(picture: np.ndarray, z_step_m: float) -> tuple[np.ndarray, np.ndarray] | None:
@@ -178,42 +178,42 @@ def _noise_of_one(picture: np.ndarray, z_step_m: float) -> tuple[np.ndarray, np.
     window = _window(picture)
     if window is None:
         return None
-    known = np.isfinite(window)
-    noise = _levelled(window, known, LONE_LEVEL_PX)
-    sigma = sigma_of(noise[known])
+    usable = np.isfinite(window)
+    noise = _levelled(window, usable, LONE_LEVEL_PX)
+    sigma = sigma_of(noise[usable])
     # with smaller noise, rounding errors are correlated
     if sigma < 0.5 * z_step_m:
         return None
-    known &= np.abs(noise) < LONE_SIGMAS * sigma
+    usable &= np.abs(noise) < LONE_SIGMAS * sigma
     # where known pixels lie to one side, their mean keeps a part of the surface's tilt
-    rows, columns = np.indices(known.shape, float)
-    off_rows = _levelled(rows, known, LONE_LEVEL_PX)
-    off_columns = _levelled(columns, known, LONE_LEVEL_PX)
-    noise = _levelled(window, known, LONE_LEVEL_PX)
-    known &= np.hypot(off_rows, off_columns) < LONE_OFF_PX
-    return noise * known, known
+    rows, columns = np.indices(usable.shape, float)
+    off_rows = _levelled(rows, usable, LONE_LEVEL_PX)
+    off_columns = _levelled(columns, usable, LONE_LEVEL_PX)
+    noise = _levelled(window, usable, LONE_LEVEL_PX)
+    usable &= np.hypot(off_rows, off_columns) < LONE_OFF_PX
+    return noise * usable, usable
 
 
 def _levelled(
     values: np.ndarray,
-    known: np.ndarray,
+    usable: np.ndarray,
     side: int,
 ) -> np.ndarray:
     """Return the values (h, w) minus their mean over a square of known ones; 0 where unknown."""
     size = (side, side)
     border = cv2.BORDER_CONSTANT
-    weight = cv2.boxFilter(known.astype(np.float64), -1, size, borderType=border)
-    total = cv2.boxFilter(np.where(known, values, 0.0), -1, size, borderType=border)
-    return np.where(known, values - total / np.maximum(weight, 1e-9), 0.0)
+    weight = cv2.boxFilter(usable.astype(np.float64), -1, size, borderType=border)
+    total = cv2.boxFilter(np.where(usable, values, 0.0), -1, size, borderType=border)
+    return np.where(usable, values - total / np.maximum(weight, 1e-9), 0.0)
 
 
-def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:
+def _first_unlike_lag(noise: np.ndarray, usable: np.ndarray) -> int:
     """Return the first lag along rows at which the mean product of noise falls below `SHARED` of
     that at lag 0; 0 if there is none."""
 
     def product(lag: int) -> float:
         width = noise.shape[1] - lag
-        pairs = (known[:, lag:] & known[:, :width]).sum()
+        pairs = (usable[:, lag:] & usable[:, :width]).sum()
         return float((noise[:, lag:] * noise[:, :width]).sum()) / max(pairs, 1)
 
     variance = product(0)

@@ -48,20 +48,28 @@ GATE_SIGMAS = 5.0
 
 @dataclass(frozen=True)
 class BetweenViews:
-    """Differences between views. ``own_m2``: variance of the error of a view and cell.
-    ``pattern_m2``: variance of the fixed pattern, with covariance exp(-(distance /
-    ``length_px``)^``exponent``) between pixels. ``noise_share``: share of the sensor law's
-    variance that is noise; below 1 only if the law is from a single frame."""
+    """Differences between views. The fixed pattern has the covariance ``pattern_m2``
+    exp(-(distance / ``length_px``)^``exponent``) between pixels."""
 
     own_m2: float = 0.0
+    """Variance of the error of a view and cell."""
     pattern_m2: float = 0.0
+    """Variance of the fixed pattern."""
     length_px: float = 1.0
+    """Distance on the sensor over which the pattern's covariance falls to 1 / e."""
     exponent: float = 1.0
+    """Shape of that fall: 1 pointed, 2 flat at first."""
     noise_share: float = 1.0
+    """Share of the sensor law's variance that is noise; below 1 only if the law is from a single
+    frame."""
 
 
 def between_views(
-    heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
+    heights: np.ndarray,
+    sensor: np.ndarray,
+    explained: np.ndarray,
+    looks_px: np.ndarray,
+    repeated: bool,
 ) -> BetweenViews:
     """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances
     that the ``sensor`` and ``other`` (lens, registration) explain; and the direction ``looks_px``
@@ -69,84 +77,101 @@ def between_views(
     variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
     chosen = several[:: max(1, len(several) // CELLS)]
-    values = (heights, sensor, other, looks_px)
-    flat, sensor, other, looks = (v.reshape(len(v), -1, *v.shape[3:])[:, chosen] for v in values)
+    flat = heights.reshape(len(heights), -1)[:, chosen]
+    sensor = sensor.reshape(len(heights), -1)[:, chosen]
+    explained = explained.reshape(len(heights), -1)[:, chosen]
+    looks = looks_px.reshape(len(heights), -1, 2)[:, chosen]
     i, j = np.triu_indices(len(heights), 1)
-    both = np.isfinite(flat[i] - flat[j])
-    if both.sum() < PER_CLASS:
+    differences = flat[i] - flat[j]
+    overlapping = np.isfinite(differences)
+    if overlapping.sum() < PER_CLASS:
         return BetweenViews()
-    apart = np.linalg.norm(looks[i] - looks[j], axis=-1)[both]
-    columns = (
-        apart,
-        (flat[i] - flat[j])[both] ** 2,
-        *(0.5 * (v[i] + v[j])[both] for v in (sensor, other)),
-    )
-    parts = np.array_split(
-        np.argsort(apart, kind="stable"), min(CLASSES, max(1, len(apart) // PER_CLASS))
-    )
-    distance, square, of_sensor, of_other = (
-        np.array([np.median(c[part]) for part in parts]) for c in columns
-    )
+    distances_px = np.linalg.norm(looks[i] - looks[j], axis=-1)[overlapping]
+    classes = min(CLASSES, max(1, len(distances_px) // PER_CLASS))
+    parts = np.array_split(np.argsort(distances_px, kind="stable"), classes)
+
+    def medians(values: np.ndarray) -> np.ndarray:
+        return np.array([np.median(values[part]) for part in parts])
+
+    distance = medians(distances_px)
+    square = medians(differences[overlapping] ** 2)
+    of_sensor = medians(0.5 * (sensor[i] + sensor[j])[overlapping])
+    of_other = medians(0.5 * (explained[i] + explained[j])[overlapping])
     half_square = np.maximum(0.5 * square / MEDIAN_SQUARE, 1e-16)
     # k - 1 of the k (k - 1) / 2 differences of k views are independent
-    error = half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(apart) / len(parts))
-    known = (half_square - of_other - (of_sensor if repeated else 0.0)) / error
-    first = (np.ones_like(distance) if repeated else of_sensor) / error
-    level, sill, length, exponent = _law(first, 1.0 / error, distance, known, repeated)
+    error = (
+        half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(distances_px) / len(parts))
+    )
+    if repeated:
+        target = (half_square - of_other - of_sensor) / error
+        first = np.ones_like(distance) / error
+    else:
+        target = (half_square - of_other) / error
+        first = of_sensor / error
+    level, sill, length, exponent = _law(first, 1.0 / error, distance, target, repeated)
     if repeated:
         return BetweenViews(level, sill, length, exponent)
-    return BetweenViews(0.0, sill, length, exponent, min(max(level, 0.01), 1.0))
+    return BetweenViews(
+        pattern_m2=sill,
+        length_px=length,
+        exponent=exponent,
+        noise_share=min(max(level, 0.01), 1.0),
+    )
 
 
 def _law(
-    first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
+    first: np.ndarray,
+    unit: np.ndarray,
+    distance: np.ndarray,
+    target: np.ndarray,
+    may_vanish: bool,
 ) -> tuple[float, float, float, float]:
     """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the
     law with the least chi square plus Schwarz's penalty: none (if it ``may_vanish``), ``first``
     alone, or both terms."""
     penalty = float(np.log(max(len(distance), 2)))
-    (level,), misfit = nnls(first[:, None], known)
+    (level,), misfit = nnls(first[:, None], target)
     best = (float(misfit) ** 2 + penalty, float(level), 0.0, 1.0, 1.0)
-    if may_vanish and known @ known <= best[0]:
-        best = (float(known @ known), 0.0, 0.0, 1.0, 1.0)
-    for exponent, length in product(
-        EXPONENTS, np.geomspace(1.0, max(1.0, float(distance.max())), LENGTHS)
-    ):
+    if may_vanish and target @ target <= best[0]:
+        best = (float(target @ target), 0.0, 0.0, 1.0, 1.0)
+    lengths = np.geomspace(1.0, max(1.0, float(distance.max())), LENGTHS)
+    for exponent, length in product(EXPONENTS, lengths):
         rise = 1.0 - np.exp(-((distance / length) ** exponent))
-        (level, sill), misfit = nnls(np.column_stack([first, rise * unit]), known)
-        if misfit**2 + 4.0 * penalty < best[0]:
-            best = (
-                float(misfit) ** 2 + 4.0 * penalty,
-                float(level),
-                float(sill),
-                float(length),
-                exponent,
-            )
+        (level, sill), misfit = nnls(np.column_stack([first, rise * unit]), target)
+        criterion = float(misfit) ** 2 + 4.0 * penalty
+        if criterion < best[0]:
+            best = (criterion, float(level), float(sill), float(length), exponent)
     return best[1:]
 
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """Values of each cell (h, w). ``height_m``: mean deviation from the fitted surface along z,
-    positive behind; NaN where no view counts. ``variance_m2``: of an intact surface's height, from
-    sensor, lens, registration and further differences between views. ``temporal_m2``: the part of
-    it that more frames would lower. ``seen_by`` (k, h, w) bool: views that count. ``shares`` (k,
-    h, w): their weights, with sum 1. ``rejected``: number of outliers."""
+    """Values of each cell of a map (h, w) of k views."""
 
     cell_m: float
+    """Side of a cell."""
     height_m: np.ndarray
+    """(h, w): mean deviation from the fitted surface along z, positive behind; NaN where no view
+    counts."""
     variance_m2: np.ndarray
+    """(h, w): of an intact surface's height, from sensor, lens, registration and further
+    differences between views."""
     temporal_m2: np.ndarray
+    """(h, w): the part of the variance that more frames would lower."""
     seen_by: np.ndarray
+    """(k, h, w) bool: views that count."""
     shares: np.ndarray
+    """(k, h, w): their weights, with sum 1."""
     rejected: int
+    """Number of outliers."""
     between: BetweenViews
+    """Differences between the views."""
 
 
 def combine(
     heights: np.ndarray,
     sensor: np.ndarray,
-    other: np.ndarray,
+    explained: np.ndarray,
     looks_px: np.ndarray,
     repeated: bool,
     cell_m: float,
@@ -155,32 +180,34 @@ def combine(
     is the inverse of its own variance. (The best weights under the covariance can be negative,
     which fails at a hole seen by only some views.) The variance of the mean includes the
     covariance of views."""
-    between = between_views(heights, sensor, other, looks_px, repeated)
+    between = between_views(heights, sensor, explained, looks_px, repeated)
     temporal = between.noise_share * sensor
-    own = temporal + other + between.own_m2
-    rejected = _outliers(heights, own + between.pattern_m2)
+    own_m2 = temporal + explained + between.own_m2
+    rejected = _outliers(heights, own_m2 + between.pattern_m2)
     used = np.isfinite(heights) & ~rejected
-    known = used.any(axis=0)
-    weights = np.where(used, 1.0 / (own + between.pattern_m2), 0.0)
+    covered = used.any(axis=0)
+    weights = np.where(used, 1.0 / (own_m2 + between.pattern_m2), 0.0)
     with np.errstate(invalid="ignore"):
         shares = np.nan_to_num(weights / weights.sum(axis=0))
     squares = shares**2
     shared = between.pattern_m2 * squares.sum(axis=0)
     if between.pattern_m2 > 0:
         for i, j in combinations(range(len(heights)), 2):
-            apart = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
-            shared += (
-                2.0
-                * between.pattern_m2
-                * shares[i]
-                * shares[j]
-                * np.exp(-(apart**between.exponent))
-            )
-    height = np.where(known, np.where(used, shares * heights, 0.0).sum(axis=0), np.nan)
-    alone = np.where(known, np.where(used, squares * own, 0.0).sum(axis=0), np.nan)
-    by_frames = np.where(known, np.where(used, squares * temporal, 0.0).sum(axis=0), np.nan)
+            separation = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
+            correlation = np.exp(-(separation**between.exponent))
+            shared += 2.0 * between.pattern_m2 * shares[i] * shares[j] * correlation
+    height = np.where(covered, np.where(used, shares * heights, 0.0).sum(axis=0), np.nan)
+    alone = np.where(covered, np.where(used, squares * own_m2, 0.0).sum(axis=0), np.nan)
+    by_frames = np.where(covered, np.where(used, squares * temporal, 0.0).sum(axis=0), np.nan)
     return SurfaceMap(
-        cell_m, height, alone + shared, by_frames, used, shares, int(rejected.sum()), between
+        cell_m=cell_m,
+        height_m=height,
+        variance_m2=alone + shared,
+        temporal_m2=by_frames,
+        seen_by=used,
+        shares=shares,
+        rejected=int(rejected.sum()),
+        between=between,
     )
 
 
@@ -190,15 +217,18 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     damage: in front of the fitted surface, where damage would have hidden it from the others; or
     behind it, but alone among their neighbours."""
     deviation = heights - pixel_medians(heights)
-    limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
+    spread = 1.4826 * pixel_medians(np.abs(deviation))
+    limit = GATE_SIGMAS * np.maximum(spread, np.sqrt(variances))
     several = np.isfinite(heights).sum(axis=0) >= 3
     rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)
     k, row, column = np.nonzero(several & (deviation > limit))
     padded = np.pad(heights, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
-    near = np.stack(
-        [padded[k, row + down, column + right] for down in range(3) for right in range(3)]
-    )
-    rejected[k, row, column] = near[4] - pixel_medians(near) > limit[k, row, column]
+    neighbours = []
+    for down in range(3):
+        for right in range(3):
+            neighbours.append(padded[k, row + down, column + right])
+    excess = neighbours[4] - pixel_medians(np.stack(neighbours))
+    rejected[k, row, column] = excess > limit[k, row, column]
     return rejected
 
 
@@ -211,6 +241,69 @@ PER_BIN = 40
 SAMPLED = 16_384
 # least variance, so that no weight is infinite: no point is known better than to 0.1 um
 LEAST_M2 = 1e-14
+
+
+@dataclass(frozen=True)
+class _Observation:
+    """What one view says about the cells (h, w) of a map."""
+
+    height_m: np.ndarray
+    """(h, w): deviation from the fitted surface along z; NaN where the view has none."""
+    sensor_m2: np.ndarray
+    """(h, w): variance of the height by the sensor's noise."""
+    explained_m2: np.ndarray
+    """(h, w): variance of the height by lens and registration."""
+    look_px: np.ndarray
+    """(h, w, 2): direction in which the view sees the cell, in pixels of the first view."""
+    extras: np.ndarray
+    """(h, w, 5): samples, red, green, blue, amplitude; NaN where unknown."""
+    repeated: bool
+    """Whether the sensor's variance comes from repeated frames."""
+
+
+def _observation(
+    view: placing.PlacedView,
+    grid: placing.CellGrid,
+    points: np.ndarray,
+    gradient: np.ndarray,
+    T_reference_map: np.ndarray,
+    slope_step: float,
+) -> _Observation:
+    """Return what a view says about the cells at ``points`` (h, w, 3) of the surface, whose height
+    changes by ``gradient`` (h, w, 3) times a small displacement. ``slope_step``: a pixel of the
+    first view."""
+    cloud = view.chosen.cloud
+    inside = view.chosen.inside
+    raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
+    variance, repeated = depth_noise(cloud, inside, _roughness(view))
+    slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
+    unknown = np.full(inside.shape, np.nan)
+    colour = [unknown] * 3
+    if cloud.rgb is not None:
+        colour = list(np.moveaxis(cloud.rgb, -1, 0))
+    amplitude = unknown
+    if cloud.amplitude is not None:
+        amplitude = cloud.amplitude
+    images = (view.deviation_m, variance * slope2, cloud.count, *colour, amplitude)
+    values = raster.at_cells(np.stack([image.ravel() for image in images], axis=-1))
+    rays = points - view.T_map_view[:3, 3]
+    per_range = (rays * gradient).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+    across = np.maximum((gradient**2).sum(axis=-1) - per_range**2, 0.0)
+    correlation = _neighbour_correlation(view)
+    kept = correlation + (1.0 - correlation) * raster.concentration
+    in_view = rays @ view.T_map_view[:3, :3]
+    by_sensor = values[..., 1] * kept * per_range**2
+    by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
+    by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
+    look_px = in_view[..., :2] / in_view[..., 2:] / slope_step
+    return _Observation(
+        height_m=values[..., 0],
+        sensor_m2=by_sensor,
+        explained_m2=by_others,
+        look_px=look_px,
+        extras=values[..., 2:],
+        repeated=repeated,
+    )
 
 
 def fuse(
@@ -231,66 +324,55 @@ def fuse(
     gradient = surface.gradients(x, y, grid.step)
     points = np.stack([x, y, z], axis=-1)
 
-    observed = []
-    repeated = True
+    observations = []
     for view in placed:
-        cloud = view.chosen.cloud
-        inside = view.chosen.inside
-        raster = placing.raster_between(view.places_m, inside, cloud.organised, view.pitch_m, grid)
-        variance, by_frames = depth_noise(cloud, inside, _roughness(view))
-        repeated &= by_frames
-        slope2 = (cloud.points_m**2).sum(axis=-1) / cloud.points_m[..., 2] ** 2
-        unknown = np.full(inside.shape, np.nan)
-        colour = [unknown] * 3 if cloud.rgb is None else list(np.moveaxis(cloud.rgb, -1, 0))
-        amplitude = unknown if cloud.amplitude is None else cloud.amplitude
-        images = (view.deviation_m, variance * slope2, cloud.count, *colour, amplitude)
-        values = raster.at_cells(np.stack([image.ravel() for image in images], axis=-1))
-        rays = points - view.T_map_view[:3, 3]
-        per_range = (rays * gradient).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
-        across = np.maximum((gradient**2).sum(axis=-1) - per_range**2, 0.0)
-        correlation = _neighbour_correlation(view)
-        kept = correlation + (1.0 - correlation) * raster.concentration
-        in_view = rays @ view.T_map_view[:3, :3]
-        by_sensor = values[..., 1] * kept * per_range**2
-        by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
-        by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
-        look_px = in_view[..., :2] / in_view[..., 2:] / views[0].slope_step
-        observed.append((values[..., 0], by_sensor, by_others, look_px, values[..., 2:]))
-    heights, sensor, other, looks_px, more = (
-        np.stack(each) for each in zip(*observed, strict=True)
+        observations.append(
+            _observation(view, grid, points, gradient, T_reference_map, views[0].slope_step)
+        )
+    extras = np.stack([observation.extras for observation in observations])
+    fused = combine(
+        heights=np.stack([observation.height_m for observation in observations]),
+        sensor=np.stack([observation.sensor_m2 for observation in observations]),
+        explained=np.stack([observation.explained_m2 for observation in observations]),
+        looks_px=np.stack([observation.look_px for observation in observations]),
+        repeated=all(observation.repeated for observation in observations),
+        cell_m=grid.step,
     )
-    found = combine(heights, sensor, other, looks_px, repeated, grid.step)
 
     clouds = [view.cloud for view in views]
-    samples = np.round(np.where(found.seen_by, more[..., 0], 0.0).sum(axis=0)).astype(np.int32)
-    means = (found.shares[..., None] * np.nan_to_num(more)).sum(axis=0)
-    known = np.isfinite(found.height_m)
-    shares = found.shares.sum(axis=(1, 2)) / found.shares.sum()
+    samples = np.round(np.where(fused.seen_by, extras[..., 0], 0.0).sum(axis=0)).astype(np.int32)
+    means = (fused.shares[..., None] * np.nan_to_num(extras)).sum(axis=0)
+    covered = np.isfinite(fused.height_m)
+    shares = fused.shares.sum(axis=(1, 2)) / fused.shares.sum()
     pixel_m = np.sqrt(shares @ np.stack([view.pixel_m for view in placed]) ** 2)
-    points[..., 2] += found.height_m
-    points[~known] = np.nan
+    points[..., 2] += fused.height_m
+    points[~covered] = np.nan
+    mean_rgb = None
+    if all(cloud.rgb is not None for cloud in clouds):
+        mean_rgb = np.round(means[..., 1:4]).astype(np.uint8)
+    mean_amplitude = None
+    if all(cloud.amplitude is not None for cloud in clouds):
+        mean_amplitude = np.where(covered, means[..., 4], np.nan)
     merged = Cloud(
         points_m=points,
-        reason=np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8),
+        reason=np.where(covered, Reason.VALID, Reason.NO_RETURN).astype(np.uint8),
         count=samples,
-        variance_m2=found.temporal_m2 * samples,
+        variance_m2=fused.temporal_m2 * samples,
         region=Region(0, grid.shape[0], 0, grid.shape[1]),
         z_step_m=0.0,
         n_frames=sum(cloud.n_frames for cloud in clouds),
-        rgb=None
-        if any(cloud.rgb is None for cloud in clouds)
-        else np.round(means[..., 1:4]).astype(np.uint8),
-        amplitude=None
-        if any(c.amplitude is None for c in clouds)
-        else np.where(known, means[..., 4], np.nan),
-        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        rgb=mean_rgb,
+        amplitude=mean_amplitude,
+        left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
         projection="parallel",
-        mean_variance_m2=found.variance_m2 if len(views) > 1 else None,
+        mean_variance_m2=fused.variance_m2 if len(views) > 1 else None,
         map_views=MapViews(
-            np.stack([view.T_map_view for view in placed]), shares, (pixel_m[0], pixel_m[1])
+            np.stack([view.T_map_view for view in placed]),
+            shares,
+            (pixel_m[0], pixel_m[1]),
         ),
     )
-    return merged, T_reference_map, found, _notes(views, found)
+    return merged, T_reference_map, fused, _notes(views, fused)
 
 
 def _roughness(view: placing.PlacedView) -> np.ndarray:
@@ -298,13 +380,13 @@ def _roughness(view: placing.PlacedView) -> np.ndarray:
     repeat."""
     inside = view.chosen.inside
     rough = np.full(inside.shape, np.nan)
-    if not (view.chosen.cloud.count[inside] > 1).any():
-        x, y = view.places_m[inside].T
-        z = view.deviation_m[inside]
-        every = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
-        rough[inside] = z - fit_surface(x[every], y[every], z[every], SurfaceConfig()).evaluate(
-            x, y
-        )
+    if (view.chosen.cloud.count[inside] > 1).any():
+        return rough
+    x, y = view.places_m[inside].T
+    z = view.deviation_m[inside]
+    stride = slice(None, None, max(1, len(z) // SMOOTH_POINTS))
+    smooth = fit_surface(x[stride], y[stride], z[stride], SurfaceConfig())
+    rough[inside] = z - smooth.evaluate(x, y)
     return rough
 
 
@@ -313,9 +395,10 @@ def _neighbour_correlation(view: placing.PlacedView) -> float:
     pixel grid."""
     if not view.chosen.cloud.organised:
         return 1.0
-    d = view.deviation_m
-    single = _median(np.abs(d - _median(d)))
-    step = _median(np.concatenate([np.abs(np.diff(d, axis=axis)).ravel() for axis in (0, 1)]))
+    deviation = view.deviation_m
+    single = _median(np.abs(deviation - _median(deviation)))
+    steps = [np.abs(np.diff(deviation, axis=axis)).ravel() for axis in (0, 1)]
+    step = _median(np.concatenate(steps))
     if not (single > 0 and np.isfinite(step)):
         return 1.0
     return float(np.clip(1.0 - 0.5 * (step / single) ** 2, 0.0, 1.0))
@@ -323,12 +406,18 @@ def _neighbour_correlation(view: placing.PlacedView) -> float:
 
 def _median(values: np.ndarray) -> float:
     """Return the median of an even sample of the finite values; NaN if there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known[:: max(1, len(known) // SMOOTH_POINTS)])) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return np.nan
+    stride = max(1, len(finite) // SMOOTH_POINTS)
+    return float(np.median(finite[::stride]))
 
 
 def _registration_variance(
-    view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
+    view: placing.ChosenView,
+    points_m: np.ndarray,
+    along: np.ndarray,
+    T_reference_map: np.ndarray,
 ) -> np.ndarray:
     """Return the variance (h, w) that the registration gives to displacements w x (p - centre) + t
     of points (h, w, 3) along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0
@@ -338,12 +427,13 @@ def _registration_variance(
     turn = np.kron(np.eye(2), T_reference_map[:3, :3])
     centre = transform_points(invert(T_reference_map), view.registration.centre_m)
     lever = np.concatenate([np.cross(points_m - centre, along), along], axis=-1)
-    spread = ((lever @ (turn.T @ view.registration.covariance @ turn)) * lever).sum(axis=-1)
+    covariance = turn.T @ view.registration.covariance @ turn
+    spread = ((lever @ covariance) * lever).sum(axis=-1)
     return np.asarray(np.maximum(spread, 0.0))
 
 
-def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str, ...]:
-    between = found.between
+def _notes(views: Sequence[placing.ChosenView], surface_map: SurfaceMap) -> tuple[str, ...]:
+    between = surface_map.between
     notes = [
         "one view: its variance excludes errors that are constant in a view (pattern, wiggling)"
     ]
@@ -358,16 +448,18 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
         notes.append(
             f"views without a covariance count among those differences: {', '.join(without)}"
         )
-    if found.rejected:
+    if surface_map.rejected:
+        kept = int(surface_map.seen_by.sum())
         notes.append(
-            f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations "
-            "were outliers"
+            f"{surface_map.rejected} of {kept + surface_map.rejected} observations were outliers"
         )
     return tuple(notes)
 
 
 def depth_noise(
-    cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray
+    cloud: Cloud,
+    inside: np.ndarray,
+    deviation_m: np.ndarray,
 ) -> tuple[np.ndarray, bool]:
     """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if
     it comes from the sample variances of repeated frames inside the target. The law is v = k q + c
@@ -379,10 +471,10 @@ def depth_noise(
     q = (cloud.points_m**2).sum(axis=-1) ** 2
     valid = cloud.valid
     if cloud.amplitude is not None:
-        known = valid & (np.nan_to_num(cloud.amplitude) > 0)
-        if known.sum() >= 0.9 * valid.sum():
-            q = 1.0 / np.where(known, cloud.amplitude, np.nan) ** 2
-            q[valid & ~known] = np.median(q[known])
+        with_amplitude = valid & (np.nan_to_num(cloud.amplitude) > 0)
+        if with_amplitude.sum() >= 0.9 * valid.sum():
+            q = 1.0 / np.where(with_amplitude, cloud.amplitude, np.nan) ** 2
+            q[valid & ~with_amplitude] = np.median(q[with_amplitude])
     used = inside & (cloud.count > 1) & np.isfinite(cloud.variance_m2)
     repeated = bool(used.sum() >= PER_BIN)
     if repeated:
@@ -399,24 +491,26 @@ def depth_noise(
     if used.any():
         thinned = slice(None, None, max(1, len(samples) // SAMPLED))
         numbers, where = np.unique(freedom[thinned], return_inverse=True)
-        samples = samples[thinned] / (2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers)[where]
+        # the median of a variance from so many degrees of freedom, over its mean
+        medians = 2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers
+        samples = samples[thinned] / medians[where]
         x = q[used][thinned]
         # medians of classes of q make the fit robust against damage in the view
-        parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))
+        classes = max(1, min(BINS, len(x) // PER_BIN))
+        parts = np.array_split(np.argsort(x, kind="stable"), classes)
         typical = float(np.median(x))
         middle = np.array([np.median(x[part]) for part in parts]) / typical
         height = np.maximum([np.median(samples[part]) for part in parts], LEAST_M2)
         # the relative error of each median is the same
-        slope, constant = nnls(
-            np.column_stack([middle, np.ones(len(parts))]) / height[:, None], np.ones(len(parts))
-        )[0]
+        ones = np.ones(len(parts))
+        design = np.column_stack([middle, ones]) / height[:, None]
+        slope, constant = nnls(design, ones)[0]
     frame = slope * q / typical + constant
-    left = 0.0
+    rounding_m2 = 0.0
     if cloud.z_step_m > 0 and repeated:
         # any average keeps an error of rounding that no scatter shows; if frames repeat exactly,
         # it is the whole error
-        left = rounding_left_m2(
-            cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0)
-        )
+        dither_m2 = max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0)
+        rounding_m2 = rounding_left_m2(cloud.z_step_m, dither_m2)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.maximum(frame / cloud.count + left, LEAST_M2), repeated
+        return np.maximum(frame / cloud.count + rounding_m2, LEAST_M2), repeated

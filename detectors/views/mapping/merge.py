@@ -65,28 +65,27 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
     order = np.flatnonzero(facing)[np.lexsort(points[facing].T[::-1])]
     n = len(order)
     variances = np.concatenate([view.cloud.variance_m2[view.inside] for view in views])
-    known = variances[np.isfinite(variances)]
+    finite = variances[np.isfinite(variances)]
+    variance_m2 = float(np.median(finite)) if len(finite) else np.nan
+    if rgb is not None:
+        rgb = np.round(255.0 * np.clip(rgb[order], 0.0, 1.0)).astype(np.uint8)[None]
     merged = Cloud(
         points_m=points[order][None],
         reason=np.zeros((1, n), dtype=np.uint8),
         count=np.ones((1, n), dtype=np.int32),
-        variance_m2=np.full((1, n), float(np.median(known)) if len(known) else np.nan),
+        variance_m2=np.full((1, n), variance_m2),
         region=Region(0, 1, 0, n),
         z_step_m=max(cloud.z_step_m for cloud in clouds),
         n_frames=min(cloud.n_frames for cloud in clouds),
         organised=False,
-        rgb=None
-        if rgb is None
-        else np.round(255.0 * np.clip(rgb[order], 0.0, 1.0)).astype(np.uint8)[None],
-        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        rgb=rgb,
+        left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
     )
-    note = f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
-    return merged, (
-        (
-            f"{note} {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are "
-            "left out"
-        ),
+    note = (
+        f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm; "
+        f"{len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are left out"
     )
+    return merged, (note,)
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
@@ -102,17 +101,14 @@ def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.nd
     columns, rows = np.floor((high - low) / step).astype(int) + 1
     grid = CellGrid(float(low[0]), float(low[1]), step, (int(rows), int(columns)))
     raster = raster_between(slopes, inside, cloud.organised, step, grid)
-    z = np.nan_to_num(raster.at_cells(cloud.points_m[..., 2].reshape(-1))).astype(np.float32)[
-        ..., None
-    ]
-    rgb = (
-        None
-        if cloud.rgb is None
-        else np.nan_to_num(raster.at_cells(cloud.rgb.reshape(-1, 3))) / 255.0
-    )
+    z = np.nan_to_num(raster.at_cells(cloud.points_m[..., 2].reshape(-1)))
+    rgb = None
+    if cloud.rgb is not None:
+        colours = raster.at_cells(cloud.rgb.reshape(-1, 3))
+        rgb = (np.nan_to_num(colours) / 255.0).astype(np.float32)
     u0, v0 = LOOKED_UP_AT - low / step
     matrix = np.array([[1.0 / step, 0.0, u0], [0.0, 1.0 / step, v0], [0.0, 0.0, 1.0]])
-    return z, None if rgb is None else rgb.astype(np.float32), matrix
+    return z.astype(np.float32)[..., None], rgb, matrix
 
 
 def _crossings(
@@ -131,31 +127,45 @@ def _crossings(
             return geometry.Image(core.Tensor(np.ascontiguousarray(values)))
 
         field = geometry.VoxelBlockGrid(
-            names, [core.float32] * len(names), channels, voxel, BLOCK, BLOCKS_AT_FIRST
+            names,
+            [core.float32] * len(names),
+            channels,
+            voxel,
+            BLOCK,
+            BLOCKS_AT_FIRST,
         )
         for view in views:
             z, rgb, matrix = _undistorted(view)
-            camera = core.Tensor(matrix), core.Tensor(invert(view.registration.T_reference_view))
-            limits = 1.0, float(z.max()) * 2.0, TRUNCATION_VOXELS
-            depth = image(z)
-            colour = [image(rgb)] if coloured and rgb is not None else []
-            blocks = field.compute_unique_block_coordinates(depth, *camera, *limits)
-            field.integrate(blocks, depth, *colour, *camera, *limits)
+            images = [image(z)]
+            if coloured and rgb is not None:
+                images.append(image(rgb))
+            projection = (
+                core.Tensor(matrix),
+                core.Tensor(invert(view.registration.T_reference_view)),
+                1.0,
+                float(z.max()) * 2.0,
+                TRUNCATION_VOXELS,
+            )
+            blocks = field.compute_unique_block_coordinates(images[0], *projection)
+            field.integrate(blocks, *images, *projection)
         try:
-            found = field.extract_point_cloud(0.5)
+            crossings = field.extract_point_cloud(0.5)
         except RuntimeError as error:
             # Open3D cannot make a cloud without points
-            what = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
+            problem = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
             raise UserError(
-                what, fix="choose smaller voxels, check the crop, or merge in another way"
+                problem, fix="choose smaller voxels, check the crop, or merge in another way"
             ) from error
-        points = found.point["positions"].numpy().astype(np.float64)
-        normals = found.point["normals"].numpy().astype(np.float64)
-        return points, normals, found.point.colors.numpy().copy() if coloured else None
+        points = crossings.point["positions"].numpy().astype(np.float64)
+        normals = crossings.point["normals"].numpy().astype(np.float64)
+        return points, normals, crossings.point.colors.numpy().copy() if coloured else None
 
 
 def _facing(
-    views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarray, pitch_m: float
+    views: Sequence[ChosenView],
+    points_m: np.ndarray,
+    normals: np.ndarray,
+    pitch_m: float,
 ) -> np.ndarray:
     """Return (n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface
     of all targets."""
@@ -177,16 +187,19 @@ MAX_BOXES = (
 
 @dataclass(frozen=True)
 class Merged:
-    """One cloud of several views. ``T_reference_cloud`` (4, 4): from its frame to the first view's
-    camera frame. ``views_used``: names of the merged views. ``surface_map``: further results of a
-    fused map."""
+    """One cloud of several views."""
 
     cloud: Cloud
     T_reference_cloud: np.ndarray
+    """(4, 4): from the cloud's frame to the first view's camera frame."""
     views_used: tuple[str, ...]
+    """Names of the merged views."""
     seconds: float
+    """Time taken by the merge."""
     notes: tuple[str, ...] = ()
+    """Views that were left out, and remarks of the merge."""
     surface_map: SurfaceMap | None = None
+    """Further results of a fused map."""
 
 
 @dataclass(frozen=True)
@@ -204,20 +217,21 @@ class Mapped:
         merged = self.merged
         count = merged.cloud.valid.size
         if merged.surface_map is not None:
-            seen = merged.surface_map.seen_by.reshape(-1, count)
-            return np.where(seen.sum(axis=0) == 1, seen.argmax(axis=0), SEVERAL)
+            seen_by = merged.surface_map.seen_by.reshape(-1, count)
+            return np.where(seen_by.sum(axis=0) == 1, seen_by.argmax(axis=0), SEVERAL)
         points = merged.cloud.points_m.reshape(-1, 3)
-        known = np.isfinite(points).all(axis=1)
+        finite = np.isfinite(points).all(axis=1)
         pairs = zip(self.views, self.registrations, strict=True)
-        used = (
-            transform_points(T.T_reference_view, view.points_m)
-            for view, T in pairs
-            if T.view in merged.views_used
-        )
-        distances = np.stack([cKDTree(placed).query(points[known])[0] for placed in used])
-        least, second = np.sort(np.vstack([distances, np.full(known.sum(), np.inf)]), axis=0)[:2]
+        distances = []
+        for view, registration in pairs:
+            if registration.view in merged.views_used:
+                placed = transform_points(registration.T_reference_view, view.points_m)
+                distances.append(cKDTree(placed).query(points[finite])[0])
+        nearest = np.argmin(distances, axis=0)
+        distances.append(np.full(finite.sum(), np.inf))
+        least, second = np.sort(distances, axis=0)[:2]
         indices = np.full(count, SEVERAL)
-        indices[known] = np.where(second <= 2 * least, SEVERAL, distances.argmin(axis=0))
+        indices[finite] = np.where(second <= 2 * least, SEVERAL, nearest)
         return indices
 
 
@@ -229,7 +243,9 @@ def prepare(view: View, config: MappingConfig) -> PreparedView:
 
 
 def merge(
-    views: Sequence[PreparedView], registrations: Sequence[Registration], config: AnyMerge
+    views: Sequence[PreparedView],
+    registrations: Sequence[Registration],
+    config: AnyMerge,
 ) -> Merged:
     """Merge the views, or the single view, whose registration did not fail. Raises UserError if no
     view is left, or if the settings ask for too many cells."""
@@ -259,10 +275,15 @@ def merge(
         cell_m = None if config.cell_mm is None else config.cell_mm * MM
         cloud, T_reference_cloud, surface_map, notes = fuse(chosen, cell_m)
     else:
-        cloud, notes = integrate(chosen, None if config.voxel_mm is None else config.voxel_mm * MM)
-    used = tuple(view.name for view in chosen)
+        voxel_m = None if config.voxel_mm is None else config.voxel_mm * MM
+        cloud, notes = integrate(chosen, voxel_m)
     return Merged(
-        cloud, T_reference_cloud, used, time.perf_counter() - began, left_out + notes, surface_map
+        cloud=cloud,
+        T_reference_cloud=T_reference_cloud,
+        views_used=tuple(view.name for view in chosen),
+        seconds=time.perf_counter() - began,
+        notes=left_out + notes,
+        surface_map=surface_map,
     )
 
 
@@ -275,40 +296,47 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would
     weight a late cloud more. ``count``: samples of all points of a box; ``variance_m2``: their
     mean variance; ``n_frames``: the least."""
-    limits = [
-        (view.points_reference_m.min(axis=0), view.points_reference_m.max(axis=0)) for view in views
-    ]
+    limits = []
+    for view in views:
+        points = view.points_reference_m
+        limits.append((points.min(axis=0), points.max(axis=0)))
     # x, y, z, red, green, blue, amplitude, samples, samples times variance, number of points
     columns = np.concatenate([_columns(view) for view in views])
     points = columns[:, :3]
-    shared = (
-        sum(((points >= low) & (points <= high)).all(axis=1).astype(int) for low, high in limits)
-        > 1
-    )
-    overlaps = [
-        (np.maximum(a[0], b[0]), np.minimum(a[1], b[1])) for a, b in combinations(limits, 2)
-    ]
+    boxes_around = np.zeros(len(points), dtype=int)
+    for low, high in limits:
+        boxes_around += ((points >= low) & (points <= high)).all(axis=1)
+    shared = boxes_around > 1
     sums = columns[~shared]
     if shared.any():
-        corner = np.min([low for low, high in overlaps if (low <= high).all()], axis=0)
+        corners = []
+        for (low, high), (other_low, other_high) in combinations(limits, 2):
+            corner = np.maximum(low, other_low)
+            if (corner <= np.minimum(high, other_high)).all():
+                corners.append(corner)
+        corner = np.min(corners, axis=0)
         boxes = np.floor((points[shared] - corner) / step_m)
         if boxes.max() >= MAX_BOXES:
-            what = (
-                f"{np.ptp(points[shared], axis=0).max():.3g} m hold too many boxes of "
-                f"{step_m * 1e3:.3g} mm"
-            )
+            extent_m = np.ptp(points[shared], axis=0).max()
+            problem = f"{extent_m:.3g} m hold too many boxes of {step_m * 1e3:.3g} mm"
             fix = "crop the views to the target, or raise merge.step_mm"
-            raise UserError(what, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
+            raise UserError(problem, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
         x, y, z = boxes.astype(np.int64).T
         keys = (x << 42) | (y << 21) | z
         order = np.argsort(keys, kind="stable")
         starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-        sums = np.concatenate([np.add.reduceat(columns[shared][order], starts, axis=0), sums])
+        box_sums = np.add.reduceat(columns[shared][order], starts, axis=0)
+        sums = np.concatenate([box_sums, sums])
     clouds = [view.cloud for view in views]
     n = sums[:, 9:]
     samples = sums[:, 7]
     # MATLAB rounds mean colours
-    colour = np.floor(sums[:, 3:6] / n + 0.5)
+    rgb = None
+    if all(cloud.rgb is not None for cloud in clouds):
+        rgb = np.floor(sums[:, 3:6] / n + 0.5).astype(np.uint8)[None]
+    amplitude = None
+    if all(cloud.amplitude is not None for cloud in clouds):
+        amplitude = (sums[:, 6] / n[:, 0])[None]
     return Cloud(
         points_m=(sums[:, :3] / n)[None],
         reason=np.zeros((1, len(sums)), dtype=np.uint8),
@@ -318,11 +346,9 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         z_step_m=max(cloud.z_step_m for cloud in clouds),
         n_frames=min(cloud.n_frames for cloud in clouds),
         organised=False,
-        rgb=None if any(cloud.rgb is None for cloud in clouds) else colour.astype(np.uint8)[None],
-        amplitude=None
-        if any(c.amplitude is None for c in clouds)
-        else (sums[:, 6] / n[:, 0])[None],
-        left_out=tuple(left for cloud in clouds for left in cloud.left_out),
+        rgb=rgb,
+        amplitude=amplitude,
+        left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
     )
 
 
@@ -332,7 +358,19 @@ def _columns(view: ChosenView) -> np.ndarray:
     inside = view.inside
     count = cloud.count[inside].astype(np.float64)
     unknown = np.full(len(count), np.nan)
-    colour = [unknown] * 3 if cloud.rgb is None else list(cloud.rgb[inside].T)
-    amplitude = unknown if cloud.amplitude is None else cloud.amplitude[inside]
-    values = (*colour, amplitude, count, count * cloud.variance_m2[inside], np.ones(len(count)))
-    return np.column_stack([view.points_reference_m, *values])
+    colour = [unknown] * 3
+    if cloud.rgb is not None:
+        colour = list(cloud.rgb[inside].T)
+    amplitude = unknown
+    if cloud.amplitude is not None:
+        amplitude = cloud.amplitude[inside]
+    return np.column_stack(
+        [
+            view.points_reference_m,
+            *colour,
+            amplitude,
+            count,
+            count * cloud.variance_m2[inside],
+            np.ones(len(count)),
+        ]
+    )

@@ -30,9 +30,13 @@ class CellGrid:
     """Cells centred at (``x0`` + column * ``step``, ``y0`` + row * ``step``)."""
 
     x0: float
+    """x of the first column, in the unit of the step."""
     y0: float
+    """y of the first row."""
     step: float
+    """Side of a cell."""
     shape: tuple[int, int]
+    """Rows and columns."""
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y (h, w) of the cells."""
@@ -43,31 +47,35 @@ class CellGrid:
 
 @dataclass(frozen=True)
 class Raster:
-    """The samples around each cell of a grid. ``weights``: sparse (h * w, n), the share of each of
-    n samples in the mean over a cell. A row sums to 1, and is empty if less than half of the cell
-    is covered."""
+    """The samples around each cell of a grid (h, w)."""
 
     weights: Any
+    """Sparse (h * w, n): the share of each of n samples in the mean over a cell. A row sums to 1,
+    and is empty if less than half of the cell is covered."""
     shape: tuple[int, int]
+    """Rows and columns of the grid."""
 
     def at_cells(self, values: np.ndarray) -> np.ndarray:
         """Return samples' values (n,) or (n, c) at the cells, (h, w) or (h, w, c); NaN where the
         cell is unknown."""
-        found = np.asarray(self.weights @ values.astype(np.float64))
-        found[self.weights.getnnz(axis=1) == 0] = np.nan
-        return found.reshape(*self.shape, *values.shape[1:])
+        means = np.asarray(self.weights @ values.astype(np.float64))
+        means[self.weights.getnnz(axis=1) == 0] = np.nan
+        return means.reshape(*self.shape, *values.shape[1:])
 
     @property
     def concentration(self) -> np.ndarray:
         """Return the sum of squares (h, w) of the samples' weights: the factor of independent
         errors' variance."""
-        return np.asarray(self.weights.multiply(self.weights).sum(axis=1), np.float64).reshape(
-            self.shape
-        )
+        squares = self.weights.multiply(self.weights)
+        return np.asarray(squares.sum(axis=1), np.float64).reshape(self.shape)
 
 
 def raster_between(
-    places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid
+    sample_xy: np.ndarray,
+    valid: np.ndarray,
+    organised: bool,
+    spacing: float,
+    grid: CellGrid,
 ) -> Raster:
     """Return the `Raster` of a grid over the ``valid`` samples at ``places`` (v, u, 2), on a pixel
     grid or not (v = 1). Cells larger than ``spacing``, that of the samples, are divided into
@@ -75,11 +83,12 @@ def raster_between(
     parts = max(1, round(grid.step / spacing))
     step = grid.step / parts
     corner = np.array([grid.x0, grid.y0]) - 0.5 * (grid.step - step)
-    flat = np.ascontiguousarray((places.reshape(-1, 2) - corner) / step)
+    flat = np.ascontiguousarray((sample_xy.reshape(-1, 2) - corner) / step)
     h, w = grid.shape
     corners = np.full((h * parts, w * parts, 3), -1)
     shares = np.zeros((h * parts, w * parts, 3))
-    _fill(flat, _of_grid(valid) if organised else _of_points(places[0], valid[0]), corners, shares)
+    triangles = _of_grid(valid) if organised else _of_points(sample_xy[0], valid[0])
+    _fill(flat, triangles, corners, shares)
     rows, columns = np.nonzero(corners[..., 0] >= 0)
     cells = rows // parts * w + columns // parts
     covered = np.bincount(cells, minlength=h * w)[cells]
@@ -90,77 +99,80 @@ def raster_between(
     covered = covered[enough]
     values = shares[rows, columns] / covered[:, None]
     indices = np.repeat(cells, 3), corners[rows, columns].ravel()
-    return Raster(csr_matrix((values.ravel(), indices), shape=(h * w, len(flat))), grid.shape)
+    weights = csr_matrix((values.ravel(), indices), shape=(h * w, len(flat)))
+    return Raster(weights, grid.shape)
 
 
 def _of_grid(valid: np.ndarray) -> np.ndarray:
     """Return triangles (t, 3) of flat indices: two for each four neighbours, or one if one of the
     four is invalid."""
     index = np.arange(valid.size).reshape(valid.shape)
-    a, b, c, d = (
-        index[r, s].ravel()
-        for r in (slice(-1), slice(1, None))
-        for s in (slice(-1), slice(1, None))
-    )
+    a = index[:-1, :-1].ravel()
+    b = index[:-1, 1:].ravel()
+    c = index[1:, :-1].ravel()
+    d = index[1:, 1:].ravel()
     has_a = valid.ravel()[a]
     has_b = valid.ravel()[b]
     has_c = valid.ravel()[c]
     has_d = valid.ravel()[d]
+    # the diagonal goes from b to c, or from a to d where b or c is invalid
     inner = has_b & has_c
-    outer = has_a & has_d & ~(has_b & has_c)
-    kinds = [
-        (inner & has_a, a, b, c),
-        (inner & has_d, b, c, d),
-        (outer & has_b, a, b, d),
-        (outer & has_c, a, c, d),
-    ]
-    return np.concatenate([np.stack(corners, axis=1)[used] for used, *corners in kinds])
+    outer = has_a & has_d & ~inner
+    return np.concatenate(
+        [
+            np.stack([a, b, c], axis=1)[inner & has_a],
+            np.stack([b, c, d], axis=1)[inner & has_d],
+            np.stack([a, b, d], axis=1)[outer & has_b],
+            np.stack([a, c, d], axis=1)[outer & has_c],
+        ]
+    )
 
 
-def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _of_points(sample_xy: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return triangles (t, 3) of indices of samples (n, 2) without a grid: Delaunay triangles with
     short edges."""
-    known = np.flatnonzero(valid)
-    triangles = known[Delaunay(places[known]).simplices.astype(np.int64)]
-    lengths = np.linalg.norm(places[triangles] - places[np.roll(triangles, 1, axis=1)], axis=-1)
-    return triangles[(lengths <= LONGEST_EDGE * np.median(lengths)).all(axis=1)]
+    valid_indices = np.flatnonzero(valid)
+    triangles = valid_indices[Delaunay(sample_xy[valid_indices]).simplices.astype(np.int64)]
+    edges = sample_xy[triangles] - sample_xy[np.roll(triangles, 1, axis=1)]
+    lengths = np.linalg.norm(edges, axis=-1)
+    short = lengths <= LONGEST_EDGE * np.median(lengths)
+    return triangles[short.all(axis=1)]
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(
-    places: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares: np.ndarray
+    sample_xy: np.ndarray,
+    triangles: np.ndarray,
+    corners: np.ndarray,
+    shares: np.ndarray,
 ) -> None:
     """Give each triangle (t, 3) the cells that no earlier triangle has; ``places`` (n, 2) in
     cells."""
     h, w = corners.shape[:2]
     for t in range(len(triangles)):
         a, b, c = triangles[t]
-        ax, ay = places[a]
-        bx, by = places[b]
-        cx, cy = places[c]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        ax, ay = sample_xy[a]
+        bx, b_y = sample_xy[b]
+        cx, cy = sample_xy[c]
+        area = (bx - ax) * (cy - ay) - (b_y - ay) * (cx - ax)
         if not abs(area) > 1e-12:
             continue
-        left = max(0, int(np.ceil(min(ax, bx, cx) - SLACK)))
+        first_column = max(0, int(np.ceil(min(ax, bx, cx) - SLACK)))
         right = min(w - 1, int(np.floor(max(ax, bx, cx) + SLACK)))
-        top = max(0, int(np.ceil(min(ay, by, cy) - SLACK)))
-        bottom = min(h - 1, int(np.floor(max(ay, by, cy) + SLACK)))
+        top = max(0, int(np.ceil(min(ay, b_y, cy) - SLACK)))
+        bottom = min(h - 1, int(np.floor(max(ay, b_y, cy) + SLACK)))
         for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
+            for column in range(first_column, right + 1):
                 of_b = ((column - ax) * (cy - ay) - (row - ay) * (cx - ax)) / area
-                of_c = ((bx - ax) * (row - ay) - (by - ay) * (column - ax)) / area
+                of_c = ((bx - ax) * (row - ay) - (b_y - ay) * (column - ax)) / area
                 of_a = 1.0 - of_b - of_c
                 if corners[row, column, 0] < 0 and min(of_a, of_b, of_c) >= -SLACK:
-                    corners[row, column, 0], corners[row, column, 1], corners[row, column, 2] = (
-                        a,
-                        b,
-                        c,
-                    )
-                    shares[row, column, 0], shares[row, column, 1], shares[row, column, 2] = (
-                        of_a,
-                        of_b,
-                        of_c,
-                    )
+                    corners[row, column, 0] = a
+                    corners[row, column, 1] = b
+                    corners[row, column, 2] = c
+                    shares[row, column, 0] = of_a
+                    shares[row, column, 1] = of_b
+                    shares[row, column, 2] = of_c
 
 
 FIT_POINTS = 20_000
@@ -171,13 +183,16 @@ MAX_CELLS = 1 << 24  # most cells of a map: those of a board of 4 m in millimetr
 
 @dataclass(frozen=True)
 class ChosenView:
-    """A view to be merged, and its registration. ``inside`` (h, w) bool: valid pixels of the
-    target."""
+    """A view to be merged."""
 
     name: str
+    """Name of the view."""
     cloud: Cloud
+    """Its cloud, camera frame."""
     inside: np.ndarray
+    """(h, w) bool: valid pixels of the target."""
     registration: Registration
+    """Its pose relative to the first view."""
 
     @property
     def known_covariance(self) -> bool:
@@ -199,9 +214,9 @@ class ChosenView:
         with np.errstate(invalid="ignore"):
             slopes = np.where(self.inside[..., None], points[..., :2] / points[..., 2:], np.nan)
         if self.cloud.organised and min(self.inside.shape) > 1:
-            steps = np.concatenate(
-                [np.abs(np.diff(slopes[..., k], axis=1 - k)).ravel() for k in (0, 1)]
-            )
+            along_rows = np.abs(np.diff(slopes[..., 0], axis=1))
+            along_columns = np.abs(np.diff(slopes[..., 1], axis=0))
+            steps = np.concatenate([along_rows.ravel(), along_columns.ravel()])
             if np.isfinite(steps).any():
                 return float(np.nanmedian(steps))
         extent = np.nanmax(slopes, axis=(0, 1)) - np.nanmin(slopes, axis=(0, 1))
@@ -210,17 +225,19 @@ class ChosenView:
 
 @dataclass(frozen=True)
 class PlacedView:
-    """A view in the map's frame. ``places_m`` (h, w, 2): x, y where each pixel's ray meets the
-    surface. ``deviation_m`` (h, w): how far behind (+) the surface, along z, the ray ends. NaN
-    outside the target. ``pixel_m`` (2,): sides along x and y of a rectangle that spreads as far as
-    a pixel on the surface. ``pitch_m``: of a square with its area."""
+    """A view in the map's frame; NaN outside the target."""
 
     chosen: ChosenView
     T_map_view: np.ndarray
+    """(4, 4): from the view's camera frame to the map's."""
     places_m: np.ndarray
+    """(h, w, 2): x, y where each pixel's ray meets the surface."""
     deviation_m: np.ndarray
+    """(h, w): how far behind (+) the surface, along z, the ray ends."""
     pixel_m: np.ndarray
+    """(2,): sides along x and y of a rectangle that spreads as far as a pixel on the surface."""
     pitch_m: float
+    """Side of a square with that pixel's area."""
 
 
 def T_reference_map_of(first: ChosenView) -> np.ndarray:
@@ -235,8 +252,11 @@ def T_reference_map_of(first: ChosenView) -> np.ndarray:
     z0, zx, zy = plane.evaluate(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     normal = np.array([z0 - zx, z0 - zy, 1.0])
     normal /= np.linalg.norm(normal)
-    meets = normal[2] > STEEPEST and z0 > 0 and x.min() <= 0 <= x.max() and y.min() <= 0 <= y.max()
-    target = np.array([0.0, 0.0, z0]) if meets else np.median(points, axis=0)
+    in_front = normal[2] > STEEPEST and z0 > 0
+    if in_front and x.min() <= 0 <= x.max() and y.min() <= 0 <= y.max():
+        target = np.array([0.0, 0.0, z0])
+    else:
+        target = np.median(points, axis=0)
     along_x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     along_x /= np.linalg.norm(along_x)
     T_reference_map = np.eye(4)
@@ -259,7 +279,11 @@ def common_surface(views: Sequence[ChosenView], T_reference_map: np.ndarray) -> 
     return fit_surface(x, y, z, SurfaceConfig())
 
 
-def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> PlacedView:
+def place(
+    view: ChosenView,
+    T_reference_map: np.ndarray,
+    surface: Surface,
+) -> PlacedView:
     """Follow each pixel's ray from its point to the surface in two steps; the remaining error is
     the squared slope of the surface times the deviation (0.3 % of it at 3 degrees). Pixel sizes
     are medians; without a grid, points count as if on a square grid. A pixel is the parallelogram
@@ -272,25 +296,38 @@ def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> Pl
     part = deviation / rays[:, 2]
     moved = points - part[:, None] * rays
     part += (moved[:, 2] - surface.evaluate(moved[:, 0], moved[:, 1])) / rays[:, 2]
-    places = np.full((*inside.shape, 2), np.nan)
+    places_m = np.full((*inside.shape, 2), np.nan)
     deviations = np.full(inside.shape, np.nan)
-    places[inside] = (points - part[:, None] * rays)[:, :2]
+    places_m[inside] = (points - part[:, None] * rays)[:, :2]
     deviations[inside] = deviation
     if view.cloud.organised and min(inside.shape) > 1:
-        by_u = places[:-1, 1:] - places[:-1, :-1]
-        by_v = places[1:, :-1] - places[:-1, :-1]
-        known = np.isfinite(by_u + by_v).all(axis=-1)
-        if known.any():
-            by_u = _some(by_u[known], FIT_POINTS)
-            by_v = _some(by_v[known], FIT_POINTS)
+        by_u = places_m[:-1, 1:] - places_m[:-1, :-1]
+        by_v = places_m[1:, :-1] - places_m[:-1, :-1]
+        finite = np.isfinite(by_u + by_v).all(axis=-1)
+        if finite.any():
+            by_u = _some(by_u[finite], FIT_POINTS)
+            by_v = _some(by_v[finite], FIT_POINTS)
             sides = np.sqrt(np.median(by_u**2, axis=0) + np.median(by_v**2, axis=0))
             areas = np.abs(by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0])
+            pitch = float(np.sqrt(np.median(areas)))
             return PlacedView(
-                view, T_map_view, places, deviations, sides, float(np.sqrt(np.median(areas)))
+                chosen=view,
+                T_map_view=T_map_view,
+                places_m=places_m,
+                deviation_m=deviations,
+                pixel_m=sides,
+                pitch_m=pitch,
             )
-    extent = np.nanmax(places, axis=(0, 1)) - np.nanmin(places, axis=(0, 1))
+    extent = np.nanmax(places_m, axis=(0, 1)) - np.nanmin(places_m, axis=(0, 1))
     pitch = float(np.sqrt(extent.prod() / inside.sum()))
-    return PlacedView(view, T_map_view, places, deviations, np.array([pitch, pitch]), pitch)
+    return PlacedView(
+        chosen=view,
+        T_map_view=T_map_view,
+        places_m=places_m,
+        deviation_m=deviations,
+        pixel_m=np.array([pitch, pitch]),
+        pitch_m=pitch,
+    )
 
 
 def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
@@ -303,14 +340,19 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     last = np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
-        what = (
-            f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of "
-            f"{step * 1e3:.3g} mm"
+        width, height = high - low
+        problem = (
+            f"a map of {width:.3g} x {height:.3g} m with cells of {step * 1e3:.3g} mm would have "
+            f"{columns * rows:.3g}"
         )
-        fix = "crop the views to the target, or give a larger merge.cell_mm"
         raise UserError(
-            f"{what} would have {columns * rows:.3g}", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix
+            problem,
+            legal=f"up to {MAX_CELLS:.2g} cells",
+            fix="crop the views to the target, or give a larger merge.cell_mm",
         )
     return CellGrid(
-        float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns))
+        x0=float(first[0] * step),
+        y0=float(first[1] * step),
+        step=float(step),
+        shape=(int(rows), int(columns)),
     )

@@ -24,7 +24,10 @@ class FusedMerge(Config):
 
     kind: Literal["fusion"] = "fusion"
     cell_mm: float | None = Field(
-        default=None, gt=0, le=50, description="null: the first view's pixel pitch"
+        default=None,
+        gt=0,
+        le=50,
+        description="null: the first view's pixel pitch",
     )
 
 
@@ -33,7 +36,10 @@ class VolumeMerge(Config):
 
     kind: Literal["volume"] = "volume"
     voxel_mm: float | None = Field(
-        default=None, gt=0, le=50, description="null: the first view's pixel pitch"
+        default=None,
+        gt=0,
+        le=50,
+        description="null: the first view's pixel pitch",
     )
 
 
@@ -45,7 +51,10 @@ class MappingConfig(Config):
     """Settings of crop (in each view's own frame), marks, registration and merge."""
 
     views: int | None = Field(
-        default=None, ge=1, le=1000, description="number of views to use; null: all"
+        default=None,
+        ge=1,
+        le=1000,
+        description="number of views to use; null: all",
     )
     crop: CropConfig = Field(default_factory=AutoCrop)
     marks: MarksConfig = Field(default_factory=ColourMarks)

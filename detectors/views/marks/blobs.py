@@ -50,7 +50,8 @@ def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     black has a share."""
     counts = rgb.astype(np.float64) + 0.5
     total = counts.sum(axis=1)
-    return counts[:, [0, 2]] / total[:, None], 1.0 / 12.0 / total**2
+    shares = counts[:, [0, 2]] / total[:, None]
+    return shares, 1.0 / 12.0 / total**2
 
 
 def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,29 +62,33 @@ def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stand_out(
-    features: np.ndarray, rounding: np.ndarray, xy: np.ndarray
+    features: np.ndarray,
+    rounding: np.ndarray,
+    xy: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (n,) of pixels from the target's own colour: in deviations of its
     scatter (the contrast), and in units of the threshold (the margin). ``features`` (n, p), p 1 or
     2. ``rounding`` (n,): their variance from whole counts; all noise is assumed to grow in
     proportion to it. ``xy`` (n, 2): any smooth co-ordinates."""
     stride = max(1, len(features) // SAMPLE)
-    (x, y), (some_x, some_y) = xy.T, xy[::stride].T
+    x, y = xy.T
+    sample_x, sample_y = xy[::stride].T
     # marks may cover a quarter, all at one end
     smooth = SurfaceConfig(degree=DEGREE, method="lts")
-    offset = np.stack(
-        [f - fit_surface(some_x, some_y, f[::stride], smooth).evaluate(x, y) for f in features.T],
-        axis=1,
-    )
+    offsets = []
+    for feature in features.T:
+        fitted = fit_surface(sample_x, sample_y, feature[::stride], smooth)
+        offsets.append(feature - fitted.evaluate(x, y))
+    offset = np.stack(offsets, axis=1)
     darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
-    apart = (offset / darkness[:, None])[::stride]
+    sample = (offset / darkness[:, None])[::stride]
     p = features.shape[1]
     # covariance (p, p) of the bulk about the backdrop, scaled like the innermost part of a
     # Gaussian
-    scatter = np.diag([max(sigma_of(each), 1e-6) ** 2 for each in apart.T])
+    scatter = np.diag([max(sigma_of(component), 1e-6) ** 2 for component in sample.T])
     for _ in range(STEPS):
-        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(scatter), apart)
-        core = apart[square <= np.quantile(square, CORE)]
+        square = np.einsum("ni,ij,nj->n", sample, np.linalg.inv(scatter), sample)
+        core = sample[square <= np.quantile(square, CORE)]
         scatter = core.T @ core / len(core) / CORE_SHRINKS[p] + 1e-12 * np.eye(p)
     scatter += np.median(rounding) * np.eye(p)
     contrast = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(scatter), offset))
@@ -92,8 +97,10 @@ def stand_out(
     # dimensions) and an exponential (shape 1), and never below the Gaussian
     middle, outer = np.quantile(distance[::stride], TAIL)
     logs = [-np.log(1.0 - share) for share in TAIL]
-    shape = np.log(logs[1] / logs[0]) / np.log(outer / middle) if 0 < middle < outer else 2.0
-    tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / float(np.clip(shape, 1.0, 2.0)))
+    shape = 2.0
+    if 0 < middle < outer:
+        shape = float(np.clip(np.log(logs[1] / logs[0]) / np.log(outer / middle), 1.0, 2.0))
+    tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / shape)
     return contrast, distance / max(tail, GAUSSIAN_LIMITS[p])
 
 
@@ -101,7 +108,8 @@ def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     """Return (h, w) bool: those ``chosen`` pixels whose contrast exceeds half of the largest
     nearby (of medians of 3 x 3), so that a group ends half way along its edge."""
     beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
-    greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((2 * NEARBY_PX + 1,) * 2, np.uint8))
+    side = 2 * NEARBY_PX + 1
+    greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((side, side), np.uint8))
     return np.asarray(chosen & (beyond > 0.5 * greatest))
 
 
@@ -138,22 +146,30 @@ over the length."""
 
 @dataclass(frozen=True)
 class Blob:
-    """``pixels`` (n,): flat indices. ``weights`` (n,): their share of the blob's colour, 0..1.
-    ``grid`` (n, 2): their places on a grid of unit step. ``grid_covariance`` (2, 2): of the
-    centroid there. ``surroundings`` (m,): flat indices of the target's points on and around it.
-    ``contrast`` (3,): logarithm of its colour over that of its surroundings by channel, in which
-    the light cancels. ``doubt``: that it is cut, else empty."""
+    """A connected group of pixels of another colour than the target's."""
 
     pixels: np.ndarray
+    """(n,): flat indices."""
     weights: np.ndarray
+    """(n,): the pixels' share of the blob's colour, 0..1."""
     grid: np.ndarray
+    """(n, 2): the pixels' places on a grid of unit step."""
     grid_covariance: np.ndarray
+    """(2, 2): of the centroid on that grid."""
     surroundings: np.ndarray
+    """(m,): flat indices of the target's points on and around it."""
     contrast: np.ndarray
+    """(3,): logarithm of its colour over that of its surroundings by channel, in which the light
+    cancels."""
     doubt: str = ""
+    """That it is cut, else empty."""
 
 
-def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
+def find_blobs(
+    cloud: Cloud,
+    inside: np.ndarray,
+    coloured: np.ndarray,
+) -> list[Blob]:
     """Return the connected groups of ``coloured`` (h, w) pixels, largest first; single missing
     pixels do not separate them. Whether rims have mixed colours is a property of the camera, so it
     is decided for all groups together."""
@@ -164,15 +180,19 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
     windows = [_window(cloud, inside, coloured, labels, label, boxes[label]) for label in large]
     rims = np.concatenate([np.zeros(0), *(rim for rim, _ in windows)])
     mixed = len(rims) > 0 and bool(np.mean((rims > 0.2) & (rims < 0.8)) >= MIXED_SHARE)
-    blobs = [blob for _, settled in windows if (blob := settled(mixed)) is not None]
+    blobs = []
+    for _, settled in windows:
+        blob = settled(mixed)
+        if blob is not None:
+            blobs.append(blob)
     # a blob that shares pixels with a larger one is part of it
     taken = np.zeros(inside.size, dtype=bool)
     kept = []
     for blob in sorted(blobs, key=lambda b: -float(b.weights.sum())):
-        own = blob.pixels[blob.weights > 0.5]
-        if not taken[own].any():
+        core_pixels = blob.pixels[blob.weights > 0.5]
+        if not taken[core_pixels].any():
             kept.append(blob)
-        taken[own] = True
+        taken[core_pixels] = True
     return kept
 
 
@@ -187,28 +207,28 @@ def _window(
     """Return the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on
     both sides of its border, and a function that makes a blob of the group once it is known
     whether rims are mixed."""
-    left, top, width, height, area = (int(value) for value in box)
+    left_px, top, width, height, area = box.tolist()
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
     row = max(top - margin, 0)
-    column = max(left - margin, 0)
-    cut = (slice(row, top + height + margin), slice(column, left + width + margin))
+    column = max(left_px - margin, 0)
+    cut = (slice(row, top + height + margin), slice(column, left_px + width + margin))
     assert cloud.rgb is not None
     target = inside[cut]
-    others = coloured[cut]
-    group = (labels[cut] == label) & others
+    candidates = coloured[cut]
+    group = (labels[cut] == label) & candidates
     core = _eroded(group)
     core = core if core.sum() >= LEAST_PIXELS else group
-    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
+    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~candidates
     if ring.sum() < LEAST_PIXELS:  # the target's own colour is not visible around it
         return np.zeros(0), lambda mixed: None
     rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
-    other = np.median(rgb[ring], axis=0)
-    span = np.median(rgb[core], axis=0) - other
-    share = (rgb - other) @ span / max(float(span @ span), 1e-12)
+    backdrop = np.median(rgb[ring], axis=0)
+    span = np.median(rgb[core], axis=0) - backdrop
+    share = (rgb - backdrop) @ span / max(float(span @ span), 1e-12)
     # mosaic and JPEG make neighbours share colour: the scatter of equivalent independent pixels
-    strays = float(
-        np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2)))
-    )
+    scatter = np.mean(share[ring] ** 2)
+    blurred_scatter = 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2)
+    strays = float(np.sqrt(max(scatter, blurred_scatter)))
     # the threshold that found the group only knows the target's colour and leaves gaps at low
     # contrast: take the connected pixels nearer to the group's colour, as far as the surroundings
     # reach
@@ -220,22 +240,24 @@ def _window(
         None if too few."""
         weights = group.astype(float)
         if mixed:
-            near = grown(group, RIM_PX) & target & ~(others & ~group)
-            weights = np.where(near, np.clip(share, 0.0, 1.0), 0.0)
+            reach = grown(group, RIM_PX) & target & ~(candidates & ~group)
+            weights = np.where(reach, np.clip(share, 0.0, 1.0), 0.0)
         v, u = np.nonzero((weights > 0.5) & target)
         if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
             return None
         # whether the group may continue where the target has no points
         around = grown(group, 1) & ~group
-        alike = np.linalg.norm(rgb - other - span, axis=-1) < ALIKE * np.linalg.norm(span)
-        on = around & alike & ~target
+        same_colour = np.linalg.norm(rgb - backdrop - span, axis=-1) < ALIKE * np.linalg.norm(span)
+        beyond_target = around & same_colour & ~target
         last_row = inside.shape[0] - 1 - row
         last_column = inside.shape[1] - 1 - column
+        at_side = u.min() == -column or u.max() == last_column
+        at_end = v.min() == -row or v.max() == last_row
         doubt = ""
-        if on.sum() > max(2.0, CUT_SHARE * around.sum()):
-            by_crop = (on & cloud.valid[cut]).sum() > on.sum() / 2
+        if beyond_target.sum() > max(2.0, CUT_SHARE * around.sum()):
+            by_crop = (beyond_target & cloud.valid[cut]).sum() > beyond_target.sum() / 2
             doubt = "cut by the crop's edge" if by_crop else "without range in parts of it"
-        elif u.min() == -column or v.min() == -row or u.max() == last_column or v.max() == last_row:
+        elif at_side or at_end:
             doubt = "cut by the picture's edge"
         used_v, used_u = np.nonzero((weights > 0) & target)
         grid = np.stack([used_u, used_v], axis=1).astype(float)
@@ -243,33 +265,41 @@ def _window(
             # the rim's weights err by `SHARE_SIGMA` and by the scatter of the surroundings'
             # colours
             arm = np.argwhere(rim)[:, ::-1] - np.argwhere(group)[:, ::-1].mean(axis=0)
-            covariance = (
-                (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / max(float(weights.sum()), 1.0) ** 2
-            )
+            area_px = max(float(weights.sum()), 1.0)
+            covariance = (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / area_px**2
         else:
             covariance = region_covariance_px2(grid)
-        own, around = (
-            (v + row) * inside.shape[1] + u + column
-            for v, u in ((used_v, used_u), np.nonzero(target))
-        )
+        target_v, target_u = np.nonzero(target)
         # a count is added to each colour, so that black has a logarithm
-        contrast = np.log((other + span + 1.0) / (other + 1.0))
-        return Blob(own, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
+        contrast = np.log((backdrop + span + 1.0) / (backdrop + 1.0))
+        width_px = inside.shape[1]
+        return Blob(
+            pixels=(used_v + row) * width_px + used_u + column,
+            weights=weights[used_v, used_u],
+            grid=grid,
+            grid_covariance=covariance,
+            surroundings=(target_v + row) * width_px + target_u + column,
+            contrast=contrast,
+            doubt=doubt,
+        )
 
     return share[rim], settled
 
 
-def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _evenly_lit(
+    rgb: np.ndarray,
+    ring: np.ndarray,
+    group: np.ndarray,
+) -> np.ndarray:
     """Return colours (h, w, 3) as if the light at the group's middle fell everywhere: each channel
     is divided by a plane fitted to the ring. Otherwise uneven light along a group would weight its
     two ends differently."""
     v, u = np.mgrid[0 : rgb.shape[0], 0 : rgb.shape[1]]
     middle_v = float(v[group].mean())
     middle_u = float(u[group].mean())
-    basis = np.stack(
-        [np.ones(rgb.shape[:2]), (u - middle_u) / rgb.shape[1], (v - middle_v) / rgb.shape[0]],
-        axis=-1,
-    )
+    by_u = (u - middle_u) / rgb.shape[1]
+    by_v = (v - middle_v) / rgb.shape[0]
+    basis = np.stack([np.ones(rgb.shape[:2]), by_u, by_v], axis=-1)
     plane = np.linalg.lstsq(basis[ring], rgb[ring], rcond=1e-9)[0]
     light = basis @ plane / np.maximum(plane[0], 1.0)
     return np.asarray(rgb / np.clip(light, 0.5, 2.0))
@@ -277,30 +307,30 @@ def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndar
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
     """Remove one pixel along the mask's border; the area beyond the window counts as outside."""
-    return shrunk(np.pad(mask, 1), 3)[1:-1, 1:-1]
+    padded = np.pad(mask, 1)
+    return shrunk(padded, 3)[1:-1, 1:-1]
 
 
 def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
     """Return the covariance (2, 2) of the centroid of the lattice points within convex polygons
     (..., n, 2), vertices in order, over all shifts of the lattice and all polygons."""
-    centred = polygon_px - _area_and_centre(polygon_px)[1][..., None, :]
-    shift = (
-        np.stack(np.meshgrid(np.arange(SHIFTS), np.arange(SHIFTS)), axis=-1).reshape(-1, 2) + 0.5
-    ) / SHIFTS
+    _, centre = _area_and_centre(polygon_px)
+    centred = polygon_px - centre[..., None, :]
+    steps = np.stack(np.meshgrid(np.arange(SHIFTS), np.arange(SHIFTS)), axis=-1)
+    shift = (steps.reshape(-1, 2) + 0.5) / SHIFTS
     # polygons by shifts, then the lattice's rows, then edges
-    x, y = np.moveaxis(centred.reshape(-1, 1, 1, *centred.shape[-2:]) + shift[:, None, None], -1, 0)
+    shifted = centred.reshape(-1, 1, 1, *centred.shape[-2:]) + shift[:, None, None]
+    x, y = np.moveaxis(shifted, -1, 0)
     row = np.arange(np.floor(y.min()), np.ceil(y.max()) + 1)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         part = (row - y) / (np.roll(y, -1, axis=-1) - y)
-        crossed = np.where(
-            (part >= 0) & (part <= 1), x + part * (np.roll(x, -1, axis=-1) - x), np.nan
-        )
+        crossing = x + part * (np.roll(x, -1, axis=-1) - x)
+        crossed = np.where((part >= 0) & (part <= 1), crossing, np.nan)
     first = np.ceil(np.fmin.reduce(crossed, axis=-1))
     last = np.floor(np.fmax.reduce(crossed, axis=-1))
     number = np.nan_to_num(np.maximum(last - first + 1, 0))
-    sums = np.stack([np.nan_to_num(number * (first + last) / 2), number * row[:, 0]], axis=-1).sum(
-        axis=-2
-    )
+    sums_x = np.nan_to_num(number * (first + last) / 2)
+    sums = np.stack([sums_x, number * row[:, 0]], axis=-1).sum(axis=-2)
     error = (sums / number.sum(axis=-1, keepdims=True) - shift).reshape(-1, 2)
     return np.asarray(error.T @ error / len(error))
 
@@ -314,8 +344,10 @@ def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     hull = cv2.convexHull(pixels.astype(np.float32))
     box_middle, size, angle = cv2.minAreaRect(hull)
     # the outermost pixel centres lie half a pixel inside the region
-    if len(pixels) > RECTANGULAR * (size[0] + 1) * (size[1] + 1):
-        outline = cv2.boxPoints((box_middle, (size[0] + 1, size[1] + 1), angle)).astype(np.float64)
+    width = size[0] + 1
+    height = size[1] + 1
+    if len(pixels) > RECTANGULAR * width * height:
+        outline = cv2.boxPoints((box_middle, (width, height), angle)).astype(np.float64)
     else:
         outline = hull[:, 0].astype(np.float64)
     area, centre = _area_and_centre(outline)
@@ -336,4 +368,5 @@ def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     following = np.roll(x, -1, axis=-2)
     cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
     area = cross.sum(axis=-1) / 2
-    return area, ((x + following) * cross[..., None]).sum(axis=-2) / (6 * area[..., None])
+    moment = ((x + following) * cross[..., None]).sum(axis=-2)
+    return area, moment / (6 * area[..., None])

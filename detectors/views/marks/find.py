@@ -42,13 +42,16 @@ LEAST_SCALE_M = 1e-6
 
 @dataclass(frozen=True)
 class Patch:
-    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m``, and the deviation of one point's
-    z about it."""
+    """The plane z = ``slope_x`` x + ``slope_y`` y + ``offset_m`` through points of a cloud."""
 
     slope_x: float
+    """Change of z along x."""
     slope_y: float
+    """Change of z along y."""
     offset_m: float
+    """z at x = y = 0."""
     sigma_m: float
+    """Standard deviation of one point's z about the plane."""
 
     @property
     def normal(self) -> np.ndarray:
@@ -70,43 +73,53 @@ class Patch:
         return np.asarray(points_m * scale[:, None])
 
     def range_covariance_m2(
-        self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray
+        self,
+        centre_m: np.ndarray,
+        cloud: Cloud,
+        pixels: np.ndarray,
     ) -> np.ndarray:
         """Return the covariance (3, 3) of a centre (3,) on the plane from its pixels' mean z (n,):
         from the largest of scatter about the plane, the frames' noise and a map's variance;
         `CORRELATED_PIXELS` share it."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
-        known = frames[np.isfinite(frames)]
-        variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
+        finite = frames[np.isfinite(frames)]
+        variance = max(self.sigma_m**2, float(finite.mean()) if len(finite) else 0.0)
         if cloud.mean_variance_m2 is not None:
             stated = cloud.mean_variance_m2.ravel()[pixels]
-            variance = max(
-                variance, float(np.nanmean(stated)) if np.isfinite(stated).any() else 0.0
-            )
-        ray = centre_m / centre_m[2] if cloud.projection == "central" else np.array([0.0, 0.0, 1.0])
+            if np.isfinite(stated).any():
+                variance = max(variance, float(np.nanmean(stated)))
+        ray = np.array([0.0, 0.0, 1.0])
+        if cloud.projection == "central":
+            ray = centre_m / centre_m[2]
         # if the plane is shifted along z by d, a ray meets it d n_z / n.ray farther along
         along = ray * self.normal[2] / (self.normal @ ray)
-        return np.asarray(
-            variance * min(1.0, CORRELATED_PIXELS / len(pixels)) * np.outer(along, along)
-        )
+        share = min(1.0, CORRELATED_PIXELS / len(pixels))
+        return np.asarray(variance * share * np.outer(along, along))
 
 
 @dataclass(frozen=True)
 class Spot:
-    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``,
-    ``pitch_m`` between pixels, and ``behind_m``: its distance behind its surroundings, with
-    standard deviation. ``sizes_m`` (3,): sides of the rectangle with its second moments, and the
-    mean breadth over the length, which gaps reduce."""
+    """A blob's place in space, camera frame."""
 
     blob: Blob
+    """Its pixels."""
     centre_m: np.ndarray
+    """(3,): its centroid on the surface."""
     covariance_m2: np.ndarray
+    """(3, 3): of the centroid."""
     normal: np.ndarray
+    """(3,): of the surface, towards the camera."""
     area_m2: float
+    """Area on the surface."""
     sizes_m: np.ndarray
+    """(3,): sides of the rectangle with its second moments, longer first, and the mean breadth
+    over the length, which gaps reduce."""
     pitch_m: float
+    """Distance between pixels."""
     behind_m: float
+    """Its distance behind its surroundings."""
     behind_sigma_m: float
+    """Standard deviation of that distance."""
 
     @property
     def is_hole(self) -> bool:
@@ -127,22 +140,28 @@ def fit_patch(points_m: np.ndarray) -> Patch | None:
     ).tolist()
     # points off the plane on only one side have shifted it, but not rotated it
     off = z - plane.evaluate(x, y)
-    off = off[
-        np.abs(off - median_of(off)) <= 3.0 * max(sigma_of(off - median_of(off)), LEAST_SCALE_M)
-    ]
+    centred = off - median_of(off)
+    off = off[np.abs(centred) <= 3.0 * max(sigma_of(centred), LEAST_SCALE_M)]
     return Patch(
-        at_x - level, at_y - level, level + float(off.mean()), max(float(off.std()), LEAST_SCALE_M)
+        slope_x=at_x - level,
+        slope_y=at_y - level,
+        offset_m=level + float(off.mean()),
+        sigma_m=max(float(off.std()), LEAST_SCALE_M),
     )
 
 
-def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
+def place_spot(
+    cloud: Cloud,
+    blob: Blob,
+    patch: Patch,
+) -> Spot:
     """Return the place of a blob whose surroundings lie on a plane."""
     pixels = blob.pixels
     weights = blob.weights
     points = cloud.points_m.reshape(-1, 3)[pixels]
-    own = weights > 0.5
+    core = weights > 0.5
     # the mean height of those points within four scales of the median
-    height = patch.above_m(points[own])
+    height = patch.above_m(points[core])
     middle = median_of(height)
     scale = max(sigma_of(height - middle), LEAST_SCALE_M)
     kept = height[np.abs(height - middle) <= 4.0 * scale]
@@ -150,25 +169,31 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     sigma = float(max(kept.std(), scale))
     settled = replace(patch, offset_m=patch.offset_m + behind, sigma_m=sigma)
     on_plane = settled.cut(points, cloud.projection)
-    covers = weights * (on_plane[:, 2] ** 3 if cloud.projection == "central" else 1.0)
+    covers = weights
+    if cloud.projection == "central":
+        covers = weights * on_plane[:, 2] ** 3
     centre = np.average(on_plane, axis=0, weights=covers)
-    jacobian = np.linalg.lstsq(blob.grid - blob.grid.mean(axis=0), on_plane - centre, rcond=None)[
-        0
-    ].T
-    covariance = (
-        settled.range_covariance_m2(centre, cloud, pixels[own])
-        + jacobian @ blob.grid_covariance @ jacobian.T
-    )
+    grid = blob.grid - blob.grid.mean(axis=0)
+    jacobian = np.linalg.lstsq(grid, on_plane - centre, rcond=None)[0].T
+    by_range = settled.range_covariance_m2(centre, cloud, pixels[core])
+    covariance = by_range + jacobian @ blob.grid_covariance @ jacobian.T
     scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
     _, minor, major = np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(scatter), 0.0))
     pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
     # the scatter of a flat mark: the different depths in a hole must not hide that it is a hole
     behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
     area = pixel_area * float(weights.sum())
-    pitch = float(np.sqrt(pixel_area))
-    covariance = (covariance + covariance.T) / 2
-    sizes = np.array([major, minor, area / major])
-    return Spot(blob, centre, covariance, settled.normal, area, sizes, pitch, behind, behind_sigma)
+    return Spot(
+        blob=blob,
+        centre_m=centre,
+        covariance_m2=(covariance + covariance.T) / 2,
+        normal=settled.normal,
+        area_m2=area,
+        sizes_m=np.array([major, minor, area / major]),
+        pitch_m=float(np.sqrt(pixel_area)),
+        behind_m=behind,
+        behind_sigma_m=behind_sigma,
+    )
 
 
 CORNER_PX = 0.25
@@ -181,33 +206,41 @@ doubt."""
 HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 
 
-def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
+def coded_marks(
+    cloud: Cloud,
+    inside: np.ndarray,
+    dictionary: str,
+) -> MarkSet:
     """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one
     code are in doubt."""
     assert cloud.rgb is not None
     grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    corners_px, found, _ = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(grey)
-    codes = [] if found is None else [int(code) for code in found.ravel()]
+    dictionary_words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    corners_px, ids, _ = cv2.aruco.ArucoDetector(dictionary_words, parameters).detectMarkers(grey)
+    codes = [] if ids is None else [int(code) for code in ids.ravel()]
     # corners (4, 2) in pixels of the grid, the centre of the first being (0, 0)
     tags = [
         (code, tag.reshape(4, 2).astype(float)) for code, tag in zip(codes, corners_px, strict=True)
     ]
     tags.sort(key=lambda tag: (tag[0], tag[1].tolist()))
-    each = [
+    candidates = [
         _coded_mark(cloud, inside, code, corners, codes.count(code) > 1) for code, corners in tags
     ]
-    marks = tuple(mark for mark in each if mark is not None)
-    off = len(each) - len(marks)
+    marks = tuple(mark for mark in candidates if mark is not None)
+    off = len(candidates) - len(marks)
     pixels = _pixels_of(marks)
     notes = (f"{off} tags lie off the target, or have no range",) if off else ()
     return MarkSet(marks, pixels, problem_of(marks, f"searched for tags of {dictionary}"), notes)
 
 
 def _coded_mark(
-    cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool
+    cloud: Cloud,
+    inside: np.ndarray,
+    code: int,
+    corners: np.ndarray,
+    twice: bool,
 ) -> Mark | None:
     """Return the tag as a mark; None if it lies off the target or has no range."""
     area = np.zeros(inside.shape, dtype=np.uint8)
@@ -223,25 +256,33 @@ def _coded_mark(
     rays = points[:, :2] / points[:, 2:] if cloud.projection == "central" else points[:, :2]
     coefficients = np.linalg.lstsq(_quadratic((grid - middle) / half), rays, rcond=1e-10)[0]
     wanted = np.concatenate([corners, corners.mean(axis=0) + HALF_STEPS])
-    found = _quadratic((wanted - middle) / half) @ coefficients
-    on_plane = patch.cut(np.column_stack([found, np.ones(len(found))]), cloud.projection)
-    places = on_plane[:4]
+    fitted = _quadratic((wanted - middle) / half) @ coefficients
+    on_plane = patch.cut(np.column_stack([fitted, np.ones(len(fitted))]), cloud.projection)
+    corner_places = on_plane[:4]
     steps = np.stack([on_plane[4] - on_plane[5], on_plane[6] - on_plane[7]], axis=1)
-    centre = places.mean(axis=0)
-    covariance = steps @ steps.T * CORNER_PX**2 / 4 + patch.range_covariance_m2(
-        centre, cloud, pixels
-    )
-    seen = len(pixels) / int(area.sum())
+    centre = corner_places.mean(axis=0)
+    by_corners = steps @ steps.T * CORNER_PX**2 / 4
+    covariance = by_corners + patch.range_covariance_m2(centre, cloud, pixels)
+    coverage = len(pixels) / int(area.sum())
     without = 1.0 - cloud.valid[area > 0].mean()
     doubt = ""
     if twice:
         doubt = f"code {code} is seen more than once"
-    elif seen < WHOLE and without > 1.0 - WHOLE:
+    elif coverage < WHOLE and without > 1.0 - WHOLE:
         doubt = f"{100 * without:.0f} % of it has no range"
-    elif seen < WHOLE:
-        doubt = f"{100 * (1 - seen):.0f} % of it is beyond the crop's edge"
-    area_m2 = float(np.linalg.norm(np.cross(places[2] - places[0], places[3] - places[1]))) / 2
-    return Mark(centre, (covariance + covariance.T) / 2, patch.normal, pixels, area_m2, code, doubt)
+    elif coverage < WHOLE:
+        doubt = f"{100 * (1 - coverage):.0f} % of it is beyond the crop's edge"
+    first_diagonal = corner_places[2] - corner_places[0]
+    second_diagonal = corner_places[3] - corner_places[1]
+    return Mark(
+        centre_m=centre,
+        covariance_m2=(covariance + covariance.T) / 2,
+        normal=patch.normal,
+        pixels=pixels,
+        area_m2=float(np.linalg.norm(np.cross(first_diagonal, second_diagonal))) / 2,
+        code=code,
+        doubt=doubt,
+    )
 
 
 def _quadratic(uv: np.ndarray) -> np.ndarray:
@@ -275,7 +316,9 @@ LARGEST_SHARE = 0.15
 
 
 def find_marks(
-    cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks
+    cloud: Cloud,
+    inside: np.ndarray,
+    config: RedMarks | ColourMarks | CodedMarks,
 ) -> MarkSet:
     """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. It raises for
     no picture; a set that cannot support a registration says so in its ``problem``."""
@@ -300,55 +343,63 @@ def find_marks(
         limit = mean + config.deviations * spread
         coloured = np.zeros(inside.shape, dtype=bool)
         coloured[inside] = red > limit
-        missing = (
-            f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and "
-            f"{config.deviations:g} standard"
-        )
-        missing += f" deviations of {spread:.0f}"
         if not cloud.organised:
-            return MarkSet(
-                (),
-                np.flatnonzero(coloured),
-                "marks need a pixel grid, which this cloud does not have",
+            problem = "marks need a pixel grid, which this cloud does not have"
+            return MarkSet((), np.flatnonzero(coloured), problem)
+        missing = ""
+        if not coloured.any():
+            missing = (
+                f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and "
+                f"{config.deviations:g} standard deviations of {spread:.0f}"
             )
-        return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
+        return _marks(cloud, inside, coloured, missing)
     # lightness is tried if chromaticity gives too few marks or hardly any contrast: black and
     # white have the light's chromaticity, and black hardly any
-    found, margin = _standing_out(cloud, inside, chromaticity)
-    if len(found.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
-        return found
+    marks, margin = _standing_out(cloud, inside, chromaticity)
+    enough = len(marks.trusted) >= LEAST_MARKS
+    if enough and margin >= CLEAR_MARGIN:
+        return marks
     lighter, lighter_margin = _standing_out(cloud, inside, lightness)
-    if len(lighter.trusted) < LEAST_MARKS or (
-        len(found.trusted) >= LEAST_MARKS and margin >= lighter_margin
-    ):
-        return found
+    if len(lighter.trusted) < LEAST_MARKS or (enough and margin >= lighter_margin):
+        return marks
     return replace(lighter, notes=(*lighter.notes, "the marks were found by their lightness"))
 
 
 def _standing_out(
-    cloud: Cloud, inside: np.ndarray, feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    cloud: Cloud,
+    inside: np.ndarray,
+    feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
 ) -> tuple[MarkSet, float]:
     """Find the marks by one feature of the colours; return them and the median margin of the
     trusted marks' pixels."""
     assert cloud.rgb is not None
     contrast = np.zeros(inside.shape)
     margin = np.zeros(inside.shape)
-    contrast[inside], margin[inside] = stand_out(
-        *feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2]
-    )
+    values, rounding = feature(cloud.rgb[inside])
+    xy = cloud.points_m[inside][:, :2]
+    contrast[inside], margin[inside] = stand_out(values, rounding, xy)
     coloured = above_half(margin > 1.0, contrast)
-    found = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
-    pixels = [mark.pixels for mark in found.trusted]
-    median = float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
+    marks = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
+    pixels = [mark.pixels for mark in marks.trusted]
+    median = 0.0
+    if pixels:
+        median = float(np.median(margin.ravel()[np.concatenate(pixels)]))
     # a hole through which another colour shows is not a fiducial
-    return replace(found, points=_pixels_of(found.marks)), median
+    return replace(marks, points=_pixels_of(marks.marks)), median
 
 
 def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *(mark.pixels for mark in marks)]))
+    """Return the flat indices of all pixels of the marks, rising."""
+    pixels = [mark.pixels for mark in marks]
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *pixels]))
 
 
-def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
+def _marks(
+    cloud: Cloud,
+    inside: np.ndarray,
+    coloured: np.ndarray,
+    missing: str,
+) -> MarkSet:
     """Return the marks among coloured pixels, in the order of their pixels; ``missing`` says why
     there are not more."""
     points_m = cloud.points_m.reshape(-1, 3)
@@ -365,9 +416,8 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     for spot in sorted(spots, key=lambda s: (-s.area_m2, int(s.blob.pixels[0]))):
         for group in colours:
             contrast = group[0].blob.contrast
-            if np.linalg.norm(spot.blob.contrast - contrast) < SAME_COLOUR * np.linalg.norm(
-                contrast
-            ):
+            difference = np.linalg.norm(spot.blob.contrast - contrast)
+            if difference < SAME_COLOUR * np.linalg.norm(contrast):
                 group.append(spot)
                 break
         else:
@@ -376,62 +426,72 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     for colour in colours:
         # if most of a colour's area lies behind, its flat-looking spots are holes too small to
         # look deep
-        flat = [s for s in colour if not s.is_hole]
-        if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(
-            s.area_m2 for s in colour
-        ):
-            whole = [s for s in flat if not s.blob.doubt]
-            usual_m = None
-            if len(whole) >= 3:
-                # half of the spots' area is in larger spots, so that chips count little
-                sizes = np.array([s.sizes_m for s in whole])
-                areas = [s.area_m2 for s in whole]
-                usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
-            groups.append(
-                (
-                    float(np.linalg.norm(flat[0].blob.contrast)),
-                    [_mark(s, usual_m, n_target) for s in flat],
-                )
-            )
-    enough = [
-        vivid for vivid, found in groups if sum(not mark.doubt for mark in found) >= LEAST_MARKS
-    ]
+        flat = [spot for spot in colour if not spot.is_hole]
+        hole_area = sum(spot.area_m2 for spot in colour if spot.is_hole)
+        if not flat or 2.0 * hole_area > sum(spot.area_m2 for spot in colour):
+            continue
+        complete = [spot for spot in flat if not spot.blob.doubt]
+        usual_m = None
+        if len(complete) >= 3:
+            # half of the spots' area is in larger spots, so that chips count little
+            sizes = np.array([spot.sizes_m for spot in complete])
+            areas = [spot.area_m2 for spot in complete]
+            usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
+        vivid = float(np.linalg.norm(flat[0].blob.contrast))
+        groups.append((vivid, [_mark(spot, usual_m, n_target) for spot in flat]))
+    enough = []
+    for vivid, colour_marks in groups:
+        if sum(not mark.doubt for mark in colour_marks) >= LEAST_MARKS:
+            enough.append(vivid)
     marks = []
-    for vivid, found in groups:
+    for vivid, colour_marks in groups:
         doubt = ""
         if vivid < WEAK_SHARE * max(enough, default=0.0):
             doubt = "its colour contrast is weak compared with the others"
-        elif enough and sum(not mark.doubt for mark in found) < LEAST_MARKS:
+        elif enough and sum(not mark.doubt for mark in colour_marks) < LEAST_MARKS:
             doubt = f"fewer than {LEAST_MARKS} marks have its colour; enough have another"
-        marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
+        marks += [replace(mark, doubt=mark.doubt or doubt) for mark in colour_marks]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
     holes = len(spots) - len(marks)
-    notes = (
-        (f"{holes} spots of another colour lie behind the surface and count as holes, not marks",)
-        if holes
-        else ()
-    )
+    notes = tuple[str, ...]()
+    if holes:
+        notes = (
+            f"{holes} spots of another colour lie behind the surface and count as holes, not marks",
+        )
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 
 
-def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
+def _mark(
+    spot: Spot,
+    usual_m: np.ndarray | None,
+    n_target: int,
+) -> Mark:
     """Return the spot as a mark, with its doubt. ``usual_m`` (3,): usual sizes. ``n_target``: the
     target's pixels."""
     doubt = spot.blob.doubt
     sizes_m = spot.sizes_m
     pixels = spot.blob.pixels[spot.blob.weights > 0.5]
+    share = len(pixels) / n_target
     if doubt:
         pass
-    elif (share := len(pixels) / n_target) > LARGEST_SHARE:
+    elif share > LARGEST_SHARE:
         doubt = f"{100 * share:.0f} % of the target: a part of it rather than a mark"
     elif -spot.behind_m > max(RAISED_SHARE * sizes_m[1], BEHIND_SIGMAS * spot.behind_sigma_m):
         doubt = f"it stands {-spot.behind_m / MM:.0f} mm in front of the surface"
     elif usual_m is not None:
-        unlike = np.abs(sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
-        (length, breadth, _), (usual_length, usual_breadth, _) = sizes_m / MM, usual_m / MM
-        if unlike.any():
+        tolerance = UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
+        if (np.abs(sizes_m - usual_m) > tolerance).any():
+            length, breadth, _ = sizes_m / MM
+            usual_length, usual_breadth, _ = usual_m / MM
             doubt = (
                 f"unlike the others: {length:.0f} x {breadth:.0f} mm, not {usual_length:.0f} x "
                 f"{usual_breadth:.0f}"
             )
-    return Mark(spot.centre_m, spot.covariance_m2, spot.normal, pixels, spot.area_m2, doubt=doubt)
+    return Mark(
+        centre_m=spot.centre_m,
+        covariance_m2=spot.covariance_m2,
+        normal=spot.normal,
+        pixels=pixels,
+        area_m2=spot.area_m2,
+        doubt=doubt,
+    )

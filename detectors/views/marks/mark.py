@@ -46,10 +46,10 @@ class CodedMarks(Config):
     def _known(cls, name: str) -> str:
         import cv2
 
-        known = sorted(word for word in dir(cv2.aruco) if word.startswith("DICT_"))
-        if name not in known:
+        dictionaries = sorted(word for word in dir(cv2.aruco) if word.startswith("DICT_"))
+        if name not in dictionaries:
             raise ValueError(
-                f"OpenCV has no dictionary of codes '{name}'; it has {', '.join(known)}"
+                f"OpenCV has no dictionary of codes '{name}'; it has {', '.join(dictionaries)}"
             )
         return name
 
@@ -59,31 +59,38 @@ MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface.
-    ``covariance_m2`` (3, 3): of the centroid, without errors that all pixels of the mark share (a
-    range offset, lens distortion). ``normal`` (3,): of the surface there, towards the camera.
-    ``pixels`` (n,): flat indices into the cloud's grid. ``area_m2``: on the surface. ``code``:
-    None for a piece of tape. ``doubt``: why it is unreliable."""
+    """One mark in one view, camera frame."""
 
     centre_m: np.ndarray
+    """(3,): its centroid on the surface."""
     covariance_m2: np.ndarray
+    """(3, 3): of the centroid, without errors that all pixels of the mark share (a range offset,
+    lens distortion)."""
     normal: np.ndarray
+    """(3,): of the surface there, towards the camera."""
     pixels: np.ndarray
+    """(n,): flat indices into the cloud's grid."""
     area_m2: float
+    """Area on the surface."""
     code: int | None = None
+    """Its printed code; None for a piece of tape."""
     doubt: str = ""
+    """Why it is unreliable, else empty."""
 
 
 @dataclass(frozen=True)
 class MarkSet:
-    """All marks of one view. ``points`` (n,): flat indices of all pixels of the fiducial colour in
-    the crop, the thesis' fiducial cloud. ``problem``: why these marks do not suffice for a
-    registration, with what is missing."""
+    """All marks of one view."""
 
     marks: tuple[Mark, ...]
+    """The marks, in doubt or not."""
     points: np.ndarray
+    """(n,): flat indices of all pixels of the fiducial colour in the crop, the thesis' fiducial
+    cloud."""
     problem: str = ""
+    """Why these marks do not suffice for a registration, with what is missing; else empty."""
     notes: tuple[str, ...] = ()
+    """Further remarks."""
 
     @property
     def trusted(self) -> tuple[Mark, ...]:
@@ -97,17 +104,23 @@ def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
     trusted = [mark for mark in marks if not mark.doubt]
     if len(trusted) >= LEAST_MARKS:
         return off_line_problem(trusted)
-    found = f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
+    counted = (
+        f"{len(trusted)} {'mark' if len(trusted) == 1 else 'marks'} found, {LEAST_MARKS} needed"
+    )
     doubts = ", ".join(sorted({mark.doubt for mark in marks if mark.doubt}))
-    in_doubt = f"{len(marks) - len(trusted)} more in doubt: {doubts}" if doubts else ""
-    return "; ".join(text for text in (found, in_doubt, missing) if text)
+    in_doubt = ""
+    if doubts:
+        in_doubt = f"{len(marks) - len(trusted)} more in doubt: {doubts}"
+    return "; ".join(text for text in (counted, in_doubt, missing) if text)
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:
     """Return a sentence, with the distance from the line, if the marks lie on a line; else ""."""
-    places = np.stack([mark.centre_m for mark in marks])
-    sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
-    error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))
+    centres = np.stack([mark.centre_m for mark in marks])
+    centred = centres - centres.mean(axis=0)
+    sizes = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(marks))
+    worst = [np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks]
+    error = float(np.sqrt(np.mean(worst)))
     if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
         return ""
     off = f"{sizes[1] / MM:.1f} mm off it"

@@ -57,38 +57,42 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         placement = _placed(fixed, moved, 0.0)
     except np.linalg.LinAlgError:
         return registered.failed(
-            view, "marks", guess, problem or "the matched marks do not determine the rotation"
+            view,
+            "marks",
+            guess,
+            problem or "the matched marks do not determine the rotation",
         )
-    freedom = 3 * len(fixed) - 6
+    half_freedom = (3 * len(fixed) - 6) / 2
     residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
-    if (
-        not problem
-        and gammaincc(freedom / 2, _placed(fixed, moved, SHARED_M).chi2 / 2) < REFUSE_BELOW
-    ):
-        problem = (
-            f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, more "
-            "than noise and"
-        )
-        problem += (
-            f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or "
-            "a mark moved"
-        )
+    if not problem:
+        tolerant = _placed(fixed, moved, SHARED_M)
+        if gammaincc(half_freedom, tolerant.chi2 / 2) < REFUSE_BELOW:
+            problem = (
+                f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, "
+                f"more than noise and {SHARED_M / MM:.0f} mm of each view's own error explain; the "
+                "targets differ, or a mark moved"
+            )
     covariance = placement.covariance
-    if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
-        ratio = float(np.sqrt(placement.chi2 / freedom))
+    if gammaincc(half_freedom, placement.chi2 / 2) < WIDEN_BELOW:
+        ratio = float(np.sqrt(placement.chi2 / (2 * half_freedom)))
         covariance = covariance * ratio**2
-        notes += (
-            (
-                f"the marks disagree by {ratio:.1f} times their noise; the covariance is "
-                "widened to match"
-            ),
+        note = (
+            f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened "
+            "to match"
         )
-    where = placement.T_to_from, covariance, placement.centre_m
-    found = registered.Registration(
-        view.view.name, "marks", *where, residual, failure=problem, notes=notes
-    )
-    return replace(
-        found, pairs=len(fixed), iterations=placement.iterations, converged=placement.converged
+        notes += (note,)
+    return registered.Registration(
+        view=view.view.name,
+        method="marks",
+        T_reference_view=placement.T_to_from,
+        covariance=covariance,
+        centre_m=placement.centre_m,
+        residual_m=residual,
+        pairs=len(fixed),
+        iterations=placement.iterations,
+        converged=placement.converged,
+        failure=problem,
+        notes=notes,
     )
 
 
@@ -101,15 +105,12 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
         return None
     squares = []
     for i, (fixed_mark, moved_mark) in enumerate(zip(fixed, moved, strict=True)):
-        rest = fixed[:i] + fixed[i + 1 :]
-        if off_line_problem(rest):
+        remaining = fixed[:i] + fixed[i + 1 :]
+        if off_line_problem(remaining):
             return None
-        T_reference_view = _placed(rest, moved[:i] + moved[i + 1 :], 0.0).T_to_from
-        squares.append(
-            np.sum(
-                (transform_points(T_reference_view, moved_mark.centre_m) - fixed_mark.centre_m) ** 2
-            )
-        )
+        T_reference_view = _placed(remaining, moved[:i] + moved[i + 1 :], 0.0).T_to_from
+        mapped = transform_points(T_reference_view, moved_mark.centre_m)
+        squares.append(np.sum((mapped - fixed_mark.centre_m) ** 2))
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -118,13 +119,12 @@ def _matched(
 ) -> tuple[tuple[Mark, ...], tuple[Mark, ...], str, tuple[str, ...]]:
     """Return the pairs of trusted marks of both views, the reason why they must not be used (or
     ""), and notes."""
-    problem = "; ".join(
-        f"{each.view.name}: {each.marks.problem}"
-        for each in (reference, view)
-        if each.marks.problem
-    )
-    if problem:
-        return (), (), problem, ()
+    problems = []
+    for prepared in (reference, view):
+        if prepared.marks.problem:
+            problems.append(f"{prepared.view.name}: {prepared.marks.problem}")
+    if problems:
+        return (), (), "; ".join(problems), ()
     fixed = reference.marks.trusted
     moved = view.marks.trusted
     pairing = pair_marks(fixed, moved, registered.guess_of(reference, view))
@@ -132,15 +132,20 @@ def _matched(
     return tuple(fixed[k] for k in i), tuple(moved[k] for k in j), pairing.problem, pairing.notes
 
 
-def _placed(fixed: Sequence[Mark], moved: Sequence[Mark], shared_m: float) -> Placement:
+def _placed(
+    fixed: Sequence[Mark],
+    moved: Sequence[Mark],
+    shared_m: float,
+) -> Placement:
     """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis
     of each mark."""
     extra = shared_m**2 * np.eye(3)
-    fixed_m, moved_m = (np.stack([mark.centre_m for mark in marks]) for marks in (fixed, moved))
-    fixed_spread, moved_spread = (
-        np.stack([mark.covariance_m2 for mark in marks]) for marks in (fixed, moved)
+    return place(
+        from_m=np.stack([mark.centre_m for mark in moved]),
+        from_spread_m2=np.stack([mark.covariance_m2 for mark in moved]) + extra,
+        to_m=np.stack([mark.centre_m for mark in fixed]),
+        to_spread_m2=np.stack([mark.covariance_m2 for mark in fixed]) + extra,
     )
-    return place(moved_m, moved_spread + extra, fixed_m, fixed_spread + extra)
 
 
 MAX_STEPS = 40
@@ -158,51 +163,69 @@ POSE_TERMS = 3
 
 @dataclass(frozen=True)
 class ViewData:
-    """One view's part: thinned target points (n, 3), and marks in its camera frame, each with its
-    index among the reference's. ``noise_m``: of a point across the surface. ``sigma_m``: inflated
-    to make points independent."""
+    """What one view gives to the adjustment, in its camera frame."""
 
     points_m: np.ndarray
+    """(n, 3): thinned points of the target."""
     marks: tuple[tuple[Mark, int], ...]
+    """Matched marks, each with its index among the reference's."""
     noise_m: float
+    """Standard deviation of a point across the surface."""
     sigma_m: float
+    """The same, inflated to make the points independent."""
 
 
 @dataclass(frozen=True)
 class JointState:
-    """Estimates. ``T`` (v, 4, 4): from the views to the surface's frame. ``surface`` (10,) and
-    ``own`` (v, 10): coefficients, metres. ``marks_m`` (m, 2): places in the plane. ``shared_m``:
-    prior deviation of each term of ``own``. ``half_m`` (2,): scales x, y to -1..1. Vectors of all
-    unknowns hold poses 1.., surface, marks, own."""
+    """Estimates for v views and m marks. Vectors of all unknowns hold poses 1.., surface, marks,
+    ``view_terms``."""
 
     T: np.ndarray
+    """(v, 4, 4): from the views to the surface's frame."""
     surface: np.ndarray
-    own: np.ndarray
+    """(10,): coefficients of the common surface, metres."""
+    view_terms: np.ndarray
+    """(v, 10): coefficients of each view's own smooth error, metres."""
     marks_m: np.ndarray
+    """(m, 2): places of the marks in the plane."""
     shared_m: float
+    """Prior deviation of each of the ``view_terms``."""
     half_m: np.ndarray
+    """(2,): scales x and y to -1..1."""
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or
         of their indices."""
-        poses, surface, marks, own = np.split(
-            values, np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size])
+        sizes = [6 * (len(self.T) - 1), len(TERMS), self.marks_m.size]
+        poses, surface, marks, view_terms = np.split(values, np.cumsum(sizes))
+        return (
+            poses.reshape(-1, 6),
+            surface,
+            marks.reshape(-1, 2),
+            view_terms.reshape(-1, len(TERMS)),
         )
-        return poses.reshape(-1, 6), surface, marks.reshape(-1, 2), own.reshape(-1, len(TERMS))
 
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
         """Return the state after a motion of all unknowns; poses move about the frame's origin."""
-        poses, surface, marks, own = self.split(motion)
-        turned = (moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))
-        T = np.stack([self.T[0], *turned])
+        poses, surface, marks, view_terms = self.split(motion)
+        T = self.T.copy()
+        for v, pose in enumerate(poses, start=1):
+            T[v] = moved_by(pose, np.zeros(3)) @ self.T[v]
         return JointState(
-            T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m
+            T=T,
+            surface=self.surface + surface,
+            view_terms=self.view_terms + view_terms,
+            marks_m=self.marks_m + marks,
+            shared_m=shared_m,
+            half_m=self.half_m,
         )
 
     def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return the (n, 10) terms of the cubic."""
         products = np.polynomial.chebyshev.chebvander2d(
-            x_m / self.half_m[0], y_m / self.half_m[1], [DEGREE, DEGREE]
+            x_m / self.half_m[0],
+            y_m / self.half_m[1],
+            [DEGREE, DEGREE],
         )
         return np.asarray(products[:, [i * (DEGREE + 1) + j for i, j in TERMS]])
 
@@ -214,7 +237,7 @@ class JointState:
         points = transform_points(self.T[v], data.points_m)
         x, y, z = points.T
         basis = self.basis(x, y)
-        residual = z - basis @ (self.surface + self.own[v])
+        residual = z - basis @ (self.surface + self.view_terms[v])
         dx, dy = 1e-3 * self.half_m
         by_x = (self.basis(x + dx, y) - self.basis(x - dx, y)) @ self.surface / (2 * dx)
         by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
@@ -229,10 +252,13 @@ class JointState:
         size = 6 * (len(self.T) - 1) + len(TERMS) * (len(self.T) + 1) + self.marks_m.size
         matrix = np.zeros((size, size))
         right = np.zeros(size)
-        poses, surface, marks, own = self.split(np.arange(size))
+        poses, surface, marks, view_terms = self.split(np.arange(size))
 
         def add(
-            columns: np.ndarray, rows: np.ndarray, residual: np.ndarray, weight: np.ndarray
+            columns: np.ndarray,
+            rows: np.ndarray,
+            residual: np.ndarray,
+            weight: np.ndarray,
         ) -> None:
             weighted = rows * weight[:, None] if weight.ndim == 1 else weight @ rows
             matrix[np.ix_(columns, columns)] += rows.T @ weighted
@@ -240,23 +266,21 @@ class JointState:
 
         for v, view in enumerate(data):
             # the first view's pose is not an unknown
-            pose, moves = (poses[v - 1], 6) if v else (np.empty(0, dtype=int), 0)
+            pose = poses[v - 1] if v else np.empty(0, dtype=int)
+            moves = len(pose)
             residual, basis, by_pose, weight = self.across(view, v)
             rows = np.concatenate([-basis, -basis, by_pose[:, :moves]], axis=1)
-            add(np.concatenate([surface, own[v], pose]), rows, residual, weight)
+            add(np.concatenate([surface, view_terms[v], pose]), rows, residual, weight)
             turn = self.T[v][:2, :3]
             for mark, label in view.marks:
-                place = transform_points(self.T[v], mark.centre_m)
-                within = displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
+                centre = transform_points(self.T[v], mark.centre_m)
+                within = displacement_jacobian(centre[None], np.zeros(3))[0, :2, :moves]
                 rows = np.concatenate([-np.eye(2), within], axis=1)
                 weight = np.linalg.inv(turn @ mark.covariance_m2 @ turn.T)
-                add(
-                    np.concatenate([marks[label], pose]),
-                    rows,
-                    place[:2] - self.marks_m[label],
-                    weight,
-                )
-            add(own[v], np.eye(len(TERMS)), self.own[v], np.full(len(TERMS), self.shared_m**-2))
+                columns = np.concatenate([marks[label], pose])
+                add(columns, rows, centre[:2] - self.marks_m[label], weight)
+            prior = np.full(len(TERMS), self.shared_m**-2)
+            add(view_terms[v], np.eye(len(TERMS)), self.view_terms[v], prior)
         return matrix, right
 
 
@@ -264,13 +288,15 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
     """Register all views but the first to the first, jointly. ``covariance``: each view's
     marginal. ``residual_m``: across the surface, of the points that count. A view whose marks fail
     keeps that failure."""
-    found = [register_by_marks(views[0], view) for view in views[1:]]
-    usable = [i for i, each in enumerate(found) if not each.failure]
+    registrations = [register_by_marks(views[0], view) for view in views[1:]]
+    usable = [i for i, registration in enumerate(registrations) if not registration.failure]
     if usable:
-        adjusted = _adjust([views[0], *(views[i + 1] for i in usable)], [found[i] for i in usable])
+        chosen = [views[i + 1] for i in usable]
+        by_marks = [registrations[i] for i in usable]
+        adjusted = _adjust([views[0], *chosen], by_marks)
         for i, registration in zip(usable, adjusted, strict=True):
-            found[i] = registration
-    return [replace(each, method="joint") for each in found]
+            registrations[i] = registration
+    return [replace(registration, method="joint") for registration in registrations]
 
 
 def _adjust(
@@ -278,7 +304,6 @@ def _adjust(
 ) -> list[registered.Registration]:
     """Return registrations of views 1.., adjusted from those by their marks, none of which
     failed."""
-    T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera
     sampling = registered.sampling_of(views[0])
@@ -289,17 +314,21 @@ def _adjust(
         [along, np.cross(sampling.normal, along), sampling.normal]
     )
     T_surface_reference[:3, 3] = -T_surface_reference[:3, :3] @ sampling.centre_m
-    T = np.stack([T_surface_reference @ each for each in T_reference])
-    half_m = np.maximum(np.abs(transform_points(T[0], views[0].points_m)[:, :2]).max(axis=0), 1e-6)
-    x, y, z = np.concatenate(
-        [transform_points(T[v], each.points_m) for v, each in enumerate(data)]
-    ).T
-    places = transform_points(T[0], np.stack([mark.centre_m for mark in views[0].marks.trusted]))[
-        :, :2
-    ]
-    noise = float(np.median([each.noise_m for each in data]))
+    T = np.stack(
+        [T_surface_reference]
+        + [T_surface_reference @ registration.T_reference_view for registration in marked]
+    )
+    reference_m = transform_points(T[0], views[0].points_m)
+    points = [transform_points(T[v], part.points_m) for v, part in enumerate(data)]
+    x, y, z = np.concatenate(points).T
+    centres = np.stack([mark.centre_m for mark in views[0].marks.trusted])
     state = JointState(
-        T, np.zeros(len(TERMS)), np.zeros((len(data), len(TERMS))), places, noise, half_m
+        T=T,
+        surface=np.zeros(len(TERMS)),
+        view_terms=np.zeros((len(data), len(TERMS))),
+        marks_m=transform_points(T[0], centres)[:, :2],
+        shared_m=float(np.median([part.noise_m for part in data])),
+        half_m=np.maximum(np.abs(reference_m[:, :2]).max(axis=0), 1e-6),
     )
     start = fit_surface(x, y, z, SurfaceConfig(degree=DEGREE)).evaluate(x, y)
     state = replace(state, surface=np.linalg.lstsq(state.basis(x, y), start, rcond=None)[0])
@@ -312,38 +341,40 @@ def _adjust(
         motion = covariance @ right
         # the maximisation step of EM: the squares of the terms that no pose can imitate, plus
         # their variance
-        squares = (state.own + state.split(motion)[3]) ** 2 + state.split(np.diag(covariance))[3]
+        moved_terms = state.view_terms + state.split(motion)[3]
+        squares = moved_terms**2 + state.split(np.diag(covariance))[3]
         shared = max(float(np.sqrt(squares[:, POSE_TERMS:].mean())), LEAST_SHARED_M)
         settled = abs(shared - state.shared_m) <= CONVERGED_SHARED * state.shared_m
         converged = settled and bool(np.abs(motion).max() <= CONVERGED_M)
         state = state.moved(motion, shared)
     covariance = np.linalg.inv(state.equations(data)[0])
     T_reference_surface = invert(T_surface_reference)
-    both = np.kron(np.eye(2), T_reference_surface[:3, :3])
+    turn = np.kron(np.eye(2), T_reference_surface[:3, :3])
     note = (
         f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the "
         "covariance includes it"
     )
     lost = "" if converged else f"did not converge in {steps} steps of the joint adjustment"
     adjusted = []
-    for v, found in enumerate(marked, start=1):
+    for v, registration in enumerate(marked, start=1):
         residual, _, _, weight = state.across(data[v], v)
         residual_m = float(np.sqrt(np.average(residual**2, weights=weight)))
         pose = slice(6 * (v - 1), 6 * v)
-        spread = both @ covariance[pose, pose] @ both.T
-        where = T_reference_surface @ state.T[v], spread, T_reference_surface[:3, 3]
+        spread = turn @ covariance[pose, pose] @ turn.T
         joint = registered.Registration(
-            found.view, found.method, *where, residual_m, pairs=len(data[v].marks)
+            view=registration.view,
+            method=registration.method,
+            T_reference_view=T_reference_surface @ state.T[v],
+            covariance=spread,
+            centre_m=T_reference_surface[:3, 3],
+            residual_m=residual_m,
+            pairs=len(data[v].marks),
+            iterations=steps,
+            converged=converged,
+            failure=lost,
+            notes=(*registration.notes, note),
         )
-        adjusted.append(
-            replace(
-                joint,
-                iterations=steps,
-                converged=converged,
-                failure=lost,
-                notes=(*found.notes, note),
-            )
-        )
+        adjusted.append(joint)
     return adjusted
 
 
@@ -351,10 +382,12 @@ def _view_data(view: PreparedView, reference: PreparedView) -> ViewData:
     points = registered.thinned(view.points_m)
     noise = max(registered.sampling_of(view).noise_m, 1e-9)
     inflation = max(len(points) / registered.independent(int(view.inside.sum())), 1.0)
-    fixed, moved = (
-        (reference.marks.trusted,) * 2 if view is reference else _matched(reference, view)[:2]
-    )
-    label = {id(mark): number for number, mark in enumerate(reference.marks.trusted)}
+    trusted = reference.marks.trusted
+    fixed = trusted
+    moved = trusted
+    if view is not reference:
+        fixed, moved, _, _ = _matched(reference, view)
+    label = {id(mark): number for number, mark in enumerate(trusted)}
     marks = tuple(
         (moved_mark, label[id(fixed_mark)])
         for fixed_mark, moved_mark in zip(fixed, moved, strict=True)

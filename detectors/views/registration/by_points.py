@@ -15,7 +15,7 @@ only the target: on a turntable the room does not move with the target. No loop 
 is kept."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -45,13 +45,15 @@ CONVERGED_PITCHES = 0.05
 
 
 def register_by_icp(
-    reference: PreparedView, view: PreparedView, config: IcpRegistration
+    reference: PreparedView,
+    view: PreparedView,
+    config: IcpRegistration,
 ) -> registered.Registration:
     """Return the registration of a view to the reference by ICP of their fiducial clouds or
     targets."""
-    fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
-    if few:
-        return registered.failed(view, "icp", start, few, *notes)
+    fixed, moving, start, notes, shortage = registered.clouds_of(reference, view, config.points)
+    if shortage:
+        return registered.failed(view, "icp", start, shortage, *notes)
     sampling = registered.sampling_of(view)
     tree = cKDTree(fixed)
     T = np.eye(4) if start is None else start
@@ -62,35 +64,43 @@ def register_by_icp(
         last = np.full(2, np.inf)
         for _ in range(STAGE_ITERATIONS):
             moved = transform_points(T, moving)
-            apart, paired = _pairs(tree, moved, limit_m)
+            distances, paired = _pairs(tree, moved, limit_m)
             if paired.sum() < 3:
                 failure = (
                     f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the "
                     "reference's"
                 )
                 return registered.failed(view, "icp", start, failure, *notes)
-            change = kabsch(moved[paired], (moved - apart)[paired], np.ones(paired.sum()))
+            change = kabsch(moved[paired], (moved - distances)[paired], np.ones(paired.sum()))
             T = change @ T
             step_m = registered.moved_m(change, moved)
             iterations += 1
-            now = np.array([paired.mean(), np.sqrt(np.mean(apart[paired] ** 2))])
+            now = np.array([paired.mean(), np.sqrt(np.mean(distances[paired] ** 2))])
             if np.abs(now - last).max() < LEAST_CHANGE:
                 break
             last = now
-    left, _, right = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = left @ right
+    u, _, right = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = u @ right
     moved = transform_points(T, moving)
-    apart, paired = _pairs(tree, moved, limit_m)
+    distances, paired = _pairs(tree, moved, limit_m)
     covariance = _covariance(tree, moved, limit_m, sampling.pitch_m)
-    residual_m = float(np.sqrt(np.sum(apart**2) / max(paired.sum(), 1)))
-    found = registered.Registration(
-        view.view.name, "icp", T, covariance, moved.mean(axis=0), residual_m
-    )
+    residual_m = float(np.sqrt(np.sum(distances**2) / max(paired.sum(), 1)))
     failure = registered.still_moving(step_m, sampling.pitch_m)
-    failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
-    converged = bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m)
-    found = replace(found, pairs=int(paired.sum()), iterations=iterations, converged=converged)
-    return replace(found, failure=failure, notes=notes)
+    if not failure and not np.isfinite(covariance).all():
+        failure = registered.SLIDES
+    return registered.Registration(
+        view=view.view.name,
+        method="icp",
+        T_reference_view=T,
+        covariance=covariance,
+        centre_m=moved.mean(axis=0),
+        residual_m=residual_m,
+        pairs=int(paired.sum()),
+        iterations=iterations,
+        converged=bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m),
+        failure=failure,
+        notes=notes,
+    )
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
@@ -103,15 +113,25 @@ def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
     return tuple(limits)
 
 
-def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(
+    tree: Any,
+    moved_m: np.ndarray,
+    limit_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return vectors (n, 3) to the partners, zero without one, and the mask (n,) of points that
     have a partner."""
     distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
     paired = np.isfinite(distances)
-    return np.where(paired[:, None], moved_m - tree.data[np.where(paired, nearest, 0)], 0.0), paired
+    partners = tree.data[np.where(paired, nearest, 0)]
+    return np.where(paired[:, None], moved_m - partners, 0.0), paired
 
 
-def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) -> np.ndarray:
+def _covariance(
+    tree: Any,
+    moved_m: np.ndarray,
+    limit_m: float,
+    pitch_m: float,
+) -> np.ndarray:
     """Return the covariance (6, 6) of the pose, as in `Registration`, about the moved points'
     centroid: H^-1 S H^-1. H is the cost's curvature with new pairs, by differences over one pitch
     (Bengtsson & Baerveldt, Robotics and Autonomous Systems 44:29, 2003); with fixed pairs, the
@@ -120,7 +140,8 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
     of many near minima. NaN if a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
     jacobian = displacement_jacobian(arm, np.zeros(3))
-    scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
+    off, _ = _pairs(tree, moved_m, limit_m)
+    scores = np.einsum("nij,ni->nj", jacobian, off)
 
     def half_cost(motion: np.ndarray) -> float:
         # a point without a partner counts as one at the limit
@@ -137,9 +158,11 @@ def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) 
     for i in range(6):
         for j in range(i + 1):
             part = 0.5 if i == j else 1.0
-            both = part * (steps[i] + steps[j])
+            product = part * (steps[i] + steps[j])
             across = part * (steps[i] - steps[j])
-            mixed = half_cost(both) + half_cost(-both) - half_cost(across) - half_cost(-across)
+            mixed = (
+                half_cost(product) + half_cost(-product) - half_cost(across) - half_cost(-across)
+            )
             curvature[i, j] = curvature[j, i] = mixed / (4 * part**2 * sizes[i] * sizes[j])
     return registered.clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
 
@@ -152,17 +175,22 @@ PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of coherent point drift. ``T_fixed_moving``: (4, 4). ``sigma_m``: the Gaussians'
-    width. ``matched``: expected number of fixed points that are not outliers. ``step_m``: how far
-    the last iteration moved the points. ``background``: a share, as in `posterior_moments`."""
+    """The result of coherent point drift."""
 
     T_fixed_moving: np.ndarray
+    """(4, 4): rigid."""
     sigma_m: float
+    """Width of the Gaussians."""
     matched: float
+    """Expected number of fixed points that are not outliers."""
     iterations: int
+    """Number of iterations."""
     converged: bool
+    """Whether they ended by the tolerance or because the clouds coincide."""
     step_m: float
+    """How far the last iteration moved the points."""
     background: float
+    """The uniform component, as in `posterior_moments`."""
 
 
 def coherent_point_drift(
@@ -195,9 +223,8 @@ def coherent_point_drift(
         and variance > LEAST_VARIANCE
     ):
         iterations += 1
-        moments, objective = posterior_moments(
-            fixed, moving, variance, outliers * (2 * np.pi * variance) ** 1.5
-        )
+        background = outliers * (2 * np.pi * variance) ** 1.5
+        moments, objective = posterior_moments(fixed, moving, variance, background)
         objective += 1.5 * len(fixed) * np.log(variance)
         change = abs((objective - last) / objective)
         last = objective
@@ -208,8 +235,8 @@ def coherent_point_drift(
         mean_x = weight @ fixed / matched
         mean_y = total[:3, 3] / matched
         cross = fixed.T @ moments[:, :3, 3] - matched * np.outer(mean_x, mean_y)
-        left, _, right = np.linalg.svd(cross)
-        d_turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        u, _, right = np.linalg.svd(cross)
+        d_turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ right)]) @ right
         d_shift = mean_x - d_turn @ mean_y
         spread_x = float(weight @ np.sum(fixed**2, axis=1)) - matched * float(mean_x @ mean_x)
         spread_y = float(np.trace(total[:3, :3])) - matched * float(mean_y @ mean_y)
@@ -226,44 +253,57 @@ def coherent_point_drift(
     background = outliers * (2 * np.pi * variance) ** 1.5
     converged = bool(change <= config.tolerance or variance <= LEAST_VARIANCE)
     return Drift(
-        T @ start,
-        float(np.sqrt(variance)) * scale,
-        matched,
-        iterations,
-        converged,
-        step,
-        background,
+        T_fixed_moving=T @ start,
+        sigma_m=float(np.sqrt(variance)) * scale,
+        matched=matched,
+        iterations=iterations,
+        converged=converged,
+        step_m=step,
+        background=background,
     )
 
 
 def register_by_cpd(
-    reference: PreparedView, view: PreparedView, config: CpdRegistration
+    reference: PreparedView,
+    view: PreparedView,
+    config: CpdRegistration,
 ) -> registered.Registration:
     """Return the registration of a view to the reference by coherent point drift of their fiducial
     clouds or targets. At the limit of iterations it fails only if its last step still moved the
     points."""
-    fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
-    if few:
-        return registered.failed(view, "cpd", start, few, *notes)
+    fixed, moving, start, notes, shortage = registered.clouds_of(reference, view, config.points)
+    if shortage:
+        return registered.failed(view, "cpd", start, shortage, *notes)
     drift = coherent_point_drift(fixed, moving, config, start)
     pitch = registered.sampling_of(view).pitch_m
-    covariance = drift_covariance(
-        fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch
-    )
-    failure = "" if drift.converged else registered.still_moving(drift.step_m, pitch)
-    failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
+    moved = transform_points(drift.T_fixed_moving, moving)
+    covariance = drift_covariance(fixed, moved, drift, pitch)
+    failure = ""
     if not drift.converged:
+        failure = registered.still_moving(drift.step_m, pitch)
         notes += (f"stopped after {drift.iterations} iterations, the limit in the settings",)
-    where = drift.T_fixed_moving, covariance, fixed.mean(axis=0)
-    found = registered.Registration(view.view.name, "cpd", *where, drift.sigma_m * np.sqrt(3.0))
-    found = replace(
-        found, pairs=round(drift.matched), iterations=drift.iterations, converged=drift.converged
+    if not failure and not np.isfinite(covariance).all():
+        failure = registered.SLIDES
+    return registered.Registration(
+        view=view.view.name,
+        method="cpd",
+        T_reference_view=drift.T_fixed_moving,
+        covariance=covariance,
+        centre_m=fixed.mean(axis=0),
+        residual_m=drift.sigma_m * np.sqrt(3.0),
+        pairs=round(drift.matched),
+        iterations=drift.iterations,
+        converged=drift.converged,
+        failure=failure,
+        notes=notes,
     )
-    return replace(found, failure=failure, notes=notes)
 
 
 def drift_covariance(
-    fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float
+    fixed_m: np.ndarray,
+    moved_m: np.ndarray,
+    drift: Drift,
+    pitch_m: float,
 ) -> np.ndarray:
     """Return the covariance (6, 6) of the pose, as in `Registration`, about the fixed cloud's
     centroid: H^-1 S H^-1. H is the observed information (Louis, JRSS B 44:226, 1982); S is the
@@ -279,7 +319,8 @@ def drift_covariance(
     # the score of a pair is J'(x - y) / variance = (y x x, x - y) / variance, linear in (y, 1)
     linear = np.zeros((len(x), 6, 4))
     linear[:, :3, :3] = np.swapaxes(np.cross(np.eye(3)[None], x[:, None]), 1, 2)
-    linear[:, 3:, :3], linear[:, 3:, 3] = -np.eye(3), x
+    linear[:, 3:, :3] = -np.eye(3)
+    linear[:, 3:, 3] = x
     scores = np.einsum("nij,nj->ni", linear, moments[:, :, 3]) / variance
     within = (linear @ moments @ np.swapaxes(linear, 1, 2)).sum(axis=0) / variance**2
     # the complete information is the weighted sum of J'J, with J linear in (y, 1) too
@@ -287,23 +328,25 @@ def drift_covariance(
     parts[:3] -= parts[3]
     complete = np.einsum("ab,aki,bkj->ij", moments.sum(axis=0), parts, parts) / variance
     information = complete - (within - scores.T @ scores)
-    both = 1 + len(fixed_m) / len(moved_m)
-    return (
-        registered.clustered_sandwich(information, scores - scores.mean(axis=0), fixed_m, pitch_m)
-        * both
-    )
+    error_factor = 1 + len(fixed_m) / len(moved_m)
+    centred = scores - scores.mean(axis=0)
+    covariance = registered.clustered_sandwich(information, centred, fixed_m, pitch_m)
+    return covariance * error_factor
 
 
 def posterior_moments(
-    fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
+    fixed: np.ndarray,
+    moving: np.ndarray,
+    variance: float,
+    background: float,
 ) -> tuple[np.ndarray, float]:
     """Return posterior sums (n, 4, 4) of (y, 1)(y, 1)' over the moving points y (m, 3) for each
     fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the
     Gaussians' factor. ``background``: the uniform component as in equation 6 of Myronenko & Song:
     (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's weight is divided out, so that
     nothing underflows at w = 0."""
-    places = np.column_stack([moving, np.ones(len(moving))])
-    products = np.einsum("mi,mj->mij", places, places).reshape(-1, 16)
+    design = np.column_stack([moving, np.ones(len(moving))])
+    products = np.einsum("mi,mj->mij", design, design).reshape(-1, 16)
     moments = []
     objective = 0.0
     for part in np.array_split(fixed, 1 + len(fixed) * len(moving) // PAIRS_AT_ONCE):
@@ -328,31 +371,51 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     are NaN. Every view needs colour, a pixel grid and a lens."""
     T = np.eye(4)
     lost = ""
-    found = []
+    registrations = []
     # one pinhole camera for all: the first lens's focal lengths, and room for every target's
     # points
     first = views[0].view.cloud.lens
     assert first is not None
-    places = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (
+    plane_px = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (
         first.fx,
         first.fy,
     )
-    low = np.floor(places.min(axis=0)) - 1
-    width, height = (np.ceil(places.max(axis=0)) + 2 - low).astype(int).tolist()
-    lens = width, height, first.fx, first.fy, -float(low[0]), -float(low[1])
-    canvas = Lens(*lens)
+    low = np.floor(plane_px.min(axis=0)) - 1
+    width, height = (np.ceil(plane_px.max(axis=0)) + 2 - low).astype(int).tolist()
+    canvas = Lens(
+        width=width,
+        height=height,
+        fx=first.fx,
+        fy=first.fy,
+        cx=-float(low[0]),
+        cy=-float(low[1]),
+    )
     with open3d_on_one_thread() as o3d:
         methods = o3d.pipelines.odometry
-        camera = o3d.camera.PinholeCameraIntrinsic(*lens)
+        camera = o3d.camera.PinholeCameraIntrinsic(
+            width,
+            height,
+            canvas.fx,
+            canvas.fy,
+            canvas.cx,
+            canvas.cy,
+        )
         option = methods.OdometryOption(
-            depth_diff_max=DEPTH_DIFFERENCE_M, depth_min=0.0, depth_max=1e3
+            depth_diff_max=DEPTH_DIFFERENCE_M,
+            depth_min=0.0,
+            depth_max=1e3,
         )
         term = methods.RGBDOdometryJacobianFromHybridTerm()
         images = [_image(o3d, view, canvas) for view in views]
         for before, now, view in zip(images, images[1:], views[1:], strict=False):
             if not lost:
                 success, step, information = methods.compute_rgbd_odometry(
-                    now, before, camera, np.eye(4), term, option
+                    now,
+                    before,
+                    camera,
+                    np.eye(4),
+                    term,
+                    option,
                 )
                 # the information's last diagonal element is the sum of 1 over pairs
                 pairs = (
@@ -367,16 +430,20 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
                         "view before it"
                     )
             if lost:
-                found.append(registered.failed(view, "odometry", None, lost))
+                registrations.append(registered.failed(view, "odometry", None, lost))
                 continue
             T = T @ step
-            found.append(
+            registrations.append(
                 registered.Registration(view.view.name, "odometry", T, pairs=pairs, notes=(DRIFTS,))
             )
-    return found
+    return registrations
 
 
-def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
+def _image(
+    o3d: Any,
+    view: PreparedView,
+    canvas: Lens,
+) -> Any:
     """Return the view's target as Open3D's intensity and depth on the canvas, both without
     distortion."""
     cloud = view.view.cloud

@@ -27,30 +27,40 @@ SMALL_STEP_M = 1e-10
 
 @dataclass(frozen=True)
 class Placement:
-    """``T_to_from`` (4, 4): rigid. ``covariance`` (6, 6): of a small error (w, t), by which a
-    point p of the target frame is off by w x (p - ``centre_m``) + t. ``residuals_m`` (n, 3):
-    mapped points minus their partners. ``chi2``: their sum of squares in units of the covariances,
-    with 3 n - 6 degrees of freedom."""
+    """The most probable rigid transform of points onto their partners."""
 
     T_to_from: np.ndarray
+    """(4, 4): rigid."""
     covariance: np.ndarray
+    """(6, 6): of a small error (w, t), by which a point p of the target frame is off by
+    w x (p - ``centre_m``) + t, radians and metres."""
     centre_m: np.ndarray
+    """(3,): centre of the small rotation."""
     residuals_m: np.ndarray
+    """(n, 3): mapped points minus their partners."""
     chi2: float
+    """Their sum of squares in units of the covariances, with 3 n - 6 degrees of freedom."""
     iterations: int
+    """Number of Gauss-Newton steps."""
     converged: bool
+    """Whether these steps came to an end."""
 
 
 def place(
-    from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_spread_m2: np.ndarray
+    from_m: np.ndarray,
+    from_spread_m2: np.ndarray,
+    to_m: np.ndarray,
+    to_spread_m2: np.ndarray,
 ) -> Placement:
     """Find the most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3,
     3), n >= 3. Raises numpy.linalg.LinAlgError if the points leave it undetermined (two, or all on
     a line)."""
 
     def state(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals (n, 3) and the inverses (n, 3, 3) of their covariances."""
         spread = to_spread_m2 + T[:3, :3] @ from_spread_m2 @ T[:3, :3].T
-        return transform_points(T, from_m) - to_m, np.linalg.inv(spread)
+        residuals = transform_points(T, from_m) - to_m
+        return residuals, np.linalg.inv(spread)
 
     trust = 1.0 / np.trace(from_spread_m2 + to_spread_m2, axis1=1, axis2=2)
     T = kabsch(from_m, to_m, trust)
@@ -62,15 +72,22 @@ def place(
         residuals, weight = state(T)
         jacobian = displacement_jacobian(residuals + to_m, centre)
         information = np.einsum("nki,nkl,nlj->ij", jacobian, weight, jacobian)
-        motion = -np.linalg.solve(
-            information, np.einsum("nki,nkl,nl->i", jacobian, weight, residuals)
-        )
+        gradient = np.einsum("nki,nkl,nl->i", jacobian, weight, residuals)
+        motion = -np.linalg.solve(information, gradient)
         T = moved_by(motion, centre) @ T
         converged = bool(np.abs(jacobian @ motion).max() < SMALL_STEP_M)
     residuals, weight = state(T)
     chi2 = float(np.einsum("ni,nij,nj->", residuals, weight, residuals))
     covariance = np.linalg.inv(information)
-    return Placement(T, (covariance + covariance.T) / 2, centre, residuals, chi2, steps, converged)
+    return Placement(
+        T_to_from=T,
+        covariance=(covariance + covariance.T) / 2,
+        centre_m=centre,
+        residuals_m=residuals,
+        chi2=chi2,
+        iterations=steps,
+        converged=converged,
+    )
 
 
 SHARED_M = 1.0 * MM
@@ -95,16 +112,20 @@ NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 @dataclass(frozen=True)
 class Pairing:
-    """``pairs`` (n, 2): indices into the reference's and the view's marks, in the reference's
-    order. ``problem``: why they must not be used, else empty. ``notes``: further remarks."""
+    """The marks of two views that belong together."""
 
     pairs: np.ndarray
+    """(n, 2): indices into the reference's and the view's marks, in the reference's order."""
     problem: str = ""
+    """Why they must not be used, else empty."""
     notes: tuple[str, ...] = ()
+    """Further remarks."""
 
 
 def pair_marks(
-    reference: Sequence[Mark], view: Sequence[Mark], T_reference_view_guess: np.ndarray | None
+    reference: Sequence[Mark],
+    view: Sequence[Mark],
+    T_reference_view_guess: np.ndarray | None,
 ) -> Pairing:
     """Match the marks of two views by the placement that is best in number of pairs, fit and
     closeness to the guess."""
@@ -119,10 +140,11 @@ def pair_marks(
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
         least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
-        what = f"of {counts}, no {least} have matching distances"
-        return Pairing(
-            NO_PAIRS, f"{what}: the targets differ, or other objects were taken for marks"
+        problem = (
+            f"of {counts}, no {least} have matching distances: the targets differ, or other "
+            "objects were taken for marks"
         )
+        return Pairing(NO_PAIRS, problem)
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
         placed = [
@@ -130,62 +152,69 @@ def pair_marks(
         ]
         off = np.stack(placed) - transform_points(T_reference_view_guess, theirs.places)
         away = np.sqrt((off**2).sum(axis=-1).mean(axis=-1))
-    number = [sum(mark >= 0 for mark in partner) for partner, _, _ in solutions]
-    fit = np.array(
-        [
-            n * (PAIR_WORTH - 0.5 * misfit)
-            for n, (_, _, misfit) in zip(number, solutions, strict=True)
-        ]
-    )
+    number = [len(partners) - partners.count(-1) for partners, _, _ in solutions]
+    misfit = np.array([misfit for _, _, misfit in solutions])
+    fit = np.array(number) * (PAIR_WORTH - 0.5 * misfit)
     odds = fit - 0.5 * (away / GUESS_SIGMA_M) ** 2
-    first, *rest = np.argsort(-odds, kind="stable").tolist()
-    pairs = np.array(
-        [(mark, solution) for mark, solution in enumerate(solutions[first][0]) if solution >= 0],
-        dtype=np.int64,
-    )
-    pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])] if swapped else pairs
-    if not rest or odds[first] - odds[rest[0]] >= CLEAR_ODDS:
+    first, *runners_up = np.argsort(-odds, kind="stable").tolist()
+    partner = np.array(solutions[first][0], dtype=np.int64)
+    matched = np.flatnonzero(partner >= 0)
+    pairs = np.stack([matched, partner[matched]], axis=1)
+    if swapped:
+        pairs = pairs[:, ::-1][np.argsort(pairs[:, 1])]
+    if not runners_up or odds[first] - odds[runners_up[0]] >= CLEAR_ODDS:
         return Pairing(pairs)
-    both = f"{number[first]} and {number[rest[0]]}"
-    problem = f"the marks lie symmetrically: two placements bring {both} of them together, and "
+    candidates = f"{number[first]} and {number[runners_up[0]]}"
+    problem = (
+        f"the marks lie symmetrically: two placements bring {candidates} of them together, and "
+    )
     if T_reference_view_guess is None:
         return Pairing(pairs, problem + "there is no guess to choose by")
     between = (
-        f"the guess lies between: {away[first] / MM:.0f} mm from one, {away[rest[0]] / MM:.0f} "
-        "mm from the other"
+        f"the guess lies between: {away[first] / MM:.0f} mm from one, "
+        f"{away[runners_up[0]] / MM:.0f} mm from the other"
     )
     return Pairing(pairs, problem + between)
 
 
 def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
-    ours, theirs = ([int(mark.code or 0) for mark in marks] for marks in (reference, view))
+    ours = [int(mark.code or 0) for mark in reference]
+    theirs = [int(mark.code or 0) for mark in view]
     twice = sorted({code for codes in (ours, theirs) for code in codes if codes.count(code) > 1})
     common = [code for code in ours if code in theirs and code not in twice]
-    pairs = np.array(
-        [(ours.index(code), theirs.index(code)) for code in common], dtype=np.int64
-    ).reshape(-1, 2)
+    indices = [(ours.index(code), theirs.index(code)) for code in common]
+    pairs = np.array(indices, dtype=np.int64).reshape(-1, 2)
     shown = [", ".join(map(str, sorted(codes))) for codes in (ours, theirs, twice)]
-    notes = (f"codes seen more than once in a view, not used: {shown[2]}",) if twice else ()
-    few = (
-        f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
-        f"the view {shown[1]}"
-    )
-    return Pairing(pairs, few if len(common) < LEAST_MARKS else "", notes)
+    notes = tuple[str, ...]()
+    if twice:
+        notes = (f"codes seen more than once in a view, not used: {shown[2]}",)
+    shortage = ""
+    if len(common) < LEAST_MARKS:
+        shortage = (
+            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
+            f"the view {shown[1]}"
+        )
+    return Pairing(pairs, shortage, notes)
 
 
 class _Side:
-    """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n) with
-    ``variances`` (n, n), and ``worst`` (n,), each place's variance in its worst direction."""
+    """The n marks of one view."""
 
     def __init__(self, marks: Sequence[Mark]) -> None:
         self.places = np.stack([mark.centre_m for mark in marks])
+        """(n, 3): their centres."""
         self.normals = np.stack([mark.normal for mark in marks])
+        """(n, 3): of the surface there."""
         covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
-        apart = self.places[:, None] - self.places[None]
-        self.distances = np.linalg.norm(apart, axis=-1)
-        along = apart / np.maximum(self.distances, 1e-12)[..., None]
-        own = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
-        self.variances, self.worst = own + own.T, np.linalg.eigvalsh(covariances)[:, -1]
+        offsets = self.places[:, None] - self.places[None]
+        self.distances = np.linalg.norm(offsets, axis=-1)
+        """(n, n): between the marks."""
+        along = offsets / np.maximum(self.distances, 1e-12)[..., None]
+        variances = np.einsum("ijk,ikl,ijl->ij", along, covariances, along)
+        self.variances = variances + variances.T
+        """(n, n): of the distances."""
+        self.worst = np.linalg.eigvalsh(covariances)[:, -1]
+        """(n,): variance of each place in its worst direction."""
 
     def frames(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return axes (k, 3, 3) (columns: from i to j, across, mean normal) and middles (k, 3) of
@@ -194,7 +223,8 @@ class _Side:
         along /= np.linalg.norm(along, axis=-1, keepdims=True)
         normal = self.normals[i] + self.normals[j]
         normal -= (normal * along).sum(axis=-1, keepdims=True) * along
-        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        normal /= np.maximum(length, 1e-12)
         axes = np.stack([along, np.cross(normal, along), normal], axis=-1)
         return axes, (self.places[i] + self.places[j]) / 2
 
@@ -204,67 +234,77 @@ Solution = tuple[tuple[int, ...], np.ndarray, float]
 over its variance."""
 
 
-def _solutions(few: _Side, many: _Side) -> list[Solution]:
+def _solutions(fewer_side: _Side, larger_side: _Side) -> list[Solution]:
     """Return the placements that match over half of the smaller set and at most `FEWER` pairs less
     than the best."""
-    n = len(few.places)
+    n = len(fewer_side.places)
     least = max(LEAST_MARKS, n // 2 + 1)
     # every set of more than half of the marks contains one of these pairs: disjoint ones, longest
     # first, and for an odd number the last mark with both marks of the first pair
     pairs: list[tuple[int, int]] = []
     free = set(range(n))
-    for i, j in sorted(combinations(range(n), 2), key=lambda pair: (-few.distances[pair], pair)):
+    longest_first = sorted(
+        combinations(range(n), 2), key=lambda pair: (-fewer_side.distances[pair], pair)
+    )
+    for i, j in longest_first:
         if i in free and j in free:
             pairs.append((i, j))
             free -= {i, j}
     pairs += [(mark, last) for last in free for mark in pairs[0]]
-    found: dict[tuple[int, ...], Solution] = {}
+    solutions: dict[tuple[int, ...], Solution] = {}
     best = least
     for i, j in pairs:
-        for solution in _holding(few, many, i, j, least):
-            found.setdefault(solution[0], solution)
+        for solution in _holding(fewer_side, larger_side, i, j, least):
+            solutions.setdefault(solution[0], solution)
             best = max(best, n - solution[0].count(-1))
-    near = [solution for solution in found.values() if n - solution[0].count(-1) >= best - FEWER]
+    credible = [
+        solution for solution in solutions.values() if n - solution[0].count(-1) >= best - FEWER
+    ]
     # leave out solutions that place the marks like a better one, to within half the distance
     # between neighbours
-    limit = (few.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
+    limit = fewer_side.distances[~np.eye(n, dtype=bool)].min() / 2
     kept: list[Solution] = []
-    for solution in sorted(near, key=lambda s: (s[0].count(-1), s[2], s[0])):
-        placed = transform_points(solution[1], few.places)
-        if all(
-            np.linalg.norm(placed - transform_points(T, few.places), axis=1).max() > limit
-            for _, T, _ in kept
-        ):
+    for solution in sorted(credible, key=lambda s: (s[0].count(-1), s[2], s[0])):
+        placed = transform_points(solution[1], fewer_side.places)
+        offsets = [placed - transform_points(T, fewer_side.places) for _, T, _ in kept]
+        if all(np.linalg.norm(offset, axis=1).max() > limit for offset in offsets):
             kept.append(solution)
     return kept
 
 
-def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Solution]:
+def _holding(
+    fewer_side: _Side,
+    larger_side: _Side,
+    i: int,
+    j: int,
+    least: int,
+) -> list[Solution]:
     """Return the solutions with at least ``least`` pairs in which marks i and j of the smaller set
     have partners."""
-    apart = np.abs(many.distances - few.distances[i, j])
-    fits = apart < DISTANCE_SIGMAS * np.sqrt(few.variances[i, j] + many.variances)
-    a, b = np.nonzero(fits & ~np.eye(len(apart), dtype=bool))
+    mismatch = np.abs(larger_side.distances - fewer_side.distances[i, j])
+    fits = mismatch < DISTANCE_SIGMAS * np.sqrt(fewer_side.variances[i, j] + larger_side.variances)
+    a, b = np.nonzero(fits & ~np.eye(len(mismatch), dtype=bool))
     if len(a) == 0:
         return []
     # partners (k, n) that lie as far from both partners (k,) of the pair as they should ...
-    consistent = np.ones((len(a), len(few.places), len(many.places)), dtype=bool)
+    consistent = np.ones((len(a), len(fewer_side.places), len(larger_side.places)), dtype=bool)
     for mark, partner in ((i, a), (j, b)):
-        off = np.abs(few.distances[mark][None, :, None] - many.distances[partner][:, None, :])
-        variance = few.variances[mark][None, :, None] + many.variances[partner][:, None, :]
+        expected_m = fewer_side.distances[mark][None, :, None]
+        off = np.abs(expected_m - larger_side.distances[partner][:, None, :])
+        expected_m2 = fewer_side.variances[mark][None, :, None]
+        variance = expected_m2 + larger_side.variances[partner][:, None, :]
         # a mark's distance to itself is exactly 0 on both sides
         consistent &= off <= DISTANCE_SIGMAS * np.sqrt(variance)
     # ... on the side of the line through them that the normals indicate: the mirror image beyond
     # it lies two heights away; half a height allows for normals wrong by 30 degrees
-    (axes,), (middle,) = few.frames(np.array([i]), np.array([j]))
-    axes_there, middle_there = many.frames(a, b)
-    local = (few.places - middle) @ axes
+    (axes,), (middle,) = fewer_side.frames(np.array([i]), np.array([j]))
+    axes_there, middle_there = larger_side.frames(a, b)
+    local = (fewer_side.places - middle) @ axes
     expected = np.einsum("kij,nj->kni", axes_there, local) + middle_there[:, None, :]
-    off = np.linalg.norm(expected[:, :, None, :] - many.places[None, None], axis=-1)
-    worst = few.worst[:, None] + many.worst[None]
-    consistent &= off < 0.5 * np.linalg.norm(local[:, 1:], axis=-1)[
-        :, None
-    ] + DISTANCE_SIGMAS * np.sqrt(worst)
+    off = np.linalg.norm(expected[:, :, None, :] - larger_side.places[None, None], axis=-1)
+    worst = fewer_side.worst[:, None] + larger_side.worst[None]
+    height = np.linalg.norm(local[:, 1:], axis=-1)[:, None]
+    consistent &= off < 0.5 * height + DISTANCE_SIGMAS * np.sqrt(worst)
     partner = _mutual(np.where(consistent, off, np.inf))
     partner = partner[(partner >= 0).sum(axis=1) >= least]
     for _ in range(2):
@@ -272,17 +312,21 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
         # transform
         if len(partner) == 0:
             return []
-        weights = np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
-        T = kabsch(np.broadcast_to(few.places, (*partner.shape, 3)), many.places[partner], weights)
-        placed = np.einsum("kij,nj->kni", T[:, :3, :3], few.places) + T[:, None, :3, 3]
-        square = ((placed[:, :, None, :] - many.places[None, None]) ** 2).sum(axis=-1) / worst
+        precision = 1.0 / (fewer_side.worst[None] + larger_side.worst[partner])
+        weights = np.where(partner >= 0, precision, 0.0)
+        from_m = np.broadcast_to(fewer_side.places, (*partner.shape, 3))
+        T = kabsch(from_m, larger_side.places[partner], weights)
+        placed = np.einsum("kij,nj->kni", T[:, :3, :3], fewer_side.places) + T[:, None, :3, 3]
+        offset = placed[:, :, None, :] - larger_side.places[None, None]
+        square = (offset**2).sum(axis=-1) / worst
         partner = _mutual(np.where(square < FIT_CHI2, square, np.inf))
-        own = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
+        squares = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
         count = (partner >= 0).sum(axis=1)
-        misfit = np.where(partner >= 0, own, 0.0).sum(axis=1) / np.maximum(count, 1)
-        T = T[count >= least]
-        partner = partner[count >= least]
-        misfit = misfit[count >= least]
+        misfit = np.where(partner >= 0, squares, 0.0).sum(axis=1) / np.maximum(count, 1)
+        enough = count >= least
+        T = T[enough]
+        partner = partner[enough]
+        misfit = misfit[enough]
     return [
         (tuple(row), transform, value)
         for row, transform, value in zip(partner.tolist(), T, misfit, strict=True)

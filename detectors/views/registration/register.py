@@ -57,23 +57,28 @@ TRIMMED = 0.9
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share
-    of the view's target points with a reference point within a pitch along the surface, at any
-    distance across it, and within a pitch (or three sigma of noise) across it. ``apart_m``: robust
-    root mean square distance across the surfaces where both exist. ``marks_m``: that of the
-    fiducial points to the nearest of the reference, without the farthest tenth; NaN if either has
-    fewer than three. ``noise_m``, ``grids_m``: distances that noise, and two grids of one pitch,
-    explain. ``scatter``, ``marks_scatter``: relative errors, times `FALSE_ALARM_SIGMAS`."""
+    """Agreement of a registered view with the reference target."""
 
     beside: float
+    """Share of the view's target points with a reference point within a pitch along the surface,
+    at any distance across it."""
     overlap: float
+    """The same, and within a pitch (or three sigma of noise) across it."""
     apart_m: float
+    """Robust root mean square distance across the surfaces where both exist."""
     marks_m: float
+    """Root mean square distance of the fiducial points to the nearest of the reference, without
+    the farthest tenth; NaN if either has fewer than three."""
     pitch_m: float
+    """Larger pitch of the two views."""
     noise_m: float
+    """Distance that noise explains."""
     grids_m: float
+    """Distance that two grids of one pitch explain."""
     scatter: float
+    """Relative error of ``apart_m``, times `FALSE_ALARM_SIGMAS`."""
     marks_scatter: float
+    """Relative error of ``marks_m``, times `FALSE_ALARM_SIGMAS`."""
 
 
 def _agreement(
@@ -91,50 +96,53 @@ def _agreement(
     noise = float(np.hypot(sampling.noise_m, of_view.noise_m))
     beside = np.zeros(1, bool)
     together = np.zeros(1, bool)
-    apart = float("nan")
+    apart_m = float("nan")
     marks_m = float("nan")
     fiducial = transform_points(T_reference_view, view.mark_points_m)
     if len(points) >= 3 and view.inside.any():
         # the reference's surface at a point is the plane through its 25 nearest points
         placed = transform_points(T_reference_view, registered.thinned(view.points_m))
         count = min(CORRELATED_PIXELS, len(points))
-        near = points[cKDTree(points).query(placed, k=count)[1]].reshape(len(placed), count, 3)
-        normals = registered.local_normals(near)
-        across = np.einsum("ni,ni->n", placed - near.mean(axis=1), normals)
-        along = np.linalg.norm(placed - across[:, None] * normals - near[:, 0], axis=1)
+        _, nearest = cKDTree(points).query(placed, k=count)
+        neighbours = points[nearest].reshape(len(placed), count, 3)
+        normals = registered.local_normals(neighbours)
+        across = np.einsum("ni,ni->n", placed - neighbours.mean(axis=1), normals)
+        along = np.linalg.norm(placed - across[:, None] * normals - neighbours[:, 0], axis=1)
         beside = along <= pitch
         together = beside & (np.abs(across) <= max(pitch, 3 * noise))
-        apart = sigma_of(across[beside]) if beside.any() else apart
+        apart_m = sigma_of(across[beside]) if beside.any() else apart_m
         if min(len(fiducial), len(marks)) >= 3:
-            distances = np.sort(cKDTree(marks).query(fiducial)[0])[
-                : max(int(TRIMMED * len(fiducial)), 1)
-            ]
+            distances = np.sort(cKDTree(marks).query(fiducial)[0])
+            distances = distances[: max(int(TRIMMED * len(fiducial)), 1)]
             marks_m = float(np.sqrt(np.mean(distances**2)))
-    scatter = (
-        FALSE_ALARM_SIGMAS
-        * MEDIAN_SCATTER
-        / float(np.sqrt(2 * registered.independent(int(beside.sum()))))
-    )
-    marks_scatter = FALSE_ALARM_SIGMAS / float(np.sqrt(2 * registered.independent(len(fiducial))))
-    shares = float(beside.mean()), float(together.mean())
+    count_beside = registered.independent(int(beside.sum()))
+    count_marks = registered.independent(len(fiducial))
     return Agreement(
-        *shares, apart, marks_m, pitch, noise, pitch / float(np.sqrt(6)), scatter, marks_scatter
+        beside=float(beside.mean()),
+        overlap=float(together.mean()),
+        apart_m=apart_m,
+        marks_m=marks_m,
+        pitch_m=pitch,
+        noise_m=noise,
+        grids_m=pitch / float(np.sqrt(6)),
+        scatter=FALSE_ALARM_SIGMAS * MEDIAN_SCATTER / float(np.sqrt(2 * count_beside)),
+        marks_scatter=FALSE_ALARM_SIGMAS / float(np.sqrt(2 * count_marks)),
     )
 
 
 def judge(
-    registration: registered.Registration, reference: PreparedView, view: PreparedView
+    registration: registered.Registration,
+    reference: PreparedView,
+    view: PreparedView,
 ) -> registered.Registration:
     """Return the registration with its overlap and, if it cannot be trusted, a ``failure`` or
     note."""
     T = registration.T_reference_view
     is_rigid = np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
     if not is_rigid or np.linalg.det(T[:3, :3]) < 0:
-        broken = (
-            "mirrored: the transform is a reflection, not a rotation"
-            if is_rigid
-            else "no transform was found"
-        )
+        broken = "no transform was found"
+        if is_rigid:
+            broken = "mirrored: the transform is a reflection, not a rotation"
         return replace(registration, overlap=0.0, failure=registration.failure or broken)
     sampling = registered.sampling_of(reference)
     points = registered.thinned(reference.points_m, 200)
@@ -143,9 +151,9 @@ def judge(
     if judged.failure:
         return judged
     if not agreement.beside >= registered.MIN_OVERLAP:
-        share = f"{100 * agreement.beside:.0f} % of the view lies beside the reference"
         elsewhere = (
-            f"the views do not overlap: {share} ({100 * registered.MIN_OVERLAP:.0f} % needed)"
+            f"the views do not overlap: {100 * agreement.beside:.0f} % of the view lies beside the "
+            f"reference ({100 * registered.MIN_OVERLAP:.0f} % needed)"
         )
     else:
         elsewhere = _jump(judged, reference, view)
@@ -155,31 +163,28 @@ def judge(
     error_m = float(np.hypot(within, across))
     limit_m = max(UNDETERMINED_PITCHES * sampling.pitch_m, BLUR_M)
     undetermined = ""
-    apart = _apart(agreement)
+    separation = _apart(agreement)
     if error_m > limit_m:
         undetermined = (
             "not determined: the points let the target slide or rotate (they lie on a line, or "
-            "the surface"
+            f"the surface slides in itself); the predicted error over it is {error_m / MM:.1f} "
+            f"mm, which would blur the map (up to {limit_m / MM:.1f} mm are merged)"
         )
-        undetermined += (
-            f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which "
-            "would blur"
-        )
-        undetermined += f" the map (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
-        return replace(
-            judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else []))
-        )
-    failure = "; ".join(reason for reason in (undetermined, apart) if reason)
-    return (
-        replace(judged, failure=failure)
-        if failure
-        else _widened(judged, sampling.normal, within, across, agreement)
-    )
+        notes = judged.notes
+        if separation:
+            notes += (separation,)
+        return replace(judged, failure=undetermined, notes=notes)
+    failure = "; ".join(reason for reason in (undetermined, separation) if reason)
+    if failure:
+        return replace(judged, failure=failure)
+    return _widened(judged, sampling.normal, within, across, agreement)
 
 
 def _jump(
-    registration: registered.Registration, reference: PreparedView, view: PreparedView
+    registration: registered.Registration,
+    reference: PreparedView,
+    view: PreparedView,
 ) -> str:
     """Return the reason why a pose is too far from its guess to be credible; empty if it is
     credible."""
@@ -189,14 +194,15 @@ def _jump(
     change = registration.T_reference_view @ invert(guess)
     turn = np.rad2deg(np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1.0, 1.0)))
     centre = view.points_m.mean(axis=0)
-    shift = np.linalg.norm(
-        transform_points(registration.T_reference_view, centre) - transform_points(guess, centre)
-    )
+    placed = transform_points(registration.T_reference_view, centre)
+    shift = np.linalg.norm(placed - transform_points(guess, centre))
     if turn <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
         return ""
-    credible = f"up to {MAX_JUMP_DEG:.0f} degrees and {MAX_JUMP_M / MM:.0f} mm are credible"
-    stands = f"is {turn:.0f} degrees and {shift / MM:.0f} mm away from its guess ({credible})"
-    return f"{stands}: marks matched wrongly, another target, or a wrong guess"
+    return (
+        f"is {turn:.0f} degrees and {shift / MM:.0f} mm away from its guess (up to "
+        f"{MAX_JUMP_DEG:.0f} degrees and {MAX_JUMP_M / MM:.0f} mm are credible): marks matched "
+        "wrongly, another target, or a wrong guess"
+    )
 
 
 def _apart(agreement: Agreement) -> str:
@@ -232,36 +238,36 @@ def _widened(
     covariance explains, is added to the shift, across the surface and within it. An offset of a
     whole view does not show."""
 
-    def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
-        return (
-            float(np.sqrt(measured_m**2 - explained_m**2))
-            if measured_m > explained_m * (1 + scatter)
-            else 0.0
-        )
+    def beyond_m(
+        measured_m: float,
+        explained_m: float,
+        scatter: float,
+    ) -> float:
+        if not measured_m > explained_m * (1 + scatter):
+            return 0.0
+        return float(np.sqrt(measured_m**2 - explained_m**2))
 
-    more_across = beyond_m(
-        agreement.apart_m, float(np.hypot(agreement.noise_m, across)), agreement.scatter
-    )
-    explained = float(
-        np.linalg.norm([agreement.noise_m, across, within, agreement.grids_m, more_across])
-    )
-    more_within = beyond_m(agreement.marks_m, explained, agreement.marks_scatter)
+    noise_m = agreement.noise_m
+    explained_across = float(np.hypot(noise_m, across))
+    more_across = beyond_m(agreement.apart_m, explained_across, agreement.scatter)
+    parts_m = [noise_m, across, within, agreement.grids_m, more_across]
+    explained_within = float(np.linalg.norm(parts_m))
+    more_within = beyond_m(agreement.marks_m, explained_within, agreement.marks_scatter)
     if not more_across and not more_within:
         return registration
     along = np.outer(normal, normal)
     covariance = registration.covariance.copy()
     # an error within the plane has two axes to share its mean square
     covariance[3:, 3:] += more_across**2 * along + 0.5 * more_within**2 * (np.eye(3) - along)
-    parts = [
-        f"{m / MM:.2g} mm {way}"
-        for m, way in ((more_across, "across"), (more_within, "along"))
-        if m
-    ]
+    parts = []
+    if more_across:
+        parts.append(f"{more_across / MM:.2g} mm across")
+    if more_within:
+        parts.append(f"{more_within / MM:.2g} mm along")
     note = (
         f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: "
-        "each view's own"
+        "each view's own error (offset, wiggling, lens); the covariance is widened by it"
     )
-    note += " error (offset, wiggling, lens); the covariance is widened by it"
     return replace(registration, covariance=covariance, notes=(*registration.notes, note))
 
 
@@ -280,18 +286,19 @@ def register(
     if len(views) == 1:
         return (of_reference,)
     if config.method in PAIRWISE:
-        found = [_pair(views[0], view, config) for view in views[1:]]
+        registrations = [_pair(views[0], view, config) for view in views[1:]]
     else:
         started = perf_counter()
-        found = (
-            register_by_odometry(views) if config.method == "odometry" else register_jointly(views)
-        )
-        share = (perf_counter() - started) / len(found)
-        found = [replace(each, seconds=share) for each in found]
-    return (
-        of_reference,
-        *(judge(each, views[0], view) for each, view in zip(found, views[1:], strict=True)),
-    )
+        if config.method == "odometry":
+            registrations = register_by_odometry(views)
+        else:
+            registrations = register_jointly(views)
+        share = (perf_counter() - started) / len(registrations)
+        registrations = [replace(registration, seconds=share) for registration in registrations]
+    judged = [of_reference]
+    for registration, view in zip(registrations, views[1:], strict=True):
+        judged.append(judge(registration, views[0], view))
+    return tuple(judged)
 
 
 def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None:
@@ -302,7 +309,7 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
         guess = view.view.T_reference_view_guess
         no_grid = not cloud.organised or cloud.lens is None
         by_points = "registration.method: icp or cpd with points: target"
-        for lacks, what, fix in (
+        for lacks, requirement, fix in (
             (
                 by_colour and cloud.rgb is None,
                 "colour for every point",
@@ -321,25 +328,30 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
         ):
             if lacks:
                 raise UserError(
-                    f"{view.view.name}: registration by {config.method} needs {what}", fix=fix
+                    f"{view.view.name}: registration by {config.method} needs {requirement}",
+                    fix=fix,
                 )
 
 
 def _pair(
-    reference: PreparedView, view: PreparedView, config: AnyRegistration
+    reference: PreparedView,
+    view: PreparedView,
+    config: AnyRegistration,
 ) -> registered.Registration:
     """Return the registration of a view to the reference, not judged yet."""
     started = perf_counter()
     if isinstance(config, IcpRegistration):
-        found = register_by_icp(reference, view, config)
+        registration = register_by_icp(reference, view, config)
     elif isinstance(config, CpdRegistration):
-        found = register_by_cpd(reference, view, config)
+        registration = register_by_cpd(reference, view, config)
     elif config.method == "marks":
-        found = register_by_marks(reference, view)
+        registration = register_by_marks(reference, view)
     else:
         # the quality of the guess is unknown
         guess = registered.guess_of(reference, view)
-        found = registered.Registration(
-            view.view.name, "nominal", np.eye(4) if guess is None else guess
+        registration = registered.Registration(
+            view.view.name,
+            "nominal",
+            np.eye(4) if guess is None else guess,
         )
-    return replace(found, seconds=perf_counter() - started)
+    return replace(registration, seconds=perf_counter() - started)

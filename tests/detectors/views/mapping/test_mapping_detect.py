@@ -27,13 +27,13 @@ def flat_map(sigma_m: np.ndarray, stated: bool = True) -> Cloud:
     z = 0.7 + sigma_m * np.random.default_rng(1).standard_normal(sigma_m.shape)
     flat = np.zeros(sigma_m.shape, dtype=np.uint8)
     return Cloud(
-        np.stack([x, y, z], axis=-1),
-        flat,
-        flat + np.int32(9),
-        np.full(sigma_m.shape, np.nan),
-        Region(0, h, 0, w),
-        0.0,
-        9,
+        points_m=np.stack([x, y, z], axis=-1),
+        reason=flat,
+        count=flat + np.int32(9),
+        variance_m2=np.full(sigma_m.shape, np.nan),
+        region=Region(0, h, 0, w),
+        z_step_m=0.0,
+        n_frames=9,
         projection="parallel",
         mean_variance_m2=sigma_m**2 / 4.0 if stated else None,
     )
@@ -65,7 +65,9 @@ def test_use_variance_off_and_a_cloud_without_variance_score_alike() -> None:
         ignored.score, DETECTOR.analyse(flat_map(sigma, stated=False)).score
     )
     np.testing.assert_allclose(
-        ignored.score * ignored.scale_m, np.abs(ignored.residual_m), rtol=1e-12
+        ignored.score * ignored.scale_m,
+        np.abs(ignored.residual_m),
+        rtol=1e-12,
     )
 
 
@@ -109,7 +111,9 @@ LIT_FROM_THE_LENS = {"blur_px": 5, "emitter_mm": (0.0, 0.0, 0.0)}
 
 
 def hole_map(
-    count: int, half_deg: float, config: FusedMerge | GridMerge
+    count: int,
+    half_deg: float,
+    config: FusedMerge | GridMerge,
 ) -> tuple[Cloud, np.ndarray, Plane]:
     plane = Plane(4.0, -6.0, HOLE)
     poses = arc(count, half_deg)
@@ -133,7 +137,9 @@ def strongest(cloud: Cloud, detector: ThesisDetector) -> tuple[Detection, object
     ("count", "half_deg", "cell_mm"), [(1, 0.0, None), (3, 25.0, 1.0), (5, 25.0, None)]
 )
 def test_hole_on_a_map_has_its_size_and_place(
-    count: int, half_deg: float, cell_mm: float | None
+    count: int,
+    half_deg: float,
+    cell_mm: float | None,
 ) -> None:
     cloud, T_plane_cloud, _ = hole_map(count, half_deg, FusedMerge(cell_mm=cell_mm))
     detector = ThesisDetector(

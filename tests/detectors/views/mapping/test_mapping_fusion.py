@@ -32,9 +32,9 @@ NOISE_M = 0.5 * MM
 
 
 def fused(views: list[PreparedView], poses: list[np.ndarray], **config: float) -> Merged:
-    registrations = [reference()] + [
-        registered(view.view.name, T) for view, T in zip(views[1:], poses[1:], strict=True)
-    ]
+    registrations = [reference()]
+    for view, T in zip(views[1:], poses[1:], strict=True):
+        registrations.append(registered(view.view.name, T))
     return merge(views, registrations, FusedMerge(**config))
 
 
@@ -45,15 +45,19 @@ def noisy(poses: list[np.ndarray], seed: int, plane: Plane, **kwargs: object) ->
     ]
 
 
-def deviations(found: Merged, plane: Plane, enough_views: int) -> np.ndarray:
+def deviations(
+    merged: Merged,
+    plane: Plane,
+    enough_views: int,
+) -> np.ndarray:
     """Of cells that enough views see, less a common plane's worth of nothing: the plane is known."""
-    cells = found.surface_map.seen_by.sum(axis=0) >= enough_views
-    return plane_height(found.cloud.points_m, found.T_reference_cloud, plane)[cells]
+    cells = merged.surface_map.seen_by.sum(axis=0) >= enough_views
+    return plane_height(merged.cloud.points_m, merged.T_reference_cloud, plane)[cells]
 
 
-def interior(found: Merged) -> np.ndarray:
+def interior(merged: Merged) -> np.ndarray:
     """(h, w) bool: seen by all views."""
-    return found.surface_map.seen_by.sum(axis=0) == len(found.views_used)
+    return merged.surface_map.seen_by.sum(axis=0) == len(merged.views_used)
 
 
 # ---------------------------------------------------------------- frame and exactness
@@ -63,16 +67,15 @@ def test_facing_plane_is_mapped_in_the_first_cameras_own_frame() -> None:
     result = fused([seen(Plane(), np.eye(4))], [np.eye(4)])
     np.testing.assert_allclose(result.T_reference_cloud, np.eye(4), atol=1e-12)
     assert result.surface_map.cell_m == pytest.approx(PITCH_M, rel=1e-12)
-    assert (
-        result.cloud.projection == "parallel"
-        and result.cloud.organised
-        and result.cloud.lens is None
-    )
+    assert result.cloud.projection == "parallel"
+    assert result.cloud.organised
+    assert result.cloud.lens is None
     valid = result.cloud.valid
     np.testing.assert_allclose(result.cloud.points_m[valid][:, 2], DISTANCE_M, atol=1e-12)
     # cells stand at whole multiples of the pitch, half a pixel off the pixels here: 119 x 159
     # between them
-    assert valid.all() and valid.shape == (119, 159)
+    assert valid.all()
+    assert valid.shape == (119, 159)
 
 
 def test_frame_stands_before_the_place_where_the_axis_meets_a_tilted_plane() -> None:
@@ -82,12 +85,15 @@ def test_frame_stands_before_the_place_where_the_axis_meets_a_tilted_plane() -> 
     normal = plane.T_reference_plane[:3, 2]
     np.testing.assert_allclose(T[:3, 2], normal, atol=1e-9)
     np.testing.assert_allclose(
-        T[:3, 3], np.array([0, 0, DISTANCE_M]) - DISTANCE_M * normal, atol=1e-9
+        T[:3, 3],
+        np.array([0, 0, DISTANCE_M]) - DISTANCE_M * normal,
+        atol=1e-9,
     )
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)
     # x has no part of the camera's y but what orthogonality to z asks for
     assert T[:3, 0] @ np.cross(normal, [1.0, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
-    assert T[0, 0] > 0 and T[1, 1] > 0
+    assert T[0, 0] > 0
+    assert T[1, 1] > 0
 
 
 def test_axis_that_misses_the_target_puts_the_origin_before_its_middle() -> None:
@@ -109,15 +115,23 @@ def test_axis_that_misses_the_target_puts_the_origin_before_its_middle() -> None
     st.sampled_from([0.8, 1.4, 3.1]),
 )
 def test_noise_free_views_of_a_plane_reproduce_it(
-    tilt_x: float, tilt_y: float, about_x: float, about_y: float, cell_mm: float
+    tilt_x: float,
+    tilt_y: float,
+    about_x: float,
+    about_y: float,
+    cell_mm: float,
 ) -> None:
     plane = Plane(tilt_x, tilt_y)
     poses = [np.eye(4), turned(about_x, about_y, (0.01, -0.02, 0.03))]
     result = fused(
-        [seen(plane, T, name=str(i)) for i, T in enumerate(poses)], poses, cell_mm=cell_mm
+        [seen(plane, T, name=str(i)) for i, T in enumerate(poses)],
+        poses,
+        cell_mm=cell_mm,
     )
     height = plane_height(
-        result.cloud.points_m[result.cloud.valid], result.T_reference_cloud, plane
+        result.cloud.points_m[result.cloud.valid],
+        result.T_reference_cloud,
+        plane,
     )
     assert result.cloud.valid.any()
     np.testing.assert_allclose(height, 0.0, atol=2e-7)
@@ -145,13 +159,16 @@ def test_order_of_the_other_views_changes_nothing_but_rounding() -> None:
     second = fused([views[0], *views[:0:-1]], [poses[0], *poses[:0:-1]])
     np.testing.assert_allclose(first.cloud.points_m, second.cloud.points_m, atol=1e-9)
     np.testing.assert_allclose(
-        first.surface_map.variance_m2, second.surface_map.variance_m2, rtol=0.02
+        first.surface_map.variance_m2,
+        second.surface_map.variance_m2,
+        rtol=0.02,
     )
 
 
 def test_the_same_views_give_the_same_bits() -> None:
     poses = arc(3, 15.0)
-    first, second = (fused(noisy(poses, 9, Plane()), poses) for _ in range(2))
+    first = fused(noisy(poses, 9, Plane()), poses)
+    second = fused(noisy(poses, 9, Plane()), poses)
     np.testing.assert_array_equal(first.cloud.points_m, second.cloud.points_m)
     np.testing.assert_array_equal(first.cloud.mean_variance_m2, second.cloud.mean_variance_m2)
 
@@ -177,7 +194,10 @@ def test_white_noise_falls_with_the_square_root_of_views() -> None:
     ("count", "frames", "cell_mm"), [(2, 10, 1.4), (5, 10, 1.4), (5, 10, 4.2), (4, 1, 1.4)]
 )
 def test_stated_variance_is_that_of_the_heights(
-    monkeypatch: pytest.MonkeyPatch, count: int, frames: int, cell_mm: float
+    monkeypatch: pytest.MonkeyPatch,
+    count: int,
+    frames: int,
+    cell_mm: float,
 ) -> None:
     # these lenses are exact
     monkeypatch.setattr(fusion, "LATERAL_PX", 0.0)
@@ -207,7 +227,9 @@ def test_registration_error_is_in_the_variance() -> None:
         assert cells.sum() > 100
     alone = surface_map.seen_by[1] & ~surface_map.seen_by[0]
     np.testing.assert_allclose(
-        (surface_map.variance_m2 - exact.variance_m2)[alone], added[alone], rtol=0.15
+        (surface_map.variance_m2 - exact.variance_m2)[alone],
+        added[alone],
+        rtol=0.15,
     )
 
 
@@ -249,7 +271,9 @@ def test_a_pattern_that_belongs_to_the_pixels_does_not_pass_for_independent() ->
     pattern *= 0.6 * MM / pattern.std()
     poses = [np.eye(4)] + [
         turned(
-            2.0 * np.sin(i), 3.0 * np.cos(2.0 * i), (0.008 * np.sin(3 * i), 0.008 * np.cos(i), 0.0)
+            2.0 * np.sin(i),
+            3.0 * np.cos(2.0 * i),
+            (0.008 * np.sin(3 * i), 0.008 * np.cos(i), 0.0),
         )
         for i in range(1, 9)
     ]
@@ -292,10 +316,13 @@ def test_what_a_cell_knows_of_its_views() -> None:
     result = fused(views, poses)
     away = np.hypot(result.cloud.points_m[..., 0], result.cloud.points_m[..., 1])
     middle = np.unravel_index(np.nanargmin(away), away.shape)
-    assert result.surface_map.seen_by.sum(axis=0)[middle] == 3 and result.cloud.count[middle] == 21
+    assert result.surface_map.seen_by.sum(axis=0)[middle] == 3
+    assert result.cloud.count[middle] == 21
     cameras = result.cloud.map_views.T_cloud_cameras[:, :3, 3]
     np.testing.assert_allclose(
-        np.rad2deg(np.arctan2(cameras[:, 0], DISTANCE_M - cameras[:, 2])), [0, -20, 20], atol=1
+        np.rad2deg(np.arctan2(cameras[:, 0], DISTANCE_M - cameras[:, 2])),
+        [0, -20, 20],
+        atol=1,
     )
     assert result.cloud.rgb[middle][0] == pytest.approx(90, abs=15)
     assert result.cloud.amplitude[middle] == pytest.approx(100.0, abs=1e-9)
@@ -305,22 +332,27 @@ def test_what_a_cell_knows_of_its_views() -> None:
 # ---------------------------------------------------------------- outliers
 
 
-def spoiled(at: tuple[slice, slice], by_m: float, which: tuple[int, ...], count: int = 5) -> Merged:
+def spoiled(
+    cells: tuple[slice, slice],
+    by_m: float,
+    view_numbers: tuple[int, ...],
+    count: int = 5,
+) -> Merged:
     poses = arc(count, 6.0)
     rng = np.random.default_rng(8)
     views = []
     for i, T in enumerate(poses):
         error = np.zeros((120, 160))
-        if i in which:
-            error[at] = by_m
+        if i in view_numbers:
+            error[cells] = by_m
         views.append(
             seen(Plane(), T, rng, noise_m=NOISE_M, frames=10, name=f"v{i}", pattern_m=error)
         )
     return fused(views, poses)
 
 
-def worst(found: Merged) -> float:
-    return float(np.abs(deviations(found, Plane(), 5)).max())
+def worst(merged: Merged) -> float:
+    return float(np.abs(deviations(merged, Plane(), 5)).max())
 
 
 def test_a_flying_pixel_is_rejected() -> None:
@@ -363,13 +395,9 @@ def test_a_view_without_a_grid_gives_the_same_map() -> None:
     flat = [without_grid(view) for view in views]
     first = fused(views, poses, cell_mm=1.4)
     second = fused(flat, poses, cell_mm=1.4)
-    h, w = (
-        min(a, b) for a, b in zip(first.cloud.valid.shape, second.cloud.valid.shape, strict=True)
-    )
-    gap = (
-        first.surface_map.height_m[5 : h - 5, 5 : w - 5]
-        - second.surface_map.height_m[5 : h - 5, 5 : w - 5]
-    )
+    h, w = np.minimum(first.cloud.valid.shape, second.cloud.valid.shape)
+    inner = (slice(5, h - 5), slice(5, w - 5))
+    gap = first.surface_map.height_m[inner] - second.surface_map.height_m[inner]
     # other diagonals in the same squares, other weights: a part of the noise, no bias
     assert np.isfinite(gap).mean() > 0.6
     assert abs(float(np.nanmean(gap))) < 0.02 * NOISE_M

@@ -56,7 +56,9 @@ def test_boxes_of_two_clouds_by_hand() -> None:
     red = [[(200, 0, 0)] * 3]
     blue = [[(0, 0, 101)] * 3]
     fixed = points_view(
-        [[-50, 0, 700], [10.0, 10.0, 700.0], [20, 20, 702]], "a", rgb=np.array(red, np.uint8)
+        [[-50, 0, 700], [10.0, 10.0, 700.0], [20, 20, 702]],
+        "a",
+        rgb=np.array(red, np.uint8),
     )
     moving = points_view(
         [[0.04, 0.02, 700.01], [10.05, 10.02, 700.06], [60, 30, 703]],
@@ -79,7 +81,8 @@ def test_boxes_of_two_clouds_by_hand() -> None:
     ]
     assert sorted(map(tuple, np.round(points, 6))) == sorted(map(tuple, expected))
     np.testing.assert_array_equal(result.T_reference_cloud, np.eye(4))
-    assert not result.cloud.organised and result.cloud.lens is None
+    assert not result.cloud.organised
+    assert result.cloud.lens is None
     assert (result.cloud.z_step_m, result.cloud.n_frames) == (1e-3, 10)
 
 
@@ -113,7 +116,9 @@ def test_a_single_cloud_and_clouds_apart_stay_as_they_are() -> None:
     separation = np.eye(4)
     separation[0, 3] = 1.0
     pair = merge(
-        [points_view(points, "a")] * 2, [reference(), registered("b", separation)], GridMerge()
+        [points_view(points, "a")] * 2,
+        [reference(), registered("b", separation)],
+        GridMerge(),
     )
     assert pair.cloud.points_m.shape == (1, 4, 3)
     assert pair.cloud.rgb is None
@@ -132,7 +137,9 @@ def test_colour_is_dropped_where_one_cloud_has_none() -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 20.0), st.integers(2, 4))
 def test_the_grid_keeps_the_mean_and_no_two_points_of_a_box(
-    seed: int, step_mm: float, views: int
+    seed: int,
+    step_mm: float,
+    views: int,
 ) -> None:
     rng = np.random.default_rng(seed)
     clouds = [
@@ -148,7 +155,9 @@ def test_the_grid_keeps_the_mean_and_no_two_points_of_a_box(
     assert weights.sum() == 50 * views
     mean = np.average(merged.cloud.points_m[0], axis=0, weights=weights)
     np.testing.assert_allclose(
-        mean, np.mean([c.points_m.mean(axis=0) for c in clouds], axis=0), atol=1e-12
+        mean,
+        np.mean([c.points_m.mean(axis=0) for c in clouds], axis=0),
+        atol=1e-12,
     )
     assert len(merged.cloud.points_m[0]) <= 50 * views
 
@@ -169,7 +178,8 @@ def test_volume_of_a_plane_lies_on_it(distortion: tuple[float, ...]) -> None:
         [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)],
         VolumeMerge(),
     )
-    assert not result.cloud.organised and result.cloud.valid.all()
+    assert not result.cloud.organised
+    assert result.cloud.valid.all()
     height = plane_height(result.cloud.points_m[0], result.T_reference_cloud, plane)
     # depth is looked up up to a quarter of a pixel beside its place along each axis, at incidences
     # up to 35 degrees
@@ -188,8 +198,9 @@ def test_volume_is_the_same_twice_and_noise_falls_with_views() -> None:
     rng = np.random.default_rng(3)
     views = [seen(plane, T, rng, noise_m=0.5 * MM, name=str(i)) for i, T in enumerate(poses)]
     registrations = [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)]
-    first, second = (merge(views, registrations, VolumeMerge()).cloud.points_m for _ in range(2))
-    np.testing.assert_array_equal(first, second)
+    first = merge(views, registrations, VolumeMerge())
+    second = merge(views, registrations, VolumeMerge())
+    np.testing.assert_array_equal(first.cloud.points_m, second.cloud.points_m)
     spread = {}
     for count in (1, 4):
         points = merge(views[:count], registrations[:count], VolumeMerge()).cloud.points_m[0]
@@ -218,7 +229,8 @@ def test_volume_keeps_face_and_floor_apart_from_the_walls_of_a_hole() -> None:
     floor = nearby & (points[:, 2] > 0.8 * hole.depth_m)
     on_wall = nearby & (points[:, 2] > 0.25 * hole.depth_m) & (points[:, 2] < 0.75 * hole.depth_m)
     # without the rule there are more points on the walls (391) than on the floor (375)
-    assert floor.sum() > 250 and on_wall.sum() < 0.1 * floor.sum()
+    assert floor.sum() > 250
+    assert on_wall.sum() < 0.1 * floor.sum()
 
 
 def test_volume_leaves_out_what_lies_outside_the_target() -> None:
@@ -259,7 +271,9 @@ def test_failed_views_are_left_out_and_named(config: GridMerge | FusedMerge | Vo
     assert result.views_used == ("v0", "v2")
     assert any("v1" in note and "too few marks" in note for note in result.notes)
     height = plane_height(
-        result.cloud.points_m[result.cloud.valid], result.T_reference_cloud, Plane()
+        result.cloud.points_m[result.cloud.valid],
+        result.T_reference_cloud,
+        Plane(),
     )
     assert float(np.abs(height).max()) < 0.3 * MM
     assert result.seconds > 0
@@ -271,7 +285,8 @@ def test_nothing_left_is_a_users_error_that_names_each_view() -> None:
     failed = registered("v1", np.eye(4), failure="no overlap")
     with pytest.raises(UserError, match="no view is left") as refusal:
         merge([nowhere, views[1]], [reference(), failed], FusedMerge())
-    assert "v0" in str(refusal.value) and "no overlap" in str(refusal.value)
+    assert "v0" in str(refusal.value)
+    assert "no overlap" in str(refusal.value)
 
 
 def test_frames_left_out_of_the_views_stay_named() -> None:
@@ -289,7 +304,11 @@ def test_frames_left_out_of_the_views_stay_named() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 1.5), st.integers(1, 3))
-def test_triangles_reproduce_what_is_linear(seed: int, step: float, parts: int) -> None:
+def test_triangles_reproduce_what_is_linear(
+    seed: int,
+    step: float,
+    parts: int,
+) -> None:
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:12, :15].astype(float)
     turn = rng.uniform(-0.15, 0.15)  # so that the cells below lie well within the samples
@@ -310,7 +329,9 @@ def test_triangles_reproduce_what_is_linear(seed: int, step: float, parts: int) 
         # cells well within; a cell that is covered in part takes the mean of that part
         complete = (x > 3) & (x < 9) & (y > 3) & (y < 7)
         np.testing.assert_allclose(
-            result[complete], (slope[0] * x + slope[1] * y + 3.0)[complete], atol=1e-9
+            result[complete],
+            (slope[0] * x + slope[1] * y + 3.0)[complete],
+            atol=1e-9,
         )
 
 
@@ -322,8 +343,10 @@ def test_cells_beyond_the_samples_are_unknown_and_one_invalid_corner_costs_a_tri
     result = raster_between(np.stack([u, v], axis=-1), valid, True, 0.5, grid).at_cells(
         np.arange(16.0)
     )
-    assert np.isnan(result[0]).all() and np.isnan(result[:, 0]).all()
-    assert np.isnan(result[1, 1]) and result[2, 2] == pytest.approx(0.75 * 5)
+    assert np.isnan(result[0]).all()
+    assert np.isnan(result[:, 0]).all()
+    assert np.isnan(result[1, 1])
+    assert result[2, 2] == pytest.approx(0.75 * 5)
 
 
 def test_concentration_is_the_variance_of_white_noise() -> None:
@@ -335,7 +358,9 @@ def test_concentration_is_the_variance_of_white_noise() -> None:
         raster = raster_between(positions, np.ones((40, 40), bool), True, 1.0, grid)
         drawn = raster.at_cells(rng.standard_normal((1600, 400)))
         np.testing.assert_allclose(
-            (drawn.var(axis=-1) / raster.concentration).mean(), 1.0, rtol=0.02
+            (drawn.var(axis=-1) / raster.concentration).mean(),
+            1.0,
+            rtol=0.02,
         )
 
 
@@ -343,7 +368,10 @@ def test_concentration_is_the_variance_of_white_noise() -> None:
 
 
 def noisy_cloud(
-    amplitude: np.ndarray | None, frame_sigma_m: np.ndarray, frames: int, seed: int
+    amplitude: np.ndarray | None,
+    frame_sigma_m: np.ndarray,
+    frames: int,
+    seed: int,
 ) -> PreparedView:
     rng = np.random.default_rng(seed)
     view = seen(Plane(), np.eye(4))
@@ -385,8 +413,8 @@ def test_noise_law_without_amplitude_goes_with_range_to_the_fourth() -> None:
     view = seen(Plane(0.0, 50.0), np.eye(4))
     distance = np.linalg.norm(view.view.cloud.points_m, axis=-1)
     sigma = 0.5 * MM * (distance / 0.7) ** 2
-    found = noisy_cloud(None, sigma, 20, 2).view.cloud
-    cloud = replace(found, points_m=view.view.cloud.points_m)
+    noisy = noisy_cloud(None, sigma, 20, 2).view.cloud
+    cloud = replace(noisy, points_m=view.view.cloud.points_m)
     mean, _ = depth_noise(cloud, view.inside, np.full(sigma.shape, np.nan))
     np.testing.assert_allclose(np.sqrt(20 * mean) / sigma, 1.0, atol=0.06)
 

@@ -24,14 +24,14 @@ PLACES = {3: (-0.2, 0.0), 7: (-0.06, 0.02), 11: (0.08, -0.02), 19: (0.2, 0.015)}
 WIDE = replace(LENS, width=400, height=160, cy=79.5)
 
 
-def tags(places: dict[int, tuple[float, float]], codes: dict[int, int] | None = None) -> Paint:
+def tags(corners: dict[int, tuple[float, float]], codes: dict[int, int] | None = None) -> Paint:
     """Tags of DICT_6X6_50 with a white rim of one module, on wood; ``codes`` of a tag where not
     its key."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50)
 
     def paint(xy: np.ndarray) -> np.ndarray:
         colours = np.broadcast_to(np.array(WOOD, float), (*xy.shape[:-1], 3)).copy()
-        for key, position in places.items():
+        for key, position in corners.items():
             modules = np.pad(
                 dictionary.generateImageMarker((codes or {}).get(key, key), 8),
                 1,
@@ -39,8 +39,10 @@ def tags(places: dict[int, tuple[float, float]], codes: dict[int, int] | None = 
             )
             # the board's y is up, a picture's rows go down
             cell = np.floor((xy - position) * [1, -1] / (TAG_M / 8) + 5).astype(int)
-            on = np.all((cell >= 0) & (cell < 10), axis=-1)
-            colours[on] = np.clip(modules[cell[on][:, 1], cell[on][:, 0]], 20, 235)[:, None]
+            within = np.all((cell >= 0) & (cell < 10), axis=-1)
+            colours[within] = np.clip(modules[cell[within][:, 1], cell[within][:, 0]], 20, 235)[
+                :, None
+            ]
         return colours
 
     return paint
@@ -99,7 +101,9 @@ def test_tags_that_are_cut_or_lack_range_are_in_doubt():
     v, u = np.divmod(complete[7].pixels, 400)
     points[v.min() : int(np.quantile(v, 0.2)), u.min() : u.max() + 1] = np.nan
     marks = find_marks(
-        replace(cloud, points_m=points), inside & np.isfinite(points[..., 2]), CodedMarks()
+        replace(cloud, points_m=points),
+        inside & np.isfinite(points[..., 2]),
+        CodedMarks(),
     )
     doubts = {mark.code: mark.doubt for mark in marks.marks}
     assert doubts[3].endswith("beyond the crop's edge")
@@ -112,7 +116,8 @@ def test_marks_need_a_pixel_grid():
     for config in (CodedMarks(), ColourMarks()):
         assert "no pixel grid" in find_marks(cloud, cloud.valid, config).problem
     of_red = find_marks(cloud, cloud.valid, RedMarks(deviations=0.1))
-    assert "need a pixel grid" in of_red.problem and of_red.points.size
+    assert "need a pixel grid" in of_red.problem
+    assert of_red.points.size
 
 
 def test_a_dictionary_that_opencv_lacks_is_refused_with_those_it_has():

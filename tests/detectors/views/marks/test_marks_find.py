@@ -22,9 +22,8 @@ def everywhere(cloud: Cloud) -> np.ndarray:
 
 def on_board_m(marks: MarkSet, T_camera_board: np.ndarray) -> np.ndarray:
     """(n, 3) centres of the trusted marks in the board's frame, by x, then y."""
-    positions = transform_points(
-        invert(T_camera_board), np.stack([mark.centre_m for mark in marks.trusted])
-    )
+    centres = np.stack([mark.centre_m for mark in marks.trusted])
+    positions = transform_points(invert(T_camera_board), centres)
     return positions[np.lexsort((positions[:, 1], positions[:, 0] > 0))]
 
 
@@ -43,15 +42,17 @@ def two_lamps(scaled: np.ndarray) -> np.ndarray:
     return 0.7 * np.stack([1.2 - 0.5 * u, np.ones_like(u), 0.9 + 0.4 * u], axis=-1)
 
 
-def photographed(cloud: Cloud, rng: np.random.Generator, quality: int = 80) -> Cloud:
+def photographed(
+    cloud: Cloud,
+    rng: np.random.Generator,
+    quality: int = 80,
+) -> Cloud:
     assert cloud.rgb is not None
-    noisy = np.clip(np.rint(cloud.rgb + 3.0 * rng.standard_normal(cloud.rgb.shape)), 0, 255).astype(
-        np.uint8
-    )
+    noisy = np.rint(cloud.rgb + 3.0 * rng.standard_normal(cloud.rgb.shape))
+    noisy = np.clip(noisy, 0, 255).astype(np.uint8)
     _, packed = cv2.imencode(".jpg", noisy[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return replace(
-        cloud, rgb=np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
-    )
+    unpacked = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+    return replace(cloud, rgb=np.ascontiguousarray(unpacked[..., ::-1]))
 
 
 @pytest.mark.parametrize(
@@ -71,9 +72,8 @@ def photographed(cloud: Cloud, rng: np.random.Generator, quality: int = 80) -> C
 def test_tape_of_any_colour_is_found_in_uneven_coloured_light_through_jpeg(colour, light):
     rng = random_stream(1, "tapes", str(colour), light.__name__)
     T = board_pose(5.0, -8.0, 2.0)
-    cloud = photographed(
-        marked_cloud(T, strips(colour=colour), rng=rng, samples=3, light=light), rng
-    )
+    sharp = marked_cloud(T, strips(colour=colour), rng=rng, samples=3, light=light)
+    cloud = photographed(sharp, rng)
     marks = find_marks(cloud, everywhere(cloud), ColourMarks())
     assert (marks.problem, len(marks.trusted)) == ("", 4), [mark.doubt for mark in marks.marks]
     # half a pixel is 0.7 mm
@@ -135,7 +135,12 @@ def test_holes_that_show_a_backing_of_another_colour_are_no_marks(backing):
     ],
 )
 @pytest.mark.slow  # a Monte Carlo campaign
-def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg, half_size):
+def test_the_stated_covariance_is_that_of_the_errors(
+    sigma_m,
+    samples,
+    turn_deg,
+    half_size,
+):
     rng = random_stream(4, "covariance", sigma_m, samples)
     squares = []
     across = []
@@ -144,13 +149,16 @@ def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg,
         T = board_pose(*rng.uniform(-15, 15, 2), rng.uniform(-turn_deg, turn_deg))
         T[:3, 3] += rng.uniform(-2e-3, 2e-3, 3)
         cloud = marked_cloud(
-            T, strips(half_size=half_size), rng=rng, samples=samples, sigma_m=sigma_m
+            T,
+            strips(half_size=half_size),
+            rng=rng,
+            samples=samples,
+            sigma_m=sigma_m,
         )
         for mark in find_marks(cloud, everywhere(cloud), ColourMarks()).trusted:
             position = transform_points(invert(T), mark.centre_m)
-            error = T[:3, :3] @ (
-                position - EXPECTED[np.linalg.norm(EXPECTED - position, axis=1).argmin()]
-            )
+            nearest = np.linalg.norm(EXPECTED - position, axis=1).argmin()
+            error = T[:3, :3] @ (position - EXPECTED[nearest])
             squares.append(error @ np.linalg.solve(mark.covariance_m2, error) / 3)
             across.append(error @ T[:3, 2])
             stated.append(T[:3, 2] @ mark.covariance_m2 @ T[:3, 2])
@@ -170,12 +178,8 @@ def test_averaged_frames_and_stated_variances_count():
     )
     mark = find_marks(noisy, everywhere(noisy), ColourMarks()).trusted[0]
     n = len(mark.pixels)
-    along = (
-        mark.centre_m
-        / mark.centre_m[2]
-        * mark.normal[2]
-        / (mark.normal @ mark.centre_m / mark.centre_m[2])
-    )
+    ray = mark.centre_m / mark.centre_m[2]
+    along = ray * mark.normal[2] / (mark.normal @ ray)
     depth_part = mark.normal @ np.outer(along, along) @ mark.normal * (1e-3) ** 2 * 25 / n
     # across the plane pixelation has no part
     assert mark.normal @ mark.covariance_m2 @ mark.normal == pytest.approx(depth_part, rel=1e-6)
@@ -195,7 +199,9 @@ def test_a_mark_cut_by_the_crop_or_the_picture_is_in_doubt_and_the_rest_is_not()
         **{name: getattr(cloud, name)[:, columns[3] :] for name in ("points_m", "reason", "count")},
     )
     edge = replace(
-        edge, variance_m2=cloud.variance_m2[:, columns[3] :], rgb=cloud.rgb[:, columns[3] :]
+        edge,
+        variance_m2=cloud.variance_m2[:, columns[3] :],
+        rgb=cloud.rgb[:, columns[3] :],
     )  # type: ignore[index]
     doubts = [mark.doubt for mark in find_marks(edge, everywhere(edge), ColourMarks()).marks]
     assert doubts.count("cut by the picture's edge") == 2
@@ -204,7 +210,7 @@ def test_a_mark_cut_by_the_crop_or_the_picture_is_in_doubt_and_the_rest_is_not()
 def test_a_mark_without_range_in_a_part_is_in_doubt():
     cloud = marked_cloud(board_pose(0.0, 0.0), strips(), rng=random_stream(7, "no range"))
     assert cloud.rgb is not None
-    v, u = (axis[0] for axis in np.nonzero((cloud.rgb == RED).all(axis=-1)))
+    v, u = np.argwhere((cloud.rgb == RED).all(axis=-1))[0]
     points = cloud.points_m.copy()
     points[v : v + 5, u : u + 12] = np.nan
     lost = replace(cloud, points_m=points)
@@ -228,17 +234,17 @@ def test_the_odd_one_out_is_in_doubt():
 
 
 @pytest.mark.parametrize(
-    ("places", "said"),
+    ("spots", "message"),
     [
         (TAPES[:2], "2 marks found, 3 needed"),
         (TAPES[:0], "0 marks found, 3 needed"),
         (np.array([[-0.2, 0.0], [0.0, 0.0], [0.15, 0.0]]), "lie on a line"),
     ],
 )
-def test_what_is_missing_is_said(places, said):
-    cloud = marked_cloud(board_pose(), strips(places), rng=random_stream(9, "missing"))
+def test_what_is_missing_is_said(spots, message):
+    cloud = marked_cloud(board_pose(), strips(spots), rng=random_stream(9, "missing"))
     for config in (ColourMarks(), RedMarks()):
-        assert said in find_marks(cloud, everywhere(cloud), config).problem
+        assert message in find_marks(cloud, everywhere(cloud), config).problem
 
 
 def test_no_colour_and_no_target_are_said():
@@ -254,7 +260,8 @@ def test_no_colour_and_no_target_are_said():
 
 def test_the_same_cloud_gives_the_same_bits():
     cloud = marked_cloud(board_pose(), strips(wood=WOOD), rng=random_stream(11, "twice"), samples=2)
-    first, second = (find_marks(cloud, everywhere(cloud), ColourMarks()) for _ in range(2))
+    first = find_marks(cloud, everywhere(cloud), ColourMarks())
+    second = find_marks(cloud, everywhere(cloud), ColourMarks())
     for a, b in zip(first.marks, second.marks, strict=True):
         np.testing.assert_array_equal(a.centre_m, b.centre_m)
         np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)

@@ -18,7 +18,11 @@ from detectors.views.marks.find import fit_patch
 from harness.vocabulary.seeds import random_stream
 
 
-def rectangle(length: float, breadth: float, turn_deg: float = 0.0) -> np.ndarray:
+def rectangle(
+    length: float,
+    breadth: float,
+    turn_deg: float = 0.0,
+) -> np.ndarray:
     turn = np.deg2rad(turn_deg)
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * [length, breadth] @ axes
@@ -46,14 +50,20 @@ def test_a_whole_number_of_pixels_shifts_by_up_to_half_a_pixel_and_a_half_one_by
 def test_the_order_of_the_vertices_does_not_matter():
     polygon = rectangle(20.3, 7.7, 12.0)
     np.testing.assert_allclose(
-        centroid_covariance_px2(polygon), centroid_covariance_px2(polygon[::-1]), rtol=1e-9
+        centroid_covariance_px2(polygon),
+        centroid_covariance_px2(polygon[::-1]),
+        rtol=1e-9,
     )
 
 
 @pytest.mark.parametrize(
     ("length", "breadth", "turn"), [(28.3, 9.1, 1.0), (28.3, 9.1, 3.0), (14.2, 14.6, 45.0)]
 )
-def test_the_lattice_error_is_that_of_random_shifts(length, breadth, turn):
+def test_the_lattice_error_is_that_of_random_shifts(
+    length,
+    breadth,
+    turn,
+):
     rng = random_stream(1, "shifts", turn)
     polygon = rectangle(length, breadth, turn)
     shifts = rng.uniform(-0.5, 0.5, (1000, 2))
@@ -61,7 +71,9 @@ def test_the_lattice_error_is_that_of_random_shifts(length, breadth, turn):
     # a variance of 1000 bounded values is known to 4 %; the frequencies left out and the first
     # order cost 12 % more
     np.testing.assert_allclose(
-        np.diag(centroid_covariance_px2(polygon)), errors.var(axis=0), rtol=0.15
+        np.diag(centroid_covariance_px2(polygon)),
+        errors.var(axis=0),
+        rtol=0.15,
     )
 
 
@@ -116,7 +128,11 @@ def test_points_on_a_line_or_too_few_give_no_plane():
     assert fit_patch(line[:5]) is None
 
 
-def wood(rng: np.random.Generator, noise: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+def wood(
+    rng: np.random.Generator,
+    noise: np.ndarray,
+    pixels: int,
+) -> tuple[np.ndarray, np.ndarray]:
     positions = rng.uniform(-1, 1, (pixels, 2))
     light = np.exp(0.5 * np.log(3.0) * positions[:, :1]) * np.array([1.0, 0.9, 0.7])
     # no channel is clipped: 98 * 1.73 * 1.5 = 254

@@ -45,27 +45,34 @@ def marks_at(
     normal = T_camera_board[:3, 2]
     return tuple(
         Mark(
-            centre,
-            covariance,
-            normal,
-            np.zeros(0, int),
-            5e-4,
-            None if codes is None else codes[number],
+            centre_m=centre,
+            covariance_m2=covariance,
+            normal=normal,
+            pixels=np.zeros(0, int),
+            area_m2=5e-4,
+            code=None if codes is None else codes[number],
         )
         for number, centre in enumerate(centres)
     )
 
 
 def view_of(
-    name: str, marks: tuple[Mark, ...], T_reference_view_guess: np.ndarray | None = None
+    name: str,
+    marks: tuple[Mark, ...],
+    T_reference_view_guess: np.ndarray | None = None,
 ) -> PreparedView:
     return prepared(
-        name, MarkSet(marks, np.zeros(0, int), problem_of(marks)), T_reference_view_guess
+        name,
+        MarkSet(marks, np.zeros(0, int), problem_of(marks)),
+        T_reference_view_guess,
     )
 
 
 def wrong_by(
-    T_reference_view: np.ndarray, about_m: np.ndarray, turn_deg: float, shift_m: float
+    T_reference_view: np.ndarray,
+    about_m: np.ndarray,
+    turn_deg: float,
+    shift_m: float,
 ) -> np.ndarray:
     error = np.eye(4)
     error[:3, :3] = Rotation.from_rotvec(
@@ -83,8 +90,9 @@ GUESS = wrong_by(TRUE, FIRST[:3, 3], 5.0, 0.02)
 
 def error_m(T_reference_view: np.ndarray) -> float:
     """The greatest over the marks of how far the view's are from the reference's."""
-    moved = transform_points(T_reference_view, transform_points(SECOND, RECTANGLE))
-    return float(np.linalg.norm(moved - transform_points(FIRST, RECTANGLE), axis=1).max())
+    moved = transform_points(T_reference_view @ SECOND, RECTANGLE)
+    offset = moved - transform_points(FIRST, RECTANGLE)
+    return float(np.linalg.norm(offset, axis=1).max())
 
 
 def test_a_turned_set_is_turned_back_exactly():
@@ -176,7 +184,12 @@ def test_marks_are_matched_without_any_guess_where_they_lie_unevenly():
     missing=st.tuples(st.integers(0, 1), st.integers(0, 1)),
     spurious=st.tuples(st.integers(0, 1), st.integers(0, 1)),
 )
-def test_missing_and_spurious_marks_do_no_harm(seed, marks, missing, spurious):
+def test_missing_and_spurious_marks_do_no_harm(
+    seed,
+    marks,
+    missing,
+    spurious,
+):
     rng = random_stream(seed, "sets")
     # 60 mm apart or more, or else a spurious mark may lie as a missing one does
     cells = rng.permutation(60)[: marks + sum(spurious)]
@@ -243,8 +256,10 @@ def test_a_guess_of_the_reference_itself_is_taken_into_account():
 
 def test_other_targets_moved_marks_and_lines_fail():
     reference = view_of("a", marks_at(RECTANGLE, FIRST), np.eye(4))
-    other = np.array([[0.0, 0.0, 0.0], [0.1, 0.02, 0.0], [0.17, -0.03, 0.0], [0.05, 0.07, 0.0]])
-    failed = register_by_marks(reference, view_of("b", marks_at(other, SECOND), GUESS))
+    another_target = np.array(
+        [[0.0, 0.0, 0.0], [0.1, 0.02, 0.0], [0.17, -0.03, 0.0], [0.05, 0.07, 0.0]]
+    )
+    failed = register_by_marks(reference, view_of("b", marks_at(another_target, SECOND), GUESS))
     assert "matching distances" in failed.failure
     np.testing.assert_array_equal(failed.T_reference_view, GUESS)
     assert np.isnan(failed.covariance).all()
@@ -283,12 +298,14 @@ def test_codes_decide_alone():
     by_marks = register_by_marks(reference, view)
     assert by_marks.failure == ""
     assert error_m(by_marks.T_reference_view) < 2e-3
-    others = view_of("b", marks_at(RECTANGLE[order], SECOND, rng, [15, 4, 23, 42]))
-    assert register_by_marks(reference, others).failure == (
+    recoded = view_of("b", marks_at(RECTANGLE[order], SECOND, rng, [15, 4, 23, 42]))
+    assert register_by_marks(reference, recoded).failure == (
         "2 codes in common, 3 needed: the reference shows 4, 8, 15, 16, the view 4, 15, 23, 42"
     )
     twice = pair_marks(
-        reference.marks.marks, marks_at(RECTANGLE, SECOND, rng, [4, 4, 15, 16]), None
+        reference.marks.marks,
+        marks_at(RECTANGLE, SECOND, rng, [4, 4, 15, 16]),
+        None,
     )
     assert twice.notes == ("codes seen more than once in a view, not used: 4",)
     assert "2 codes in common" in twice.problem

@@ -37,14 +37,24 @@ def transform(
     return T
 
 
-def dense_posterior(fixed: np.ndarray, moving: np.ndarray, variance: float, w: float) -> np.ndarray:
+def dense_posterior(
+    fixed: np.ndarray,
+    moving: np.ndarray,
+    variance: float,
+    w: float,
+) -> np.ndarray:
     """Equation 6 of Myronenko & Song: (m, n), moving by fixed."""
     gauss = np.exp(-cdist(moving, fixed, "sqeuclidean") / (2 * variance))
     uniform = (2 * np.pi * variance) ** 1.5 * w / (1 - w) * len(moving) / len(fixed)
     return gauss / (gauss.sum(axis=0) + uniform)
 
 
-def dense_cpd(fixed: np.ndarray, moving: np.ndarray, w: float, iterations: int) -> np.ndarray:
+def dense_cpd(
+    fixed: np.ndarray,
+    moving: np.ndarray,
+    w: float,
+    iterations: int,
+) -> np.ndarray:
     """Figure 2 of the paper with s = 1, in the normalised units of the module under test."""
     middle = fixed.mean(axis=0)
     scale = np.sqrt(np.mean(np.sum((fixed - middle) ** 2, axis=1)))
@@ -101,7 +111,10 @@ def test_every_iteration_is_that_of_a_dense_implementation(w):
         result = coherent_point_drift(fixed, moving, config)
         assert result.iterations == iterations
         np.testing.assert_allclose(
-            result.T_fixed_moving, dense_cpd(fixed, moving, w, iterations), rtol=0, atol=1e-9
+            result.T_fixed_moving,
+            dense_cpd(fixed, moving, w, iterations),
+            rtol=0,
+            atol=1e-9,
         )
 
 
@@ -111,7 +124,11 @@ def test_every_iteration_is_that_of_a_dense_implementation(w):
     seed=st.integers(0, 5),
 )
 @settings(max_examples=8, deadline=None)
-def test_known_transforms_come_back_through_outliers(turn, shift, seed):
+def test_known_transforms_come_back_through_outliers(
+    turn,
+    shift,
+    seed,
+):
     T = transform(turn, shift)
     fixed = cloud(150, seed)
     moving = transform_points(np.linalg.inv(T), fixed)
@@ -136,7 +153,8 @@ def test_the_background_is_that_of_the_last_iteration():
     drift = coherent_point_drift(fixed, truth, CpdRegistration(max_iterations=500, tolerance=1e-13))
     moved = transform_points(drift.T_fixed_moving, truth)
     moments, _ = posterior_moments(fixed, moved, drift.sigma_m**2, drift.background)
-    assert drift.converged and drift.matched < 359
+    assert drift.converged
+    assert drift.matched < 359
     np.testing.assert_allclose(float(moments[:, 3, 3].sum()), drift.matched, rtol=0, atol=1e-9)
 
 
@@ -158,16 +176,20 @@ def test_only_the_turn_of_the_guess_matters():
     moving = transform_points(transform((60, 0, 0), (0, 0, 0)), cloud(100))
     start = transform((-55, 3, 0), (0.0, 0.0, 0.0))
     far = transform((0, 0, 0), (3.0, -2.0, 1.0)) @ start
-    near = coherent_point_drift(fixed, moving, EXACT, start).T_fixed_moving
+    from_guess = coherent_point_drift(fixed, moving, EXACT, start).T_fixed_moving
     np.testing.assert_allclose(
-        coherent_point_drift(fixed, moving, EXACT, far).T_fixed_moving, near, atol=1e-9
+        coherent_point_drift(fixed, moving, EXACT, far).T_fixed_moving,
+        from_guess,
+        atol=1e-9,
     )
-    np.testing.assert_allclose(transform_points(near, moving), fixed, atol=1e-5)
+    np.testing.assert_allclose(transform_points(from_guess, moving), fixed, atol=1e-5)
 
 
 def test_equal_clouds_end_at_once_and_stay():
     result = coherent_point_drift(
-        cloud(50), cloud(50), CpdRegistration(outlier_ratio=0.0, max_iterations=1000)
+        cloud(50),
+        cloud(50),
+        CpdRegistration(outlier_ratio=0.0, max_iterations=1000),
     )
     assert result.converged
     np.testing.assert_allclose(result.T_fixed_moving, np.eye(4), atol=1e-9)
@@ -179,7 +201,8 @@ def test_a_loose_tolerance_stops_early_and_a_tight_one_runs_on():
     moving = transform_points(transform((5, 0, 0), (0.01, 0, 0)), cloud(100) + noise)
     loose = coherent_point_drift(fixed, moving, CpdRegistration(tolerance=0.5))
     tight = coherent_point_drift(fixed, moving, CpdRegistration(tolerance=1e-12))
-    assert loose.converged and loose.iterations < 5 < tight.iterations
+    assert loose.converged
+    assert loose.iterations < 5 < tight.iterations
 
 
 @pytest.mark.slow
@@ -222,6 +245,9 @@ def test_points_all_over_a_flat_disc_hold_no_turn():
     moving = disc[1500:]
     drift = coherent_point_drift(fixed, moving, CpdRegistration())
     covariance = drift_covariance(
-        fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch_m=0.004
+        fixed,
+        transform_points(drift.T_fixed_moving, moving),
+        drift,
+        pitch_m=0.004,
     )
     assert np.isnan(covariance).all() or np.sqrt(covariance[2, 2]) > np.deg2rad(2)

@@ -19,7 +19,10 @@ PITCH_M = 0.5 / 300
 
 
 def wavy_view(
-    T_camera_object: np.ndarray, guess: np.ndarray | None, seed: int, noise_m: float
+    T_camera_object: np.ndarray,
+    guess: np.ndarray | None,
+    seed: int,
+    noise_m: float,
 ) -> PreparedView:
     """2500 points scattered over a wavy sheet of 0.2 m, without a pixel grid; noise across it."""
     random = np.random.default_rng(seed)
@@ -32,13 +35,13 @@ def wavy_view(
     points = transform_points(T_camera_object, np.stack([x, y, z], axis=1))[None]
     flat = np.zeros((1, 2500), dtype=np.uint8)
     cloud = Cloud(
-        points,
-        flat,
-        flat + 1,
-        np.full((1, 2500), np.nan),
-        Region(0, 1, 0, 2500),
-        0.0,
-        1,
+        points_m=points,
+        reason=flat,
+        count=flat + 1,
+        variance_m2=np.full((1, 2500), np.nan),
+        region=Region(0, 1, 0, 2500),
+        z_step_m=0.0,
+        n_frames=1,
         organised=False,
     )
     return PreparedView(View("wavy", cloud, guess), cloud.valid, MarkSet((), np.empty(0, int)))
@@ -53,8 +56,11 @@ def test_a_shaped_target_is_found_from_a_usual_guess():
     wrong = by_icp.T_reference_view @ np.linalg.inv(pose() @ np.linalg.inv(pose(5, -8)))
     moved = transform_points(wrong, by_icp.centre_m) - by_icp.centre_m
     turn = Rotation.from_matrix(wrong[:3, :3]).magnitude()
-    assert np.linalg.norm(moved) < 1.5e-3 and turn * 0.1 < 1.5e-3
-    assert not by_icp.failure and by_icp.converged and by_icp.pairs > 2400
+    assert np.linalg.norm(moved) < 1.5e-3
+    assert turn * 0.1 < 1.5e-3
+    assert not by_icp.failure
+    assert by_icp.converged
+    assert by_icp.pairs > 2400
 
 
 def test_flat_marks_come_as_near_as_point_to_point_can():
@@ -62,18 +68,21 @@ def test_flat_marks_come_as_near_as_point_to_point_can():
     reference, view = views(POSES, guess_error=usual_error(), noise_m=3e-4)
     by_icp = register_by_icp(reference.prepared, view.prepared, IcpRegistration())
     within, across = target_error_m(by_icp, reference, view)
-    assert within < 3e-3 and across < 0.2 * PITCH_M
+    assert within < 3e-3
+    assert across < 0.2 * PITCH_M
     predicted = predicted_error_m(
-        by_icp, reference.prepared.points_m[::50], reference.T_camera_board[:3, 2]
+        by_icp,
+        reference.prepared.points_m[::50],
+        reference.T_camera_board[:3, 2],
     )
-    assert 0.05e-3 < predicted[0] < 2 * PITCH_M and 1e-6 < predicted[1] < 0.2 * PITCH_M
+    assert 0.05e-3 < predicted[0] < 2 * PITCH_M
+    assert 1e-6 < predicted[1] < 0.2 * PITCH_M
 
 
 def test_the_same_views_give_the_same_bits():
     reference, view = views(POSES, guess_error=usual_error(), noise_m=3e-4)
-    first, second = (
-        register_by_icp(reference.prepared, view.prepared, IcpRegistration()) for _ in range(2)
-    )
+    first = register_by_icp(reference.prepared, view.prepared, IcpRegistration())
+    second = register_by_icp(reference.prepared, view.prepared, IcpRegistration())
     assert first.T_reference_view.tobytes() == second.T_reference_view.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()
 
@@ -84,7 +93,9 @@ def test_without_a_guess_it_starts_at_the_reference_and_says_so():
     by_icp = register_by_icp(reference, blind, IcpRegistration(points="target"))
     assert "no guess" in by_icp.notes[0]
     np.testing.assert_allclose(
-        by_icp.T_reference_view @ pose(2, 3, 0, (0.004, 0.0, 0.0)), pose(), atol=1e-6
+        by_icp.T_reference_view @ pose(2, 3, 0, (0.004, 0.0, 0.0)),
+        pose(),
+        atol=1e-6,
     )
 
 

@@ -20,16 +20,24 @@ POSES = [
 ]
 
 
-def across_error(found: Registration, reference, view) -> float:
-    return target_error_m(found, reference, view)[1]
+def across_error(
+    registration: Registration,
+    reference,
+    view,
+) -> float:
+    return target_error_m(registration, reference, view)[1]
 
 
 def test_without_noise_the_surfaces_meet_to_a_micrometre():
     created = views(POSES, guess_error=usual_error())
     for result, view in zip(
-        register_jointly([each.prepared for each in created]), created[1:], strict=True
+        register_jointly([board.prepared for board in created]),
+        created[1:],
+        strict=True,
     ):
-        assert not result.failure and result.converged and result.method == "joint"
+        assert not result.failure
+        assert result.converged
+        assert result.method == "joint"
         assert across_error(result, created[0], view) < 2e-6
 
 
@@ -39,10 +47,12 @@ def test_across_it_is_better_than_the_marks_where_noise_is_white():
     errors = []
     for seed in range(3):
         created = views(POSES[:3], guess_error=usual_error(), noise_m=1e-3, seed=seed)
-        joint = register_jointly([each.prepared for each in created])
+        joint = register_jointly([board.prepared for board in created])
         for result, view in zip(joint, created[1:], strict=True):
             marks = register_by_marks(created[0].prepared, view.prepared)
-            errors.append([across_error(each, created[0], view) for each in (result, marks)])
+            errors.append(
+                [across_error(registration, created[0], view) for registration in (result, marks)]
+            )
     # four marks of 180 pixels against 2000 points: sqrt(720 / 2000) = 0.6 for a level, more for
     # tilts, which the marks in the corners hold well
     by_joint, by_marks = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -65,10 +75,14 @@ def smooth_error_repeats(repeats: int) -> np.ndarray:
             for i, T in enumerate(poses)
         ]
         for result, view in zip(
-            register_jointly([each.prepared for each in created]), created[1:], strict=True
+            register_jointly([board.prepared for board in created]),
+            created[1:],
+            strict=True,
         ):
             _, predicted = predicted_error_m(
-                result, created[0].prepared.points_m[::40], created[0].T_camera_board[:3, 2]
+                result,
+                created[0].prepared.points_m[::40],
+                created[0].T_camera_board[:3, 2],
             )
             squares.append((across_error(result, created[0], view) / predicted) ** 2)
     return np.array(squares)
@@ -89,10 +103,13 @@ def test_a_view_whose_marks_fail_takes_no_part():
     good = register_jointly([created[0].prepared, created[2].prepared])[0]
     spoilt = created[1].prepared
     hidden = PreparedView(
-        spoilt.view, spoilt.inside, MarkSet((), np.empty(0, int), "no mark found, 3 needed")
+        spoilt.view,
+        spoilt.inside,
+        MarkSet((), np.empty(0, int), "no mark found, 3 needed"),
     )
     failed, result = register_jointly([created[0].prepared, hidden, created[2].prepared])
-    assert "no mark found" in failed.failure and failed.method == "joint"
+    assert "no mark found" in failed.failure
+    assert failed.method == "joint"
     np.testing.assert_array_equal(result.T_reference_view, good.T_reference_view)
 
 
@@ -100,9 +117,11 @@ def test_points_count_as_fewer_than_they_are():
     """The covariance across is that of one independent value in 25 pixels: between that of 1/5 and
     1/50 of them."""
     created = views(POSES[:2], noise_m=1e-3)
-    result = register_jointly([each.prepared for each in created])[0]
+    result = register_jointly([board.prepared for board in created])[0]
     _, across = predicted_error_m(
-        result, created[0].prepared.points_m[::40], created[0].T_camera_board[:3, 2]
+        result,
+        created[0].prepared.points_m[::40],
+        created[0].T_camera_board[:3, 2],
     )
     pixels = created[0].prepared.inside.sum()
     # two views' noise, three unknowns of which each is known to sigma / sqrt(n)

@@ -23,7 +23,7 @@ from detectors.views.registration.settings import (
     IcpRegistration,
     PlainRegistration,
 )
-from detectors.views.view import PreparedView, View
+from detectors.views.view import PreparedView
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens
 from tests.support.board_views import TAPES_M, board_view, pose, target_error_m, usual_error, views
@@ -41,37 +41,43 @@ SLOW_CPD = pytest.param(
 )  # test_registration_cpd has its own
 
 
-def prepared(made) -> list[PreparedView]:
-    return [each.prepared for each in made]
+def prepared(boards) -> list[PreparedView]:
+    return [board.prepared for board in boards]
 
 
 def changed(view: PreparedView, **cloud) -> PreparedView:
     """The view with other fields of its cloud."""
-    return PreparedView(
-        replace(view.view, cloud=replace(view.view.cloud, **cloud)), view.inside, view.marks
-    )
+    changed_cloud = replace(view.view.cloud, **cloud)
+    return replace(view, view=replace(view.view, cloud=changed_cloud))
 
 
 @pytest.mark.parametrize(
-    "config", [*BY_MARKS[::2], IcpRegistration(), SLOW_CPD], ids=lambda config: config.method
+    "config",
+    [*BY_MARKS[::2], IcpRegistration(), SLOW_CPD],
+    ids=lambda config: config.method,
 )
 def test_good_views_are_registered_and_nothing_is_said(config):
     created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
     reference, *result = register(prepared(created), config)
     np.testing.assert_array_equal(reference.T_reference_view, np.eye(4))
-    assert reference.overlap == 1.0 and not reference.covariance.any()
-    for each, view, expected in zip(result, created[1:], ("view 1", "view 2"), strict=True):
-        assert (each.view, each.method, each.failure) == (expected, config.method, "")
-        within, across = target_error_m(each, created[0], view)
-        assert (
-            within < (2.0 if config.method == "icp" else 0.5) * PITCH_M and across < 0.3 * PITCH_M
-        )
-        assert each.overlap > 0.9 and each.seconds > 0
+    assert reference.overlap == 1.0
+    assert not reference.covariance.any()
+    for registration, view, expected in zip(result, created[1:], ("view 1", "view 2"), strict=True):
+        assert registration.view == expected
+        assert registration.method == config.method
+        assert registration.failure == ""
+        within, across = target_error_m(registration, created[0], view)
+        limit = 2.0 if config.method == "icp" else 0.5
+        assert within < limit * PITCH_M
+        assert across < 0.3 * PITCH_M
+        assert registration.overlap > 0.9
+        assert registration.seconds > 0
 
 
 def test_one_view_is_its_own_reference():
     (only,) = register(prepared(views(POSES[:1])), CpdRegistration())
-    assert only.failure == "" and only.converged
+    assert only.failure == ""
+    assert only.converged
 
 
 def test_no_views_are_refused():
@@ -82,43 +88,45 @@ def test_no_views_are_refused():
 # ------------------------------------------------------------ failures, in words
 
 
-def only_failure(made, config: AnyRegistration) -> str:
-    return register(prepared(made), config)[1].failure
+def only_failure(boards, config: AnyRegistration) -> str:
+    return register(prepared(boards), config)[1].failure
 
 
 def test_views_that_do_not_overlap():
     away = np.eye(4)
     away[0, 3] = 0.29
     created = views(POSES[:2])
-    moved = View(
-        "view 1",
-        created[1].prepared.view.cloud,
-        away @ created[1].prepared.view.T_reference_view_guess,
-    )
-    side = PreparedView(moved, created[1].prepared.inside, created[1].prepared.marks)
+    view = created[1].prepared
+    side = replace_guess(view, away @ view.view.T_reference_view_guess)
     failure = register([created[0].prepared, side], PlainRegistration(method="nominal"))[1].failure
-    assert "the views do not overlap" in failure and "%" in failure
+    assert "the views do not overlap" in failure
+    assert "%" in failure
 
 
 def test_other_marks_on_the_other_target():
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M)
     remaining = tuple((x * 0.5, y * 0.6) for x, y in TAPES_M)
     guess = POSES[0] @ np.linalg.inv(POSES[1])
-    other = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=remaining)
-    assert "do not coincide" in only_failure(
-        [reference, other], IcpRegistration()
-    ) or "no pairs" in only_failure([reference, other], IcpRegistration())
-    assert "do not coincide" in only_failure([reference, other], CpdRegistration())
-    assert only_failure([reference, other], PlainRegistration(method="marks"))
+    moved_marks = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=remaining)
+    by_icp = only_failure([reference, moved_marks], IcpRegistration())
+    assert "do not coincide" in by_icp or "no pairs" in by_icp
+    assert "do not coincide" in only_failure([reference, moved_marks], CpdRegistration())
+    assert only_failure([reference, moved_marks], PlainRegistration(method="marks"))
 
 
 def test_a_target_of_another_shape_lies_apart():
     bent = np.zeros((4, 4))
     bent[2, 0] = 0.012
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M)
-    other = board_view(POSES[1], POSES[0] @ np.linalg.inv(POSES[1]), noise_m=NOISE_M, smooth_m=bent)
-    result = register(prepared([reference, other]), CpdRegistration())[1]
-    assert "apart" in result.failure and "different targets" in result.failure
+    bent_view = board_view(
+        POSES[1],
+        POSES[0] @ np.linalg.inv(POSES[1]),
+        noise_m=NOISE_M,
+        smooth_m=bent,
+    )
+    result = register(prepared([reference, bent_view]), CpdRegistration())[1]
+    assert "apart" in result.failure
+    assert "different targets" in result.failure
 
 
 FINE = Lens(440, 320, 600.0, 600.0, 219.5, 159.5)
@@ -129,11 +137,17 @@ FINE = Lens(440, 320, 600.0, 600.0, 219.5, 159.5)
 def fine_pair(bend_mm: float, seed: int = 0):
     """Make two views through fine pixels; the second errs as a whole by a bend."""
     smooth = np.zeros((4, 4))
-    smooth[2, 0], smooth[0, 2] = 1e-3 * bend_mm, -0.7e-3 * bend_mm
+    smooth[2, 0] = 1e-3 * bend_mm
+    smooth[0, 2] = -0.7e-3 * bend_mm
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M, lens=FINE, seed=2 * seed)
     guess = POSES[0] @ np.linalg.inv(POSES[1])
     return reference, board_view(
-        POSES[1], guess, noise_m=NOISE_M, lens=FINE, seed=2 * seed + 1, smooth_m=smooth
+        POSES[1],
+        guess,
+        noise_m=NOISE_M,
+        lens=FINE,
+        seed=2 * seed + 1,
+        smooth_m=smooth,
     )
 
 
@@ -173,7 +187,9 @@ def test_the_widened_covariance_holds_the_true_errors():
         result = register(prepared(pair), PlainRegistration(method="marks"))[1]
         assert result.failure == ""
         _, predicted = predicted_error_m(
-            result, pair[0].prepared.points_m, pair[0].T_camera_board[:3, 2]
+            result,
+            pair[0].prepared.points_m,
+            pair[0].T_camera_board[:3, 2],
         )
         ratios.append(target_error_m(result, *pair)[1] / predicted)
     # chi square of 12 degrees lies below 32.9 with a probability of 0.999: the covariance may be
@@ -185,30 +201,34 @@ def test_a_wrong_guess_turns_the_board_about():
     twins = ((-0.1, 0.06), (0.1, 0.06), (-0.1, -0.06), (0.1, -0.06))
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M, tapes_m=twins)
     guess = POSES[0] @ np.linalg.inv(POSES[1])
-    other = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=twins)
+    twin_view = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=twins)
     half_turn = POSES[0] @ np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(POSES[1])
     turned = register(
-        [reference.prepared, replace_guess(other.prepared, half_turn)], CpdRegistration()
+        [reference.prepared, replace_guess(twin_view.prepared, half_turn)], CpdRegistration()
     )[1]
     # the twin fits as well, and nothing in the clouds tells: what the guess says is what is
     # believed
-    assert not turned.failure and target_error_m(turned, reference, other)[0] > 0.1
-    judged = judge(turned, reference.prepared, other.prepared)
+    assert not turned.failure
+    assert target_error_m(turned, reference, twin_view)[0] > 0.1
+    judged = judge(turned, reference.prepared, twin_view.prepared)
     assert judged.failure.startswith("is 180 degrees and ")
 
 
 def replace_guess(view: PreparedView, guess: np.ndarray | None) -> PreparedView:
-    return PreparedView(replace(view.view, T_reference_view_guess=guess), view.inside, view.marks)
+    return replace(view, view=replace(view.view, T_reference_view_guess=guess))
 
 
 def test_points_on_a_line_leave_a_turn_open():
     created = views(POSES[:2], noise_m=NOISE_M)
     result = register(prepared(created), PlainRegistration(method="marks"))[1]
     open_turn = np.diag([0.2**2, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
-    judged = judge(replace(result, covariance=open_turn), created[0].prepared, created[1].prepared)
-    assert "lie on a line" in judged.failure and "which would blur" in judged.failure
+    reference = created[0].prepared
+    view = created[1].prepared
+    judged = judge(replace(result, covariance=open_turn), reference, view)
+    assert "lie on a line" in judged.failure
+    assert "which would blur" in judged.failure
     slides = np.diag([1e-8, 1e-8, 1e-8, 0.01**2, 1e-8, 1e-8])
-    judged = judge(replace(result, covariance=slides), created[0].prepared, created[1].prepared)
+    judged = judge(replace(result, covariance=slides), reference, view)
     assert "not determined: the points let the target slide" in judged.failure
 
 
@@ -217,7 +237,9 @@ def test_a_mirror_image_or_nothing_is_no_registration(broken):
     created = views(POSES[:2])
     result = register(prepared(created), PlainRegistration(method="marks"))[1]
     judged = judge(
-        replace(result, T_reference_view=broken), created[0].prepared, created[1].prepared
+        replace(result, T_reference_view=broken),
+        created[0].prepared,
+        created[1].prepared,
     )
     assert judged.failure in (
         "mirrored: the transform is a reflection, not a rotation",
@@ -235,13 +257,15 @@ def test_one_bad_view_does_not_spoil_the_others():
     hidden = board_view(POSES[1], None, tapes_m=TAPES_M[:1]).prepared
     for config in BY_MARKS[:1] + BY_MARKS[2:]:
         _, bad, good = register([created[0].prepared, hidden, created[2].prepared], config)
-        assert "3 needed" in bad.failure and good.failure == ""
+        assert "3 needed" in bad.failure
+        assert good.failure == ""
 
 
 def test_what_nominal_leaves_is_noted_and_not_refused():
     created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
     result = register(prepared(created), PlainRegistration(method="nominal"))[1]
-    assert result.failure == "" and "apart" in result.notes[-1]
+    assert result.failure == ""
+    assert "apart" in result.notes[-1]
     np.testing.assert_array_equal(
         result.T_reference_view, created[1].prepared.view.T_reference_view_guess
     )
@@ -254,17 +278,20 @@ def test_what_nominal_leaves_is_noted_and_not_refused():
     "config", [*BY_MARKS, IcpRegistration(), PlainRegistration(method="odometry")]
 )
 def test_a_capture_without_colour_is_refused_where_colour_is_needed(config):
-    created = prepared(views(POSES[:2]))
+    reference, view = prepared(views(POSES[:2]))
+    colourless = changed(view, rgb=None)
     with pytest.raises(UserError, match=r"view 1: registration by \w+ needs colour"):
-        register([created[0], changed(created[1], rgb=None)], config)
+        register([reference, colourless], config)
 
 
 def test_odometry_needs_a_lens_and_nominal_a_guess():
-    created = prepared(views(POSES[:2]))
+    reference, view = prepared(views(POSES[:2]))
+    without_lens = changed(view, lens=None)
     with pytest.raises(UserError, match="needs a pixel grid and the lens"):
-        register([created[0], changed(created[1], lens=None)], PlainRegistration(method="odometry"))
+        register([reference, without_lens], PlainRegistration(method="odometry"))
+    without_guess = replace_guess(view, None)
     with pytest.raises(UserError, match="needs the nominal pose of every view"):
-        register([created[0], replace_guess(created[1], None)], PlainRegistration(method="nominal"))
+        register([reference, without_guess], PlainRegistration(method="nominal"))
 
 
 # ------------------------------------------------------------ the yardstick
@@ -299,11 +326,13 @@ def test_the_predicted_error_is_the_jacobians():
     points = random.standard_normal((20, 3))
     centre = np.array([0.1, 0.2, 0.3])
     normal = np.array([0.6, 0.0, 0.8])
-    registration = Registration("", "", np.eye(4), root @ root.T, centre, 0.0, 1.0, 0, 0, True, 0.0)
+    registration = Registration("", "", np.eye(4), covariance=root @ root.T, centre_m=centre)
     motions = random.standard_normal((20000, 6)) @ root.T
     errors = np.cross(motions[:, None, :3], points - centre) + motions[:, None, 3:]
     np.testing.assert_allclose(
-        errors[0], displacement_jacobian(points, centre) @ motions[0], atol=1e-12
+        errors[0],
+        displacement_jacobian(points, centre) @ motions[0],
+        atol=1e-12,
     )
     across = np.sqrt(np.mean((errors @ normal) ** 2))
     within = np.sqrt(np.mean(np.sum(errors**2, axis=2)) - across**2)

@@ -22,16 +22,19 @@ WALK = [
 
 def test_it_follows_a_walk_and_drifts():
     created = views(WALK, noise_m=2e-4, textured=True)
-    result = register([each.prepared for each in created], PlainRegistration(method="odometry"))
+    result = register([board.prepared for board in created], PlainRegistration(method="odometry"))
     errors = [
-        np.hypot(*target_error_m(each, created[0], view))
-        for each, view in zip(result, created, strict=True)
+        np.hypot(*target_error_m(registration, created[0], view))
+        for registration, view in zip(result, created, strict=True)
     ]
-    assert not any(each.failure for each in result) and errors[0] == 0.0
+    assert not any(registration.failure for registration in result)
+    assert errors[0] == 0.0
     # steps of 3 degrees and 5 mm; without following them the last view would be 24 mm off
-    assert max(errors[1:]) < 1.5 * PITCH_M and errors[-1] > errors[1] > 1e-5
+    assert max(errors[1:]) < 1.5 * PITCH_M
+    assert errors[-1] > errors[1] > 1e-5
     assert all(
-        np.isnan(each.covariance).all() and "no covariance" in each.notes[0] for each in result[1:]
+        np.isnan(registration.covariance).all() and "no covariance" in registration.notes[0]
+        for registration in result[1:]
     )
 
 
@@ -51,8 +54,8 @@ def test_after_a_view_that_shows_nothing_it_is_lost_for_good():
     nothing[tuple(np.argwhere(created[2].inside)[:3].T)] = True
     created[2] = replace(created[2], inside=nothing)
     by_odometry = register_by_odometry(created)
-    assert [bool(each.failure) for each in by_odometry] == [False, True, True]
-    assert all("failed at view 2" in each.failure for each in by_odometry[1:])
+    assert [bool(registration.failure) for registration in by_odometry] == [False, True, True]
+    assert all("failed at view 2" in registration.failure for registration in by_odometry[1:])
 
 
 def test_distortion_is_taken_out():
@@ -68,7 +71,7 @@ def test_distortion_is_taken_out():
     errors = []
     for lens in (LENS, bent):
         created = views(WALK[:2], noise_m=2e-4, textured=True, lens=lens)
-        (result,) = register_by_odometry([each.prepared for each in created])
+        (result,) = register_by_odometry([board.prepared for board in created])
         errors.append(np.hypot(*target_error_m(result, created[0], created[1])))
     # left in, the distortion shifts the board's corners by 3 pixels
     assert errors[1] < 2 * errors[0] + 0.2 * PITCH_M
