@@ -4,6 +4,7 @@ it."""
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,14 +17,17 @@ from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
+    from harness.experiment.schema import Experiment
     from harness.programs.coverage.jobs import Pose, Survey
 
 # candidates for --suggest and --goal
 TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0)
 GOAL_TILTS_DEG = (-30.0, 0.0, 30.0)
-GOAL_DISTANCES = (0.7, 1.0, 1.4)  # Distances for --goal, as multiples of the experiment's distance
-# Most poses to reach a goal, and seconds to move the camera between two poses
+# Distances for --goal, as multiples of the experiment's distance
+GOAL_DISTANCES = (0.7, 1.0, 1.4)
+# Most poses to reach a goal
 MOST_POSES = 6
+# Seconds to move the camera between two poses
 MOVE_S = 10.0
 
 
@@ -101,22 +105,56 @@ def _pose(text: str) -> Pose:
 def main(options: argparse.Namespace, command: str) -> int:
     """Return 0 (even if a goal is not reached), 2 after a user's mistake, 130 after Ctrl-C."""
     from harness.experiment.load import load_experiment, resolved_yaml
-    from harness.programs.coverage.jobs import declared, refuse_size, survey
-    from harness.programs.coverage.page import answer, coverage_html, scene_of, warnings_of
-    from harness.programs.coverage.tables import COVERAGE, GOALS, POSES
-    from harness.records.outputs import COVERAGE_PAGE, EXPERIMENT
+    from harness.programs.coverage.jobs import declared, survey
+    from harness.records.outputs import EXPERIMENT
     from harness.runs.engines import engine_of
     from harness.runs.options import EngineOptions
     from harness.runs.shards import locked
-    from harness.runs.tables import write_tables
     from harness.vocabulary.files import write_text
-    from harness.vocabulary.program import length_m
-    from harness.vocabulary.provenance import RESULTS_VERSION, record
-    from harness.vocabulary.text import many, show
     from scenes.render.cache import in_use
 
     experiment = load_experiment(options.experiment, options.overrides)
-    name = experiment.config.name
+    config = experiment.config
+    size_mm = _wanted_mm(options, experiment)
+    given_poses, further_poses = _poses(options, declared(config)[1].distance_m)
+    folder = options.out or options.results / "coverage" / config.name
+    cache = options.results / ".cache" / "renders"
+    write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
+    engine_options = EngineOptions(jobs=options.jobs, serial=options.serial)
+    engine = engine_of(engine_options, {config.detector.name})
+    with in_use(cache), locked(folder), engine:
+        surveys = survey(experiment, [*given_poses, *further_poses], cache, folder, engine)
+    covered = _covered(surveys, size_mm, len(given_poses), options)
+    if not covered.poses:
+        message = f"{config.name}: no pose finds damage of {covered.size_mm:.3g} mm anywhere"
+        raise UserError(message, fix="ask for a larger size")
+    _write_tables(folder, covered, experiment, command)
+    _write_page(folder, covered, config.name, len(given_poses), options, command)
+    return 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Covered:
+    """The answer: a set-up, and poses of it."""
+
+    # The set-up whose poses are shown: that of the best way if a goal is given
+    survey: Survey
+    # The wanted size of damage, mm
+    size_mm: float
+    # Rows of the table of poses, in the order in which they are added
+    poses: list[dict[str, Any]]
+    # Rows of the table of ways to the goal, the best first; empty without a goal
+    goals: list[dict[str, Any]]
+    # Smallest size (n,) found in any of the poses, mm, by patch; inf: none is; NaN: not judged
+    limits_mm: np.ndarray
+
+
+def _wanted_mm(options: argparse.Namespace, experiment: Experiment) -> float | None:
+    """Return the wanted size in millimetres, None for the largest of the experiment. Raises
+    UserError for options that contradict each other or the experiment."""
+    from harness.programs.coverage.jobs import refuse_size
+    from harness.vocabulary.program import length_m
+
     if options.goal and (options.size or options.suggest or options.pose):
         raise UserError(
             "--goal states a size and chooses the poses",
@@ -124,119 +162,168 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     if not 0 < options.share <= 1:
         raise UserError(f"--share {options.share:g}", legal="a share above 0, up to 1")
-    if len(experiment.points) > 1 and not options.goal:
-        message = (
-            f"{name}: has {len(experiment.points)} set-ups, but only --goal can compare several"
-        )
+    set_ups = len(experiment.points)
+    if set_ups > 1 and not options.goal:
         raise UserError(
-            message, fix="choose one set-up with --set, such as sweep={} and the values of its axes"
+            f"{experiment.config.name}: has {set_ups} set-ups, but only --goal can compare several",
+            fix="choose one set-up with --set, such as sweep={} and the values of its axes",
         )
-    size = options.goal or options.size
-    size_mm = length_m("--goal" if options.goal else "--size", size) / MM if size else None
+    size_mm = None
+    if options.goal:
+        size_mm = length_m("--goal", options.goal) / MM
+    elif options.size:
+        size_mm = length_m("--size", options.size) / MM
     for point in experiment.points:
         refuse_size(point.config, size_mm)
-    given_poses, further_poses = _poses(options, declared(experiment.config)[1].distance_m)
-    folder = options.out or options.results / "coverage" / name
-    cache = options.results / ".cache" / "renders"
-    write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
-    engine = engine_of(
-        EngineOptions(jobs=options.jobs, serial=options.serial), {experiment.config.detector.name}
-    )
-    with in_use(cache), locked(folder), engine:
-        surveys = survey(experiment, [*given_poses, *further_poses], cache, folder, engine)
-    chosen = surveys[0]
+    return size_mm
+
+
+def _covered(
+    surveys: list[Survey], size_mm: float | None, given_count: int, options: argparse.Namespace
+) -> _Covered:
+    """Return the given and suggested poses of the only set-up, or the best way to the goal."""
     goals = []
     if options.goal:
-        ways = (
-            row
-            for survey in surveys
-            for row in _ways(survey, size_mm or survey.found.sizes_mm[1], options.share)
-        )
-        order = {True: "capture_s", False: "missing_share"}
-        goals = sorted(ways, key=lambda row: (not row["reached"], row[order[row["reached"]]]))
-        chosen = goals[0]["survey"]
-    wanted = size_mm or chosen.found.sizes_mm[1]
-    findable = chosen.found
-    poses = (
-        goals[0]["rows"]
-        if goals
-        else _rows(chosen, list(chosen.seen), wanted, len(given_poses), options.suggest)
-    )
-    if not poses:
-        raise UserError(
-            f"{name}: no pose finds damage of {wanted:.3g} mm anywhere", fix="ask for a larger size"
-        )
-    each_mm = np.stack([row["limits_mm"] for row in poses])
-    patches = chosen.patches
-    best = np.nan_to_num(each_mm, nan=np.inf).argmin(axis=0)
-    limits_mm = np.fmin.reduce(each_mm)
-    seen_at_poses = [chosen.seen[row["pose"]] for row in poses]
-    facts = np.stack(
-        [
-            [seen_at_pose.deviation_m, seen_at_pose.cosine, seen_at_pose.range_m]
-            for seen_at_pose in seen_at_poses
-        ]
-    )
-    columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm, best + 1]
-    noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
-    columns += [noise_m / MM, np.degrees(np.arccos(cosine)), range_m]
-    names = [column.name for column in COVERAGE.columns]
-    rows = {COVERAGE: [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]}
-    rows |= {POSES: poses, GOALS: goals}
-    provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
-    provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
-    write_tables(folder, {table: table.frame(row) for table, row in rows.items()}, provenance)
-    warnings = warnings_of(findable, chosen.seen)
-    sentence = answer(findable, patches, limits_mm, wanted, len(poses))
-    if (added := len(poses) - len(given_poses)) < options.suggest:
-        note_text = (
-            f"{added} of {many(options.suggest, 'pose')} suggested: no other pose increases the "
-            "coverage"
-        )
-        warnings.insert(0, note_text)
+        for surveyed in surveys:
+            wanted_mm = size_mm or surveyed.found.sizes_mm[1]
+            goals += _ways(surveyed, wanted_mm, options.share)
+        goals.sort(key=_rank)
+    chosen = goals[0]["survey"] if goals else surveys[0]
+    wanted_mm = size_mm or chosen.found.sizes_mm[1]
     if goals:
-        lead = f"Quickest capture ({goals[0]['capture_s']:.0f} s)"
-        if not goals[0]["reached"]:
-            lead = f"No set of poses covers {100 * options.share:g} % of the face; the best one"
-        frames = many(goals[0]["frames"], "frame")
-        sentence = (
-            f"{lead}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {sentence}"
+        poses = goals[0]["rows"]
+    else:
+        poses = _rows(chosen, list(chosen.seen), wanted_mm, given_count, options.suggest)
+    limits_mm = np.fmin.reduce([row["limits_mm"] for row in poses]) if poses else np.empty(0)
+    return _Covered(survey=chosen, size_mm=wanted_mm, poses=poses, goals=goals, limits_mm=limits_mm)
+
+
+def _rank(way: dict[str, Any]) -> tuple[bool, float]:
+    """Order ways that reach the goal by time, after them the others by what they miss."""
+    if way["reached"]:
+        return False, way["capture_s"]
+    return True, way["missing_share"]
+
+
+def _write_tables(folder: Path, covered: _Covered, experiment: Experiment, command: str) -> None:
+    from harness.programs.coverage.tables import COVERAGE, GOALS, POSES
+    from harness.runs.tables import write_tables
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+
+    rows = {COVERAGE: _patch_rows(covered), POSES: covered.poses, GOALS: covered.goals}
+    provenance = {
+        **record(command),
+        "results_version": RESULTS_VERSION,
+        "experiment": experiment.config.name,
+        "digest": experiment.digest,
+        "seed": experiment.config.seed,
+    }
+    write_tables(folder, {table: table.frame(row) for table, row in rows.items()}, provenance)
+
+
+def _patch_rows(covered: _Covered) -> list[dict[str, Any]]:
+    """Return a row for each patch of the face, with the view of its best pose."""
+    from harness.programs.coverage.tables import COVERAGE
+
+    patches = covered.survey.patches
+    pose_limits_mm = np.stack([row["limits_mm"] for row in covered.poses])
+    best = np.nan_to_num(pose_limits_mm, nan=np.inf).argmin(axis=0)
+    views = [covered.survey.seen[row["pose"]] for row in covered.poses]
+    facts = np.stack([[view.deviation_m, view.cosine, view.range_m] for view in views])
+    noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
+    columns = [
+        *(patches.points_m / MM).T,
+        patches.areas_m2,
+        covered.limits_mm,
+        best + 1,
+        noise_m / MM,
+        np.degrees(np.arccos(cosine)),
+        range_m,
+    ]
+    names = [column.name for column in COVERAGE.columns]
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def _write_page(
+    folder: Path,
+    covered: _Covered,
+    name: str,
+    given_count: int,
+    options: argparse.Namespace,
+    command: str,
+) -> None:
+    """Write the page, and show its sentences and tables in the terminal."""
+    from harness.programs.coverage.page import answer, coverage_html, scene_of, warnings_of
+    from harness.programs.coverage.tables import GOALS, POSES
+    from harness.records.outputs import COVERAGE_PAGE
+    from harness.vocabulary.files import write_text
+    from harness.vocabulary.text import many, show
+
+    patches = covered.survey.patches
+    findable = covered.survey.found
+    poses = covered.poses
+    goals = covered.goals
+    warnings = warnings_of(findable, covered.survey.seen)
+    added = len(poses) - given_count
+    if added < options.suggest:
+        warnings.insert(
+            0,
+            f"{added} of {many(options.suggest, 'pose')} suggested: no other pose increases the "
+            "coverage",
         )
-    config = chosen.point.config
-    scene = scene_of(patches, limits_mm, findable)
-    camera = config.simulated.camera
-    detector = (
-        f"the detector {config.detector.name} at a threshold of "
-        f"{chosen.task.criteria.threshold:.3g}"
-    )
-    unit = (
-        f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, "
-        f"{many(config.capture.frames, 'frame')}"
-    )
-    first = f"Simulated, for {unit}, {detector}. {findable.statement}"
-    html = coverage_html(name, sentence, first, scene, poses, goals, warnings, command)
-    write_text(folder / COVERAGE_PAGE.name, html)
-    grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]
+    sentence = answer(findable, patches, covered.limits_mm, covered.size_mm, len(poses))
+    if goals:
+        sentence = f"{_lead(goals[0], options.share)}. {sentence}"
+    first = _origin(covered.survey)
+    scene = scene_of(patches, covered.limits_mm, findable)
+    page = folder / COVERAGE_PAGE.name
+    write_text(page, coverage_html(name, sentence, first, scene, poses, goals, warnings, command))
+    grids = [
+        table.grid(rows, terminal=True) for table, rows in ((GOALS, goals), (POSES, poses)) if rows
+    ]
     show([*(f"warning: {text}" for text in warnings), sentence, first, *grids])
-    print(f"page: {folder / COVERAGE_PAGE.name}")
-    return 0
+    print(f"page: {page}")
 
 
-def _poses(options: argparse.Namespace, own_m: float) -> tuple[list[Pose], list[Pose]]:
+def _lead(way: dict[str, Any], share: float) -> str:
+    """State the best way to the goal."""
+    from harness.vocabulary.text import many
+
+    lead = f"Quickest capture ({way['capture_s']:.0f} s)"
+    if not way["reached"]:
+        lead = f"No set of poses covers {100 * share:g} % of the face; the best one"
+    frames = many(way["frames"], "frame")
+    return f"{lead}: {way['camera']}, {frames}, {way['distance_m']:g} m"
+
+
+def _origin(surveyed: Survey) -> str:
+    """State what was simulated, and the law of the signal."""
+    from harness.vocabulary.text import many
+
+    config = surveyed.point.config
+    camera = config.simulated.camera
+    title = camera_title(Path(camera.name).stem)
+    frames = many(config.capture.frames, "frame")
+    return (
+        f"Simulated, for unit {camera.unit_seed} of {title}, {frames}, the detector "
+        f"{config.detector.name} at a threshold of {surveyed.task.criteria.threshold:.3g}. "
+        f"{surveyed.found.statement}"
+    )
+
+
+def _poses(options: argparse.Namespace, declared_m: float) -> tuple[list[Pose], list[Pose]]:
     """Return the given poses, and the further poses to choose from."""
     if options.goal:
-        distances = [round(own_m * part, 4) for part in GOAL_DISTANCES]
+        distances = [round(declared_m * part, 4) for part in GOAL_DISTANCES]
         tilts = GOAL_TILTS_DEG
         return [], list(product(distances, tilts, tilts))
-    given_poses = list(dict.fromkeys(options.pose or [(own_m, 0.0, 0.0)]))
-    grid = [
-        pose
-        for pose in product([given_poses[0][0]], TILTS_DEG, TILTS_DEG)
-        if min(abs(pose[1]), abs(pose[2])) < 40
-    ]
-    return given_poses, [
-        pose for pose in grid if pose not in given_poses
-    ] if options.suggest else []
+    given_poses = list(dict.fromkeys(options.pose or [(declared_m, 0.0, 0.0)]))
+    further_poses: list[Pose] = []
+    if options.suggest:
+        for pose in product([given_poses[0][0]], TILTS_DEG, TILTS_DEG):
+            if min(abs(pose[1]), abs(pose[2])) < 40 and pose not in given_poses:
+                further_poses.append(pose)
+    return given_poses, further_poses
 
 
 def _rows(
@@ -246,21 +333,24 @@ def _rows(
     from harness.programs.coverage.statistics import in_turn
 
     limits_mm = [surveyed.found.limits_mm(surveyed.seen[pose]) for pose in poses]
+    found_patches = [limit_mm <= size_mm for limit_mm in limits_mm]
+    turns = in_turn(surveyed.patches, found_patches, given_count, further_count)
     rows = list[dict[str, Any]]()
-    for pose_index, gain, total in in_turn(
-        surveyed.patches,
-        [limit_mm <= size_mm for limit_mm in limits_mm],
-        given_count,
-        further_count,
-    ):
+    for pose_index, gain, total in turns:
+        pose = poses[pose_index]
+        distance_m, tilt_x_deg, tilt_y_deg = pose
         row = {
             "number": len(rows) + 1,
-            "pose": poses[pose_index],
+            "pose": pose,
             "limits_mm": limits_mm[pose_index],
+            "distance_m": distance_m,
+            "tilt_x_deg": tilt_x_deg,
+            "tilt_y_deg": tilt_y_deg,
+            "alone_share": surveyed.patches.share(found_patches[pose_index]),
+            "gain_share": gain,
+            "total_share": total,
         }
-        row |= dict(zip(("distance_m", "tilt_x_deg", "tilt_y_deg"), poses[pose_index], strict=True))
-        row |= {"alone_share": surveyed.patches.share(limits_mm[pose_index] <= size_mm)}
-        rows.append(row | {"gain_share": gain, "total_share": total})
+        rows.append(row)
     return rows
 
 
@@ -270,42 +360,30 @@ def _ways(surveyed: Survey, size_mm: float, share: float) -> list[dict[str, Any]
     from scenes.sensor.camera import camera_of
 
     ways = []
-    config = surveyed.point.config
-    camera = camera_of(config.simulated.camera)
-    frames = config.capture.frames
+    frames = surveyed.point.config.capture.frames
+    camera = camera_of(surveyed.point.config.simulated.camera)
     for distance_m in dict.fromkeys(pose[0] for pose in surveyed.seen):
-        rows = _rows(
-            surveyed,
-            [pose for pose in surveyed.seen if pose[0] == distance_m],
-            size_mm,
-            0,
-            MOST_POSES,
-        )
-        rows = rows[
-            : next((row["number"] for row in rows if row["total_share"] >= share), len(rows))
-        ]
+        poses = [pose for pose in surveyed.seen if pose[0] == distance_m]
+        rows = _rows(surveyed, poses, size_mm, 0, MOST_POSES)
+        needed = (row["number"] for row in rows if row["total_share"] >= share)
+        rows = rows[: next(needed, len(rows))]
         covered = rows[-1]["total_share"] if rows else 0.0
-        seconds = (
-            len(rows) * frames / camera.unit.frames_per_second.value
-            + max(len(rows) - 1, 0) * MOVE_S
-        )
-        tilts = "; ".join(f"{row['tilt_x_deg']:g}, {row['tilt_y_deg']:g}" for row in rows)
-        way = {
+        moving_s = max(len(rows) - 1, 0) * MOVE_S
+        row = {
             "set_up": in_words(surveyed.point.variant),
             "camera": camera_title(camera.name),
             "frames": frames,
+            "distance_m": distance_m,
+            "poses": len(rows),
+            "tilts": "; ".join(f"{row['tilt_x_deg']:g}, {row['tilt_y_deg']:g}" for row in rows),
+            "total_share": covered,
+            "capture_s": len(rows) * frames / camera.unit.frames_per_second.value + moving_s,
+            "reached": covered >= share,
+            "missing_share": 1 - covered,
+            "rows": rows,
+            "survey": surveyed,
         }
-        way |= {"distance_m": distance_m, "poses": len(rows), "tilts": tilts}
-        way |= {"total_share": covered, "capture_s": seconds}
-        ways.append(
-            {
-                **way,
-                "reached": covered >= share,
-                "missing_share": 1 - covered,
-                "rows": rows,
-                "survey": surveyed,
-            }
-        )
+        ways.append(row)
     return ways
 
 

@@ -43,26 +43,26 @@ AROUND_PX = 31
 NEAR_PX = 15
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # sizes that differ by less are equal; if all are, the size of damage is its depth
-ON_FACE_M = (
-    5 * MM
-    # a patch is visible if its z and the view's differ by less, or by less than two pixels on the
-    # slope
-)
+# A patch is visible if its z and the view's differ by less, or by less than two pixels on the slope
+ON_FACE_M = 5 * MM
 
-Pose = tuple[
-    float, float, float
-]  # Distance in metres, tilts of the part about its x and y in degrees
+# Distance in metres, tilts of the part about its x and y in degrees
+Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A set-up in front of a part. ``task``: has the threshold. ``found``: the signal's law.
-    ``seen``: by pose."""
+    """A set-up in front of a part."""
 
+    # The set-up
     point: Point
+    # The point as its trials have it, with its threshold
     task: TrialPoint
+    # The face of the part
     patches: Patches
+    # The law of the signal
     found: Findable
+    # The view of the patches, by pose
     seen: dict[Pose, Seen]
 
 
@@ -79,7 +79,9 @@ def survey(
     with progress_display() as report:
         outcome = run_plan(plan, journal, engine, report)
     for entry in map(journal.read, outcome.finished):
-        for row in (entry.record or {}).get("holes", ()) if entry else ():
+        if entry is None or not entry.record:
+            continue
+        for row in entry.record.get("holes", ()):
             damage_key = (row["variant"], row["frames"], row["board"], row["hole"])
             missed = np.inf if row["no_return"] else np.nan
             scores.setdefault(damage_key, []).append(row["score"] if row["detected"] else missed)
@@ -118,20 +120,13 @@ def survey(
             seen_of_views = values_of(
                 _part_seen, [(view, task, group.seed, patches) for view in views], engine
             )
-            seen_of_views = [
-                Seen(blind, np.ones(len(blind)), np.ones(len(blind)))
-                if seen_of_view is None
-                else seen_of_view
-                for seen_of_view in seen_of_views
-            ]
+            seen = {}
+            for pose, seen_of_view in zip(poses, seen_of_views, strict=True):
+                if seen_of_view is None:
+                    seen_of_view = Seen(blind, np.ones(len(blind)), np.ones(len(blind)))
+                seen[pose] = seen_of_view
             surveys.append(
-                Survey(
-                    point,
-                    task,
-                    patches,
-                    findable_sizes,
-                    dict(zip(poses, seen_of_views, strict=True)),
-                )
+                Survey(point=point, task=task, patches=patches, found=findable_sizes, seen=seen)
             )
     return surveys
 
@@ -140,16 +135,18 @@ def patches_of(board: BoardConfig) -> Patches:
     """Return the face of a board in about `MOST_PATCHES` patches that are square in plan."""
     sides_m = np.array([board.width_mm, board.height_mm]) * MM
     counts = np.maximum(np.rint(sides_m / np.sqrt(sides_m.prod() / MOST_PATCHES)), 2).astype(int)
-    x, y = (
-        (np.arange(n) + 0.5) * side / n - side / 2
-        for n, side in zip(counts.tolist(), sides_m, strict=True)
-    )
+    column_count, row_count = counts.tolist()
+    width_m, height_m = sides_m
+    x = (np.arange(column_count) + 0.5) * width_m / column_count - width_m / 2
+    y = (np.arange(row_count) + 0.5) * height_m / row_count - height_m / 2
+    grid_x, grid_y = np.meshgrid(x, y)
     face = face_of(board)
-    points = face.point(*np.meshgrid(x, y)).reshape(-1, 3)
+    points = face.point(grid_x, grid_y).reshape(-1, 3)
     points = points[np.isfinite(points[:, 2])]
     normals = face.axis(points[:, 0], points[:, 1])
     kept = normals[:, 2] > 0
-    return Patches(points[kept], normals[kept], sides_m.prod() / counts.prod() / normals[kept, 2])
+    areas_m2 = sides_m.prod() / counts.prod() / normals[kept, 2]
+    return Patches(points[kept], normals[kept], areas_m2)
 
 
 def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConfig]:
@@ -173,10 +170,11 @@ def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
     """Raise UserError for a size outside the declared range, that of depths if all sizes in plan
     are equal."""
     damage = declared(config)[1].damage
-    low, high = damage.size_mm
     word = damage.size_of
+    low, high = damage.size_mm
     if high - low < SAME_MM and damage.depths_mm:
-        word, (low, high) = "depth", damage.depths_mm
+        word = "depth"
+        low, high = damage.depths_mm
     if size_mm is not None and not low <= size_mm <= high:
         fix = (
             "change the damage's range in the experiment: sizes that are not inspected have no "
@@ -191,15 +189,13 @@ def _widened(group: Group, poses: Sequence[Pose]) -> Group:
     face is curved."""
     source, family = declared(group.points[0].config)
     bent_deg = float(np.degrees(np.arccos(patches_of(family.board).normals[:, 2].min())))
-    tilt_deg = min(
-        family.tilt_deg + bent_deg + max(max(abs(x), abs(y)) for _, x, y in poses), STEEPEST_DEG
-    )
-    near_m, far_m = (end(distance_m for distance_m, _, _ in poses) for end in (min, max))
-    jitter_mm = family.distance_jitter_mm + (far_m - near_m) / 2 / MM
+    largest_tilt_deg = max(max(abs(x), abs(y)) for _, x, y in poses)
+    near_m = min(distance_m for distance_m, _, _ in poses)
+    far_m = max(distance_m for distance_m, _, _ in poses)
     wide = {
-        "tilt_deg": tilt_deg,
+        "tilt_deg": min(family.tilt_deg + bent_deg + largest_tilt_deg, STEEPEST_DEG),
         "distance_m": (near_m + far_m) / 2,
-        "distance_jitter_mm": jitter_mm,
+        "distance_jitter_mm": family.distance_jitter_mm + (far_m - near_m) / 2 / MM,
     }
     family = family.model_copy(update=wide)
     cache = group.then[0].renders[0].folder
@@ -240,12 +236,15 @@ def _inspections(
             f"{point.label or point.variant}: no damaged board was judged",
             fix="check the detector's crop",
         )
-    numbers, plan_mm, depth_mm, *seen_damage, score = np.array(facts).T
-    size_of = boards[0][1][0][0].size_of
-    word, size_mm = (
-        ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
+    numbers, plan_mm, depth_mm, deviation_m, cosine, range_m, score = np.array(facts).T
+    is_depth = np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm)
+    return ScoredDamage(
+        size_of="depth" if is_depth else boards[0][1][0][0].size_of,
+        damage=numbers,
+        size_mm=depth_mm if is_depth else plan_mm,
+        seen=Seen(deviation_m, cosine, range_m),
+        score=score,
     )
-    return ScoredDamage(word, numbers, size_mm, Seen(*seen_damage), score)
 
 
 def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
@@ -265,23 +264,18 @@ def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
         criteria = point.criteria
         detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
         evidence = detector.analyse(cloud_of(task, point))
-        is_known = np.isfinite(evidence.score)
-        fields.append(
-            [
-                is_known,
-                *(
-                    np.where(is_known, image**2, 0.0)
-                    for image in (evidence.residual_m, evidence.score)
-                ),
-            ]
-        )
-    is_known, *squares = np.mean(fields, axis=0)
-    square, of_score = (ndimage.uniform_filter(image, AROUND_PX) for image in squares)
-    judged = (is_known >= 0.5) & (square > 0) & (of_score > 0)
+        is_judged = np.isfinite(evidence.score)
+        residual_square_m2 = np.where(is_judged, evidence.residual_m**2, 0.0)
+        score_square = np.where(is_judged, evidence.score**2, 0.0)
+        fields.append([is_judged, residual_square_m2, score_square])
+    judged_share, residual_square_m2, score_square = np.mean(fields, axis=0)
+    residual_square_m2 = ndimage.uniform_filter(residual_square_m2, AROUND_PX)
+    score_square = ndimage.uniform_filter(score_square, AROUND_PX)
+    judged = (judged_share >= 0.5) & (residual_square_m2 > 0) & (score_square > 0)
+    judged_share_nearby = ndimage.uniform_filter(judged_share, NEAR_PX)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(
-            judged, np.sqrt(square / of_score / ndimage.uniform_filter(is_known, NEAR_PX)), np.inf
-        )
+        unit_m = np.sqrt(residual_square_m2 / score_square / judged_share_nearby)
+    return np.where(judged, unit_m, np.inf)
 
 
 def _board_seen(
@@ -306,9 +300,8 @@ def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> S
     deviation_m = _unit_m(view, point, seed)
     points_m = transform_points(set_up.T_camera_board, patches.points_m)
     range_m = np.linalg.norm(points_m, axis=1)
-    cosine = (
-        -(rotate_vectors(set_up.T_camera_board, patches.normals) * points_m).sum(axis=1) / range_m
-    )
+    normals = rotate_vectors(set_up.T_camera_board, patches.normals)
+    cosine = -(normals * points_m).sum(axis=1) / range_m
     region = set_up.unit.region
     camera = set_up.unit.camera
     lens = camera.nominal_lens
@@ -327,4 +320,8 @@ def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> S
     slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
     reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
     is_seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
-    return Seen(np.where(is_seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)
+    return Seen(
+        deviation_m=np.where(is_seen, deviation_m[v, u], np.inf),
+        cosine=np.clip(cosine, 1e-3, 1.0),
+        range_m=range_m,
+    )

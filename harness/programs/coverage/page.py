@@ -79,8 +79,9 @@ def answer(
 ) -> str:
     """State the shares of the face on which damage of a size is found, on which no size is, and
     that is not judged."""
-    groups = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
-    share, blind, unknown = (f"{percent(patches.share(group))} %" for group in groups)
+    share = f"{percent(patches.share(limits_mm <= size_mm))} %"
+    blind = f"{percent(patches.share(np.isinf(limits_mm)))} %"
+    unknown = f"{percent(patches.share(np.isnan(limits_mm)))} %"
     return (
         f"Damage with a {findable.size_of} of {size_mm:.3g} mm is found nine times in ten "
         f"on {share} of the face in "
@@ -93,9 +94,8 @@ def answer(
 def warnings_of(findable: Findable, seen_by_view: Mapping[Any, Seen]) -> list[str]:
     """Return warnings that the figures are unreliable."""
     warnings = [findable.doubt] if findable.doubt else []
-    if unseen := sum(
-        bool(np.isinf(seen_of_view.deviation_m).all()) for seen_of_view in seen_by_view.values()
-    ):
+    unseen = sum(bool(np.isinf(view.deviation_m).all()) for view in seen_by_view.values())
+    if unseen:
         warnings.append(
             f"the detector judges nothing in {unseen} of the {len(seen_by_view)} simulated poses"
         )

@@ -31,57 +31,71 @@ FEWEST = 20  # fewest damages from which the law is fitted
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of a part's face: ``points_m`` and unit ``normals`` (n, 3), board frame, and
-    ``areas_m2`` (n,)."""
+    """Patches of a part's face."""
 
+    # Centres (n, 3), board frame, metres
     points_m: np.ndarray
+    # Unit normals (n, 3), board frame, towards the camera
     normals: np.ndarray
+    # Areas (n,), square metres
     areas_m2: np.ndarray
 
     def share(self, chosen: np.ndarray) -> float:
         """Return the share of the area that the patches ``chosen`` (n,) bool cover."""
-        return float(self.areas_m2[chosen].sum() / self.areas_m2.sum())
+        covered_m2 = self.areas_m2[chosen].sum()
+        return float(covered_m2 / self.areas_m2.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """View of places, (n,): noise ``deviation_m``, infinite if not judged; ``cosine`` of
-    incidence; ``range_m``."""
+    """The view of n places."""
 
+    # Standard deviation (n,) of the noise, metres; infinite where the detector does not judge
     deviation_m: np.ndarray
+    # Cosine (n,) of the angle of incidence
     cosine: np.ndarray
+    # Distance (n,) from the camera, metres
     range_m: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredDamage:
-    """Inspections of damage, (n,) each. ``damage``: its number. ``size_mm``: the size that
-    ``size_of`` names. ``seen``: its view. ``score``: the lowest threshold at which it is no longer
-    found; NaN if it was missed at the threshold in use, infinite if only missing returns found it.
-    """
+    """Inspections of damage, n of them."""
 
+    # The size's name: "diameter", "width" or "depth"
     size_of: str
+    # Number (n,) of the damage
     damage: np.ndarray
+    # Size (n,), millimetres
     size_mm: np.ndarray
+    # View (n,) of the damage's place
     seen: Seen
+    # Lowest threshold (n,) at which it is no longer found; NaN if it was missed at the threshold
+    # in use, infinite if only missing returns found it
     score: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """Law of the signal. ``coefficients``: of `_design`. ``scatter``: of the signal's logarithm in
-    a frontal view; it grows with 1 / cosine to the power ``growth``. ``ratio``: of the sizes found
-    with 90 % and 50 % at the median angle. ``steepest``: least cosine inspected. ``damages``:
-    number in the fit."""
+    """Law of the signal."""
 
+    # The size's name: "diameter", "width" or "depth"
     size_of: str
+    # Factors (5,) of the terms of `_design`
     coefficients: np.ndarray
+    # Standard deviation of the signal's logarithm in a frontal view
     scatter: float
+    # Power of 1 / cosine with which the scatter grows
     growth: float
+    # Size found with 90 % over the size found with 50 %, at the median angle
     ratio: float
+    # Score above which damage is found
     threshold: float
+    # Smallest and largest size inspected, millimetres
     sizes_mm: tuple[float, float]
+    # Least cosine of incidence inspected
     steepest: float
+    # Number of damages in the fit
     damages: int
 
     @property
@@ -131,8 +145,10 @@ class Findable:
             np.exp((needed - without_size) / self.coefficients[1]), self.sizes_mm[0]
         )
         limits_mm = np.where(limits_mm > self.sizes_mm[1], np.inf, limits_mm)
-        beyond = np.cos(min(np.arccos(self.steepest) + np.deg2rad(BEYOND_DEG), np.pi / 2))
-        return np.where(np.isfinite(view.deviation_m) & (view.cosine >= beyond), limits_mm, np.nan)
+        steepest_rad = np.arccos(self.steepest) + np.deg2rad(BEYOND_DEG)
+        beyond = np.cos(min(steepest_rad, np.pi / 2))
+        is_judged = np.isfinite(view.deviation_m) & (view.cosine >= beyond)
+        return np.where(is_judged, limits_mm, np.nan)
 
 
 def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:
@@ -159,22 +175,25 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
     design = _design(size_mm, cosine, scored.seen.range_m[judged])
     below = np.isnan(score)
     found_scores = np.sort(score[score > threshold])
-    far = max(FAR * threshold, *found_scores[np.isfinite(found_scores)][:FEWEST])
+    lowest_scores = found_scores[np.isfinite(found_scores)][:FEWEST]
+    far = max([FAR * threshold, *lowest_scores])
     above = score > far
-    signal = np.log(
-        np.minimum(np.where(below, threshold, score), far) * scored.seen.deviation_m[judged]
-    )
+    clipped = np.minimum(np.where(below, threshold, score), far)
+    signal = np.log(clipped * scored.seen.deviation_m[judged])
 
     def fitted(growth: float) -> tuple[float, CensoredFit]:
         """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit to
         weighted rows."""
         weight = cosine**growth
         fit = fit_censored(design * weight[:, None], signal * weight, below, above)
-        return fit.log_likelihood + float(np.log(weight[~(below | above)]).sum()), fit
+        exact_weight = weight[~(below | above)]
+        return fit.log_likelihood + float(np.log(exact_weight).sum()), fit
 
     fits = [fitted(growth) for growth in GROWTHS]
-    best = int(np.nanargmax([value for value, _ in fits]))
-    growth, (coefficients, scatter, _, _) = float(GROWTHS[best]), fits[best][1]
+    best = int(np.nanargmax([likelihood for likelihood, _ in fits]))
+    growth = float(GROWTHS[best])
+    _, best_fit = fits[best]
+    coefficients, scatter, _, _ = best_fit
     if coefficients[1] <= 0:
         message = (
             f"what is found does not follow the {scored.size_of} of the damage: no limit can be "
@@ -185,8 +204,17 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
         )
     ratio = np.exp(special.ndtri(POD) * scatter / np.median(cosine) ** growth / coefficients[1])
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
-    law = (coefficients, scatter, growth, float(ratio), threshold)
-    return Findable(scored.size_of, *law, sizes_mm, float(cosine.min()), damages)
+    return Findable(
+        size_of=scored.size_of,
+        coefficients=coefficients,
+        scatter=scatter,
+        growth=growth,
+        ratio=float(ratio),
+        threshold=threshold,
+        sizes_mm=sizes_mm,
+        steepest=float(cosine.min()),
+        damages=damages,
+    )
 
 
 def in_turn(

@@ -23,9 +23,11 @@ Splices = Mapping[KeyPath, type[Config]]
 
 @dataclass(frozen=True)
 class Slot:
-    """A place for data: the alternatives of its type, each with its constraints, and its field."""
+    """A place for data, as an annotation describes it."""
 
+    # The alternatives of its type, each with its constraints by name: "ge", "pattern", ...
     branches: tuple[tuple[Any, Mapping[str, Any]], ...]
+    # The model's field that holds the data; None for a member of a list or of a union
     field: FieldInfo | None = None
 
     @property
@@ -40,10 +42,13 @@ class Slot:
 
 @dataclass(frozen=True)
 class Declared:
-    """A model, the data that is meant to fill it, and the models that belong in its free data."""
+    """What is declared for a document: a model, and the models that belong in its free data."""
 
+    # The model of the whole document
     model: type[BaseModel]
+    # Plain data that is meant to fill the model; it may be wrong anywhere
     data: Any
+    # The model that belongs at each path of free data
     splices: Splices
 
     def at(self, path: KeyPath) -> Slot | None:
@@ -64,15 +69,18 @@ class Declared:
         of free data."""
         data = get(self.data, path)
         model = model_for(self.at(path), data)
-        return tuple(model.model_fields if model else data if isinstance(data, Mapping) else ())
+        if model is not None:
+            return tuple(model.model_fields)
+        return tuple(data) if isinstance(data, Mapping) else ()
 
     def paths(self, path: KeyPath = (), depth: int = 8) -> Iterator[KeyPath]:
         """Yield every path that can be set: model fields down to ``depth`` levels, and the list
         items in the data."""
+        if depth == 0:
+            return
         data = get(self.data, path)
-        for key in (
-            (range(len(data)) if isinstance(data, list) else self.names(path)) if depth else ()
-        ):
+        keys = range(len(data)) if isinstance(data, list) else self.names(path)
+        for key in keys:
             yield (*path, key)
             yield from self.paths((*path, key), depth - 1)
 
@@ -84,27 +92,32 @@ settings belong in it."""
 
 def slot_of(annotation: Any, field: FieldInfo | None = None) -> Slot:
     """Return the slot for an annotation, or for a field with this annotation."""
-    return Slot(tuple(_branches(annotation, tuple(field.metadata) if field else ())), field)
+    constraints = tuple(field.metadata) if field else ()
+    return Slot(tuple(_branches(annotation, constraints)), field)
 
 
 def _branches(
     annotation: Any, metadata: tuple[Any, ...]
 ) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+    """Yield the alternatives of an annotation, each with the constraints in ``metadata``."""
     if get_origin(annotation) is Annotated:
-        inner, *further_arguments = get_args(annotation)
-        yield from _branches(
-            inner,
-            (*metadata, *(m for x in further_arguments for m in getattr(x, "metadata", (x,)))),
-        )
+        inner, *inner_metadata = get_args(annotation)
+        constraints = list(metadata)
+        for item in inner_metadata:
+            # A pydantic Field groups several constraints
+            constraints.extend(getattr(item, "metadata", (item,)))
+        yield from _branches(inner, tuple(constraints))
     elif get_origin(annotation) in (Union, UnionType):
         for member in get_args(annotation):
             yield from _branches(member, metadata)
     else:
-        names = (*BOUNDS, "min_length", "max_length", "pattern")
-        yield (
-            annotation,
-            {n: v for m in metadata for n in names if (v := getattr(m, n, None)) is not None},
-        )
+        limits = {}
+        for constraint in metadata:
+            for name in (*BOUNDS, "min_length", "max_length", "pattern"):
+                limit = getattr(constraint, name, None)
+                if limit is not None:
+                    limits[name] = limit
+        yield annotation, limits
 
 
 def kinds_of(slot: Slot | None) -> tuple[str, Mapping[str, type[BaseModel]]] | None:
@@ -115,32 +128,43 @@ def kinds_of(slot: Slot | None) -> tuple[str, Mapping[str, type[BaseModel]]] | N
 
 @lru_cache(maxsize=1000)
 def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[BaseModel]]] | None:
-    for key in models[0].model_fields if len(models) > 1 else ():
-        fields = [model.model_fields.get(key) for model in models]
-        tags = [
-            get_args(f.annotation) if f and get_origin(f.annotation) is Literal else ()
-            for f in fields
-        ]
+    if len(models) < 2:
+        return None
+    for key in models[0].model_fields:
+        tags_of_models = [_tags(model, key) for model in models]
         models_by_tag = {
             str(tag): model
-            for model, model_tags in zip(models, tags, strict=True)
-            for tag in model_tags
+            for model, tags in zip(models, tags_of_models, strict=True)
+            for tag in tags
         }
-        if all(tags) and len(models_by_tag) == sum(map(len, tags)):
+        if all(tags_of_models) and len(models_by_tag) == sum(map(len, tags_of_models)):
             return key, models_by_tag
     return None
+
+
+def _tags(model: type[BaseModel], key: str) -> tuple[Any, ...]:
+    """Return the values of a model's Literal field, () without such a field."""
+    field = model.model_fields.get(key)
+    if field is None or get_origin(field.annotation) is not Literal:
+        return ()
+    return get_args(field.annotation)
 
 
 def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
     """Return the model that a mapping is meant to fill: by its kind, or else the model with most
     keys in common."""
-    kinds = kinds_of(slot)
+    if slot is None:
+        return None
     values = data if isinstance(data, Mapping) else {}
-    if kinds and str(values.get(kinds[0])) in kinds[1]:
-        return kinds[1][str(values[kinds[0]])]
+    kinds = kinds_of(slot)
+    if kinds is not None:
+        tag_key, models_by_tag = kinds
+        tag = str(values.get(tag_key))
+        if tag in models_by_tag:
+            return models_by_tag[tag]
     return max(
-        slot.models if slot else (),
-        key=lambda m: len(values.keys() & m.model_fields.keys()),
+        slot.models,
+        key=lambda model: len(values.keys() & model.model_fields.keys()),
         default=None,
     )
 
@@ -157,12 +181,9 @@ def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
         if kind is Any:
             return slot
         if isinstance(key, int) and get_origin(kind) in (tuple, list):
-            is_list = get_origin(kind) is list or arguments[-1] is Ellipsis
-            return (
-                slot_of(arguments[0 if is_list else key])
-                if is_list or key < len(arguments)
-                else None
-            )
+            if get_origin(kind) is list or arguments[-1] is Ellipsis:
+                return slot_of(arguments[0])
+            return slot_of(arguments[key]) if key < len(arguments) else None
         if isinstance(key, str) and get_origin(kind) is dict:
             return slot_of(arguments[1])
     return None
@@ -176,18 +197,14 @@ def default_at(slot: Slot | None) -> tuple[Any, ...]:
     default = slot.field.get_default(call_default_factory=True)
     if not isinstance(default, Config):
         return (json.loads(json.dumps(default)),)
-    fields = type(default).model_fields
-    constant = {
-        n: getattr(default, n)
-        for n, f in fields.items()
-        if len(choices_of(slot_of(f.annotation))) == 1
-    }
-    least = {**constant, **default.model_dump(mode="json", exclude_defaults=True)}
-    return (
-        least
-        if type(default).from_data(json.loads(json.dumps(least))) == default
-        else default.to_data(),
-    )
+    model = type(default)
+    least = {}
+    for name, field in model.model_fields.items():
+        if len(choices_of(slot_of(field.annotation))) == 1:
+            least[name] = getattr(default, name)
+    least.update(default.model_dump(mode="json", exclude_defaults=True))
+    is_enough = model.from_data(json.loads(json.dumps(least))) == default
+    return (least if is_enough else default.to_data(),)
 
 
 def get(data: Any, path: KeyPath) -> Any:
@@ -201,74 +218,82 @@ def child(data: Any, key: str | int) -> Any:
     """Return the value under a key or index, or None if there is none."""
     if isinstance(data, Mapping):
         return data.get(key)
-    return (
-        data[key]
-        if isinstance(data, list) and isinstance(key, int) and 0 <= key < len(data)
-        else None
-    )
+    if isinstance(data, list) and isinstance(key, int) and 0 <= key < len(data):
+        return data[key]
+    return None
 
 
 def choices_of(slot: Slot | None) -> tuple[Any, ...]:
     """Return the values of a Literal in this slot, or () if it is not a Literal."""
+    choices: list[Any] = []
     branches = slot.branches if slot else ()
-    return tuple(v for kind, _ in branches if get_origin(kind) is Literal for v in get_args(kind))
+    for kind, _ in branches:
+        if get_origin(kind) is Literal:
+            choices.extend(get_args(kind))
+    return tuple(choices)
 
 
 def legal_at(slot: Slot | None) -> str | None:
     """Describe in words what a slot accepts: type, bounds, choices, and the field's description."""
     if slot is None:
         return None
-    words = " or ".join(
-        filter(None, dict.fromkeys(_words(kind, limits) for kind, limits in slot.branches))
-    )
-    note = (slot.field.description if slot.field else None) or ""
-    return f"{words} ({note})" if words and 0 < len(note) <= LONGEST_NOTE else words or None
+    alternatives = dict.fromkeys(_words(kind, limits) for kind, limits in slot.branches)
+    words = " or ".join(filter(None, alternatives))
+    if not words:
+        return None
+    note = slot.field.description if slot.field else None
+    return f"{words} ({note})" if note and len(note) <= LONGEST_NOTE else words
 
 
 def _words(kind: Any, limits: Mapping[str, Any]) -> str:
+    """Describe one alternative of a slot; empty if there is nothing to say."""
     origin = get_origin(kind)
     arguments = get_args(kind)
     if origin is Literal:
-        return ("one of " if len(arguments) > 1 else "") + ", ".join(map(plain, arguments))
+        lead = "one of " if len(arguments) > 1 else ""
+        return lead + ", ".join(map(plain, arguments))
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return "a mapping with the keys " + ", ".join(kind.model_fields)
     if origin is dict:
         inner = legal_at(slot_of(arguments[1]))
         return f"a mapping of names to {inner}" if inner else "a mapping"
     if origin is tuple and arguments[-1] is not Ellipsis:
-        return "a list of " + ", ".join(
-            legal_at(slot_of(argument)) or "a value" for argument in arguments
-        )
+        items = [legal_at(slot_of(argument)) or "a value" for argument in arguments]
+        return "a list of " + ", ".join(items)
     if origin in (tuple, list):
-        least = limits.get("min_length")
-        longest = limits.get("max_length")
-        inner = legal_at(slot_of(arguments[0]))
-        count = (
-            f"at most {longest}"
-            if not least
-            else f"{least} to {longest}"
-            if longest
-            else f"at least {least}"
-        )
-        return (
-            "a list"
-            + (f" ({count} items)" if least or longest else "")
-            + (f", each {inner}" if inner else "")
-        )
+        return _words_of_list(legal_at(slot_of(arguments[0])), limits)
     if kind is str:
         return f"text that matches {limits['pattern']}" if "pattern" in limits else "text"
-    words = {int: "a whole number", float: "a number", bool: "true or false", NoneType: "null"}.get(
-        kind, ""
-    )
-    bounds = {
-        n: f"{limits[n]:g}" if isinstance(limits[n], float) else str(limits[n])
-        for n in BOUNDS
-        if n in limits
-    }
+    return _words_of_number(kind, limits)
+
+
+def _words_of_list(item: str | None, limits: Mapping[str, Any]) -> str:
+    """Describe a list of any number of items within the limits."""
+    fewest = limits.get("min_length")
+    longest = limits.get("max_length")
+    words = "a list"
+    if fewest and longest:
+        words += f" ({fewest} to {longest} items)"
+    elif fewest:
+        words += f" (at least {fewest} items)"
+    elif longest:
+        words += f" (at most {longest} items)"
+    return f"{words}, each {item}" if item else words
+
+
+def _words_of_number(kind: Any, limits: Mapping[str, Any]) -> str:
+    """Describe a number with its bounds, a truth value or null; empty for any other type."""
+    nouns = {int: "a whole number", float: "a number", bool: "true or false", NoneType: "null"}
+    noun = nouns.get(kind, "")
+    bounds = {}
+    for name in BOUNDS:
+        if name in limits:
+            limit = limits[name]
+            bounds[name] = f"{limit:g}" if isinstance(limit, float) else str(limit)
     if {"ge", "le"} <= bounds.keys():
-        return f"{words} from {bounds['ge']} to {bounds['le']}"
+        return f"{noun} from {bounds['ge']} to {bounds['le']}"
     bound_texts = [f"{BOUNDS[name]} {bound}" for name, bound in bounds.items()]
-    return f"{words} {' and '.join(bound_texts)}".strip()
+    return f"{noun} {' and '.join(bound_texts)}".strip()
 
 
 def every_key(
@@ -287,8 +312,9 @@ def every_key(
                 break
         kinds = kinds_of(slot)
         if kinds is not None:
-            for kind, chosen in kinds[1].items():
-                yield from every_key(chosen, f"{path}[{kinds[0]}={kind}].")
+            tag_key, models_by_tag = kinds
+            for tag, tagged_model in models_by_tag.items():
+                yield from every_key(tagged_model, f"{path}[{tag_key}={tag}].")
         elif slot.models:
             yield from every_key(slot.models[0], f"{path}.")
 
