@@ -61,25 +61,33 @@ def _padded(height: int, width: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseSums:
-    """Sums over noise fields, by lag: ``products`` and ``pairs`` (2 m + 1, 2 m + 1) of pairs of
-    known pixels, with m = `LONGEST_LAG_PX`; ``fourth`` and ``pixels``: sum of fourth powers, and
-    number of pixels."""
+    """Sums over the judged pixels of noise fields; m = `LONGEST_LAG_PX`."""
 
+    # Sum of the products of pairs of pixels (2 m + 1, 2 m + 1), by lag
     products: np.ndarray
+    # Number of pairs (2 m + 1, 2 m + 1), by lag
     pairs: np.ndarray
+    # Sum of fourth powers
     fourth: float
+    # Number of pixels
     pixels: float
 
     def __add__(self, added: NoiseSums) -> NoiseSums:
         """Add the sums over other fields."""
         return NoiseSums(
-            *(getattr(self, name) + getattr(added, name) for name in self.__dataclass_fields__)
+            products=self.products + added.products,
+            pairs=self.pairs + added.pairs,
+            fourth=self.fourth + added.fourth,
+            pixels=self.pixels + added.pixels,
         )
 
     def __sub__(self, subtracted: NoiseSums) -> NoiseSums:
         """Remove the sums over some fields."""
         return NoiseSums(
-            *(getattr(self, name) - getattr(subtracted, name) for name in self.__dataclass_fields__)
+            products=self.products - subtracted.products,
+            pairs=self.pairs - subtracted.pairs,
+            fourth=self.fourth - subtracted.fourth,
+            pixels=self.pixels - subtracted.pixels,
         )
 
     @cached_property
@@ -93,10 +101,8 @@ class NoiseSums:
     @property
     def kurtosis(self) -> float:
         """Excess kurtosis of the noise: 0 if it is Gaussian."""
-        middle = LONGEST_LAG_PX
-        return float(
-            self.fourth / self.pixels / (self.products[middle, middle] / self.pixels) ** 2 - 3.0
-        )
+        variance = self.products[LONGEST_LAG_PX, LONGEST_LAG_PX] / self.pixels
+        return float(self.fourth / self.pixels / variance**2 - 3.0)
 
     def power(self, shape: tuple[int, int]) -> np.ndarray:
         """Return the power spectrum on a periodic grid of ``shape``, ordered as by
@@ -138,8 +144,8 @@ def inverse_times(images: np.ndarray, is_known: np.ndarray, sums: NoiseSums) -> 
             is_known * scipy.fft.irfft2(response * scipy.fft.rfft2(image, shape), shape)[:h, :w]
         )
 
-    found = np.zeros(images.shape)
-    for image, solution in zip(images, found, strict=True):
+    solutions = np.zeros(images.shape)
+    for image, solution in zip(images, solutions, strict=True):
         residual = is_known * image
         enough = CONVERGED**2 * float((residual**2).sum())
         direction = np.zeros(residual.shape)
@@ -155,7 +161,7 @@ def inverse_times(images: np.ndarray, is_known: np.ndarray, sums: NoiseSums) -> 
             step = product / float((direction * onward).sum())
             solution += step * direction
             residual = residual - step * onward
-    return found
+    return solutions
 
 
 def detectability(
@@ -257,8 +263,12 @@ def detection_probability(needed: np.ndarray, index: float) -> float:
 
 def index_for(needed: np.ndarray, share: float) -> float:
     """Return d' at which a share of damages is found, from `needed_indices`."""
-    ends = needed.min() - 5.0, needed.max() + 5.0
-    return float(optimize.brentq(lambda d: detection_probability(needed, d) - share, *ends))
+    lowest = needed.min() - 5.0
+    highest = needed.max() + 5.0
+    root = optimize.brentq(
+        lambda index: detection_probability(needed, index) - share, lowest, highest
+    )
+    return float(root)
 
 
 # ---------------------------------------------------------------- damages of a set-up
@@ -266,38 +276,51 @@ def index_for(needed: np.ndarray, share: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One damaged board as the ideal observer sees it, (h, w) each. ``known``: judged pixels.
-    ``deviation_m``: of the noise. ``signals_m`` (n, h, w): signatures of the ``holes``, 0 where
-    not known. ``surface`` (p, h, w): polynomials. ``sums``: over the noise of ``units`` units.
-    ``pixel_m2``: area of a pixel on the face. ``lost``: share of the pixels within damage that
-    return nothing."""
+    """One damaged board with n damages as the ideal observer sees it."""
 
+    # Number of the board
     board: int
+    # Names of the damages
     holes: tuple[str, ...]
+    # Mask (h, w) of the judged pixels
     known: np.ndarray
+    # Standard deviation (h, w) of the noise, metres
     deviation_m: np.ndarray
+    # Signatures (n, h, w) of the damages, metres, 0 where nothing is judged
     signals_m: np.ndarray
+    # Polynomials (p, h, w) whose sum the surface is
     surface: np.ndarray
+    # Sums over the noise of all units
     sums: NoiseSums
+    # Number of units
     units: int
+    # Area of a pixel on the face, square metres
     pixel_m2: float
+    # Share of the pixels within damage that return nothing
     lost: float
 
 
 @dataclass(frozen=True, eq=False)
 class IdealDamages:
-    """The ideal observer on damages, (n,) each. ``index``: d'. ``threshold``: NaN if d' is 0.
-    ``needed`` (2, n): d' at which shares of `SHARES` are found. ``kurtosis``: excess, of the noise
-    of ``units``. ``lost``: largest share of a board's damage without return."""
+    """The ideal observer on n damages."""
 
+    # Number (n,) of each damage's board
     board: np.ndarray
+    # Name (n,) of each damage
     hole: np.ndarray
+    # d' (n,)
     index: np.ndarray
+    # Threshold (n,) of the statistic; NaN if d' is 0
     threshold: np.ndarray
+    # Probability of detection (n,)
     pod: np.ndarray
+    # d' (2, n) at which the shares `SHARES` are found
     needed: np.ndarray
+    # Number of units whose noise is pooled
     units: int
+    # Excess kurtosis of the noise
     kurtosis: float
+    # Largest share of a board's pixels within damage that return nothing
     lost: float
 
 
@@ -324,11 +347,15 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
             needed = needed_indices(field / square, threshold)
             rows.append((view.board, hole, d, threshold, detection_probability(needed, d)))
             at_shares.append([index_for(needed, share) for share in SHARES])
-    boards, holes, indices, thresholds, pods = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
-    units = sum(view.units for view in views)
-    lost = max(view.lost for view in views)
+    boards, holes, indices, thresholds, pods = zip(*rows, strict=True)
     return IdealDamages(
-        boards, holes, indices, thresholds, pods, np.array(at_shares).T, units, sums.kurtosis, lost
+        board=np.array(boards),
+        hole=np.array(holes),
+        index=np.array(indices),
+        threshold=np.array(thresholds),
+        pod=np.array(pods),
+        needed=np.array(at_shares).T,
+        units=sum(view.units for view in views),
+        kurtosis=sums.kurtosis,
+        lost=max(view.lost for view in views),
     )

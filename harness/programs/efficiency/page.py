@@ -73,7 +73,8 @@ def efficiency_figure(rows: Sequence[Efficiency]) -> str:
     conditions = list(
         dict.fromkeys((row.limit.record.frames, row.limit.largest_mm) for row in rows)
     )
-    index, pod = (np.concatenate([getattr(row, name) for row in rows]) for name in ("index", "pod"))
+    index = np.concatenate([row.index for row in rows])
+    pod = np.concatenate([row.pod for row in rows])
     order = np.argsort(index)
 
     def draw(figure: Figure) -> None:

@@ -36,40 +36,57 @@ MOST_LOST = 0.01
 
 @dataclass(frozen=True)
 class Level:
-    """Both observers at one share of damages found. ``ideal_mm``: the ideal observer's size, or
-    the smallest inspected if none is missed (``at_most``). ``ideal_index``, ``index``: d' that
-    each needs, NaN if unknown."""
+    """Both observers at one share of damages found."""
 
+    # Size that the ideal observer needs, millimetres; the smallest inspected if none is missed
     ideal_mm: float
+    # Its 95 % interval
     ideal_mm_interval: Interval
+    # Whether the ideal observer misses none, so that its size is an upper bound
     at_most: bool
+    # d' that the ideal observer needs
     ideal_index: float
+    # d' that the detector needs; NaN if unknown
     index: float
+    # Its 95 % interval
     index_interval: Interval
+    # (ideal_index / index)^2; NaN if unknown
     efficiency: float
+    # Its 95 % interval
     interval: Interval
 
 
 @dataclass(frozen=True, eq=False)
 class Efficiency:
-    """A set-up's detector and the ideal observer, at shares of 50 % (``half``) and 90 %
-    (``most``). ``size_mm``, ``index``, ``pod`` (ideal observer's), ``hits``, ``inspections``: (n,)
-    of each damage. ``curve``: the detector's POD against d'; None if there is none, and ``why``.
-    """
+    """A set-up's detector and the ideal observer on n damages."""
 
+    # The set-up and its limit
     limit: SetUpLimit
+    # The ideal observer on all damages of the set-up
     ideal: IdealDamages
+    # Both observers where 50 % of the damages are found
     half: Level
+    # Both observers where 90 % of the damages are found
     most: Level
+    # Number (n,) of each damage's board
     board: np.ndarray
+    # Name (n,) of each damage
     hole: np.ndarray
+    # Size (n,), millimetres
     size_mm: np.ndarray
+    # d' (n,)
     index: np.ndarray
+    # The ideal observer's threshold (n,); NaN if d' is 0
     threshold: np.ndarray
+    # The ideal observer's probability of detection (n,)
     pod: np.ndarray
+    # The detector's hits (n,)
     hits: np.ndarray
+    # Number of inspections (n,)
     inspections: np.ndarray
+    # The detector's POD against d'; None if no curve fits
     curve: PodCurve | None
+    # Why the efficiency is unknown; empty if it is known
     why: str
 
 
@@ -142,16 +159,22 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     except UserError as error:
         why = error.message
     all_found = bool((1.0 - pod).sum() <= HARDLY)
-    half, most = (
-        _level(*level_parts, all_found)
-        for level_parts in zip(ideal_mm, ideal_index, needed, strict=True)
+    return Efficiency(
+        limit=limit,
+        ideal=ideal,
+        half=_level(ideal_mm[0], ideal_index[0], needed[0], all_found),
+        most=_level(ideal_mm[1], ideal_index[1], needed[1], all_found),
+        board=ideal.board[kept],
+        hole=ideal.hole[kept],
+        size_mm=size_mm,
+        index=ideal.index[kept],
+        threshold=ideal.threshold[kept],
+        pod=pod,
+        hits=hits,
+        inspections=inspections,
+        curve=curve,
+        why=why,
     )
-    board = ideal.board[kept]
-    hole = ideal.hole[kept]
-    exact = ideal.index[kept]
-    threshold = ideal.threshold[kept]
-    of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
-    return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
 
 
 def _level(
@@ -162,14 +185,15 @@ def _level(
         share = (ideal_index / needed) ** 2
     of_index = percentiles(needed[1:]) if np.isfinite(needed[0]) else UNKNOWN
     of_share = percentiles(share[1:]) if np.isfinite(needed[0]) else UNKNOWN
-    indices = float(ideal_index[0]), float(needed[0]), of_index
     return Level(
-        float(ideal_mm[0]),
-        percentiles(ideal_mm[1:]),
-        all_found,
-        *indices,
-        float(share[0]),
-        of_share,
+        ideal_mm=float(ideal_mm[0]),
+        ideal_mm_interval=percentiles(ideal_mm[1:]),
+        at_most=all_found,
+        ideal_index=float(ideal_index[0]),
+        index=float(needed[0]),
+        index_interval=of_index,
+        efficiency=float(share[0]),
+        interval=of_share,
     )
 
 

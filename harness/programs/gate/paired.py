@@ -20,16 +20,19 @@ Tails = tuple[float, float]
 
 @dataclass(frozen=True)
 class HitsChange:
-    """Hits of two set-ups on the same ``inspections`` of ``boards``. ``only_first``,
-    ``only_second``: found by only one. ``fewer_p``, ``more_p``: one-sided sign-flip test over
-    boards: the probability of so few (many) hits of the second if each board's two sums of hits
-    are exchangeable."""
+    """Hits of two set-ups on the same inspections, by a one-sided sign-flip test over boards."""
 
+    # Number of boards
     boards: int
+    # Number of inspections that both have
     inspections: int
+    # Inspections found by the first set-up only
     only_first: int
+    # Inspections found by the second set-up only
     only_second: int
+    # Probability of so few hits of the second if each board's two sums of hits are exchangeable
     fewer_p: float
+    # Probability of so many hits of the second, likewise
     more_p: float
 
 
@@ -40,25 +43,36 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     if not len(rows_1):
         return None
     first_hits = first.hit[rows_1]
-    now = second.hit[rows_2]
-    only_first = int((first_hits & ~now).sum())
-    only_second = int((now & ~first_hits).sum())
+    second_hits = second.hit[rows_2]
+    only_first = int((first_hits & ~second_hits).sum())
+    only_second = int((second_hits & ~first_hits).sum())
     names, board = np.unique(first.board[rows_1], return_inverse=True)
-    gained = np.bincount(board, now.astype(float) - first_hits.astype(float)).round().astype(int)
-    return HitsChange(len(names), len(rows_1), only_first, only_second, *sign_flip(gained))
+    gained = np.bincount(board, second_hits.astype(float) - first_hits.astype(float))
+    gained = gained.round().astype(int)
+    fewer_p, more_p = sign_flip(gained)
+    return HitsChange(
+        boards=len(names),
+        inspections=len(rows_1),
+        only_first=only_first,
+        only_second=only_second,
+        fewer_p=fewer_p,
+        more_p=more_p,
+    )
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows (k,) of ``first`` and of ``second`` that are the same inspection."""
-    keys = (
-        zip(t.board.tolist(), t.hole.tolist(), t.repeat.tolist(), strict=True)
-        for t in (first, second)
-    )
-    row_1, row_2 = ({key: row for row, key in enumerate(inspections)} for inspections in keys)
+    row_1 = _row_of_inspection(first)
+    row_2 = _row_of_inspection(second)
     shared = [key for key in row_1 if key in row_2]
-    return np.array([row_1[key] for key in shared], int), np.array(
-        [row_2[key] for key in shared], int
-    )
+    rows_1 = np.array([row_1[key] for key in shared], int)
+    rows_2 = np.array([row_2[key] for key in shared], int)
+    return rows_1, rows_2
+
+
+def _row_of_inspection(table: Inspected) -> dict[tuple[int, str, int], int]:
+    keys = zip(table.board.tolist(), table.hole.tolist(), table.repeat.tolist(), strict=True)
+    return {key: row for row, key in enumerate(keys)}
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
@@ -73,22 +87,30 @@ def sign_flip(gained: np.ndarray) -> Tails:
 
 def _tails(chance: np.ndarray, observed: int) -> Tails:
     """Return (P(<= observed), P(>= observed)) for a distribution over 0, 1, ..."""
-    return min(1.0, float(chance[: observed + 1].sum())), min(1.0, float(chance[observed:].sum()))
+    at_most = float(chance[: observed + 1].sum())
+    at_least = float(chance[observed:].sum())
+    return min(1.0, at_most), min(1.0, at_least)
 
 
 @dataclass(frozen=True)
 class LimitChange:
-    """Ratio and difference of the second set-up's a90 to the first's. ``interval_mm``: 95 %
-    percentiles of the difference over resampled boards, the same for both if ``paired``.
-    ``grown_p``, ``shrunk_p``: one-sided, by Student's t of the change's logarithm over its
-    deviation in paired draws. If unpaired, or if many draws have no a90, they are the share of
-    draws in which it has not grown (shrunk)."""
+    """Change of a90 from the first set-up to the second.
 
+    The p-values are one-sided, by Student's t of the change's logarithm over its deviation in
+    paired draws. If unpaired, or if many draws have no a90, they are the share of draws in which
+    it has not grown (shrunk)."""
+
+    # Second a90 over the first
     ratio: float
+    # Second a90 minus the first, millimetres
     difference_mm: float
+    # 95 % percentiles of the difference over resampled boards
     interval_mm: Interval
+    # p-value of growth
     grown_p: float
+    # p-value of shrinkage
     shrunk_p: float
+    # Whether both set-ups are resampled with the same boards
     paired: bool
 
 
@@ -107,11 +129,12 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     with np.errstate(invalid="ignore"):  # infinity minus infinity is NaN: no evidence
         differences = draws_2 - draws_1 if paired else (draws_2[:, None] - draws_1[None, :]).ravel()
     tie = 0.5 * float(np.mean(np.isnan(differences) | (differences == 0)))
-    weight = (
-        1.0 / (1 + len(draws_1)) if paired else 0.0
-    )  # the least p-value that so few draws can support
-    shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
-    grown, shrunk = ((1 - weight) * share + weight for share in shares)
+    # the least p-value that so few draws can support
+    weight = 1.0 / (1 + len(draws_1)) if paired else 0.0
+    share_shrunk = float(np.mean(differences < 0)) + tie
+    share_grown = float(np.mean(differences > 0)) + tie
+    grown_p = (1 - weight) * share_shrunk + weight
+    shrunk_p = (1 - weight) * share_grown + weight
     before = first.a90_mm
     now = second.a90_mm
     with np.errstate(all="ignore"):
@@ -119,10 +142,16 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
         logs = np.log(draws_2 / draws_1) if paired else np.empty(0)
     finite_logs = logs[np.isfinite(logs)]
     if len(finite_logs) > KNOWN * len(logs) and finite_logs.std() > 0 and np.isfinite(change):
-        grown, shrunk = t.sf(
-            [change, -change], len(boards[0]) - 1, scale=finite_logs.std()
-        ).tolist()
-    return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
+        tails = t.sf([change, -change], len(boards[0]) - 1, scale=finite_logs.std())
+        grown_p, shrunk_p = tails.tolist()
+    return LimitChange(
+        ratio=now / before,
+        difference_mm=now - before,
+        interval_mm=percentiles(differences),
+        grown_p=grown_p,
+        shrunk_p=shrunk_p,
+        paired=paired,
+    )
 
 
 SAME = 1e-6  # relative difference of equal thresholds between machines
@@ -130,16 +159,22 @@ SAME = 1e-6  # relative difference of equal thresholds between machines
 
 @dataclass(frozen=True)
 class SignalChange:
-    """Change of the signals of ``damages``, each divided by the least signal that is found
-    (``found_from``: first, second). ``ratio``: median, as a factor. ``error``: of its logarithm,
-    over boards, calibrations. p: one-sided, by Student's t, as these errors are estimates too
-    (Satterthwaite, Biometrics Bulletin 2 (1946), 110)."""
+    """Change of the signals of damages, each divided by the least signal that is found.
 
+    The p-values are one-sided, by Student's t, as the errors are estimates too (Satterthwaite,
+    Biometrics Bulletin 2 (1946), 110)."""
+
+    # Number of damages
     damages: int
+    # Median change, as a factor
     ratio: float
+    # Least signal that is found: (first, second)
     found_from: tuple[float, float]
+    # Standard error of the ratio's logarithm, over boards and calibrations
     error: float
+    # p-value of weaker signals
     less_p: float
+    # p-value of stronger signals
     more_p: float
 
 
@@ -151,14 +186,11 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     rows_1, rows_2 = shared_rows(first.inspected, second.inspected)
     if first.detector != second.detector or not len(rows_1):
         return None
-    needed = found_from(first), found_from(second)
+    needed_1, variance_1 = found_from(first)
+    needed_2, variance_2 = found_from(second)
     with np.errstate(divide="ignore", invalid="ignore"):
-        before, now = (
-            np.log(record.inspected.signal[rows] / needed_signal)
-            for record, rows, (needed_signal, _) in zip(
-                (first, second), (rows_1, rows_2), needed, strict=True
-            )
-        )
+        before = np.log(first.inspected.signal[rows_1] / needed_1)
+        now = np.log(second.inspected.signal[rows_2] / needed_2)
         clear = np.isfinite(before + now) & (before + now > 0)
     change = (now - before)[clear]
     board = first.inspected.board[rows_1][clear]
@@ -169,15 +201,23 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     parts = [(of_boards.var(ddof=1) / len(names), len(names) - 1.0)]
     if not np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
         parts += [_threshold_variance(first), _threshold_variance(second)]
-    variances, freedoms = np.array([*parts, *((unsure, np.inf) for _, unsure in needed)]).T
+    parts += [(variance_1, np.inf), (variance_2, np.inf)]
+    variances, freedoms = np.array(parts).T
     error = float(np.sqrt(variances.sum()))
     median = float(np.median(change))
-    p = [float(median >= 0), float(median <= 0)]
+    less_p = float(median >= 0)
+    more_p = float(median <= 0)
     if error > 0:
-        p = t.cdf(
-            np.array([median, -median]) / error, error**4 / (variances**2 / freedoms).sum()
-        ).tolist()
-    return SignalChange(len(change), float(np.exp(median)), (needed[0][0], needed[1][0]), error, *p)
+        freedom = error**4 / (variances**2 / freedoms).sum()
+        less_p, more_p = t.cdf(np.array([median, -median]) / error, freedom).tolist()
+    return SignalChange(
+        damages=len(change),
+        ratio=float(np.exp(median)),
+        found_from=(needed_1, needed_2),
+        error=error,
+        less_p=less_p,
+        more_p=more_p,
+    )
 
 
 def found_from(record: SetUpRecord) -> tuple[float, float]:
@@ -198,9 +238,10 @@ def found_from(record: SetUpRecord) -> tuple[float, float]:
     strongest_miss = logs[~hit].max(initial=logs.min())
     weakest_hit = logs[hit].min(initial=logs.max())
     if strongest_miss <= weakest_hit:
-        return float(np.exp((strongest_miss + weakest_hit) / 2)), float(
-            (weakest_hit - strongest_miss) ** 2 / 12
-        )
+        middle = float(np.exp((strongest_miss + weakest_hit) / 2))
+        # of a uniform distribution between the two
+        variance = float((weakest_hit - strongest_miss) ** 2 / 12)
+        return middle, variance
     try:
         curve = fit_hit_miss(signal, hit, log_size=True).curve
     except UserError:
@@ -220,35 +261,45 @@ def _threshold_variance(record: SetUpRecord) -> tuple[float, float]:
     rank = max(int((falling >= np.log(record.threshold)).sum()), 1)
     upper = n // 2
     scale = (falling[:upper] - falling[upper]).mean()
-    return float(scale**2 * max(1 / rank - 1 / n, 1 / n**2)), upper / 2
+    variance = float(scale**2 * max(1 / rank - 1 / n, 1 / n**2))
+    return variance, upper / 2
 
 
 @dataclass(frozen=True)
 class CallsChange:
-    """False calls, each as (first, second): ``calls`` on ``areas_m2`` of hole-free boards, and
-    ``calling`` of ``boards`` with a call in their first repeat. ``more_p``, ``fewer_p``:
-    one-sided. ``way``: "signs", the signs of boards are randomised (same frames and threshold);
-    "calibrations", two draws of the calibration (different frames); "both", the larger p."""
+    """Change of false calls on hole-free boards; each pair is (first, second)."""
 
+    # Number of false calls
     calls: tuple[int, int]
+    # Area of the hole-free boards, square metres
     areas_m2: tuple[float, float]
+    # Number of hole-free boards
     boards: tuple[int, int]
+    # Number of boards with a call in their first repeat
     calling: tuple[int, int]
+    # One-sided p-value of more calls
     more_p: float
+    # One-sided p-value of fewer calls
     fewer_p: float
+    # "signs": the signs of boards are randomised (same frames and threshold); "calibrations": two
+    # draws of the calibration (different frames); "both": the larger p
     way: Literal["signs", "calibrations", "both"]
 
     @property
     def rates_per_m2(self) -> tuple[float, float]:
         """False calls per square metre: (first, second)."""
-        return self.calls[0] / self.areas_m2[0], self.calls[1] / self.areas_m2[1]
+        before = self.calls[0] / self.areas_m2[0]
+        now = self.calls[1] / self.areas_m2[1]
+        return before, now
 
     @property
     def ratio(self) -> float:
         """The second rate over the first: infinite if only the second has calls, 1 if neither
         has."""
         before, now = self.rates_per_m2
-        return now / before if before else (np.inf if now else 1.0)
+        if before:
+            return now / before
+        return np.inf if now else 1.0
 
 
 def calls_change(
@@ -267,7 +318,8 @@ def calls_change(
     if not min(areas) > 0:
         return None
     calls = (int(unflawed_1.calls.sum()), int(unflawed_2.calls.sum()))
-    (boards_1, calling_1), (boards_2, calling_2) = _calling(unflawed_1), _calling(unflawed_2)
+    boards_1, calling_1 = _calling(unflawed_1)
+    boards_2, calling_2 = _calling(unflawed_2)
     # on identical frames, an equal calibrated threshold means equal scores: two scorings give the
     # same number by chance only if scores are few whole numbers; a given threshold has no scatter
     is_given = not (first.calibration_runs or second.calibration_runs)
@@ -276,7 +328,8 @@ def calls_change(
         method = "calibrations"
     elif is_given or np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
         method = "signs"
-    by_signs = by_draws = (0.0, 0.0)
+    by_signs = (0.0, 0.0)
+    by_draws = (0.0, 0.0)
     if method != "calibrations":
         _, row_1, row_2 = np.intersect1d(
             np.unique(unflawed_1.board), np.unique(unflawed_2.board), return_indices=True
@@ -288,19 +341,27 @@ def calls_change(
         by_signs = sign_flip((sums[1][row_2] - sums[0][row_1]).round().astype(int))
     if method != "signs":
         total = calling_1 + calling_2
-        ranks = _rank(first, wanted_per_m2), _rank(second, wanted_per_m2)
+        rank_1 = _rank(first, wanted_per_m2)
+        rank_2 = _rank(second, wanted_per_m2)
         of_second = np.arange(total + 1)  # number of the second's boards among all that called
-        if ranks[0] is None or ranks[1] is None:
+        if rank_1 is None or rank_2 is None:
             chance = hypergeom.pmf(of_second, boards_1 + boards_2, total, boards_2)
         else:
-            logs = betabinom.logpmf(total - of_second, boards_1, *ranks[0])
-            logs = logs + betabinom.logpmf(of_second, boards_2, *ranks[1])
+            alpha_1, beta_1 = rank_1
+            alpha_2, beta_2 = rank_2
+            logs = betabinom.logpmf(total - of_second, boards_1, alpha_1, beta_1)
+            logs = logs + betabinom.logpmf(of_second, boards_2, alpha_2, beta_2)
             chance = np.exp(logs - logs.max())
             chance = chance / chance.sum()
         by_draws = _tails(chance, calling_2) if total else (1.0, 1.0)
-    fewer, more = (max(pair) for pair in zip(by_signs, by_draws, strict=True))
     return CallsChange(
-        calls, areas, (boards_1, boards_2), (calling_1, calling_2), more, fewer, method
+        calls=calls,
+        areas_m2=areas,
+        boards=(boards_1, boards_2),
+        calling=(calling_1, calling_2),
+        more_p=max(by_signs[1], by_draws[1]),
+        fewer_p=max(by_signs[0], by_draws[0]),
+        way=method,
     )
 
 
@@ -317,8 +378,8 @@ def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] |
     n = record.calibration_runs
     if not n:
         return None
-    silent = (
-        -np.expm1(-wanted_per_m2 * float(record.unflawed.area_m2.mean())) if wanted_per_m2 else 0.0
-    )
+    silent = 0.0
+    if wanted_per_m2:
+        silent = -np.expm1(-wanted_per_m2 * float(record.unflawed.area_m2.mean()))
     r = int(np.clip(np.floor((n + 1) * silent * (1 + 1e-12)), 1, n))
     return r, n + 1 - r

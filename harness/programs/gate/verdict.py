@@ -41,20 +41,31 @@ Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 @dataclass(frozen=True, eq=False)
 class ComparedSetUps:
-    """One set-up of two studies. ``*_p``: adjusted p for (worse, better), 1 without a test.
-    ``why``: reason."""
+    """One set-up of two studies."""
 
+    # The first study's set-up and its limit; None if only the second has the set-up
     first: SetUpLimit | None
+    # The second study's; None if only the first has the set-up
     second: SetUpLimit | None
+    # Differences between the set-ups that may be the cause of a change
     changed: tuple[str, ...] = ()
+    # Change of a90; None if the two are not comparable
     limit: paired.LimitChange | None = None
+    # Change of hits; None on other boards
     hits: paired.HitsChange | None = None
+    # Change of false calls; None without hole-free boards
     calls: paired.CallsChange | None = None
+    # Change of signals; None on other boards or with another detector
     signal: paired.SignalChange | None = None
+    # Adjusted p-values of the limit for (worse, better); 1 without a test
     limit_p: Tails = (1.0, 1.0)
+    # Adjusted p-values of false calls for (worse, better)
     calls_p: Tails = (1.0, 1.0)
+    # Adjusted p-values of signals for (worse, better)
     signal_p: Tails = (1.0, 1.0)
+    # The verdict
     mark: Mark = "as good"
+    # The verdict's reason; empty if it needs none
     why: str = ""
 
     @property
@@ -95,10 +106,12 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
     rows = []
     for old, new in paired_set_ups(first, second):
         if old is None or new is None:
-            limits = limit_of(old) if old else None, limit_of(new) if new else None
-            rows.append(
-                ComparedSetUps(*limits, mark="only in second" if old is None else "only in first")
+            row = ComparedSetUps(
+                limit_of(old) if old else None,
+                limit_of(new) if new else None,
+                mark="only in second" if old is None else "only in first",
             )
+            rows.append(row)
             continue
         before = limit_of(old)
         now = limit_of(new)
@@ -112,7 +125,13 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         signal = paired.signal_change(old, new) if same else None
         rows.append(
             ComparedSetUps(
-                before, now, changed, paired.limit_change(before, now, same), hits, calls, signal
+                first=before,
+                second=now,
+                changed=changed,
+                limit=paired.limit_change(before, now, same),
+                hits=hits,
+                calls=calls,
+                signal=signal,
             )
         )
     # only questions that were asked belong to the family of tests
@@ -121,7 +140,8 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
     for side in (0, 1):
         adjusted = iter(holm(p[side] for p in p_values if p is not None))
         sides.append([1.0 if p is None else float(next(adjusted)) for p in p_values])
-    p = list(zip(*sides, strict=True))
+    worse_p, better_p = sides
+    p = list(zip(worse_p, better_p, strict=True))
     judged = []
     for k, row in enumerate(rows):
         row = replace(row, limit_p=p[3 * k], calls_p=p[3 * k + 1], signal_p=p[3 * k + 2])
@@ -179,35 +199,35 @@ def not_comparable(
     if first.hit_overlap != second.hit_overlap:
         return f"hits {first.hit_rule} there, {second.hit_rule} here"
     if first.false_calls_per_m2 != second.false_calls_per_m2:
-        rates = (first.false_calls_per_m2, second.false_calls_per_m2)
-        before, now = (
-            "no stated rate" if rate is None else f"{rate:g} false calls per m²" for rate in rates
-        )
-        return f"thresholds for {before} there, for {now} here"
+        return f"thresholds for {_wanted_calls(first)} there, for {_wanted_calls(second)} here"
     if bool(first_set_up.calibration_runs) != bool(second_set_up.calibration_runs):
         return "one threshold is calibrated, the other is given"
     boards = [len(np.unique(record.inspected.board)) for record in (first_set_up, second_set_up)]
     if first_set_up.targets_digest == second_set_up.targets_digest or not min(boards):
         return ""
     for column, noun in (("diameter_mm", "sizes"), ("depth_mm", "depths")):
-        values = (getattr(record.inspected, column) for record in (first_set_up, second_set_up))
-        distance = float(ks_2samp(*values, method="asymp").statistic)
+        first_mm = getattr(first_set_up.inspected, column)
+        second_mm = getattr(second_set_up.inspected, column)
+        distance = float(ks_2samp(first_mm, second_mm, method="asymp").statistic)
         if kstwobign.sf(distance / np.sqrt(1 / boards[0] + 1 / boards[1])) < OTHER_DAMAGE_P:
             return f"the damage is of other {noun}"
     return ""
 
 
+def _wanted_calls(study: StudyRecord) -> str:
+    rate = study.false_calls_per_m2
+    return "no stated rate" if rate is None else f"{rate:g} false calls per m²"
+
+
 def differences(first_set_up: SetUpRecord, second_set_up: SetUpRecord) -> tuple[str, ...]:
     """Return differences that may be the cause."""
-    facts = [
-        (f"{record.detector} {record.detector_version}", f"frames {record.frames}")
-        for record in (first_set_up, second_set_up)
-    ]
-    changes = [
-        f"{before} → {now.removeprefix('frames ')}"
-        for before, now in zip(*facts, strict=True)
-        if before != now
-    ]
+    changes = []
+    first_detector = f"{first_set_up.detector} {first_set_up.detector_version}"
+    second_detector = f"{second_set_up.detector} {second_set_up.detector_version}"
+    if first_detector != second_detector:
+        changes.append(f"{first_detector} → {second_detector}")
+    if first_set_up.frames != second_set_up.frames:
+        changes.append(f"frames {first_set_up.frames} → {second_set_up.frames}")
     for axis in sorted({*first_set_up.axes, *second_set_up.axes}):
         before = first_set_up.axes.get(axis, "default")
         now = second_set_up.axes.get(axis, "default")
@@ -244,24 +264,21 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
     growth = _growth(first, second)
     grown = f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
     if first.a90_95.demonstrated != second.a90_95.demonstrated:
-        bounds = (first.a90_95, second.a90_95)
-        before, now = (
-            f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated"
-            for bound in bounds
-        )
-        grown = f"a90/95 {before} → {now}"
+        grown = f"a90/95 {_bound(first)} → {_bound(second)}"
     if why := _lost(first, second):
         return "newly failing", why
     margin = limit_margin(row.signal)
     if growth > margin and row.limit_p[0] < alpha:
         return "worse", grown
     if calls is not None and calls.ratio > MARGIN and row.calls_p[0] < alpha:
-        return "worse", "false calls {:.2f} → {:.2f} per m²".format(*calls.rates_per_m2)
+        calls_before, calls_now = calls.rates_per_m2
+        return "worse", f"false calls {calls_before:.2f} → {calls_now:.2f} per m²"
     if row.signal is not None and row.signal.ratio < 1 / MARGIN and row.signal_p[0] < alpha:
-        needed = "{:.3g} → {:.3g}".format(*row.signal.found_from)
+        needed_before, needed_now = row.signal.found_from
         return (
             "worse",
-            f"signals over what is needed {100 * (row.signal.ratio - 1):+.0f} % (needed {needed})",
+            f"signals over what is needed {100 * (row.signal.ratio - 1):+.0f} % "
+            f"(needed {needed_before:.3g} → {needed_now:.3g})",
         )
     if np.isnan(growth):
         why = _lost(second, first)
@@ -269,6 +286,11 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
     if growth < 1 / margin and row.limit_p[1] < alpha:
         return "better", grown
     return ("as good", "") if 1 / MARGIN <= growth <= MARGIN else ("not significant", grown)
+
+
+def _bound(limit: SetUpLimit) -> str:
+    bound = limit.a90_95
+    return f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated"
 
 
 def limit_margin(signal: paired.SignalChange | None) -> float:

@@ -17,12 +17,17 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import program, span
 
 if TYPE_CHECKING:
-    from harness.programs.implant.scans import Scan
+    from detectors.interface import Detector
+    from harness.evaluation.study.record import SetUpRecord
+    from harness.programs.implant.scans import Implanted, Judging, Scan
+    from harness.records.trials import ResultTables
+    from harness.vocabulary.geometry import Cloud
     from scenes.target.drawn import DrawnTargetConfig
 
 DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
-# Most damages of a placement, and share of the scan within half of --apart from them
+# Most damages of a placement
 MOST_AT_ONCE = 8
+# Largest share of the scan within half of --apart from a placement's damages
 FILLED = 0.25
 COMPARED = (
     "virtual damage may be harder to find than real damage: on the only drilled plate where "
@@ -159,82 +164,44 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130
     after Ctrl-C."""
-    from harness.evaluation.study.record import StudyRecord, record_text
-    from harness.evaluation.study.result import evaluate_study
     from harness.inspection.arguments import opened_as
-    from harness.inspection.judging import analysed, refuse_thresholds, threshold_of
-    from harness.programs.implant.scans import Judging, Scan, judge_scans, placements
-    from harness.records.outputs import PROVENANCE, REPORT, STUDY
-    from harness.report.study_page import study_html, study_parts
-    from harness.runs.tables import write_tables
-    from harness.tables.study import study_tables
-    from harness.vocabulary.declaration.yaml_source import to_yaml
-    from harness.vocabulary.files import write_json, write_text
-    from harness.vocabulary.provenance import RESULTS_VERSION, record
-    from harness.vocabulary.seeds import canonical_json, digest
-    from harness.vocabulary.text import show
+    from harness.inspection.judging import refuse_thresholds
+    from harness.programs.implant.scans import Scan, judge_scans
     from scenes.render.scene import load_mitsuba
 
     load_mitsuba()  # must precede Open3D, after which LLVM cannot be loaded
-    options.quiet_capture = options.target = (
-        None  # options of tofpod detect that this program lacks
-    )
+    # options of tofpod detect that this program lacks
+    options.quiet_capture = None
+    options.target = None
     refuse_thresholds(options)
-    numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
-    for name, number in [
-        *numbers,
-        *(("frames", frame_count) for frame_count in options.frames or ()),
-    ]:
-        if not 0 < number < math.inf:
-            raise UserError(f"--{name} {number:g}", legal="above 0")
+    _refuse_numbers(options)
     detector, settings = cli.detector_of(options, options.crop, options.set)
-
-    def own_threshold(cloud: Any) -> tuple[float, tuple[str, ...]]:
-        value, _, evidence = threshold_of(
-            options, detector, cloud, analysed(detector, cloud), lambda: (0.0, "")
-        )
-        return value, evidence.warnings
-
-    judging_options = (options.hit_radius * MM, options.threshold, own_threshold)
-    judging = Judging(options.detector, canonical_json(settings), *judging_options)
+    judging = _judging(options, detector, settings)
     cli.refuse_repeats(options.paths)
     reading = cli.reading_of(options)
-    opened = [
+    recordings = [
         opened_as(options.camera, [path], options.intrinsics, **reading) for path in options.paths
     ]
-    scans = [Scan(recording, judging) for recording in opened]
+    scans = [Scan(recording, judging) for recording in recordings]
     family = _family(options, scans)
-    cache = options.out / ".cache" / "renders"
-    made = []
-    for placement in placements(
-        scans, family, options.camera, options.targets, options.seed, cache
-    ):
-        made.append(placement)
-        print(
-            f"damages rendered: {sum(len(p.implants) for p in made)}, wanted: {options.targets}",
-            file=sys.stderr,
-        )
+    implanted = _implanted(options, scans, family)
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
-    tables, set_ups, warnings = judge_scans(scans, made, family, options.camera, judging, frames)
-    warnings = (*(doubt for scan in scans for doubt in scan.recording.warnings), *warnings)
+    tables, set_ups, doubts = judge_scans(scans, implanted, family, options.camera, judging, frames)
+    warnings = [COMPARED]
+    for recording in recordings:
+        warnings.extend(recording.warnings)
+    warnings.extend(doubts)
 
     area_m2 = sum(scan.area_m2 for scan in scans)
-    recordings = (
-        f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² "
-        "judged"
-    )
+    plural = "s" * (len(scans) > 1)
+    scanned = f"{len(scans)} recording{plural} of {longest} frames, {area_m2:.3g} m² judged"
+    peaks_mm = [implant.depth_mm for placement in implanted for implant in placement.implants]
+    notes = dict.fromkeys(note for recording in recordings for note in recording.notes)
     facts = {
         "implanted": [
-            *_shares(
-                options,
-                recordings,
-                [implant.depth_mm for implanted in made for implant in implanted.implants],
-            ),
-            *(
-                f"Note: {note}."
-                for note in dict.fromkeys(note for recording in opened for note in recording.notes)
-            ),
+            *_shares(options, scanned, peaks_mm),
+            *(f"Note: {note}." for note in notes),
         ],
         "recordings": [str(path) for path in options.paths],
         "camera": options.camera,
@@ -243,19 +210,83 @@ def main(options: argparse.Namespace, command: str) -> int:
         "detector": {"name": options.detector, "settings": settings},
         "family": family.to_data(),
     }
-    origin = record(command) | {
-        "warnings": [COMPARED, *warnings],
-        "seed": options.seed,
-        "failures": [],
-    }
-    title = f"Virtual damage in {recordings}"
-    expected = options.false_calls or cli.DEFAULT_FALSE_CALLS
-    calls = f"{expected:g} false calls a capture: the median over groups of frames."
-    own_text = (
-        "Set by the undamaged frames, as in tofpod detect, by noise towards the camera, for "
-        f"{calls}"
+    _write(options, command, tables, set_ups, facts, warnings, f"Virtual damage in {scanned}")
+    return 0
+
+
+def _refuse_numbers(options: argparse.Namespace) -> None:
+    """Raise UserError for a number that is not above 0."""
+    numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
+    for frame_count in options.frames or ():
+        numbers.append(("frames", frame_count))
+    for name, number in numbers:
+        if not 0 < number < math.inf:
+            raise UserError(f"--{name} {number:g}", legal="above 0")
+
+
+def _judging(options: argparse.Namespace, detector: Detector, settings: dict[str, Any]) -> Judging:
+    """Return the rule by which clouds are judged."""
+    from harness.inspection.judging import analysed, threshold_of
+    from harness.programs.implant.scans import Judging
+    from harness.vocabulary.seeds import canonical_json
+
+    def own_threshold(cloud: Cloud) -> tuple[float, tuple[str, ...]]:
+        """Return the threshold of an undamaged cloud, and warnings."""
+        threshold, _, evidence = threshold_of(
+            options, detector, cloud, analysed(detector, cloud), lambda: (0.0, "")
+        )
+        return threshold, evidence.warnings
+
+    return Judging(
+        detector=options.detector,
+        settings_json=canonical_json(settings),
+        radius_m=options.hit_radius * MM,
+        threshold=options.threshold,
+        threshold_of=own_threshold,
     )
-    thresholds = f"Given as {options.threshold:g}." if options.threshold else own_text
+
+
+def _implanted(
+    options: argparse.Namespace, scans: list[Scan], family: DrawnTargetConfig
+) -> list[Implanted]:
+    """Render all placements of damage, with a line of progress for each."""
+    from harness.programs.implant.scans import placements
+
+    cache = options.out / ".cache" / "renders"
+    implanted = []
+    rendered = 0
+    for placement in placements(
+        scans, family, options.camera, options.targets, options.seed, cache
+    ):
+        implanted.append(placement)
+        rendered += len(placement.implants)
+        print(f"damages rendered: {rendered}, wanted: {options.targets}", file=sys.stderr)
+    return implanted
+
+
+def _write(
+    options: argparse.Namespace,
+    command: str,
+    tables: ResultTables,
+    set_ups: tuple[SetUpRecord, ...],
+    facts: dict[str, Any],
+    warnings: list[str],
+    title: str,
+) -> None:
+    """Write the study's record, its tables and its page, and show it in the terminal."""
+    from harness.evaluation.study.record import StudyRecord, record_text
+    from harness.evaluation.study.result import evaluate_study
+    from harness.records.outputs import PROVENANCE, REPORT, STUDY
+    from harness.report.study_page import study_html, study_parts
+    from harness.runs.tables import write_tables
+    from harness.tables.study import study_tables
+    from harness.vocabulary.declaration.yaml_source import to_yaml
+    from harness.vocabulary.files import write_json, write_text
+    from harness.vocabulary.provenance import RESULTS_VERSION, record
+    from harness.vocabulary.seeds import digest
+    from harness.vocabulary.text import show
+
+    origin = {**record(command), "warnings": warnings, "seed": options.seed, "failures": []}
     recorded_origin = {
         key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")
     }
@@ -264,7 +295,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         digest=digest(facts),
         hit_radius_mm=options.hit_radius,
         false_calls_per_m2=None,
-        provenance={**recorded_origin, "thresholds": thresholds},
+        provenance={**recorded_origin, "thresholds": _thresholds(options)},
         set_ups=set_ups,
     )
     provenance = {
@@ -274,18 +305,25 @@ def main(options: argparse.Namespace, command: str) -> int:
         "digest": study.digest,
     }
     result = evaluate_study(study, tables, facts)
-    write_text(options.out / STUDY.name, record_text(study))
-    write_tables(
-        options.out,
-        {table: table.frame(rows) for table, rows in study_tables(result).items()},
-        provenance,
-    )
-    write_json(options.out / PROVENANCE.name, provenance)
+    frames = {table: table.frame(rows) for table, rows in study_tables(result).items()}
     page = options.out / REPORT.name
+    write_text(options.out / STUDY.name, record_text(study))
+    write_tables(options.out, frames, provenance)
+    write_json(options.out / PROVENANCE.name, provenance)
     write_text(page, study_html(result, (), provenance, to_yaml(facts), title))
-    show([*(f"warning: {text}" for text in (COMPARED, *warnings)), *study_parts(result)])
+    show([*(f"warning: {text}" for text in warnings), *study_parts(result)])
     print(f"report: {page}")
-    return 0
+
+
+def _thresholds(options: argparse.Namespace) -> str:
+    """State how the thresholds were set."""
+    if options.threshold:
+        return f"Given as {options.threshold:g}."
+    expected = options.false_calls or cli.DEFAULT_FALSE_CALLS
+    return (
+        "Set by the undamaged frames, as in tofpod detect, by noise towards the camera, for "
+        f"{expected:g} false calls a capture: the median over groups of frames."
+    )
 
 
 def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig:
@@ -296,13 +334,17 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     from scenes.sensor.common.config import CameraConfig
     from scenes.target.drawn import DrawnTargetConfig
 
-    width_mm, height_mm = (max(float(scan.size_m[axis]) for scan in scans) / MM for axis in (0, 1))
+    width_mm = max(float(scan.size_m[0]) for scan in scans) / MM
+    height_mm = max(float(scan.size_m[1]) for scan in scans) / MM
     apart_mm = options.apart or 2 * options.hit_radius + 10
     room = FILLED * min(scan.area_m2 for scan in scans) / (math.pi / 4 * (apart_mm * MM) ** 2)
     damage = {"kind": options.damage, "per_board": max(1, min(MOST_AT_ONCE, int(room)))}
-    damage |= {"width_mm" if options.damage == "slot" else "diameter_mm": list(options.diameters)}
-    damage |= {"depth_mm": list(options.depths)} if options.depths else {}
-    damage |= {"length_mm": list(options.lengths)} if options.lengths else {}
+    size_name = "width_mm" if options.damage == "slot" else "diameter_mm"
+    damage[size_name] = list(options.diameters)
+    if options.depths:
+        damage["depth_mm"] = list(options.depths)
+    if options.lengths:
+        damage["length_mm"] = list(options.lengths)
     wavelength_nm = camera_of(CameraConfig(name=options.camera)).optics.wavelength_nm
     albedos = {"wavelength_nm": wavelength_nm, "board": options.albedo, "backing": options.albedo}
     try:
