@@ -245,7 +245,7 @@ LEAST_M2 = 1e-14
 
 @dataclass(frozen=True)
 class _Observation:
-    """What one view says about the cells (h, w) of a map."""
+    """The observation of one view of the cells (h, w) of a map."""
 
     height_m: np.ndarray
     """(h, w): deviation from the fitted surface along z; NaN where the view has none."""

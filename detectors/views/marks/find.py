@@ -456,7 +456,10 @@ def _marks(
     notes = tuple[str, ...]()
     if holes:
         notes = (
-            f"{holes} spots of another colour lie behind the surface and count as holes, not marks",
+            (
+                f"{holes} spots of another colour lie behind the surface and count as holes, "
+                "not marks"
+            ),
         )
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 

@@ -69,7 +69,8 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         if gammaincc(half_freedom, tolerant.chi2 / 2) < REFUSE_BELOW:
             problem = (
                 f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, "
-                f"more than noise and {SHARED_M / MM:.0f} mm of each view's own error explain; the "
+                f"more than noise and {SHARED_M / MM:.0f} mm of each view's own error "
+                "explain; the "
                 "targets differ, or a mark moved"
             )
     covariance = placement.covariance
@@ -163,7 +164,7 @@ POSE_TERMS = 3
 
 @dataclass(frozen=True)
 class ViewData:
-    """What one view gives to the adjustment, in its camera frame."""
+    """The part of one view in the adjustment, in its camera frame."""
 
     points_m: np.ndarray
     """(n, 3): thinned points of the target."""

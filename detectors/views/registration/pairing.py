@@ -191,7 +191,8 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
     shortage = ""
     if len(common) < LEAST_MARKS:
         shortage = (
-            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows {shown[0]}, "
+            f"{len(common)} codes in common, {LEAST_MARKS} needed: the reference shows "
+            f"{shown[0]}, "
             f"the view {shown[1]}"
         )
     return Pairing(pairs, shortage, notes)

@@ -152,7 +152,8 @@ def judge(
         return judged
     if not agreement.beside >= registered.MIN_OVERLAP:
         elsewhere = (
-            f"the views do not overlap: {100 * agreement.beside:.0f} % of the view lies beside the "
+            f"the views do not overlap: {100 * agreement.beside:.0f} % of the view lies "
+            "beside the "
             f"reference ({100 * registered.MIN_OVERLAP:.0f} % needed)"
         )
     else:

@@ -165,7 +165,10 @@ def _wanted_mm(options: argparse.Namespace, experiment: Experiment) -> float | N
     set_ups = len(experiment.points)
     if set_ups > 1 and not options.goal:
         raise UserError(
-            f"{experiment.config.name}: has {set_ups} set-ups, but only --goal can compare several",
+            (
+                f"{experiment.config.name}: has {set_ups} set-ups, but only --goal can compare "
+                "several"
+            ),
             fix="choose one set-up with --set, such as sweep={} and the values of its axes",
         )
     size_mm = None

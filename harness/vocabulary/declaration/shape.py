@@ -42,7 +42,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Declared:
-    """What is declared for a document: a model, and the models that belong in its free data."""
+    """The declaration of a document: a model, and the models that belong in its free data."""
 
     # The model of the whole document
     model: type[BaseModel]
