@@ -136,10 +136,7 @@ class CalibrateConfig(Config):
             raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
         if self.boards is None and self.false_calls_per_m2 is not None:
             raise ValueError(
-                
-                    "`false_calls_per_m2` needs `boards`, since repeats of one board cannot "
-                    "show a rate"
-                
+                "`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate"
             )
         return self
 

@@ -145,10 +145,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     )
     print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
     print(
-        
-            f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json; print "
-            "at 100 %"
-        
+        f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json; print at 100 %"
     )
     return 0
 

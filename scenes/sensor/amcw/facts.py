@@ -379,10 +379,7 @@ class AmcwCamera(CameraFacts):
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
             raise ValueError(
-                
-                    f"lens.width_px is {self.lens.width_px.value}; the model allows at most "
-                    f"{widest_px}"
-                
+                f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}"
             )
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
             raise ValueError(

@@ -141,10 +141,7 @@ class ScannedLidar(CameraFacts):
             )
         if len(self.weights) < 3:
             raise ValueError(
-                
-                    "code.period_ns must be longer: fewer than three spectral lines are within "
-                    "the band"
-                
+                "code.period_ns must be longer: fewer than three spectral lines are within the band"
             )
         return self
 

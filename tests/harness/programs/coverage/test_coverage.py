@@ -252,3 +252,21 @@ def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
     # the program says that a single patch's limit may be wrong by 40 %
     assert np.abs(np.log(ratio)).max() < np.log(1.45), dict(zip(studied, ratio, strict=True))
     assert np.sqrt(np.mean(np.log(ratio) ** 2)) < np.log(1.2)
+
+
+def test_the_limit_is_at_least_the_smallest_size_inspected():
+    """A law by which a signal of any size exceeds the threshold says nothing about sizes below
+    those inspected."""
+    law = Findable(
+        size_of="diameter",
+        coefficients=np.array([10.0, 1.0, 0.0, 0.0, 0.0]),
+        scatter=0.1,
+        growth=0.0,
+        ratio=1.1,
+        threshold=1e-3,
+        sizes_mm=(2.0, 8.0),
+        steepest=0.5,
+        damages=30,
+    )
+    frontal = Seen(deviation_m=np.full(3, 1e-3), cosine=np.ones(3), range_m=np.full(3, 0.7))
+    assert law.limits_mm(frontal).tolist() == [2.0, 2.0, 2.0]
