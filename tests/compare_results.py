@@ -436,7 +436,7 @@ def _decoded(content: bytes) -> str:
 def excerpts(old: str, new: str) -> str:
     """Return the parts of two different texts where they begin to differ, as ``OLD -> NEW``."""
     pairs = zip_longest(old, new)
-    first = next(place for place, (before, after) in enumerate(pairs) if before != after)
+    first = next(position for position, (before, after) in enumerate(pairs) if before != after)
     start = max(first - SHOWN_CHARACTERS // 3, 0)
     shown = slice(start, start + SHOWN_CHARACTERS)
     return f"{old[shown]!r} -> {new[shown]!r}"
@@ -466,8 +466,8 @@ def report_lines(comparison: Comparison, shown: int | None) -> Iterator[str]:
     if comparison.exceptions_used:
         yield "exceptions that were applied:"
     for exception, count in comparison.exceptions_used.most_common():
-        what = exception.what[:SHOWN_CHARACTERS]
-        yield f"    {count} files: {exception.reason} ({exception.files} {what!r})"
+        content = exception.what[:SHOWN_CHARACTERS]
+        yield f"    {count} files: {exception.reason} ({exception.files} {content!r})"
     equal_bytes = f"{comparison.equal_bytes} of them equal to the last byte"
     yield f"{comparison.compared} files compared, {equal_bytes}"
     yield f"{len(comparison.differences)} files with differences that no exception covers"

@@ -133,9 +133,9 @@ def test_the_rules_see_a_forbidden_import_and_a_circle(tmp_path):
     for name, text in texts.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    made = structure.module_graph(structure.modules_in(tmp_path))
-    assert structure.circles(made) == [["harness.core", "harness.programs.one.first"]]
-    assert structure.arrows_to_programs(made) == (
+    created = structure.module_graph(structure.modules_in(tmp_path))
+    assert structure.circles(created) == [["harness.core", "harness.programs.one.first"]]
+    assert structure.arrows_to_programs(created) == (
         {("one", "two")},
         {("harness.core", "harness.programs.one.first")},
     )

@@ -69,9 +69,9 @@ def commands_in(path: Path) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
 def test_every_command_is_understood(path: Path):
-    for name, *given in commands_in(path):
-        program, words = importlib.import_module(MODULES[name]).main.chosen_by(given)
-        assert program.parser().parse_args(words), given
+    for name, *arguments in commands_in(path):
+        program, words = importlib.import_module(MODULES[name]).main.chosen_by(arguments)
+        assert program.parser().parse_args(words), arguments
 
 
 def block_of(document: str, first_line: str) -> str:
@@ -86,7 +86,10 @@ def test_the_taste_of_the_readme_is_what_the_program_prints(capsys):
     """Numbers may change with the stored limits; every line must still be there."""
     shown = block_of(
         "README.md",
-        "$ tofpod ask --damage hole --size 7mm --distance 1m --camera azure_kinect_nfov --albedo 0.6",
+        (
+            "$ tofpod ask --damage hole --size 7mm --distance 1m --camera azure_kinect_nfov "
+            "--albedo 0.6"
+        ),
     )
     command, *lines = shown.strip().splitlines()
     assert main(shlex.split(command)[2:]) == 0
@@ -223,12 +226,12 @@ def simulated(
     lens = unit.camera.nominal_lens
     cut = unit.region.within(lens.whole)
     rng = np.random.default_rng(len(place))
-    whole = []
+    complete = []
     for frame in tofpod.frames(unit, 50, seed=int(rng.integers(99))).frames():
         z_m = rng.normal(1.3, 2 * MM, lens.whole.shape) * bool(holes)
         z_m[cut] = np.where(np.isfinite(frame.z_m), frame.z_m, z_m[cut])
-        whole.append(z_m)
-    write_capture(home / place, whole, lens)
+        complete.append(z_m)
+    write_capture(home / place, complete, lens)
 
 
 def seen_at(cloud: Cloud, count: int = 5) -> list[np.ndarray]:
@@ -256,8 +259,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("documents")
     (home / "experiments").symlink_to(ROOT / "experiments")
     (home / "study.yaml").write_text(STUDY.replace("name: tiny", "name: study"))
-    for number, place in enumerate(WALLS):
-        simulated(home, place, 0.8 if "far" in place else 0.5, 15.0 * (number % 3))
+    for number, position in enumerate(WALLS):
+        simulated(home, position, 0.8 if "far" in position else 0.5, 15.0 * (number % 3))
     shutil.copytree(home / "captures" / "wall", home / "captures" / "part")
     simulated(home, "captures/board", 0.5, 0.0, hole_mm=16.0)
 
@@ -294,9 +297,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     rng = np.random.default_rng(4)
     size = rng.uniform(1, 9, 80)
-    found = rng.random(80) < 1 / (1 + np.exp(-2 * (size - 4)))
+    result = rng.random(80) < 1 / (1 + np.exp(-2 * (size - 4)))
     table = pd.DataFrame(
-        {"length": size, "length_mm": size, "diameter_mm": size, "hit": found.astype(int)}
+        {"length": size, "length_mm": size, "diameter_mm": size, "hit": result.astype(int)}
     )
     table = table.assign(found=table["hit"], inspector_A=table["hit"], inspector_B=table["hit"])
     table = table.assign(hole=range(80), board=[f"b{n // 20}" for n in range(80)])
@@ -321,7 +324,7 @@ def already_run() -> set[str]:
 def filled(words: list[str], home: Path) -> list[str]:
     """Return words as a shell and a reader would fill them in: patterns of names, and the digests
     of results."""
-    whole = []
+    complete = []
     for word in words:
         pattern = re.sub(r"<\w+>|\bDIGEST\b", "*", word)
         names = sorted(
@@ -330,12 +333,12 @@ def filled(words: list[str], home: Path) -> list[str]:
         if "<another>" in word:
             names = names[1:]
         if pattern == word and "*" not in word:
-            whole.append(word)
+            complete.append(word)
         elif names:
-            whole += names if "_0*" in word or "part*" in word else names[:1]
+            complete += names if "_0*" in word or "part*" in word else names[:1]
         else:  # a folder that the command makes, named as the one before it
-            whole.append(str(Path(word).parent / Path(whole[-2]).name))
-    return [{"NAME": "azure_kinect_nfov"}.get(word, word) for word in whole]
+            complete.append(str(Path(word).parent / Path(complete[-2]).name))
+    return [{"NAME": "azure_kinect_nfov"}.get(word, word) for word in complete]
 
 
 def prepare(command: str, home: Path) -> None:
@@ -376,13 +379,13 @@ def test_every_command_runs(
     for name, text in re.findall(r"\n    # (\w+\.yaml)\n((?:    .*\n)+)", path.read_text()):
         (home / name).write_text(textwrap.dedent(text))
     monkeypatch.chdir(home)
-    for name, *given in commands_in(path):
-        command = shlex.join([name, *given])
-        known = re.sub(r"experiments/(\w+)\.yaml", r"\1", command)
-        if known not in already_run and not any(part in command for part in ONLY_PARSED):
-            already_run.update({known} if name in IN_RESULTS else ())
+    for name, *arguments in commands_in(path):
+        command = shlex.join([name, *arguments])
+        reference = re.sub(r"experiments/(\w+)\.yaml", r"\1", command)
+        if reference not in already_run and not any(part in command for part in ONLY_PARSED):
+            already_run.update({reference} if name in IN_RESULTS else ())
             prepare(command, home)
-            code = main([name, *shrunk(name, filled(given, home))])
+            code = main([name, *shrunk(name, filled(arguments, home))])
             assert code == 0, f"{command}\n{''.join(capfd.readouterr())}"
 
 

@@ -233,8 +233,8 @@ def targets() -> set[str]:
 def test_every_target_that_is_named_exists(name: str):
     commands = re.findall(r"(?:^ {4}|^|`|run: )make ([^`#\n]+)", text_of(name), re.MULTILINE)
     for command in commands:
-        named = [word for word in shlex.split(command) if not word.startswith("-")]
-        assert set(named) <= targets(), f"make {command}"
+        by_name = [word for word in shlex.split(command) if not word.startswith("-")]
+        assert set(by_name) <= targets(), f"make {command}"
 
 
 def test_all_phony_targets_have_a_recipe():

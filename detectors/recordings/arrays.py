@@ -15,24 +15,29 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens, Reason
 
 LEGAL_ARRAYS = "numeric arrays as written by numpy.save or numpy.savez, without objects"
-LEGAL_MAT = "MATLAB 5 to 7 files (-v6, -v7) of numeric arrays: Location (h, w, 3), (n, 3) or (k, n, 3), and Color"
+LEGAL_MAT = (
+    "MATLAB 5 to 7 files (-v6, -v7) of numeric arrays: Location (h, w, 3), (n, 3) or (k, n, 3), "
+    "and Color"
+)
 LEGAL_RAW = (
-    "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
-    "BYTES before the first frame"
+    "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; "
+    "STEP bytes from pixel to pixel; BYTES before the first frame"
 )
 LEGAL_PICTURES = (
     "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
@@ -56,11 +61,11 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
     or has objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
-            stated = sum(entry.file_size for entry in archive.infolist())
+            unpacked = sum(entry.file_size for entry in archive.infolist())
         fix = f"save its frames as .npy, which is not unpacked; {RAISE}"
-        refuse_bytes(str(path), stated, files.ARRAYS_BYTES, "unpacks to", fix)
-        with np.load(path, allow_pickle=False) as held:
-            return {name: np.asarray(held[name]) for name in held}
+        refuse_bytes(str(path), unpacked, files.ARRAYS_BYTES, "unpacks to", fix)
+        with np.load(path, allow_pickle=False) as archived:
+            return {name: np.asarray(archived[name]) for name in archived}
 
 
 def load_mat(path: Path) -> dict[str, np.ndarray]:
@@ -70,24 +75,25 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     import scipy.io
 
     fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
+    flat = []
     with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
-            # cells and structs hold no frames, and deeply nested ones end the process without a
-            # message
-            flat = [
-                name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")
-            ]
+            for name, _, kind in scipy.io.whosmat(path):
+                # cells and structs hold no frames, and deeply nested ones end the process without
+                # a message
+                if kind not in ("cell", "struct"):
+                    flat.append(name)
         except TypeError as error:
-            raise ValueError(
-                "it holds a MATLAB object, which cannot be read outside MATLAB"
-            ) from error
+            problem = "it holds a MATLAB object, which cannot be read outside MATLAB"
+            raise ValueError(problem) from error
         loaded = scipy.io.loadmat(path, variable_names=flat)
     arrays = {}
     for name, value in loaded.items():
         # MATLAB's scalars are 1 x 1 arrays; text has another kind
         if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size > 1:
-            stacked_last = value.ndim == 4 and value.shape[2] == 3 and value.shape[3] != 3
-            arrays[name] = np.moveaxis(value, -1, 0) if stacked_last else value
+            if value.ndim == 4 and value.shape[2] == 3 and value.shape[3] != 3:
+                value = np.moveaxis(value, -1, 0)
+            arrays[name] = value
     if not arrays:
         raise UserError(f"{path}: holds no numeric array", legal=LEGAL_MAT, fix=fix)
     return arrays
@@ -97,9 +103,8 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
     """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files
     and pictures."""
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(
-        cv2.utils.logging.LOG_LEVEL_SILENT
-    )  # the messages below replace its output
+    # the messages below replace its output
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         with read_errors(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
@@ -110,38 +115,32 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{stack.shape[3]} channels of {stack.dtype}, which is a picture")
     finally:
         cv2.utils.logging.setLogLevel(level)
-    return {
-        "": stack[..., ::-1] if stack.ndim == 4 else stack
-    }  # OpenCV gives the last channel first
+    if stack.ndim == 4:
+        stack = stack[..., ::-1]  # OpenCV gives the last channel first
+    return {"": stack}
 
 
 SENSOR_SIZES = (
-    *(
-        (640, 576),
-        (320, 288),
-        (512, 512),
-        (1024, 1024),
-        (640, 480),
-        (512, 424),
-        (320, 240),
-        (224, 172),
-        (224, 171),
-    ),
-    *(
-        (256, 192),
-        (160, 120),
-        (240, 180),
-        (1024, 768),
-        (1280, 720),
-        (848, 480),
-        (1280, 960),
-        (1280, 1024),
-    ),
+    (640, 576),
+    (320, 288),
+    (512, 512),
+    (1024, 1024),
+    (640, 480),
+    (512, 424),
+    (320, 240),
+    (224, 172),
+    (224, 171),
+    (256, 192),
+    (160, 120),
+    (240, 180),
+    (1024, 768),
+    (1280, 720),
+    (848, 480),
+    (1280, 960),
+    (1280, 1024),
 )  # (width, height) of the depth images of usual cameras
-SAME_SCENE = 0.05
-SEVERAL = 8
-"""Largest relative difference of the median pixel between successive frames, and number of frames
-examined."""
+SAME_SCENE = 0.05  # largest relative difference of the median pixel between successive frames
+SEVERAL = 8  # number of frames examined for it
 NEIGHBOURS = 0.1
 """Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a
 wrong layout by 100 %."""
@@ -149,14 +148,16 @@ wrong layout by 100 %."""
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Whole frames of ``width`` x ``height`` numbers, row by row, from byte ``offset`` of a file
-    on. ``step``: bytes from pixel to pixel, more than a number's if brightness and confidence lie
-    between."""
+    """Loads whole frames of bare numbers, row by row, from a file."""
 
+    # size of a frame, pixels
     width: int
     height: int
+    # numpy's name of the numbers' type
     kind: str
+    # bytes from pixel to pixel: more than a number's if brightness and confidence lie between
     step: int
+    # bytes before the first frame
     offset: int
 
     @classmethod
@@ -170,126 +171,170 @@ class RawLoader:
         width, height, kind, step, offset = match.groups()
         refuse_pixels(f"--raw {text}", int(width), int(height))
         kind = kind or "u2"
-        own = np.dtype(kind).itemsize
-        if int(step or own) < own:
-            raise UserError(
-                f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW
-            )
+        if kind[0] not in "<>":
+            kind = f"<{kind}"
+        item_bytes = np.dtype(kind).itemsize
+        if int(step or item_bytes) < item_bytes:
+            problem = f"--raw {text}: a number of {item_bytes} bytes in every {step}"
+            raise UserError(problem, legal=LEGAL_RAW)
         return cls(
-            int(width),
-            int(height),
-            kind if kind[0] in "<>" else f"<{kind}",
-            int(step or own),
-            int(offset or 0),
+            width=int(width),
+            height=int(height),
+            kind=kind,
+            step=int(step or item_bytes),
+            offset=int(offset or 0),
         )
+
+    @property
+    def _frame_bytes(self) -> int:
+        return self.width * self.height * self.step
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
         """Map the frames (n, h, w). Raises UserError if there is none."""
-        kind = np.dtype(self.kind)
         size = path.stat().st_size - self.offset
-        frame = self.width * self.height * self.step
-        if size < frame:
-            needs = f"a frame of {self.width} x {self.height} numbers in steps of {self.step} bytes needs {frame}"
-            raise UserError(
-                f"{path}: has {size} bytes from byte {self.offset} on, but {needs}", legal=LEGAL_RAW
+        frame_bytes = self._frame_bytes
+        if size < frame_bytes:
+            problem = (
+                f"{path}: has {size} bytes from byte {self.offset} on, but a frame of "
+                f"{self.width} x {self.height} numbers in steps of {self.step} bytes "
+                f"needs {frame_bytes}"
             )
-        content = np.memmap(path, np.uint8, "r", self.offset, (size // frame * frame,))
-        strides = (frame, self.width * self.step, self.step)
-        return {
-            "": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)
-        }
+            raise UserError(problem, legal=LEGAL_RAW)
+        count = size // frame_bytes
+        content = np.memmap(path, np.uint8, "r", self.offset, (count * frame_bytes,))
+        frames = np.ndarray(
+            (count, self.height, self.width),
+            np.dtype(self.kind),
+            content,
+            strides=(frame_bytes, self.width * self.step, self.step),
+        )
+        return {"": frames}
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
         """Return the number of bytes after the last frame. Raises UserError if neighbours differ
         too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
-            what = (
-                f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
+            problem = (
+                f"{path}: in this layout the median pixel differs from its neighbour by "
+                f"{100 * rough:.3g} %: this layout is wrong"
             )
-            raise UserError(
-                f"{path}: {what}: this layout is wrong",
-                legal=LEGAL_RAW,
-                fix=raw_layout_of(path).fix,
-            )
-        return (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
+            raise UserError(problem, legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
+        return (path.stat().st_size - self.offset) % self._frame_bytes
 
 
 def raw_layout_of(path: Path) -> UserError:
     """Return the error for a file of bare numbers, with the layouts of common cameras that fit its
     size."""
     size = path.stat().st_size
-    layouts = {
-        f"{w}x{h}": size // (w * h)
-        for w, h in SENSOR_SIZES
-        if size % (w * h) == 0 and size >= 2 * w * h
-    }
-    ranked = sorted(layouts, key=lambda wh: layouts[wh] != 2)[:4]
-    fitting = " or ".join(
-        f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked
-    )
-    fix = "state the layout" + (f"; its size fits {fitting}" if fitting else "")
+    two_bytes = []
+    other_bytes = []
+    for width, height in SENSOR_SIZES:
+        pixels = width * height
+        if size % pixels or size < 2 * pixels:
+            continue
+        layout = f"--raw {width}x{height}"
+        pixel_bytes = size // pixels
+        if pixel_bytes == 2:
+            two_bytes.append(layout)
+        elif pixel_bytes < 17:
+            other_bytes.append(f"{layout}:u2/{pixel_bytes}")
+        else:  # several frames
+            other_bytes.append(layout)
+    fitting = " or ".join([*two_bytes, *other_bytes][:4])
+    fix = "state the layout"
+    if fitting:
+        fix += f"; its size fits {fitting}"
     return UserError(f"{path}: the layout of its {size} bytes is unknown", legal=LEGAL_RAW, fix=fix)
 
 
 LOADERS: dict[str, ArraysLoader] = {
-    **{".npy": load_npy, ".npz": load_npz, ".mat": load_mat},
-    **dict.fromkeys((".tif", ".tiff", ".pfm"), load_picture),
+    ".npy": load_npy,
+    ".npz": load_npz,
+    ".mat": load_mat,
+    ".tif": load_picture,
+    ".tiff": load_picture,
+    ".pfm": load_picture,
 }
 DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
-LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
+LEGAL_AXES = (
+    "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, "
+    "(n_points, 3)"
+)
 FEWEST_ROWS = 8  # of an image; an array with fewer rows is a table of points
 FRAMES_OF_POINTS = 20
 """(a, b, 3) counts as a frames of b points, not as a grid, from b = 20 a on: no sensor is that
 wide."""
 
-Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
+
+class Stack(NamedTuple):
+    """The frames in a file of arrays."""
+
+    # distances (n, h, w) or points (n, h, w, 3), as they are stored
+    distances: np.ndarray
+    # (n, h, w, 3) uint8
+    rgb: np.ndarray | None
+    # (n, h, w) float32
+    amplitude: np.ndarray | None
+    # whether there is a pixel grid
+    organised: bool
+    # how the axes were interpreted, "" if they are usual
+    note: str
+
+
 """Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a
 note on the axes."""
 
 
-def open_arrays(path: Path, given: Given) -> Recording:
+def open_arrays(path: Path, options: CaptureOptions) -> Recording:
     """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array
     or several fit."""
-    load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
-    if given.pitch is not None:
-        return _open_height_map(path, load, given)
-    distances, _, _, organised, note = _stack(path, load, given)
+    load = LOADERS[path.suffix.lower()] if options.raw is None else RawLoader.stated(options.raw)
+    if options.pitch is not None:
+        return _open_height_map(path, load, options)
+    first = _stack(path, load, options)
+    distances = first.distances
     left_over = load.refuse_doubtful(path, distances) if isinstance(load, RawLoader) else 0
-    if distances.ndim == 3:
-        _refuse_other_planes(str(path), given.array or "", distances, left_over)
-    height, width = distances.shape[1:3]
     lens: Lens | None = None
-    files: tuple[Path, ...] = ()
+    lens_files: tuple[Path, ...] = ()
     if distances.ndim == 3:
+        _refuse_other_planes(str(path), options.array or "", distances, left_over)
+        _, height, width = distances.shape
         hint = "; for a height map, state the distance between its pixels: --pitch 0.5mm"
-        lens, files = lens_for(
-            str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint
-        )
-    scale_m = given.scale_m or default_metres(distances.dtype)
+        beside = [path.parent, path.parent.parent]
+        lens, lens_files = lens_for(str(path), options, width, height, beside=beside, hint=hint)
+    scale_m = options.scale_m or default_metres(distances.dtype)
 
     def read() -> Iterator[Frame]:
         # ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole
-        distances, *beside, _, _ = _stack(path, load, given)
-        for i, stored in enumerate(distances):
-            rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
+        stack = _stack(path, load, options)
+        for i, stored in enumerate(stack.distances):
+            rgb = None if stack.rgb is None else stack.rgb[i]
+            amplitude = None if stack.amplitude is None else stack.amplitude[i]
             yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
 
-    is_whole = distances.dtype.kind in "iu"
-    more = {"files": (path, *files), "lens": lens, "organised": organised, "notes": (note,)}
-    return Recording.begun(path.name, read, scale_m, is_whole, **more)
+    return Recording.begun(
+        path.name,
+        read,
+        scale_m,
+        is_whole=distances.dtype.kind in "iu",
+        files=(path, *lens_files),
+        lens=lens,
+        organised=first.organised,
+        notes=(first.note,),
+    )
 
 
-def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording:
+def open_array_list(paths: Sequence[Path], options: CaptureOptions, name: str) -> Recording:
     """Open files of arrays of one kind as one capture, in the order given. Raises UserError as
     `open_arrays` does."""
-    first = open_arrays(paths[0], given)
+    first = open_arrays(paths[0], options)
 
     def read() -> Iterator[Frame]:
         for path in paths:
-            yield from open_arrays(path, given).read()
+            yield from open_arrays(path, options).read()
 
     return replace(first, name=name, read=read, files=(*paths, *first.files[1:]))
 
@@ -297,51 +342,60 @@ def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording
 def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
     """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y,
     colour or amplitude."""
-    changed = [
-        each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)
-    ]
-    worst = max(changed, default=0.0)
+    worst = 0.0
+    for before, after in pairwise(frames[:SEVERAL]):
+        difference = _apart(before, after)
+        if math.isfinite(difference):
+            worst = max(worst, difference)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
-        more = f" and {left_over} bytes more" * bool(left_over)
-        what = f"{name}: {len(frames)} planes{more}; the median pixel differs by"
-        what += f" {100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness or confidence?"
+        remainder = f" and {left_over} bytes more" if left_over else ""
+        problem = (
+            f"{name}: {len(frames)} planes{remainder}; the median pixel differs by "
+            f"{100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness "
+            "or confidence?"
+        )
         fix = f"choose the plane that holds depth by its number from 0: --array {key}:N"
-        raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
+        raise UserError(problem, legal="frames of one scene, or one plane", fix=fix)
 
 
-def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
+def _stack(path: Path, load: ArraysLoader, options: CaptureOptions) -> Stack:
     """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis
     first."""
     arrays = load(path)
-    name, array = _named_array(str(path), arrays, DISTANCE_NAMES, given.array)
+    name, array = _named_array(str(path), arrays, DISTANCE_NAMES, options.array)
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
-    note = ""
-    if (
-        array.ndim == 4 and 1 in array.shape[1::2]
-    ):  # (n, 1, h, w) or (n, h, w, 1), as networks take images
+    # (n, 1, h, w) or (n, h, w, 1), as networks take images
+    if array.ndim == 4 and 1 in array.shape[1::2]:
         array = array.squeeze(axis=1 if array.shape[1] == 1 else 3)
+    note = ""
     if _frames_are_last(array):
         note = f"{name} {array.shape}: the frames are assumed to lie along the last axis"
         array = np.moveaxis(array, -1, 0)
-    has_points, shape, organised = _axes(name, array.shape, given.lens)
+    has_points, shape, organised = _axes(name, array.shape, options.lens)
     refuse_pixels(name, shape[2], shape[1])
-    beside = {key.lower(): value for key, value in arrays.items() if value.dtype.kind in "biuf"}
-
-    def named(names: Sequence[str], size: int) -> np.ndarray | None:
-        found = next((beside[key] for key in names if key in beside), None)
-        return found if found is not None and found.size == size else None
-
-    rgb = named(COLOUR_NAMES, 3 * math.prod(shape))
-    amplitude = named(AMPLITUDE_NAMES, math.prod(shape))
+    pixels = math.prod(shape)
+    rgb = _companion(arrays, COLOUR_NAMES, 3 * pixels)
     if rgb is not None:
         if rgb.dtype.kind == "f":
-            rgb = np.nan_to_num(
-                np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255)
-            )
+            # floating-point colours run from 0 to 1 or to 255
+            levels = rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb
+            rgb = np.nan_to_num(np.clip(np.rint(levels), 0, 255))
         rgb = rgb.astype(np.uint8).reshape(*shape, 3)
-    amplitude = None if amplitude is None else amplitude.reshape(shape).astype(np.float32)
-    return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised, note
+    amplitude = _companion(arrays, AMPLITUDE_NAMES, pixels)
+    if amplitude is not None:
+        amplitude = amplitude.reshape(shape).astype(np.float32)
+    distances = array.reshape((*shape, 3) if has_points else shape)
+    return Stack(distances, rgb, amplitude, organised, note=note)
+
+
+def _companion(arrays: Arrays, names: Sequence[str], size: int) -> np.ndarray | None:
+    """Return the first array with one of the names, in any case, if it has this size."""
+    numeric = {key.lower(): value for key, value in arrays.items() if value.dtype.kind in "biuf"}
+    for key in names:
+        if key in numeric:
+            return numeric[key] if numeric[key].size == size else None
+    return None
 
 
 def _frames_are_last(array: np.ndarray) -> bool:
@@ -350,9 +404,10 @@ def _frames_are_last(array: np.ndarray) -> bool:
     everywhere, repeated distances are."""
     if not _is_deep(array):
         return False
-    return array.shape[2] != 3 or all(
-        _apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1)
-    )
+    if array.shape[2] != 3:
+        return True
+    last = array[..., 2]
+    return all(_apart(array[..., k], last) < SAME_SCENE for k in (0, 1))
 
 
 def _is_deep(array: np.ndarray) -> bool:
@@ -361,75 +416,82 @@ def _is_deep(array: np.ndarray) -> bool:
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
     """Return the median relative difference where both have a number; infinity if there is none."""
-    both = (first > 0) & (second > 0)
-    before = first[both].astype(np.float64)
-    after = second[both].astype(np.float64)
-    return float(np.median(np.abs(before - after) / before)) if both.any() else float("inf")
+    is_common = (first > 0) & (second > 0)
+    if not is_common.any():
+        return float("inf")
+    before = first[is_common].astype(np.float64)
+    after = second[is_common].astype(np.float64)
+    return float(np.median(np.abs(before - after) / before))
 
 
 def _named_array(
-    name: str, arrays: Arrays, usual: Sequence[str], given: str | None
+    name: str, arrays: Arrays, usual: Sequence[str], selector: str | None
 ) -> tuple[str, np.ndarray]:
     """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else
     the only one."""
-    held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
-    key, _, number = (given or "").partition(":")
-    if not key:
-        found = [key for key in arrays if key.lower() in usual]
-        found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
-        if len(found) != 1:
-            what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
-            fix = (
-                f"choose one, for instance --array {found[0]} (add --pitch for a height map)"
-                if found
-                else None
-            )
-            raise UserError(
-                what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix
-            )
-        (key,) = found
+    shapes = [f"{key} {value.shape}".strip() for key, value in arrays.items()]
+    contents = ", ".join(shapes) or "nothing"
+    key, _, number = (selector or "").partition(":")
+    key = key or _likely_key(name, arrays, usual, contents)
     if key not in arrays:
-        raise UserError(
-            f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}"
-        )
+        fix = f"--array {next(iter(arrays), '')}"
+        raise UserError(f"{name}: holds no array {key}", legal=contents, fix=fix)
     array = arrays[key]
-    name = f"{name}: {key}" if key else name
+    if key:
+        name = f"{name}: {key}"
     if number:
-        array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
+        if _is_deep(array) and array.shape[2] != 3:
+            array = np.moveaxis(array, -1, 0)
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
-            raise UserError(
-                f"--array {given}: no such part of {name} {array.shape}",
-                legal="NAME, or NAME:0 onwards",
-            )
+            problem = f"--array {selector}: no such part of {name} {array.shape}"
+            raise UserError(problem, legal="NAME, or NAME:0 onwards")
         array = array[int(number)]
-        name = f"{name if key else name + ': '}:{number}"
+        name = f"{name}:{number}" if key else f"{name}: :{number}"
     refuse_narrow(name, array.dtype)
     return name, array
+
+
+def _likely_key(name: str, arrays: Arrays, usual: Sequence[str], contents: str) -> str:
+    """Return the name of the only array that may hold the depth. Raises UserError if there are
+    none or several."""
+    candidates = [key for key in arrays if key.lower() in usual]
+    candidates = candidates or [key for key in arrays if "depth" in key.lower()] or list(arrays)
+    if len(candidates) == 1:
+        return candidates[0]
+    fix = None
+    if candidates:
+        fix = f"choose one, for instance --array {candidates[0]} (add --pitch for a height map)"
+    raise UserError(
+        f"{name}: no array, or several arrays, that could be the depth (it holds {contents})",
+        legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}",
+        fix=fix,
+    )
 
 
 def _axes(
     name: str, shape: tuple[int, ...], lens: Lens | None
 ) -> tuple[bool, tuple[int, int, int], bool]:
     """Return (holds points, (n, h, w), has a pixel grid) of an array's shape."""
-    is_lists = shape[-1:] == (3,) and (
-        len(shape) == 2 or (len(shape) == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0])
-    )
+    dimensions = len(shape)
+    is_lists = False
+    if shape[-1:] == (3,):
+        is_wide = dimensions == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0]
+        is_lists = dimensions == 2 or is_wide
     if is_lists:
         frames, points = (1, *shape[:-1])[-2:]
         if lens is not None and points == lens.width * lens.height:
             return True, (frames, lens.height, lens.width), True
         return True, (frames, 1, points), False
-    has_points = len(shape) in (3, 4) and shape[-1] == 3
-    n, *grid = (1, 1, *(shape[:-1] if has_points else shape))[-3:]
-    is_table = len(shape) == 2 and min(shape) < FEWEST_ROWS
-    if (len(shape) == 4 and not has_points) or len(shape) not in (2, 3, 4) or is_table:
-        fix = (
-            "if rows hold more numbers than x, y and z, save only these: array[:, :3]"
-            if is_table
-            else None
-        )
+    has_points = dimensions in (3, 4) and shape[-1] == 3
+    is_table = dimensions == 2 and min(shape) < FEWEST_ROWS
+    is_stack_of_stacks = dimensions == 4 and not has_points
+    if is_stack_of_stacks or dimensions not in (2, 3, 4) or is_table:
+        fix = None
+        if is_table:
+            fix = "if rows hold more numbers than x, y and z, save only these: array[:, :3]"
         raise UserError(f"{name}: a shape of {shape} is not a capture", legal=LEGAL_AXES, fix=fix)
-    return has_points, (n, grid[0], grid[1]), True
+    n, height, width = (1, 1, *(shape[:-1] if has_points else shape))[-3:]
+    return has_points, (n, height, width), True
 
 
 HEIGHT_NAMES = ("height", "heights", "heightmap", "height_map", "elevation", "dem", "map", "h", "z")
@@ -445,47 +507,65 @@ RELIEF = (5e-4, 0.5)
 only one fits."""
 
 
-def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
+def _open_height_map(path: Path, load: ArraysLoader, options: CaptureOptions) -> Recording:
     """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be
     determined."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
+    pitch_m = _pitch_m(options.pitch or "")
+    name, heights = _map_in(path, load, options.array)
+    finite_heights = heights[np.isfinite(heights)].astype(np.float64)
+    if finite_heights.size == 0:
+        legal = "numbers, and NaN where there is no height"
+        raise UserError(f"{name}: has no finite height", legal=legal)
+    relief = float(np.ptp(np.quantile(finite_heights, (0.01, 0.99))))
+    height, width = heights.shape
+    side_m = min(height, width) * pitch_m
+    span = f"{relief:.4g} over {1e3 * side_m:.4g} mm"
+    scale_m = options.scale_m
+    if scale_m is None:
+        scale_m = _height_unit_m(relief, side_m)
+    if scale_m is None:
+        problem = f"{name}: the unit of its heights is not stated: they span {span}"
+        raise UserError(problem, fix="state it: --unit mm, --unit m or --unit um")
+    is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
+    signed_m = -scale_m
+    direction = "grow towards the viewer: holes are low"
+    if is_down:
+        signed_m = scale_m
+        direction = "grow away from the viewer, as its name says"
+    note = (
+        f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; "
+        f"its numbers {direction}"
+    )
+    return Recording(
+        name=path.name,
+        read=partial(_map_frames, path, load, options.array, pitch_m, signed_m),
+        shape=(height, width),
+        scale_m=scale_m,
+        # whole numbers were rounded, others were not
+        z_step_m=0.0 if (finite_heights % 1).any() else scale_m,
+        files=(path,),
+        notes=(note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm"),
+        unit_from=f"the map's relief, {span} (--unit states another)",
+        projection="parallel",
+    )
+
+
+def _pitch_m(text: str) -> float:
+    """Parse the distance between a map's pixels, metres. Raises UserError for anything else."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", text.strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
         legal = "the distance between pixels with its unit, for instance 0.5mm, 200um or 0.001m"
-        raise UserError(f"--pitch {given.pitch}: is not a length", legal=legal)
-    name, heights = _map_in(path, load, given.array)
-    known = heights[np.isfinite(heights)].astype(np.float64)
-    if known.size == 0:
-        raise UserError(
-            f"{name}: has no finite height", legal="numbers, and NaN where there is no height"
-        )
-    relief = float(np.ptp(np.quantile(known, (0.01, 0.99))))
-    height, width = heights.shape
-    side_m = min(height, width) * pitch_m
-    plausible = (
-        UNITS_M[u]
-        for u in ("mm", "m", "um")
-        if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1]
-    )
-    scale_m = next(plausible, None) if given.scale_m is None else given.scale_m
-    if scale_m is None:
-        what = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
-        raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
-    is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
-    direction = (
-        "grow away from the viewer, as its name says"
-        if is_down
-        else "grow towards the viewer: holes are low"
-    )
-    z_step_m = 0.0 if (known % 1).any() else scale_m  # whole numbers were rounded, others were not
-    read = partial(_map_frames, path, load, given.array, pitch_m, scale_m if is_down else -scale_m)
-    note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
-    notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
-    origin = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
-    found = Recording(
-        path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin
-    )
-    return replace(found, projection="parallel")
+        raise UserError(f"--pitch {text}: is not a length", legal=legal)
+    return pitch_m
+
+
+def _height_unit_m(relief: float, side_m: float) -> float | None:
+    """Return the unit in which a relief is plausible over a map's shorter side, None if none is."""
+    for unit in ("mm", "m", "um"):
+        if RELIEF[0] <= relief * UNITS_M[unit] / side_m < RELIEF[1]:
+            return UNITS_M[unit]
+    return None
 
 
 def _map_frames(
@@ -493,17 +573,15 @@ def _map_frames(
 ) -> Iterator[Frame]:
     """Yield the map as a frame. If ``scale_m`` is below 0, heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)
-    known = np.isfinite(heights)
+    is_finite = np.isfinite(heights)
     z_m = scale_m * heights.astype(np.float64)
-    z_m += DISTANCE_M - (np.median(z_m[known]) if known.any() else 0.0)
-    z_m[~known] = np.nan
-    v, u = np.mgrid[: heights.shape[0], : heights.shape[1]]
-    xy_m = (
-        np.stack([u - (heights.shape[1] - 1) / 2, v - (heights.shape[0] - 1) / 2], axis=-1)
-        * pitch_m
-    )
-    xy_m[~known] = np.nan
-    reason = np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
+    z_m += DISTANCE_M - (np.median(z_m[is_finite]) if is_finite.any() else 0.0)
+    z_m[~is_finite] = np.nan
+    rows, columns = heights.shape
+    v, u = np.mgrid[:rows, :columns]
+    xy_m = np.stack([u - (columns - 1) / 2, v - (rows - 1) / 2], axis=-1) * pitch_m
+    xy_m[~is_finite] = np.nan
+    reason = np.where(is_finite, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
     yield Frame(name, z_m.astype(np.float32), reason, xy_m=xy_m)
 
 
@@ -511,11 +589,16 @@ def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.
     """Return the name and the map (h, w). Raises UserError for several maps, which are not frames
     of one capture."""
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
-    values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
+    if values.ndim == 3 and values.shape[0] == 1:
+        values = values[0]
     if values.ndim == 3:
-        what = f"{name}: {values.shape[0]} maps of {values.shape[2]} x {values.shape[1]} pixels"
-        fix = f"choose one by its number: --array {(array or '').partition(':')[0]}:0"
-        raise UserError(what, legal="one map: different maps are not averaged", fix=fix)
+        count, rows, columns = values.shape
+        key = (array or "").partition(":")[0]
+        raise UserError(
+            f"{name}: {count} maps of {columns} x {rows} pixels",
+            legal="one map: different maps are not averaged",
+            fix=f"choose one by its number: --array {key}:0",
+        )
     if values.ndim != 2 or min(values.shape) < 2:
         legal = "(h, w), or (n, h, w) with --array NAME:NUMBER"
         raise UserError(f"{name}: a shape of {values.shape} is not a height map", legal=legal)

@@ -21,7 +21,7 @@ from detectors.recordings.depth_images import NOT_DEPTH
 from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
-from detectors.recordings.recording import NO_GRID, Given, Recording, read_errors
+from detectors.recordings.recording import NO_GRID, CaptureOptions, Recording, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Lens
@@ -39,19 +39,21 @@ MAX_MESSAGE_BYTES = 2**28  # 256 MiB: a cloud of four million points with 64 byt
 
 @dataclass(frozen=True)
 class Bag:
-    """The bag at ``path``. ``files``: they hold the messages, in order."""
+    """A ROS bag, as its recorder left it."""
 
+    # the folder or file that the user names
     path: Path
+    # the files that hold the messages, in order
     files: tuple[Path, ...]
+    # the description in a folder of ROS 2
     metadata: Path | None = None
 
     @cached_property
     def topics(self) -> dict[str, str]:
-        """Return the message type of each topic, sorted; for a topic with several types, the last."""
+        """Return the message type of each topic, sorted; the last of several types."""
         with self._opened() as reader:
-            return dict(
-                sorted((connection.topic, connection.msgtype) for connection in reader.connections)
-            )
+            pairs = [(connection.topic, connection.msgtype) for connection in reader.connections]
+        return dict(sorted(pairs))
 
     def first(self, topic: str) -> Any:
         """Return the first message of a topic, None if it has none."""
@@ -65,19 +67,19 @@ class Bag:
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
             wanted = [connection for connection in reader.connections if connection.topic == topic]
-            found = reader.messages(wanted) if wanted else iter(())
+            stored_messages = reader.messages(wanted) if wanted else iter(())
             for number in count():
                 name = f"{self.path.name} {topic} message {number}"
                 with self._readable():
-                    item = next(found, None)
+                    item = next(stored_messages, None)
                     if item is None:
                         break
-                    if len(item[2]) > MAX_MESSAGE_BYTES:
-                        most = f"{MAX_MESSAGE_BYTES >> 20} MiB"
-                        raise UserError(
-                            f"{name}: has more than {most}", legal=f"messages up to {most}"
-                        )
-                    message = decode(item[2], item[0].msgtype)
+                    connection, _, content = item
+                    if len(content) > MAX_MESSAGE_BYTES:
+                        limit = f"{MAX_MESSAGE_BYTES >> 20} MiB"
+                        legal = f"messages up to {limit}"
+                        raise UserError(f"{name}: has more than {limit}", legal=legal)
+                    message = decode(content, connection.msgtype)
                 yield name, message
 
     @property
@@ -85,13 +87,13 @@ class Bag:
         return self.path.suffix.lower() == ROS1_SUFFIX
 
     def _readable(self) -> AbstractContextManager[None]:
-        mend = (
-            f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
-        )
-        what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is not a bag"
-        return read_errors(
-            what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}"
-        )
+        mend = "ros2 bag reindex, or mcap recover"
+        if self._is_ros1:
+            mend = f"rosbag reindex {self.path}"
+        files = ", ".join(map(str, self.files))
+        problem = f"{files}: is truncated or damaged, or is not a bag"
+        fix = f"copy it again; if the recording was cut off, run: {mend}"
+        return read_errors(problem, LEGAL_BAG, fix)
 
     @contextmanager
     def _opened(self) -> Iterator[Reader | Ros1Reader]:
@@ -122,9 +124,9 @@ def is_bag(path: Path) -> bool:
         if any(_holds_messages(inside) for inside in path.iterdir()):
             return True
         metadata = path / METADATA
-        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.open("rb").read(
-            MAX_BYTES
-        )
+        if not metadata.is_file():
+            return False
+        return b"rosbag2_bagfile_information" in metadata.open("rb").read(MAX_BYTES)
     except OSError:
         return False
 
@@ -136,27 +138,33 @@ def find_bag(path: Path) -> Bag:
         return Bag(path, (path,))
     metadata = path / METADATA
     if not metadata.is_file():
-        held = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
-        what = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}"
+        pieces = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
         raise UserError(
-            what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex"
+            f"{path}: has no {METADATA} (the recorder writes it when it stops), "
+            f"but {', '.join(pieces)}",
+            legal=LEGAL_BAG,
+            fix="name that file itself, or run: ros2 bag reindex",
         )
+    problem = f"{metadata}: is not a description of a ROS 2 bag, or is cut off"
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
-    with read_errors(
-        f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix
-    ):
+    with read_errors(problem, LEGAL_BAG, fix):
         info = read_yaml(metadata).data["rosbag2_bagfile_information"]
         files = tuple(path / Path(name).name for name in info["relative_file_paths"])
         mode = str(info.get("compression_mode") or "none").lower()
     if mode == "file":
         fix = f"unpack it (zstd -d {files[0] if files else path}) and name the unpacked file"
         raise UserError(f"{path}: its files are compressed as a whole", legal=LEGAL_BAG, fix=fix)
-    absent = [
-        file.name for file in files if not (file.is_file() and file.suffix.lower() in BAG_SUFFIXES)
-    ]
+    absent = []
+    for file in files:
+        if not file.is_file() or file.suffix.lower() not in BAG_SUFFIXES:
+            absent.append(file.name)
     if absent or not files:
-        what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is missing or is not a file that can be read"
-        raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
+        raise UserError(
+            f"{path}: {METADATA} names {', '.join(absent) or 'no file'}, "
+            "which is missing or is not a file that can be read",
+            legal=LEGAL_BAG,
+            fix="copy the whole folder again",
+        )
     return Bag(path, files, metadata)
 
 
@@ -174,19 +182,17 @@ RAY_TOLERANCE_PX = 0.01
 of float32."""
 
 
-def open_bag(path: Path, given: Given) -> Recording:
+def open_bag(path: Path, options: CaptureOptions) -> Recording:
     """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens
     does not fit."""
     bag = find_bag(path)
-    chosen, note = _chosen_topic(bag, given)
+    chosen, note = _chosen_topic(bag, options)
     if bag.first(chosen) is None:
-        raise UserError(
-            f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again"
-        )
-    recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(
-        bag, chosen, given
-    )
-    files = (*bag.files, *filter(None, (bag.metadata, given.intrinsics)))
+        problem = f"{path}: no message on {chosen}"
+        raise UserError(problem, legal="clouds or depth images", fix="record again")
+    opener = _open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images
+    recording = opener(bag, chosen, options)
+    files = (*bag.files, *filter(None, (bag.metadata, options.intrinsics)))
     return replace(recording, files=files, notes=(note, *recording.notes))
 
 
@@ -198,126 +204,156 @@ def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Fra
         yield replace(frame, xy_m=None) if by_lens else frame
 
 
-def _open_clouds(bag: Bag, topic: str, given: Given) -> Recording:
-    scale_m = given.scale_m or UNITS_M["m"]
+def _open_clouds(bag: Bag, topic: str, options: CaptureOptions) -> Recording:
+    scale_m = options.scale_m or UNITS_M["m"]
     first = next(_frames(bag, topic, scale_m, by_lens=False))
     height, width = first.z_m.shape
-    lens = read_lens(given.intrinsics, width, height) if given.intrinsics else given.lens
+    lens = options.lens
+    if options.intrinsics:
+        lens = read_lens(options.intrinsics, width, height)
     note = ""
     if lens is not None:
-        if (lens.height, lens.width) != (height, width):
-            what = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
-            raise UserError(f"{bag.path}: {what}")
-        if (off := _off_ray_px(lens, first)) > RAY_TOLERANCE_PX:
-            what = f"the named lens does not fit these points: they lie up to {off:.2g} pixels beside its rays"
-            fix = "leave --intrinsics out: the points are then used as they are stored"
-            raise UserError(f"{bag.path}: {what}", fix=fix)
+        _refuse_misfit(bag, lens, first)
     elif height == 1:
         note = NO_GRID
     else:
-        messages = (bag.first(name) for name, kind in bag.topics.items() if kind == INFO_TYPE)
-        found = (
-            lens_of_info(message, (height, width)) for message in messages if message is not None
-        )
-        fitting = (
-            each
-            for each in found
-            if isinstance(each, Lens) and _off_ray_px(each, first) <= RAY_TOLERANCE_PX
-        )
-        lens = next(fitting, None)
+        lens = _lens_of_points(bag, first)
         if lens is None:
             note = "no CameraInfo in the bag fits the points; each frame's own x and y are averaged"
-    read = partial(_frames, bag, topic, scale_m, lens is not None)
-    unit_from = "ROS, whose clouds are in metres"
-    more = {"lens": lens, "organised": height > 1, "unit_from": unit_from, "notes": (note,)}
-    return Recording.begun(bag.path.name, read, scale_m, **more)
+    return Recording.begun(
+        bag.path.name,
+        partial(_frames, bag, topic, scale_m, lens is not None),
+        scale_m,
+        lens=lens,
+        organised=height > 1,
+        unit_from="ROS, whose clouds are in metres",
+        notes=(note,),
+    )
 
 
-def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
+def _refuse_misfit(bag: Bag, lens: Lens, frame: Frame) -> None:
+    """Raise UserError if a cloud's points do not lie on the rays of the lens."""
+    height, width = frame.z_m.shape
+    if (lens.height, lens.width) != (height, width):
+        raise UserError(
+            f"{bag.path}: clouds of {width} x {height} points, "
+            f"but the lens is of {lens.width} x {lens.height}"
+        )
+    off_px = _off_ray_px(lens, frame)
+    if off_px > RAY_TOLERANCE_PX:
+        raise UserError(
+            f"{bag.path}: the named lens does not fit these points: "
+            f"they lie up to {off_px:.2g} pixels beside its rays",
+            fix="leave --intrinsics out: the points are then used as they are stored",
+        )
+
+
+def _lens_of_points(bag: Bag, frame: Frame) -> Lens | None:
+    """Return the lens of the first CameraInfo whose rays pass through a cloud's points."""
+    for name, kind in bag.topics.items():
+        message = bag.first(name) if kind == INFO_TYPE else None
+        if message is None:
+            continue
+        lens = lens_of_info(message, frame.z_m.shape)
+        if isinstance(lens, Lens) and _off_ray_px(lens, frame) <= RAY_TOLERANCE_PX:
+            return lens
+    return None
+
+
+def _open_images(bag: Bag, topic: str, options: CaptureOptions) -> Recording:
     name, message = next(bag.messages(topic))
     stored = stored_depth(name, message)
     height, width = stored.shape
     is_whole = stored.dtype.kind == "u"
-    own = partial(_lens_of_images, bag, topic, (height, width))
-    lens, _ = lens_for(str(bag.path), given, width, height, own)
-    scale_m = given.scale_m
+    capture_lens = partial(_lens_of_images, bag, topic, (height, width))
+    lens, _ = lens_for(str(bag.path), options, width, height, capture_lens)
+    scale_m = options.scale_m
     unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
-    for name, kind in bag.topics.items():
-        # RealSense's viewer states the unit with a sensor's streams
-        sensor, _, option = name.partition("/option/")
-        is_stated = (
-            kind == UNIT_TYPE
-            and option.startswith("Depth_Units")
-            and topic.startswith(sensor + "/")
-        )
-        if scale_m is None and is_whole and is_stated:
-            message = bag.first(name)
-            if message is not None and 1e-6 <= message.data <= 1:
-                # the option is a float32: 0.00025 is stored as 0.00025000001
-                scale_m = float(f"{message.data:.6g}")
-                unit_from = name
+    if scale_m is None and is_whole:
+        stated = _stated_unit(bag, topic)
+        if stated is not None:
+            unit_from, scale_m = stated
     scale_m = scale_m or default_metres(stored.dtype)
     read = partial(_frames, bag, topic, scale_m, by_lens=False)
     return Recording.begun(bag.path.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
 
 
-def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
+def _stated_unit(bag: Bag, topic: str) -> tuple[str, float] | None:
+    """Return the topic that states the unit of a depth topic, and the unit in metres: RealSense's
+    viewer states it with a sensor's streams."""
+    for name, kind in bag.topics.items():
+        sensor, _, option = name.partition("/option/")
+        is_unit = kind == UNIT_TYPE and option.startswith("Depth_Units")
+        if is_unit and topic.startswith(sensor + "/"):
+            message = bag.first(name)
+            if message is not None and 1e-6 <= message.data <= 1:
+                # the option is a float32: 0.00025 is stored as 0.00025000001
+                return name, float(f"{message.data:.6g}")
+    return None
+
+
+def _chosen_topic(bag: Bag, options: CaptureOptions) -> tuple[str, str]:
     """Return the topic to read, and a note on the other topics."""
     path = bag.path
     topics = bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     images = _depth_topics(bag)
-    both = ", ".join([*clouds, *images])
-    held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
+    depth_topics = ", ".join([*clouds, *images])
+    contents = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
-    if given.topic is not None:
-        name = given.topic if given.topic in topics else f"/{given.topic}"
+    if options.topic is not None:
+        name = options.topic if options.topic in topics else f"/{options.topic}"
         if name not in topics:
-            raise UserError(
-                f"{path}: no topic {given.topic}; its topics: {held}", legal=both or LEGAL_BAG
-            )
+            problem = f"{path}: no topic {options.topic}; its topics: {contents}"
+            raise UserError(problem, legal=depth_topics or LEGAL_BAG)
         if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
         return name, ""
+    if len(images) == 1:
+        has_lens = options.intrinsics or options.lens or _infos_of(bag, images[0])
+        if not clouds:
+            return images[0], ""
+        if has_lens:
+            clause = f"with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
+            return images[0], f"the depth images on {images[0]} are read, {clause}"
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
-    if len(images) == 1 and (
-        not clouds or given.intrinsics or given.lens or _infos_of(bag, images[0])
-    ):
-        also = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
-        return images[0], f"the depth images on {images[0]} are read{also}" if clouds else ""
     if len(usual) == 1:
-        also = f"; depth images: {', '.join(images)}; --topic chooses"
-        return usual[0], f"the clouds on {usual[0]} are read{also}" if images else ""
-    if not both:
-        fix = "record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info"
+        note = ""
+        if images:
+            note = f"the clouds on {usual[0]} are read; depth images: {', '.join(images)}"
+            note += "; --topic chooses"
+        return usual[0], note
+    if not depth_topics:
         raise UserError(
-            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}",
+            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {contents}",
             legal=kinds,
-            fix=fix,
+            fix="record the camera's depth with its lens: "
+            "ros2 bag record /depth/image_raw /depth/camera_info",
         )
-    own = next((topic for topic in images if _infos_of(bag, topic)), "")
-    found = (
-        f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
-    )
-    fix = f"choose one, for instance --topic {own or (images or clouds)[0]}"
-    raise UserError(f"{path}: {found}", legal=both, fix=fix)
+    problem = f"{len(images)} topics hold depth images"
+    if clouds:
+        problem = f"{len(clouds)} topics hold clouds"
+    calibrated = [topic for topic in images if _infos_of(bag, topic)]
+    fix = f"choose one, for instance --topic {(calibrated or images or clouds)[0]}"
+    raise UserError(f"{path}: {problem}", legal=depth_topics, fix=fix)
 
 
 def _depth_topics(bag: Bag) -> list[str]:
     """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and
     no copies."""
-    found = []
-    for topic in (
-        name
-        for name, kind in bag.topics.items()
-        if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)
-    ):
+    topics = []
+    for topic, kind in bag.topics.items():
+        if kind not in IMAGE_TYPES or NOT_DEPTH.search(topic):
+            continue
         message = bag.first(topic)
         encoding = encoding_of(message) if message is not None else ""
         if encoding in DEPTH_NUMBERS and (encoding != "mono16" or "depth" in topic.lower()):
-            found.append(topic)
+            topics.append(topic)
+    # a compressed topic repeats the pictures of the plain one
     return [
-        topic for topic in found if _of_pictures(topic) == topic or _of_pictures(topic) not in found
+        topic
+        for topic in topics
+        if _of_pictures(topic) == topic or _of_pictures(topic) not in topics
     ]
 
 
@@ -339,70 +375,89 @@ def _infos_of(bag: Bag, topic: str) -> list[str]:
 def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
     """Return the lens of depth images. Raises UserError if the bag has none for them, or one of
     another model."""
-    every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
-    why: list[str] = []
+    all_infos = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
+    infos = _infos_of(bag, topic)
+    if not infos and len(all_infos) == 1:
+        infos = all_infos
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
-    for info in _infos_of(bag, topic) or (every if len(every) == 1 else []):
+    reasons: list[str] = []
+    for info in infos:
         message = bag.first(info)
         lens = "is empty" if message is None else lens_of_info(message, shape, is_rectified)
         if isinstance(lens, Lens):
             return lens
-        why.append(f"{info} {lens}")
-    reason = (
-        "; ".join(why)
-        or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+        reasons.append(f"{info} {lens}")
+    fix = "pass --intrinsics FILE"
+    if reasons:
+        fix += ", or the rectified topic by --topic"
+        reason = "; ".join(reasons)
+    else:
+        stated = ", ".join(all_infos) or "none"
+        reason = f"no CameraInfo lies beside {topic} (the bag's: {stated})"
+    raise UserError(
+        f"{bag.path}: {reason}: the lens of these depth images is unknown; "
+        "without it they give no points",
+        legal=LEGAL_LENS,
+        fix=fix,
     )
-    what = f"{bag.path}: {reason}: the lens of these depth images is unknown; without it they give no points"
-    fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
-    raise UserError(what, legal=LEGAL_LENS, fix=fix)
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
     """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A
     rectified image has the lens P and no distortion. K and P are of the whole sensor: binning and
     the region of interest are accounted for."""
-    d, k, p = (
-        np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float)
-        for key in ("d", "k", "p")
-    )
-    d = np.zeros(0) if is_rectified or not d.any() else d
-    model = str(message.distortion_model)
+    height, width = shape
     across = max(1, int(message.binning_x))
     down = max(1, int(message.binning_y))
     roi = message.roi
-    width, height = (
-        (int(roi.width), int(roi.height))
-        if roi.width and roi.height
-        else (message.width, message.height)
-    )
-    if (height // down, width // across) != tuple(shape):
-        return f"is for images of {width // across} x {height // down} pixels, not {shape[1]} x {shape[0]}"
-    if d.size and (
-        model.lower() not in KNOWN_MODELS or d.size not in (4, 5, 8, 12, 14) or d[8:].any()
-    ):
-        return f"has the distortion model {model or '(none)'} with {d.size} numbers, which is not supported"
-    fx, fy, cx, cy = (
-        p[[0, 5, 2, 6]] if is_rectified and p.size == 12 and p[0] > 0 else k[[0, 4, 2, 5]]
-    )
+    full_width = message.width
+    full_height = message.height
+    if roi.width and roi.height:
+        full_width = int(roi.width)
+        full_height = int(roi.height)
+    if (full_height // down, full_width // across) != (height, width):
+        size = f"{full_width // across} x {full_height // down}"
+        return f"is for images of {size} pixels, not {width} x {height}"
+    d = _info_numbers(message, "d")
+    if is_rectified or not d.any():
+        d = np.zeros(0)
+    model = str(message.distortion_model)
+    is_known = model.lower() in KNOWN_MODELS and d.size in (4, 5, 8, 12, 14) and not d[8:].any()
+    if d.size and not is_known:
+        model = model or "(none)"
+        return f"has the distortion model {model} with {d.size} numbers, which is not supported"
+    p = _info_numbers(message, "p")
+    if is_rectified and p.size == 12 and p[0] > 0:
+        fx, fy, cx, cy = p[[0, 5, 2, 6]]
+    else:
+        fx, fy, cx, cy = _info_numbers(message, "k")[[0, 4, 2, 5]]
     if not np.isfinite([*d, fx, fy, cx, cy]).all() or not (fx > 0 and fy > 0):
         return f"states the focal length {fx:g}, {fy:g}, as an uncalibrated camera does"
-    # pixel positions count from the first pixel's centre, which lies half a pixel inside
-    cx = (cx - roi.x_offset + 0.5) / across - 0.5
-    cy = (cy - roi.y_offset + 0.5) / down - 0.5
-    distortion = tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8))))
+    distortion = np.pad(d[:8], (0, 8 - min(d.size, 8)))
     return Lens(
-        shape[1], shape[0], float(fx / across), float(fy / down), float(cx), float(cy), distortion
+        width=width,
+        height=height,
+        fx=float(fx / across),
+        fy=float(fy / down),
+        # pixel positions count from the first pixel's centre, which lies half a pixel inside
+        cx=float((cx - roi.x_offset + 0.5) / across - 0.5),
+        cy=float((cy - roi.y_offset + 0.5) / down - 0.5),
+        distortion=tuple(float(coefficient) for coefficient in distortion),
     )
+
+
+def _info_numbers(message: Any, key: str) -> np.ndarray:
+    """Return the numbers of a CameraInfo's matrix: ROS 1 spells it in upper case."""
+    return np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float)
 
 
 def _off_ray_px(lens: Lens, frame: Frame) -> float:
     """Return the distance of a frame's worst point from its pixel's ray."""
     assert frame.xy_m is not None
     valid = np.isfinite(frame.z_m)
-    slopes = lens.region_slopes(lens.whole)[valid]
-    off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (
-        lens.fx,
-        lens.fy,
-    )
-    worst = float(off.max()) if valid.any() else float("inf")
+    if not valid.any():
+        return float("inf")
+    slopes = frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64)
+    off = np.abs(slopes - lens.region_slopes(lens.whole)[valid]) * (lens.fx, lens.fy)
+    worst = float(off.max())
     return worst if np.isfinite(worst) else float("inf")

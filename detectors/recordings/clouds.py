@@ -22,7 +22,7 @@ import numpy as np
 from detectors.open3d_library import load_open3d
 from detectors.recordings.arrays import SENSOR_SIZES
 from detectors.recordings.distances import UNITS_M, frame_of
-from detectors.recordings.recording import NO_GRID, Given, Recording, read_errors
+from detectors.recordings.recording import NO_GRID, CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens
@@ -34,12 +34,12 @@ RASTER_CORRELATION = 0.999
 reduces it by 1 %."""
 
 
-def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
+def open_clouds(paths: Sequence[Path], options: CaptureOptions, name: str) -> Recording:
     """Open clouds in the order given, one frame each. Raises UserError for a broken file."""
-    scale_m = given.scale_m or UNITS_M["m"]
+    scale_m = options.scale_m or UNITS_M["m"]
     is_list = paths[0].suffix.lower() in POINT_LISTS
     read = partial(
-        _frames, tuple(paths), _read_list if is_list else _read_cloud, given.lens, scale_m
+        _frames, tuple(paths), _read_list if is_list else _read_cloud, options.lens, scale_m
     )
     recording = Recording.begun(name, read, scale_m, files=tuple(paths))
     height, width = recording.shape
@@ -65,8 +65,8 @@ def _stated_size(lines: Sequence[str]) -> tuple[int, int]:
     """Return the width and height that lines of a header state, 0 if they do not."""
     text = "\n".join(lines).lower()
     names = (r"(?:num_)?(?:width|cols)", r"(?:num_)?(?:height|rows)")
-    found = (re.search(rf"\b{name}\b\s*[:=]?\s*(\d{{1,9}})\b", text) for name in names)
-    width, height = (int(match.group(1)) if match else 0 for match in found)
+    matches = (re.search(rf"\b{name}\b\s*[:=]?\s*(\d{{1,9}})\b", text) for name in names)
+    width, height = (int(match.group(1)) if match else 0 for match in matches)
     return width, height
 
 
@@ -81,7 +81,8 @@ def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
             v, u = np.divmod(np.arange(count), width)
             slopes = points[valid, :2] / points[valid, 2, None]
             turns = [
-                np.corrcoef(slopes[:, axis], at[valid])[0, 1] for axis, at in enumerate((u, v))
+                np.corrcoef(slopes[:, axis], pixels[valid])[0, 1]
+                for axis, pixels in enumerate((u, v))
             ]
             if min(map(abs, turns)) > RASTER_CORRELATION:
                 return height, width
@@ -114,9 +115,9 @@ def _read_cloud(
     if width * height < 1:
         raise UserError(f"{path}: holds no points", legal=LEGAL_CLOUD)
     refuse_pixels(f"{path}: its cloud", width, height)
-    if (found := path.stat().st_size) < data_bytes:
-        what = f"{path}: is truncated: {found} of at least {data_bytes} bytes"
-        raise UserError(what, legal="a whole file", fix="copy or export it again")
+    if (file_bytes := path.stat().st_size) < data_bytes:
+        problem = f"{path}: is truncated: {file_bytes} of at least {data_bytes} bytes"
+        raise UserError(problem, legal="a whole file", fix="copy or export it again")
     # Open3D prints warnings to the terminal; their causes are checked here and reported once
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.t.io.read_point_cloud(
@@ -124,8 +125,10 @@ def _read_cloud(
         )
     read = len(cloud.point.positions) if "positions" in cloud.point else 0
     if read != width * height:
-        what = f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
-        raise UserError(what, legal=LEGAL_CLOUD, fix="copy or export it again")
+        problem = (
+            f"{path}: is truncated or damaged: {read} of {width * height} points could be read"
+        )
+        raise UserError(problem, legal=LEGAL_CLOUD, fix="copy or export it again")
     attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
     points = attributes["positions"]
     rgb = attributes.get("colors")
@@ -208,8 +211,8 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
         packed, states = struct.unpack("<II", stated.ljust(8, b"\0"))
         least = 8 + packed
         if len(stated) == 8 and (states != unpacked or states > LZF_STRONGEST * packed):
-            what = f"{path}: its points would have {unpacked} bytes, but it states {states} packed into {packed}"
-            raise UserError(what, legal=LEGAL_CLOUD, fix="copy or export it again")
+            problem = f"{path}: its points would have {unpacked} bytes, but it states {states} packed into {packed}"
+            raise UserError(problem, legal=LEGAL_CLOUD, fix="copy or export it again")
     return width, height, end.end() + least
 
 
@@ -307,13 +310,13 @@ def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]
     if len(names) == count and set("xyz") <= set(names):
         return {name: values[:, i] for i, name in reversed(list(enumerate(names))) if name}
     if "z" in names:
-        what = f"{path}: names the columns {bare[:100]!r}, but its lines have {count} numbers"
-        raise UserError(what, legal=LEGAL_LIST)
+        problem = f"{path}: names the columns {bare[:100]!r}, but its lines have {count} numbers"
+        raise UserError(problem, legal=LEGAL_LIST)
     colour = {6: "rgb", 7: "irgb"}.get(count, "i" if count in (4, 5) else "")
-    found = {name: values[:, i] for i, name in enumerate("xyz" + colour)}
-    if "r" in found and (
+    columns = {name: values[:, i] for i, name in enumerate("xyz" + colour)}
+    if "r" in columns and (
         (beyond := values[:, count - 3 :]).min() < 0 or beyond.max() > 255 or (beyond % 1).any()
     ):
         # normals or something else, but no colour
-        return {name: found[name] for name in found if name not in "rgb"}
-    return found
+        return {name: columns[name] for name in columns if name not in "rgb"}
+    return columns

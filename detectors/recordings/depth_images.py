@@ -21,7 +21,7 @@ from PIL import ImageFile, JpegImagePlugin, PngImagePlugin
 
 from detectors.recordings.distances import UNITS_M, frame_of
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame
@@ -54,10 +54,10 @@ def refuse_broken_png(name: str, content: bytes) -> None:
     try:
         _header(name, content).verify()
     except (SyntaxError, OSError, ValueError) as error:
-        what = "damaged" if "broken" in str(error) or "checksum" in str(error) else "truncated"
-        what = f"{name}: is {what} ({error}; {len(content)} bytes)"
+        problem = "damaged" if "broken" in str(error) or "checksum" in str(error) else "truncated"
+        problem = f"{name}: is {problem} ({error}; {len(content)} bytes)"
         fix = "copy or export it again"
-        raise UserError(what, legal="a whole PNG", fix=fix) from error
+        raise UserError(problem, legal="a whole PNG", fix=fix) from error
 
 
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
@@ -87,12 +87,12 @@ NOT_DEPTH = re.compile(
 or floating point."""
 
 
-def open_depth_folder(folder: Path, given: Given) -> Recording:
+def open_depth_folder(folder: Path, options: CaptureOptions) -> Recording:
     """Open a folder of depth PNGs. Raises UserError if it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
-    is_tum = any((place / "depth.txt").is_file() for place in (folder, folder.parent))
+    is_tum = any((parent / "depth.txt").is_file() for parent in (folder, folder.parent))
 
     colour_folder = next((root / name for name in COLOUR_FOLDERS if (root / name).is_dir()), None)
     beside = [
@@ -100,30 +100,30 @@ def open_depth_folder(folder: Path, given: Given) -> Recording:
         for path in shown(root)
         if re.search("colou?r|rgb", path.stem.lower()) and path not in depths
     ]
-    found = beside if colour_folder is None else shown(colour_folder)
-    pictures = [path for path in found if path.suffix.lower() in COLOUR_SUFFIXES]
+    candidates = beside if colour_folder is None else shown(colour_folder)
+    pictures = [path for path in candidates if path.suffix.lower() in COLOUR_SUFFIXES]
     # the colour picture of each depth picture: the same number in its name, or the nearest time
     # stamp
     stamps = {number: path for path in pictures if (number := _last_number(path)) is not None}
     colours: list[Path | None] = []
     for number in map(_last_number, depths):
-        apart = (
+        differences = (
             {abs(stamp - number): path for stamp, path in stamps.items()}
             if number is not None
             else {}
         )
-        is_near = bool(apart) and min(apart) <= (TUM_MATCH_S if is_tum else 0.0)
-        colours.append(apart[min(apart)] if is_near else None)
+        is_near = bool(differences) and min(differences) <= (TUM_MATCH_S if is_tum else 0.0)
+        colours.append(differences[min(differences)] if is_near else None)
     note = ""
     if pictures and (None in colours or len(pictures) != len(depths)):
         without = f"{colours.count(None)} depth pictures have no colour"
         note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without}"
-    return open_depth_list(depths, given, folder.name, root, colours, is_tum, note)
+    return open_depth_list(depths, options, folder.name, root, colours, is_tum, note)
 
 
 def open_depth_list(
     depths: Sequence[Path],
-    given: Given,
+    options: CaptureOptions,
     name: str,
     root: Path | None = None,
     colours: Sequence[Path | None] = (),
@@ -136,26 +136,26 @@ def open_depth_list(
     root = root or depths[0].parent
     width, height = _depth_size(depths[0])
     lens, lens_files = lens_for(
-        str(root), given, width, height, beside=(root, depths[0].parent, root.parent)
+        str(root), options, width, height, beside=(root, depths[0].parent, root.parent)
     )
     notes = [note]
     first = next((path for path in colours if path), None)
-    if first is not None and (found := _colour(first).shape)[:2] != (height, width):
+    if first is not None and (colour_shape := _colour(first).shape)[:2] != (height, width):
         colours = ()
         notes = [
-            f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"
+            f"colour pictures of {colour_shape[1]} x {colour_shape[0]} pixels are not aligned with the depth and are not used"
         ]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are assumed to be undistorted")
-    scale_m = given.scale_m or UNITS_M["tum" if is_tum else "mm"]
+    scale_m = options.scale_m or UNITS_M["tum" if is_tum else "mm"]
     is_whole = (
         scale_m != UNITS_M["tum"]
     )  # its unit of 0.2 mm is finer than the steps of most cameras
     files = (*depths, *filter(None, colours), *lens_files)
     unit_from = "depth.txt, which marks TUM RGB-D" * is_tum
-    more = {"files": files, "lens": lens, "notes": tuple(notes), "unit_from": unit_from}
+    fields = {"files": files, "lens": lens, "notes": tuple(notes), "unit_from": unit_from}
     recording = Recording.begun(
-        name, partial(_frames, depths, colours, scale_m), scale_m, is_whole, **more
+        name, partial(_frames, depths, colours, scale_m), scale_m, is_whole, **fields
     )
     return replace(recording, z_step_m=recording.z_step_m or scale_m)
 
@@ -191,11 +191,11 @@ def depth_files(folder: Path) -> tuple[Path, ...]:
     return chosen
 
 
-def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ...]:
+def depth_named(paths: Sequence[Path], candidates: Sequence[Path]) -> tuple[Path, ...]:
     """Return the files whose names contain "depth", else ``others`` without `NOT_DEPTH`, sorted by
     number."""
     chosen = [path for path in paths if "depth" in path.stem.lower()]
-    chosen = chosen or [path for path in others if not NOT_DEPTH.search(path.stem)]
+    chosen = chosen or [path for path in candidates if not NOT_DEPTH.search(path.stem)]
 
     def natural(path: Path) -> tuple[object, ...]:  # 9 before 10
         parts = re.split(f"({NUMBER.pattern})", path.stem)
@@ -233,11 +233,11 @@ def _depth_size(path: Path) -> tuple[int, int]:
         channels = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}.get(
             kind, f"type {kind}"
         )
-        what = (
+        problem = (
             f"{path}: {bits} bits per channel, {channels}: a picture or a mask, not a depth image"
         )
         raise UserError(
-            what,
+            problem,
             legal=LEGAL_PNG,
             fix="export the depth itself; a preview scaled to 0..255 has lost it",
         )

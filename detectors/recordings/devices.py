@@ -27,7 +27,7 @@ from detectors.recordings.intrinsics import (
     lens_for,
     parse_calibration,
 )
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import (
     FRAME_PIXELS,
@@ -47,15 +47,15 @@ SEGMENT_ID = bytes.fromhex("18538067")
 WAITING = 4
 
 
-def open_mkv(path: Path, given: Given) -> Recording:
+def open_mkv(path: Path, options: CaptureOptions) -> Recording:
     """Open a recording with its own calibration, or with the given lens. Raises UserError if it
     has no depth."""
     _refuse_truncated(path)
     with _opened(path) as container:
         tracks = _tracks(container)
         if "DEPTH" not in tracks:
-            found = ", ".join(sorted(tracks)) or "none"
-            raise UserError(f"{path}: has no DEPTH track (its tracks: {found})", legal=LEGAL_MKV)
+            titles = ", ".join(sorted(tracks)) or "none"
+            raise UserError(f"{path}: has no DEPTH track (its tracks: {titles})", legal=LEGAL_MKV)
         sizes = {
             title: (t.codec_context.width, t.codec_context.height) for title, t in tracks.items()
         }
@@ -78,23 +78,23 @@ def open_mkv(path: Path, given: Given) -> Recording:
         else parse_calibration(f"{path} (calibration.json)", calibration)
     )
 
-    def own() -> Lens | None:
+    def capture_lens() -> Lens | None:
         mode = stated or depth_mode_of_size(width, height) or "(not stated)"
         return None if cameras is None else depth_lens(str(path), cameras, mode)
 
-    lens, lens_files = lens_for(str(path), given, width, height, own)
+    lens, lens_files = lens_for(str(path), options, width, height, capture_lens)
     colour = (
         colour_camera(str(path), cameras, *sizes["COLOR"])
         if cameras is not None and "COLOR" in sizes
         else None
     )
     note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
-    scale_m = given.scale_m or UNITS_M["mm"]
+    scale_m = options.scale_m or UNITS_M["mm"]
     read = partial(_frames, path, scale_m, lens, colour)
     notes = () if colour is None else (note,)
-    more = {"files": (path, *lens_files), "lens": lens, "notes": notes}
+    fields = {"files": (path, *lens_files), "lens": lens, "notes": notes}
     return Recording.begun(
-        path.name, read, scale_m, True, unit_from="k4arecorder, which writes millimetres", **more
+        path.name, read, scale_m, True, unit_from="k4arecorder, which writes millimetres", **fields
     )
 
 
@@ -123,9 +123,9 @@ def colour_on_depth(
     """
     points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1) * z_m[..., None]
     points_colour = transform_points(colour.T_colour_depth, points)
-    seen = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
-    at = np.full((*z_m.shape, 2), -1e3, np.float32)
-    at[seen] = colour.lens.project(points_colour[seen])
+    is_visible = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
+    colour_px = np.full((*z_m.shape, 2), -1e3, np.float32)
+    colour_px[is_visible] = colour.lens.project(points_colour[is_visible])
     # Beyond the frame the rational distortion may fold back into it; true rays there are steeper
     # than the corner's.
     corner = np.abs(
@@ -134,13 +134,13 @@ def colour_on_depth(
         )
     )
     steep = np.abs(
-        points_colour[..., :2] / np.where(seen, points_colour[..., 2], 1.0)[..., None]
+        points_colour[..., :2] / np.where(is_visible, points_colour[..., 2], 1.0)[..., None]
     ) > 1.2 * corner.max(0)
-    at[steep.any(axis=-1)] = -1e3
+    colour_px[steep.any(axis=-1)] = -1e3
     return cv2.remap(
         picture,
-        at[..., 0],
-        at[..., 1],
+        colour_px[..., 0],
+        colour_px[..., 1],
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
@@ -170,9 +170,9 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
     for title, time_s, period_s, picture in _pictures(path, with_colour):
         home = next(
             (
-                held
-                for at_s, held in waiting
-                if abs(at_s - time_s) < period_s / 2 and title not in held
+                capture
+                for at_s, capture in waiting
+                if abs(at_s - time_s) < period_s / 2 and title not in capture
             ),
             None,
         )
@@ -182,7 +182,7 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
         home[title] = picture
         if len(waiting) > WAITING and "DEPTH" in (ready := waiting.pop(0)[1]):
             yield ready
-    yield from (held for _, held in waiting if "DEPTH" in held)
+    yield from (capture for _, capture in waiting if "DEPTH" in capture)
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
@@ -223,21 +223,21 @@ def _refuse_truncated(path: Path) -> None:
     variable-length size)."""
     with path.open("rb") as file:
         head = file.read(4096)
-    at = head.find(SEGMENT_ID) + len(SEGMENT_ID)
-    if at < len(SEGMENT_ID) or at >= len(head) or head[at] == 0:
+    start = head.find(SEGMENT_ID) + len(SEGMENT_ID)
+    if start < len(SEGMENT_ID) or start >= len(head) or head[start] == 0:
         raise UserError(
             f"{path}: is truncated, or is not Matroska",
             legal=LEGAL_MKV,
             fix="copy or record it again",
         )
-    length = 9 - head[at].bit_length()
+    length = 9 - head[start].bit_length()
     bits = 7 * length
-    size = int.from_bytes(head[at : at + length], "big") & ((1 << bits) - 1)
-    expected = at + length + size
-    found = path.stat().st_size
-    if size != (1 << bits) - 1 and found < expected:
-        what = f"{path}: is truncated: {found} of {expected} bytes"
-        raise UserError(what, legal="a whole recording", fix="copy or record it again")
+    size = int.from_bytes(head[start : start + length], "big") & ((1 << bits) - 1)
+    expected = start + length + size
+    file_bytes = path.stat().st_size
+    if size != (1 << bits) - 1 and file_bytes < expected:
+        problem = f"{path}: is truncated: {file_bytes} of {expected} bytes"
+        raise UserError(problem, legal="a whole recording", fix="copy or record it again")
 
 
 LEGAL_STRAY = (
@@ -252,7 +252,7 @@ BLUR_PX = 0.5  # motion by this much of a pixel blurs an edge more than the sens
 
 def _recording(
     path: Path,
-    given: Given,
+    options: CaptureOptions,
     read: Callable[[], Iterator[Frame]],
     size: tuple[int, int],
     scaled_lens: Callable[[], Lens],
@@ -263,19 +263,19 @@ def _recording(
 ) -> Recording:
     """Return the recording of either program. ``size``: width, height. ``poses``: places,
     quaternions, their source."""
-    lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
+    lens, lens_files = lens_for(str(path), options, *size, scaled_lens)
     notes = (
         ()
-        if lens_files or given.lens
+        if lens_files or options.lens
         else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
     )
     first_m = next(read()).z_m
     median_m = (
         float(np.median(first_m[np.isfinite(first_m)])) if np.isfinite(first_m).any() else 1.0
     )
-    warnings = _motion_warnings(*poses, given.frames, lens, median_m)
-    more = {"files": (*files, *lens_files), "lens": lens, "notes": notes, "warnings": warnings}
-    return Recording.begun(path.name, read, scale_m, "milli" in writer, unit_from=writer, **more)
+    warnings = _motion_warnings(*poses, options.frames, lens, median_m)
+    fields = {"files": (*files, *lens_files), "lens": lens, "notes": notes, "warnings": warnings}
+    return Recording.begun(path.name, read, scale_m, "milli" in writer, unit_from=writer, **fields)
 
 
 def _frame(name: str, stored: np.ndarray, confidence: np.ndarray | None, scale_m: float) -> Frame:
@@ -300,9 +300,9 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
         np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
     )
     if not good or not (0 < cx < colour[0] and 0 < cy < colour[1] and fy > 0):
-        what = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is not a lens of {size} pixels"
+        problem = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is not a lens of {size} pixels"
         raise UserError(
-            f"{name}: {what}", fix="pass --intrinsics FILE with the lens of the depth pictures"
+            f"{name}: {problem}", fix="pass --intrinsics FILE with the lens of the depth pictures"
         )
     # positions count from the first pixel's centre
     return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
@@ -340,14 +340,14 @@ def is_stray(folder: Path) -> bool:
     return (folder / "camera_matrix.csv").is_file() and (folder / "depth").is_dir()
 
 
-def open_stray(folder: Path, given: Given) -> Recording:
+def open_stray(folder: Path, options: CaptureOptions) -> Recording:
     """Open Stray Scanner's folder. Raises UserError if a file is broken or the lens's resolution
     is unknown."""
     depths = depth_files(folder / "depth")
     height, width = read_depth_png(depths[0]).shape
     beside = [folder / "confidence" / path.name for path in depths]
     confidences = tuple(path if path.is_file() else None for path in beside)
-    scale_m = given.scale_m or UNITS_M["mm"]
+    scale_m = options.scale_m or UNITS_M["mm"]
     matrix = folder / "camera_matrix.csv"
     odometry = folder / "odometry.csv"
 
@@ -359,8 +359,8 @@ def open_stray(folder: Path, given: Given) -> Recording:
             )
         across = next((w for w in COLOUR_WIDTHS if abs(2 * k[0, 2] - w) < 0.05 * w), None)
         if across is None:
-            what = f"cx = {k[0, 2]:g} is not the centre of any ARKit picture"
-            raise UserError(f"{matrix}: {what}", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
+            problem = f"cx = {k[0, 2]:g} is not the centre of any ARKit picture"
+            raise UserError(f"{matrix}: {problem}", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
         return _scaled(str(matrix), k, (across, across * 3 // 4), (width, height))
 
     # x y z, then the quaternion
@@ -375,7 +375,7 @@ def open_stray(folder: Path, given: Given) -> Recording:
     motion = (poses[:, :3], poses[:, 3:], odometry.name)
     writer = "Stray Scanner, which writes millimetres"
     return _recording(
-        folder, given, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer
+        folder, options, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer
     )
 
 
@@ -392,13 +392,15 @@ def _table(path: Path) -> np.ndarray:
     return table
 
 
-def open_r3d(path: Path, given: Given) -> Recording:
+def open_r3d(path: Path, options: CaptureOptions) -> Recording:
     """Open Record3D's .r3d. Raises UserError if it is broken, or if pyliblzfse, which unpacks its
     depth, is missing."""
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
-            held = ", ".join(archive.namelist()[:6]) or "nothing"
-            raise UserError(f"{path}: contains no Record3D capture ({held[:200]})", legal=LEGAL_R3D)
+            contents = ", ".join(archive.namelist()[:6]) or "nothing"
+            raise UserError(
+                f"{path}: contains no Record3D capture ({contents[:200]})", legal=LEGAL_R3D
+            )
         content = _content(path, archive, "metadata")
     with read_errors(f"{path}: its metadata cannot be read", LEGAL_R3D):
         info = strict_json(content)
@@ -408,7 +410,7 @@ def open_r3d(path: Path, given: Given) -> Recording:
         colour = int(info["w"]), int(info["h"])
         poses = np.array(info.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
     refuse_pixels(str(path), width, height)
-    scale_m = given.scale_m or UNITS_M["m"]
+    scale_m = options.scale_m or UNITS_M["m"]
     scaled_lens = partial(_scaled, f"{path}: metadata", k, colour, (width, height))
 
     def read() -> Iterator[Frame]:
@@ -430,7 +432,7 @@ def open_r3d(path: Path, given: Given) -> Recording:
     motion = (poses[:, 4:], poses[:, :4], "its metadata")
     writer = "Record3D, which writes metres"
     return _recording(
-        path, given, read, (width, height), scaled_lens, (path,), motion, scale_m, writer
+        path, options, read, (width, height), scaled_lens, (path,), motion, scale_m, writer
     )
 
 
@@ -440,8 +442,8 @@ def _archive(path: Path) -> zipfile.ZipFile:
 
 
 def _depth_names(archive: zipfile.ZipFile) -> list[str]:
-    found = [name for name in archive.namelist() if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name)]
-    return sorted(found, key=lambda name: int(Path(name).stem))
+    names = [name for name in archive.namelist() if re.fullmatch(r"(?:.*/)?\d{1,9}\.depth", name)]
+    return sorted(names, key=lambda name: int(Path(name).stem))
 
 
 def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
@@ -460,7 +462,9 @@ def _plane(
     try:
         import liblzfse  # type: ignore[import-not-found]
     except ImportError as error:
-        what = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
-        raise UserError(what, fix="pip install pyliblzfse, or export the capture as PLY") from error
+        problem = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
+        raise UserError(
+            problem, fix="pip install pyliblzfse, or export the capture as PLY"
+        ) from error
     with read_errors(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
         return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])

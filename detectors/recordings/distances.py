@@ -54,7 +54,7 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
     objects."""
     is_narrow = dtype.kind in "iu" and dtype.itemsize == 1
     if is_narrow or dtype.kind not in "iuf":
-        what = (
+        problem = (
             "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
         )
         legal = "integers of 16 bits or more, or floating point"
@@ -63,7 +63,7 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
             if is_narrow
             else "save an array of plain numbers"
         )
-        raise UserError(f"{name}: holds {what}", legal=legal, fix=fix)
+        raise UserError(f"{name}: holds {problem}", legal=legal, fix=fix)
 
 
 def frame_of(
@@ -98,9 +98,9 @@ def frame_of(
     elif behind.sum() > max(
         (0.5 if stored.ndim == 2 else 1 - TURNED_SHARE) * valid.sum(), SHARED_CODE
     ):
-        what = f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the camera (z below 0)"
+        problem = f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the camera (z below 0)"
         fix = "transform the cloud (from y up, z back: negate y and z; from x forward, z up: take -y, -z, x)"
-        raise UserError(what, legal=CAMERA_FRAME, fix=fix)
+        raise UserError(problem, legal=CAMERA_FRAME, fix=fix)
     reason[behind] = Reason.OUT_OF_RANGE
     xy_m = None
     if stored.ndim == 3:
@@ -130,13 +130,16 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
-    if SHARED_CODE <= negative.size < stored.size and (few := np.unique(negative)).size <= 3:
+    if (
+        SHARED_CODE <= negative.size < stored.size
+        and (codes_below_zero := np.unique(negative)).size <= 3
+    ):
         # a surface's distances differ from pixel to pixel; codes do not
-        codes += [float(code) for code in few]
-    rest = stored[stored > 0]
-    while rest.size:
-        top = rest.max().item()
-        below = rest[rest < top]
+        codes += [float(code) for code in codes_below_zero]
+    distances = stored[stored > 0]
+    while distances.size:
+        top = distances.max().item()
+        below = distances[distances < top]
         # 16-bit numbers are often divided by 1000 before they are stored in metres
         is_largest = (
             top == np.iinfo(stored.dtype).max if is_integer else bool(np.isclose(top, 65.535, 1e-6))
@@ -144,23 +147,28 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
         bits = math.log2(top + 3) if top < 2**32 else 0
         below_power = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
         shared = (
-            rest.size - below.size >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()
+            distances.size - below.size >= SHARED_CODE
+            and below.size > 0
+            and top > 1.25 * below.max()
         )
         if not (is_largest or (below_power and shared)):
             break
         codes.append(float(top))
-        rest = below
+        distances = below
     # Between neighbours that differ by a factor of four, an octave is empty: most frames need no
     # sorting.
-    if rest.size and not np.bincount((octaves := np.frexp(rest)[1]) - octaves.min()).all():
-        different = np.unique(rest)
+    if (
+        distances.size
+        and not np.bincount((octaves := np.frexp(distances)[1]) - octaves.min()).all()
+    ):
+        different = np.unique(distances)
         ratios = different[1:] / different[:-1].astype(np.float64)
         far = np.flatnonzero(ratios >= ISOLATED)
         far = far[(far >= FEW_CODES) & (far >= len(different) - 1 - FEW_CODES)]
         isolated = different[far[0] + 1 :] if far.size else different[:0]
-        near = np.flatnonzero(ratios[:FEW_CODES] >= ISOLATED)
-        if is_integer and near.size and len(different) - near[-1] - 1 > FEW_CODES:
-            isolated = np.concatenate([different[: near[-1] + 1], isolated])
+        near_gaps = np.flatnonzero(ratios[:FEW_CODES] >= ISOLATED)
+        if is_integer and near_gaps.size and len(different) - near_gaps[-1] - 1 > FEW_CODES:
+            isolated = np.concatenate([different[: near_gaps[-1] + 1], isolated])
         codes += [float(code) for code in isolated]
     return tuple(codes)
 
@@ -242,9 +250,11 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
             number = float(counted.group(1) or 1.0)
         except ValueError:
             continue
-        named = UNIT_NAMES.get(counted.group(2).rstrip("s"))
+        unit_m = UNIT_NAMES.get(counted.group(2).rstrip("s"))
         scales = (
-            [number * named] if named else [number, number * 1e-3, 1.0 / number if number else 0.0]
+            [number * unit_m]
+            if unit_m
+            else [number, number * 1e-3, 1.0 / number if number else 0.0]
         )
         fitting = {scale for scale in scales if 0.1 <= median * scale <= 10.0}
         if len(fitting) == 1:
@@ -261,7 +271,7 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     numbers supports the unit in which they are whole millimetres. Image sizes that only cameras
     with 1 mm have support that unit (`MILLIMETRE_SIZES`), and exclude it beyond their range.
     Raises UserError if no reading is clearly the most likely, with their distances."""
-    near, median = (
+    foreground, median = (
         float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5))
     )
     integers = usual_m == UNITS_M["mm"]
@@ -279,9 +289,9 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
             weight *= 100.0
         if not NEAREST_M <= median * metres <= FARTHEST_M:
             weight = 0.0
-        off = math.log(max(near * metres, 1e-9) / NEAR_M[0]) / math.log(NEAR_M[1])
+        off = math.log(max(foreground * metres, 1e-9) / NEAR_M[0]) / math.log(NEAR_M[1])
         weights[unit] = weight * (
-            math.exp(-0.5 * off * off) + FAR_FLOOR * (near * metres > NEAR_LIMIT_M)
+            math.exp(-0.5 * off * off) + FAR_FLOOR * (foreground * metres > NEAR_LIMIT_M)
         )
     total = sum(weights.values())
     chances = {unit: weight / total if total > 0 else 0.0 for unit, weight in weights.items()}
@@ -293,14 +303,14 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     ]
     best = ranked[0]
     if chances[best] < LIKELY:
-        what = "several units are plausible" if shown else "no usual unit is plausible"
-        what = f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})"
+        problem = "several units are plausible" if shown else "no usual unit is plausible"
+        problem = f"{name}: nothing states the unit of its depth, and {problem} (median stored number {median:.5g})"
         fix = (
             f"pass the unit; median distance in each: {', '.join(shown)}"
             if shown
             else f"--unit: {LEGAL_UNITS}"
         )
-        raise UserError(what, fix=fix)
+        raise UserError(problem, fix=fix)
     scale_m = metres_per_unit(best)
     usual = f"what is usual for {'integers' if integers else 'floating-point numbers'}"
     if math.isclose(scale_m, usual_m):
@@ -341,23 +351,27 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
         for unit, m in in_each.items()
         if NEAREST_M <= m <= FARTHEST_M
     ]
-    what = (
+    problem = (
         f"{frame.name}: the median distance would be {median_m:.4g} m, which suggests a wrong unit"
     )
     fix = (
         "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
     )
-    raise UserError(what, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix)
+    raise UserError(
+        problem, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix
+    )
 
 
 def refuse_far_aside(frame: Frame) -> None:
     """Raise UserError if half of the points are farther off the axis than in any camera's picture."""
     across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
-        what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
-        what += " off the camera's axis: the cloud is in another frame, or z has another unit than x and y"
+        problem = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
+        problem += " off the camera's axis: the cloud is in another frame, or z has another unit than x and y"
         raise UserError(
-            what, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it"
+            problem,
+            legal=CAMERA_FRAME,
+            fix="move the cloud into the frame of the camera that took it",
         )
 
 
@@ -373,12 +387,12 @@ def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]
     if not bends[0] > RAYS_TELL * bends[1]:
         return ""
-    what = f"the numbers look like lengths along the rays, not z: as lengths, surfaces are {bends[0] / bends[1]:.0f}"
-    return f"{what} times as flat. Places and sizes are then wrong: store z, the length times the ray's cosine"
+    problem = f"the numbers look like lengths along the rays, not z: as lengths, surfaces are {bends[0] / bends[1]:.0f}"
+    return f"{problem} times as flat. Places and sizes are then wrong: store z, the length times the ray's cosine"
 
 
 def _bend(image: np.ndarray) -> float:
-    far = [(each, max(len(each) // 8, 1)) for each in (image, image.T)]
-    bends = [each[2 * n :] - 2 * each[n:-n] + each[: -2 * n] for each, n in far]
-    sizes = np.abs(np.concatenate([each[np.isfinite(each)] for each in bends]))
+    far = [(values, max(len(values) // 8, 1)) for values in (image, image.T)]
+    bends = [values[2 * n :] - 2 * values[n:-n] + values[: -2 * n] for values, n in far]
+    sizes = np.abs(np.concatenate([bend[np.isfinite(bend)] for bend in bends]))
     return float(np.median(sizes)) if sizes.size else math.nan

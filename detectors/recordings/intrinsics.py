@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detectors.recordings.recording import Given, read_errors
+from detectors.recordings.recording import CaptureOptions, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, strict_json
@@ -111,10 +111,10 @@ def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str,
         is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
         model = camera["Intrinsics"]["ModelType"]
         numbers = [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
-    known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
-    if not known or numbers[10] or numbers[11]:
-        what = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
-        raise UserError(f"{name}: {what}", legal=legal, fix=OWN_LENS)
+    is_known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
+    if not is_known or numbers[10] or numbers[11]:
+        problem = f"lens model {model} with {len(numbers)} parameters, or with a centre of distortion, is not known"
+        raise UserError(f"{name}: {problem}", legal=legal, fix=OWN_LENS)
     return camera, numbers
 
 
@@ -122,8 +122,8 @@ def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters
     if not (fx > 0 and fy > 0):
         raise UserError(f"{name}: the focal length is {fx:g}, {fy:g}", legal="above 0")
-    (across, down), (left, top), image = mode
-    centre = cx * across - left - 0.5, cy * down - top - 0.5
+    (across, down), (offset_x, top), image = mode
+    centre = cx * across - offset_x - 0.5, cy * down - top - 0.5
     return Lens(*image, fx * across, fy * down, *centre, (k1, k2, p1, p2, k3, k4, k5, k6))
 
 
@@ -192,10 +192,10 @@ KNOWN_MODELS = (
 
 def lens_for(
     name: str,
-    given: Given,
+    options: CaptureOptions,
     width: int,
     height: int,
-    own: Callable[[], Lens | None] = lambda: None,
+    capture_lens: Callable[[], Lens | None] = lambda: None,
     beside: Sequence[Path] = (),
     hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
@@ -203,10 +203,10 @@ def lens_for(
     camera's, the capture's ``own``, or the first file named like a lens in the folders ``beside``.
     Raises UserError if no lens is stated (``hint`` ends its advice), or only that of other images.
     """
-    lens = given.lens
-    file = given.intrinsics
+    lens = options.lens
+    file = options.intrinsics
     if lens is None and file is None:
-        lens = own()
+        lens = capture_lens()
         names = [
             *(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")),
             *BARE_MATRICES,
@@ -217,21 +217,25 @@ def lens_for(
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
-        what = f"{name}: the lens of these depth images is unknown; without it they give no points"
+        problem = (
+            f"{name}: the lens of these depth images is unknown; without it they give no points"
+        )
         fix = f"pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough{hint}"
-        raise UserError(what, legal=LEGAL_LENS, fix=fix)
+        raise UserError(problem, legal=LEGAL_LENS, fix=fix)
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
     for mode in modes:
         if (mode.width, mode.height) == (width, height):
             return mode, (file,) if file else ()
-    known = ", ".join(
-        f"{each.mode} {each.width} x {each.height}"
-        for each in modes[1:]
-        if isinstance(each, OtherLens)
+    mode_names = ", ".join(
+        f"{mode.mode} {mode.width} x {mode.height}"
+        for mode in modes[1:]
+        if isinstance(mode, OtherLens)
     )
-    what = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
+    problem = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
     fix = "pass --intrinsics FILE with the lens of these images (of the colour camera, if the depth was aligned to it)"
-    raise UserError(what, legal=f"the modes of this camera: {known}" if known else None, fix=fix)
+    raise UserError(
+        problem, legal=f"the modes of this camera: {mode_names}" if mode_names else None, fix=fix
+    )
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
@@ -256,9 +260,9 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
             f"{path}: the lens' width and height are not whole numbers", legal=LEGAL_LENS
         )
     if across * height != down * width:
-        what = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
+        problem = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
         raise UserError(
-            what,
+            problem,
             fix="give the lens of the depth images (or of the colour camera they are aligned to)",
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
@@ -270,10 +274,10 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
     if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
-        what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for {width} x {height}"
+        problem = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for {width} x {height}"
         fix = "multiply a normalised focal length by the image's width"
         raise UserError(
-            f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix
+            f"{path}: {problem}", legal="pixels, from the centre of the first one", fix=fix
         )
     numbers = (width, height, fx, fy, cx, cy, _distortion(path, data))
     if (across, down) != (width, height):
@@ -320,9 +324,9 @@ def parsed_lens(path: Path) -> dict[str, Any]:
             ) from error
         except DeclarationError as error:
             first = error.problems[0]
-            at = error.problems[0].place
+            position = error.problems[0].place
             raise UserError(
-                f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS
+                f"{position.head if position else path}: {first.message}", legal=LEGAL_LENS
             ) from error
     if not isinstance(data, dict):
         raise UserError(f"{path}: contains no keys with values", legal=LEGAL_LENS)
@@ -344,24 +348,27 @@ def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[s
     """Return the mapping in a file that holds the lens: if several differ, those of this image
     size, then those with a name that contains "depth". Raises UserError if there is none, or if
     several remain."""
-    found = [
+    lenses = [
         pair
         for pair in mappings(data)
         if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)
     ]
-    for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
-        if len(found) > 1:
-            found = [(name, each) for name, each in found if fits(name, each)] or found
-    if not found:
+    for fits in (
+        lambda _, mapping: _size(mapping) == size,
+        lambda name, _: "depth" in name.lower(),
+    ):
+        if len(lenses) > 1:
+            lenses = [(name, mapping) for name, mapping in lenses if fits(name, mapping)] or lenses
+    if not lenses:
         keys = ", ".join(str(key)[:40] for key in list(data)[:20]) or "none"
         raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
-    if len({_focal_and_centre(path, each) for _, each in found}) > 1:
-        names = ", ".join(name for name, _ in found[:9])
+    if len({_focal_and_centre(path, mapping) for _, mapping in lenses}) > 1:
+        names = ", ".join(name for name, _ in lenses[:9])
         fix = "write the lens of these images to a file of its own"
         raise UserError(
-            f"{path}: holds {len(found)} different lenses ({names})", legal=LEGAL_LENS, fix=fix
+            f"{path}: holds {len(lenses)} different lenses ({names})", legal=LEGAL_LENS, fix=fix
         )
-    return found[0][1]
+    return lenses[0][1]
 
 
 def _named(data: dict[str, Any], quantity: str) -> str | None:
@@ -398,14 +405,16 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return OpenCV's eight coefficients; absent ones are 0. Raises UserError for other models."""
     key = next((k for k in COEFFICIENTS if k in data), None)
     if key is None or (isinstance(data[key], dict) and "data" not in data[key]):
-        given = data if key is None else data[key]
-        unknown = [] if key is None else sorted(map(str, set(given) - set(DISTORTION_NAMES)))
+        coefficients = data if key is None else data[key]
+        unknown = [] if key is None else sorted(map(str, set(coefficients) - set(DISTORTION_NAMES)))
         if unknown:
             raise UserError(
                 f"{path}: {key} has unknown names: {', '.join(unknown)}",
                 legal=", ".join(DISTORTION_NAMES),
             )
-        numbers = tuple(_number(path, name, given.get(name, 0.0)) for name in DISTORTION_NAMES)
+        numbers = tuple(
+            _number(path, name, coefficients.get(name, 0.0)) for name in DISTORTION_NAMES
+        )
     else:
         numbers = _numbers(path, key, data[key], None)
     if len(numbers) not in (0, 4, 5, 8, 12, 14) or any(numbers[8:]):

@@ -47,8 +47,8 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
     truncated."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
-        what = encoding or getattr(message, "format", "")
-        raise UserError(f"{name}: holds {what[:60]!r} pictures, not depth", legal=LEGAL_IMAGE)
+        problem = encoding or getattr(message, "format", "")
+        raise UserError(f"{name}: holds {problem[:60]!r} pictures, not depth", legal=LEGAL_IMAGE)
     if hasattr(message, "format"):
         return _unpacked(name, encoding, bytes(message.data))
     kind = np.dtype((">" if message.is_bigendian else "<") + DEPTH_NUMBERS[encoding])
@@ -66,8 +66,8 @@ def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray
         row_bytes < width * kind.itemsize
         or data.size < (height - 1) * row_bytes + width * kind.itemsize
     ):
-        what = f"{data.size} bytes in rows of {row_bytes} cannot hold {width} of {kind.itemsize} bytes, {height} times"
-        raise UserError(f"{name}: is truncated: {what}", fix="record or convert it again")
+        problem = f"{data.size} bytes in rows of {row_bytes} cannot hold {width} of {kind.itemsize} bytes, {height} times"
+        raise UserError(f"{name}: is truncated: {problem}", fix="record or convert it again")
     return np.ndarray((height, width), kind, data.data, strides=(row_bytes, kind.itemsize))
 
 
@@ -104,27 +104,27 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
     nibbles = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32) & 15).ravel()
     last = np.flatnonzero(nibbles < 8)
     first = np.concatenate([[0], last[:-1] + 1]) if last.size else last
-    place = np.arange(last[-1] + 1 if last.size else 0) - np.repeat(first, last - first + 1)
+    digit = np.arange(last[-1] + 1 if last.size else 0) - np.repeat(first, last - first + 1)
     # no number of this stream has more than seven nibbles
-    parts = (nibbles[: place.size] & 7).astype(np.int64) << 3 * np.minimum(place, 10)
+    parts = (nibbles[: digit.size] & 7).astype(np.int64) << 3 * np.minimum(digit, 10)
     numbers = np.add.reduceat(parts, first) if last.size else np.zeros(0, np.int64)
     filled = np.zeros(width * height, bool)
     folded: list[np.ndarray] = []
-    pixel = at = 0
+    pixel = index = 0
     while pixel < filled.size:
-        run = int(numbers[at + 1]) if at + 1 < numbers.size else numbers.size
+        run = int(numbers[index + 1]) if index + 1 < numbers.size else numbers.size
         if (
-            run > numbers.size - at - 2
-            or pixel + numbers[at] + run > filled.size
-            or run + numbers[at] == 0
+            run > numbers.size - index - 2
+            or pixel + numbers[index] + run > filled.size
+            or run + numbers[index] == 0
         ):
-            what = f"{name}: its RVL stream is damaged or ends too early"
-            raise UserError(what, legal=LEGAL_IMAGE, fix="record it again")
-        pixel += int(numbers[at])
+            problem = f"{name}: its RVL stream is damaged or ends too early"
+            raise UserError(problem, legal=LEGAL_IMAGE, fix="record it again")
+        pixel += int(numbers[index])
         filled[pixel : pixel + run] = True
-        folded.append(numbers[at + 2 : at + 2 + run])
+        folded.append(numbers[index + 2 : index + 2 + run])
         pixel = pixel + run
-        at = at + 2 + run
+        index = index + 2 + run
     differences = np.concatenate(folded)
     stored = np.zeros(filled.size, np.uint16)
     stored[filled] = np.cumsum(differences >> 1 ^ -(differences & 1)).astype(np.uint16)
@@ -174,12 +174,13 @@ def _points(name: str, message: Any) -> np.ndarray:
     single = {f.name: f for f in message.fields if f.count <= 1 and f.datatype in FIELD_TYPES}
     missing = [axis for axis in "xyz" if axis not in single]
     if missing:
-        held = (
+        contents = (
             ", ".join(f"{f.name} (type {f.datatype}, count {f.count})" for f in message.fields)
             or "none"
         )
         raise UserError(
-            f"{name}: has no field {' or '.join(missing)}; its fields: {held}", legal=LEGAL_CLOUD
+            f"{name}: has no field {' or '.join(missing)}; its fields: {contents}",
+            legal=LEGAL_CLOUD,
         )
     types = {key: np.dtype(order + FIELD_TYPES[f.datatype]) for key, f in single.items()}
     for key, field in single.items():

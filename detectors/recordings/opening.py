@@ -28,7 +28,7 @@ from detectors.recordings.distances import (
     scale_in,
 )
 from detectors.recordings.intrinsics import mappings, parsed_lens
-from detectors.recordings.recording import Given, Recording, read_errors
+from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import OtherLens
 
@@ -40,7 +40,7 @@ LEGAL_FORMATS = (
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
 """File suffixes for which one file is a capture, and the function that opens it."""
-ListOpener = Callable[[Sequence[Path], Given, str], Recording]
+ListOpener = Callable[[Sequence[Path], CaptureOptions, str], Recording]
 LISTS: dict[str, ListOpener] = {
     ".png": open_depth_list,
     **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds),
@@ -62,7 +62,7 @@ HELD = 6  # most names of a folder's contents in a message
 def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements: Any) -> Recording:
     """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of
     the stored distances (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other
-    ``statements`` are the fields of `recording.Given`. Raises UserError for every fault of the
+    ``statements`` are the fields of `recording.CaptureOptions`. Raises UserError for every fault of the
     files."""
     paths = [Path(path) for path in paths]
     if not paths:
@@ -71,14 +71,14 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
         if not path.is_file() and not path.is_dir():
             odd = path.exists() and "is neither a file nor a folder, but a device or a pipe"
             raise UserError(f"{path}: {odd or 'no such file or folder'}", legal=LEGAL_FORMATS)
-    given = Given(metres_per_unit(unit) if unit else None, **statements)
-    recording = replace(_opened(paths, given), selection=given.frames)
+    options = CaptureOptions(metres_per_unit(unit) if unit else None, **statements)
+    recording = replace(_opened(paths, options), selection=options.frames)
     stated = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
     if not stated.origin:
         stated = _unit_not_stated(recording)
         if stated.scale_m != recording.scale_m:
             recording = replace(
-                _opened(paths, replace(given, scale_m=stated.scale_m)), selection=given.frames
+                _opened(paths, replace(options, scale_m=stated.scale_m)), selection=options.frames
             )
     first, *second = islice(recording.frames(), 2)
     lens = recording.lens
@@ -103,8 +103,10 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
 def _unit_not_stated(recording: Recording) -> Unit:
     """Return a unit that the format leaves open: from a file beside the capture, the named camera,
     or the data."""
-    found = (frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected())
-    z_m = next((each for each in found if each.size), None)
+    frames_m = (
+        frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected()
+    )
+    z_m = next((frame_m for frame_m in frames_m if frame_m.size), None)
     if z_m is None:
         return Unit(recording.scale_m, "what is usual")
     stored = z_m / recording.scale_m
@@ -128,27 +130,29 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
         )
         for path in islice(beside, 20):
             try:
-                yield from ((path, each) for _, each in mappings(parsed_lens(path)))
+                yield from ((path, mapping) for _, mapping in mappings(parsed_lens(path)))
             except UserError:
                 continue
 
 
-def _opened(paths: list[Path], given: Given) -> Recording:
+def _opened(paths: list[Path], options: CaptureOptions) -> Recording:
     """Open a capture by the first format that its paths fit."""
     path = paths[0]
     is_single = len(paths) == 1
-    suffix, *more = {each.suffix.lower() for each in paths}
-    opener: Callable[[Path, Given], Recording] | None = FILES.get(suffix) if is_single else None
+    suffix, *other_suffixes = {file.suffix.lower() for file in paths}
+    opener: Callable[[Path, CaptureOptions], Recording] | None = (
+        FILES.get(suffix) if is_single else None
+    )
     if is_single and path.is_dir():
-        opener = open_bag if is_bag(path) and given.raw is None else _open_folder
-    elif is_single and given.raw is not None:
+        opener = open_bag if is_bag(path) and options.raw is None else _open_folder
+    elif is_single and options.raw is not None:
         opener = open_arrays
-    if given.topic is not None and opener is not open_bag:
+    if options.topic is not None and opener is not open_bag:
         raise UserError(
-            f"{path}: is not a ROS bag, so it has no topic {given.topic}", fix="leave out --topic"
+            f"{path}: is not a ROS bag, so it has no topic {options.topic}", fix="leave out --topic"
         )
     unused = next(
-        (name for name in ("array", "pitch", "raw") if getattr(given, name) is not None), None
+        (name for name in ("array", "pitch", "raw") if getattr(options, name) is not None), None
     )
     if unused and opener is not open_arrays:
         legal = f"{', '.join(LOADERS)}, or bare numbers with --raw"
@@ -156,20 +160,20 @@ def _opened(paths: list[Path], given: Given) -> Recording:
             f"{path}: --{unused} is for files of arrays", legal=legal, fix=f"leave out --{unused}"
         )
     if opener is not None:
-        return opener(path, given)
-    if any(each.is_dir() for each in paths):
+        return opener(path, options)
+    if any(file.is_dir() for file in paths):
         raise UserError(
             f"{len(paths)} paths that include folders",
             legal=LEGAL_FORMATS,
             fix="name one folder alone",
         )
-    if suffix in LISTS and not more:
+    if suffix in LISTS and not other_suffixes:
         return LISTS[suffix](
-            paths, given, path.name if is_single else f"{path.name} .. {paths[-1].name}"
+            paths, options, path.name if is_single else f"{path.name} .. {paths[-1].name}"
         )
     if not is_single:
         raise UserError(
-            f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *more)))}",
+            f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *other_suffixes)))}",
             legal=LEGAL_FORMATS,
         )
     if suffix in (".bin", ".raw", ".dat"):
@@ -180,15 +184,15 @@ def _opened(paths: list[Path], given: Given) -> Recording:
     )
 
 
-def _open_folder(folder: Path, given: Given) -> Recording:
+def _open_folder(folder: Path, options: CaptureOptions) -> Recording:
     with read_errors(f"{folder}: cannot be read", LEGAL_FORMATS, "check its permissions"):
         inside = shown(folder)
     if is_stray(folder):
-        return open_stray(folder, given)
+        return open_stray(folder, options)
     for suffix in (*CLOUDS, *POINT_LISTS[:3]):
         clouds = [path for path in inside if path.suffix.lower() == suffix]
         if clouds:
-            recording = open_clouds(clouds, given, folder.name)
+            recording = open_clouds(clouds, options, folder.name)
             beside = sum(path.suffix.lower() in (".png", *LOADERS) for path in inside)
             note = (
                 f"{beside} pictures or arrays beside the {suffix} files are ignored"
@@ -207,22 +211,24 @@ def _open_folder(folder: Path, given: Given) -> Recording:
         and not is_depth
         and not any(path.suffix.lower() == ".png" for path in inner.iterdir())
     ):
-        return _open_folder(inner, given)
+        return _open_folder(inner, options)
     if is_depth or inner.is_dir():
-        return open_depth_folder(folder, given)
+        return open_depth_folder(folder, options)
     frames = depth_named(arrays, arrays)
     if len(frames) > 1 and len({path.suffix.lower() for path in frames}) == 1:
-        return open_array_list(frames, given, folder.name)
-    held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
-    known = (
+        return open_array_list(frames, options, folder.name)
+    contents = ", ".join(path.name for path in inside[:HELD]) + (
+        ", .." if len(inside) > HELD else ""
+    )
+    is_capture = (
         p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir()
         for p in inside
     )
-    captures = [path for path, is_known in zip(inside, known, strict=True) if is_known]
-    what = f"contains no capture; it holds {held}" if held else "is empty"
+    captures = [path for path, is_known in zip(inside, is_capture, strict=True) if is_known]
+    problem = f"contains no capture; it holds {contents}" if contents else "is empty"
     fix = (
         f"name {'one of ' * (len(captures) > 1)}{', '.join(map(str, captures[:HELD]))}"
         if captures
         else None
     )
-    raise UserError(f"{folder}: {what}", legal=LEGAL_FORMATS, fix=fix)
+    raise UserError(f"{folder}: {problem}", legal=LEGAL_FORMATS, fix=fix)

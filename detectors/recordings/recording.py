@@ -24,7 +24,7 @@ NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
-def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
+def read_errors(problem: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
     """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and
     limit its memory."""
     try:
@@ -39,12 +39,12 @@ def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> 
             else str(error)
         )
         raise UserError(
-            f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix
+            f"{problem} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix
         ) from error
 
 
 @dataclass(frozen=True)
-class Given:
+class CaptureOptions:
     """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the
     format's usual one. ``intrinsics``: a file with the depth pixels' lens, preferred to one that
     comes with the frames. ``lens``: the same as a value. ``frames``: selects frames by number.
@@ -92,7 +92,7 @@ class Recording:
         read: Callable[[], Iterator[Frame]],
         scale_m: float,
         is_whole: bool = False,
-        **more: Any,
+        **fields: Any,
     ) -> Recording:
         """Return a recording of the first frame's size and step. Raises UserError without a frame."""
         first = next(read(), None)
@@ -103,7 +103,7 @@ class Recording:
                 fix="copy or record it again",
             )
         step_m = scale_m if is_whole else rounding_step_m(first.z_m)
-        return cls(name, read, first.z_m.shape, scale_m, step_m, **more)
+        return cls(name, read, first.z_m.shape, scale_m, step_m, **fields)
 
     @property
     def region(self) -> Region:
@@ -134,13 +134,15 @@ class Recording:
         for frame in self.selected():
             count += 1
             if frame.z_m.shape != self.shape:
-                what = "pixels" if self.organised else "points"
+                elements = "pixels" if self.organised else "points"
                 sizes = [
                     f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)
                 ]
-                what = f"{frame.name}: {sizes[0]} {what}, but the first frame has {sizes[1]}"
+                elements = (
+                    f"{frame.name}: {sizes[0]} {elements}, but the first frame has {sizes[1]}"
+                )
                 raise UserError(
-                    what, legal="frames of one size", fix="run the differing frames separately"
+                    elements, legal="frames of one size", fix="run the differing frames separately"
                 )
             if self.slopes is not None and frame.xy_m is None:
                 rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)

@@ -35,16 +35,14 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 MOST_CELLS = 3600
-CELL_POINTS = 16
-EVEN_CELL_POINTS = 64
+CELL_POINTS = 16  # least number of points in a cell
+EVEN_CELL_POINTS = 64  # points in a cell where there are enough
 ENOUGH_CELLS = 600
 FEW_CELLS = 40
-"""Most cells; points per cell, at least and where there are enough; enough cells; fewest cells to
-choose a shape."""
-TILE_CELLS = 3
+"""Fewest cells to choose a shape."""
+TILE_CELLS = 3  # side, in cells, of a tile that is predicted as a whole
 FOLDS = 5
-"""Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the
-tiles are dealt."""
+"""Number of folds into which the tiles are dealt."""
 # largest width of damage, unless the settings differ: no free form that could follow it is chosen
 LEAST_SCALE_M = 0.04
 # a shape is as good as the best if its error of prediction is larger by at most this share of the
@@ -56,50 +54,57 @@ NOISIER = 1.25
 STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its
 noise grows."""
-FREE_FORM_FROM = 0.02
+FREE_FORM_FROM = 0.02  # share of the area with structure from which a free form is tried
 MISFIT_FROM = 0.1
-"""Share of the area with structure from which a free form is tried, and from which a warning of a
-misfit is given."""
+"""Share of the area with structure from which a warning of a misfit is given."""
 STATED = ("polynomial", "mesh")  # shapes that the user states
-STRUCTURE_CELLS = 5
-STRUCTURE_SIGMAS = 4.0
+STRUCTURE_CELLS = 5  # side of the block averaged to see structure
+STRUCTURE_SIGMAS = 4.0  # least significance of structure
 SEEN = 0.5
-"""Side of the block averaged to see structure, least significance of structure, and share of a
-pixel's noise."""
+"""Least size of structure, as a share of a pixel's noise."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface,
-    and z of the cloud minus the surface; NaN where it is not judged. ``noise_m`` (h, w): standard
-    deviation of the residuals nearby, without the surface's own misfit. ``scale_m``: width above
-    which a free form follows shallow damage. ``warning``: a sentence if remaining structure could
-    be mistaken for damage."""
+    """The surface without its damage; maps are NaN where it is not judged."""
 
+    # z of the surface (h, w), metres
     surface_z_m: np.ndarray
+    # z of the cloud minus the surface (h, w), metres
     residual_m: np.ndarray
+    # standard deviation of the residuals nearby (h, w), without the surface's own misfit
     noise_m: np.ndarray
+    # the shape's name and limits, as programs print them
     description: str
+    # width above which a free form follows shallow damage; None for other shapes
     scale_m: float | None
+    # a sentence if remaining structure could be mistaken for damage, else ""
     warning: str
+    # facts by name, as they are recorded
     notes: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """``points`` (c, 3) metres: a ray through each cell and its median z. ``weights`` (c,).
-    ``noise`` (c,): of a pixel. ``level_noise``: of a median. ``of`` (n,): each point's cell or -1.
-    ``side``: in the picture's units."""
+    """A grid of small cells of the picture, each with the median of its points."""
 
+    # a ray through each cell and its median z (c, 3), metres
     points: np.ndarray
+    # weight of each cell (c,): 1 if it is full
     weights: np.ndarray
+    # standard deviation of a pixel in each cell (c,), metres
     noise: np.ndarray
+    # standard deviation of a cell's median, metres
     level_noise: float
-    of: np.ndarray
+    # each point's cell (n,), or -1
+    cell_of_point: np.ndarray
+    # each cell's row and column on the grid (c,)
     row: np.ndarray
     column: np.ndarray
+    # side of a cell in the picture's units, and in metres
     side: float
     side_m: float
+    # whether rays leave the origin, else they are parallel
     central: bool
 
     def image(self, values: np.ndarray, empty: float = np.nan) -> np.ndarray:
@@ -112,31 +117,40 @@ class _Cells:
     def pixel_noise(self) -> float:
         """Return the standard deviation of a pixel: about its cell's median, combined with that of
         the median."""
-        return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
+        within = median_of(self.noise[np.isfinite(self.noise)])
+        return float(np.hypot(within, self.level_noise))
 
     def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
         """Return the cells with medians and deviations of the points' residuals (n,); some cells
         are then dropped."""
-        medians, deviations = _group_medians(residuals, self.of, len(self.points))
+        medians, deviations = _group_medians(residuals, self.cell_of_point, len(self.points))
         z = fit(self.points) + medians
-        known = np.isfinite(z)
-        moved = (
-            self.points * (z / self.points[:, 2])[:, None] if self.central else self.points.copy()
-        )
+        is_judged = np.isfinite(z)
+        moved = self.points.copy()
+        if self.central:
+            moved = self.points * (z / self.points[:, 2])[:, None]
         moved[:, 2] = z
-        moved[~known] = self.points[~known]
-        weights = np.where(known, self.weights, 0.0)
-        level_noise = _cell_noise(self.image(medians))[0]
+        moved[~is_judged] = self.points[~is_judged]
         return replace(
-            self, points=moved, weights=weights, noise=deviations, level_noise=level_noise
+            self,
+            points=moved,
+            weights=np.where(is_judged, self.weights, 0.0),
+            noise=deviations,
+            level_noise=_cell_noise(self.image(medians))[0],
         )
 
 
 class _Shape(NamedTuple):
+    """A kind of surface, fitted to cells."""
+
     name: str
+    # fits this kind of surface to points (c, 3) with weights (c,)
     fit_to: Callable[[np.ndarray, np.ndarray], Fit | None]
+    # the fit to all cells
     fit: Fit
+    # the cells' robust weights (c,) in that fit
     weights: np.ndarray
+    # shortest wave of a free form, in the picture's units
     wavelength: float | None
 
 
@@ -147,77 +161,108 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     central = cloud.projection == "central"
     cells = _cells(points, cloud)
     if cells is None:
-        name, fit = _stated(
-            points, config if config.shape in STATED else SurfaceConfig(degree=1), central
-        )
-        fitted = fit(points)
-        noise_m = sigma_of(points[:, 2] - fitted)
-        warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"
-        few: dict[str, Any] = {"shape": name, "local_noise_m": noise_m, "misfit_share": None}
-        z_m = on_grid(fitted, mask)
-        residual_m = on_grid(points[:, 2] - fitted, mask)
-        return Background(
-            z_m, residual_m, np.where(mask, noise_m, np.nan), name, None, warning, few
-        )
+        return _of_few_points(points, mask, config, central)
     wavelength = None
     if config.shape in STATED:
         name, fit = _stated(points, config, central)
     else:
-        _, start = _stated(
-            points[:: max(1, len(points) // 8192)], SurfaceConfig(degree=2, method="bisquare")
-        )
-        shape = _chosen(cells.refreshed(points[:, 2] - start(points), start), config)
-        for _ in range(2):
-            cells = cells.refreshed(points[:, 2] - shape.fit(points), shape.fit)
-            shape = (
-                _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True) or shape
-            )
+        shape, cells = _shape_of(points, cells, config)
         name = shape.name
         fit = shape.fit
         wavelength = shape.wavelength
 
     fitted = fit(points)
     residuals = points[:, 2] - fitted
-    unseen = ~np.isfinite(fitted)
-    if cells.central:
-        # only the few pixels near the steepest incidence are examined one by one; a ray that
-        # misses the surface beside the pixel gives NaN, which is not below the limit either
-        near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
-        looked = np.flatnonzero((cells.of < 0) | near[cells.of])
-        unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
+    unseen = _unseen(points, cells, fit, fitted)
     if unseen.all():
-        what = f"the whole target is seen at more than {STEEPEST_DEG:g} degrees, where nothing is judged"
-        raise UserError(what, fix="choose another target or crop, or record it from its front")
+        problem = (
+            f"the whole target is seen at more than {STEEPEST_DEG:g} degrees, "
+            "where nothing is judged"
+        )
+        raise UserError(problem, fix="choose another target or crop, or record it from its front")
     fitted[unseen] = np.nan
     cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)
+    notes.update(shape=name, steep_share=float(unseen.mean()))
     text = name
     scale_m = None
     if wavelength is not None:
         scale_m = 0.5 * wavelength * cells.side_m / cells.side
         text += f", which absorbs shallow damage wider than {scale_m / MM:.0f} mm"
     if unseen.mean() > 0.001:
-        steep = f"seen at more than {STEEPEST_DEG:g} degrees" + " or at an edge of the mesh" * (
-            config.shape == "mesh"
-        )
+        steep = f"seen at more than {STEEPEST_DEG:g} degrees"
+        if config.shape == "mesh":
+            steep += " or at an edge of the mesh"
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
-    # a pixel's noise near each cell: the target's median, or the median over 7 x 7 cells if that
-    # is much larger
+    return Background(
+        surface_z_m=on_grid(fitted, mask),
+        residual_m=on_grid(points[:, 2] - fitted, mask),
+        noise_m=on_grid(_noise_of_points(cells), mask),
+        description=text,
+        scale_m=scale_m,
+        warning=warning,
+        notes=notes,
+    )
+
+
+def _of_few_points(
+    points: np.ndarray, mask: np.ndarray, config: SurfaceConfig, central: bool
+) -> Background:
+    """Return the stated surface, or a plane, behind points (n, 3) that are too few to judge it."""
+    if config.shape not in STATED:
+        config = SurfaceConfig(degree=1)
+    name, fit = _stated(points, config, central)
+    fitted = fit(points)
+    residuals = points[:, 2] - fitted
+    noise_m = sigma_of(residuals)
+    return Background(
+        surface_z_m=on_grid(fitted, mask),
+        residual_m=on_grid(residuals, mask),
+        noise_m=np.where(mask, noise_m, np.nan),
+        description=name,
+        scale_m=None,
+        warning=f"{len(points)} points are too few to tell whether the surface ({name}) fits",
+        notes={"shape": name, "local_noise_m": noise_m, "misfit_share": None},
+    )
+
+
+def _shape_of(points: np.ndarray, cells: _Cells, config: SurfaceConfig) -> tuple[_Shape, _Cells]:
+    """Choose the shape of points (n, 3), refine its fit with cells centred on it, and return
+    both."""
+    sample = points[:: max(1, len(points) // 8192)]
+    _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"))
+    shape = _chosen(cells.refreshed(points[:, 2] - start(points), start), config)
+    for _ in range(2):
+        cells = cells.refreshed(points[:, 2] - shape.fit(points), shape.fit)
+        refined = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True)
+        shape = refined or shape
+    return shape, cells
+
+
+def _unseen(points: np.ndarray, cells: _Cells, fit: Fit, fitted: np.ndarray) -> np.ndarray:
+    """Return which points (n, 3) have no surface (``fitted`` (n,) is NaN), or too steep a one."""
+    unseen = ~np.isfinite(fitted)
+    if cells.central:
+        # only the few pixels near the steepest incidence are examined one by one; a ray that
+        # misses the surface beside the pixel gives NaN, which is not below the limit either
+        is_steep = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
+        examined = np.flatnonzero((cells.cell_of_point < 0) | is_steep[cells.cell_of_point])
+        incidence_deg = _incidence_deg(points[examined], fit, 0.1 * cells.side)
+        unseen[examined] |= ~(incidence_deg < STEEPEST_DEG)
+    return unseen
+
+
+def _noise_of_points(cells: _Cells) -> np.ndarray:
+    """Return a pixel's noise (n,) near each point's cell: the target's median, or the median over
+    7 x 7 cells if that is much larger."""
     padded = np.pad(cells.image(cells.noise), 3, constant_values=np.nan)
-    around = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))[
-        cells.row, cells.column
-    ].reshape(-1, 49)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))
+    around = windows[cells.row, cells.column].reshape(-1, 49)
     with np.errstate(all="ignore"):
         local = np.hypot(np.nanmedian(around, axis=1), cells.level_noise)
     pixel = cells.pixel_noise
-    noise = np.where(
-        cells.of >= 0, np.where(local > NOISIER * pixel, local, pixel)[cells.of], pixel
-    )
-    z_m = on_grid(fitted, mask)
-    residual_m = on_grid(points[:, 2] - fitted, mask)
-    noise_map_m = on_grid(noise, mask)
-    notes.update(shape=name, steep_share=float(unseen.mean()))
-    return Background(z_m, residual_m, noise_map_m, text, scale_m, warning, notes)
+    of_cells = np.where(local > NOISIER * pixel, local, pixel)
+    return np.where(cells.cell_of_point >= 0, of_cells[cells.cell_of_point], pixel)
 
 
 def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
@@ -227,7 +272,7 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:
         return ""
-    medians, deviations = _group_medians(residual_m[mask], cells.of, len(cells.points))
+    medians, deviations = _group_medians(residual_m[mask], cells.cell_of_point, len(cells.points))
     level_noise = _cell_noise(cells.image(medians))[0]
     flat = np.column_stack([cells.points[:, :2], medians])
     level = replace(cells, points=flat, noise=deviations, level_noise=level_noise)
@@ -235,10 +280,15 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
 
 
 def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> tuple[str, Fit]:
+    """Return the name and the fit of a surface whose kind is stated."""
     if config.reference is not None:
         return laid_on(points, config.reference, central)
     surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
-    return f"degree {config.degree}, {surface.note}", lambda p: surface.evaluate(p[:, 0], p[:, 1])
+
+    def z_at(queries: np.ndarray) -> np.ndarray:
+        return surface.evaluate(queries[:, 0], queries[:, 1])
+
+    return f"degree {config.degree}, {surface.note}", z_at
 
 
 def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
@@ -249,34 +299,45 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     central = cloud.projection == "central" and float(points[:, 2].min()) > 0
     x, y = np.ascontiguousarray(picture_places(points, central).T)
     extent = np.maximum([np.ptp(x), np.ptp(y)], 1e-12)
-    wanted = max(
-        min(max(CELL_POINTS, len(points) / ENOUGH_CELLS), EVEN_CELL_POINTS),
-        len(points) / MOST_CELLS,
-    )
+    even = min(max(CELL_POINTS, len(points) / ENOUGH_CELLS), EVEN_CELL_POINTS)
+    wanted = max(even, len(points) / MOST_CELLS)
     side = float(np.sqrt(extent.prod() * wanted / len(points)))
+    # the picture may be partly empty: the side is adapted to the cells that are not
     for _ in range(3):
         across = ((x - x.min()) / side).astype(np.int64)
         down = ((y - y.min()) / side).astype(np.int64)
         columns = int(across.max()) + 1
         keys = down * columns + across
         counts = np.bincount(keys)
-        side *= float(np.sqrt(wanted / max(median_of(counts[counts > 0].astype(float)), 1.0)))
-    held = np.flatnonzero(counts >= max(4, wanted / 4))
-    if len(held) < FEW_CELLS:
+        usual = median_of(counts[counts > 0].astype(float))
+        side *= float(np.sqrt(wanted / max(usual, 1.0)))
+    filled = np.flatnonzero(counts >= max(4, wanted / 4))
+    if len(filled) < FEW_CELLS:
         return None
     number = np.full(len(counts), -1)
-    number[held] = np.arange(len(held))
-    of = number[keys]
-    row, column = np.divmod(held, columns)
-    x = np.bincount(keys, x)[held] / counts[held]
-    y = np.bincount(keys, y)[held] / counts[held]
-    z = np.bincount(keys, points[:, 2])[held] / counts[held]
-    side_m = side * (float(np.median(points[:, 2])) if central else 1.0)
-    rays = np.column_stack([x, y]) * (z[:, None] if central else 1.0)
-    weights = np.minimum(counts[held] / wanted, 1.0)
-    none = np.zeros(len(held))
+    number[filled] = np.arange(len(filled))
+    row, column = np.divmod(filled, columns)
+
+    def means(values: np.ndarray) -> np.ndarray:
+        return np.bincount(keys, values)[filled] / counts[filled]
+
+    z = means(points[:, 2])
+    lateral = np.column_stack([means(x), means(y)])
+    side_m = side
+    if central:
+        lateral = lateral * z[:, None]
+        side_m = side * float(np.median(points[:, 2]))
     return _Cells(
-        np.column_stack([rays, z]), weights, none, 0.0, of, row, column, side, side_m, central
+        points=np.column_stack([lateral, z]),
+        weights=np.minimum(counts[filled] / wanted, 1.0),
+        noise=np.zeros(len(filled)),
+        level_noise=0.0,
+        cell_of_point=number[keys],
+        row=row,
+        column=column,
+        side=side,
+        side_m=side_m,
+        central=central,
     )
 
 
@@ -291,19 +352,19 @@ def _group_medians(
         if group[i] >= 0 and np.isfinite(values[i]):
             starts[group[i] + 1] += 1
     starts = np.cumsum(starts)
-    at = starts[:-1].copy()
-    held = np.empty(starts[-1])
+    next_slot = starts[:-1].copy()
+    grouped = np.empty(starts[-1])
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
-            held[at[group[i]]] = values[i]
-            at[group[i]] += 1
+            grouped[next_slot[group[i]]] = values[i]
+            next_slot[group[i]] += 1
     medians = np.full(groups, np.nan)
     deviations = np.full(groups, np.nan)
     for g in range(groups):
         if starts[g + 1] > starts[g]:
-            some = held[starts[g] : starts[g + 1]]
-            medians[g] = _median(some)
-            deviations[g] = _median(np.abs(some - medians[g])) / 0.6745
+            members = grouped[starts[g] : starts[g + 1]]
+            medians[g] = _median(members)
+            deviations[g] = _median(np.abs(members - medians[g])) / 0.6745
     return medians, deviations
 
 
@@ -329,33 +390,29 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
     differences."""
 
     def bend(step: int) -> float:
-        bends = [
-            each[2 * step :] - 2 * each[step:-step] + each[: -2 * step] for each in (image, image.T)
-        ]
-        some = np.concatenate([each.ravel() for each in bends])
-        some = some[np.isfinite(some)]
-        return sigma_of(some) if len(some) else 0.0
+        bends = []
+        for values in (image, image.T):
+            bend = values[2 * step :] - 2 * values[step:-step] + values[: -2 * step]
+            bends.append(bend.ravel())
+        differences = np.concatenate(bends)
+        differences = differences[np.isfinite(differences)]
+        return sigma_of(differences) if len(differences) else 0.0
 
-    near = bend(1)
-    far = bend(2)
+    adjacent = bend(1)
+    second = bend(2)
     # for cells with variance s^2 and correlation r with direct neighbours: (6 - 8 r) s^2 and 6 s^2
-    deviation = max(near, far) / np.sqrt(6.0)
-    return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
+    deviation = max(adjacent, second) / np.sqrt(6.0)
+    correlation = (6.0 - (adjacent / max(deviation, 1e-12)) ** 2) / 8.0
+    return deviation, float(np.clip(correlation, 0.0, 0.5))
 
 
 def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
+    """Return the simplest shape that predicts left-out cells about as well as any."""
     shapes: list[_Shape] = []
     errors: list[np.ndarray] = []
     worth = WORTH * cells.pixel_noise
     auto = config.shape == "auto"
-    degrees = {degree: partial(polynomial, degree=degree) for degree in (1, 2, 3, 4, 5)}
-    formulas: list[tuple[str, Any]] = [
-        ("plane", degrees[1]),
-        ("polynomial of degree 2", degrees[2]),
-    ]
-    formulas += [("quadric", partial(quadric, central=cells.central))]
-    formulas += [(f"polynomial of degree {degree}", degrees[degree]) for degree in (3, 4, 5)]
-    for name, fit_to in formulas:
+    for name, fit_to in _formulas(cells.central):
         shape = _fitted(cells, name, fit_to, None)
         if shape is not None:
             shapes.append(shape)
@@ -366,21 +423,42 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     best = shapes[_simplest(errors, worth)]
     if auto and _misfit(cells, best.fit, "")[1]["misfit_share"] < FREE_FORM_FROM:
         return best
-    base = shapes[int(np.argmin([each.mean() for each in errors]))]
-    # wavelengths in cells, longest first, down to twice the side of a tile or to the least scale
-    ladder: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
-    while ladder[-1] / 1.6 >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
-        ladder.append(ladder[-1] / 1.6)
-    if config.scale_mm is not None:
-        ladder = [2 * config.scale_mm * MM / cells.side_m]
+    mean_errors = [tile_errors.mean() for tile_errors in errors]
+    base = shapes[int(np.argmin(mean_errors))]
     free = [best] if auto else []
-    for wavelength in (each * cells.side for each in ladder):
+    for length_cells in _wavelengths(cells, config):
+        wavelength = length_cells * cells.side
         fit_to = partial(
             free_form, base=base.fit, wavelength=wavelength, cell=cells.side, central=cells.central
         )
-        made = _fitted(cells, "free form", fit_to, wavelength)
-        free += [] if made is None else [made]
+        fitted = _fitted(cells, "free form", fit_to, wavelength)
+        if fitted is not None:
+            free.append(fitted)
     return free[_simplest([_prediction_errors(cells, shape) for shape in free], worth)]
+
+
+def _formulas(central: bool) -> list[tuple[str, Any]]:
+    """Return the names of the shapes with few coefficients and their fits, simplest first."""
+    formulas: list[tuple[str, Any]] = [
+        ("plane", partial(polynomial, degree=1)),
+        ("polynomial of degree 2", partial(polynomial, degree=2)),
+        ("quadric", partial(quadric, central=central)),
+    ]
+    for degree in (3, 4, 5):
+        formulas.append((f"polynomial of degree {degree}", partial(polynomial, degree=degree)))
+    return formulas
+
+
+def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:
+    """Return the wavelengths of free forms to try, in cells, longest first: down to twice the side
+    of a tile or to the least scale."""
+    if config.scale_mm is not None:
+        return [2 * config.scale_mm * MM / cells.side_m]
+    wavelengths: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
+    shortest = max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m)
+    while wavelengths[-1] / 1.6 >= shortest:
+        wavelengths.append(wavelengths[-1] / 1.6)
+    return wavelengths
 
 
 def _fitted(
@@ -395,26 +473,29 @@ def _fitted(
         if fit is None:
             return None
         error = cells.points[:, 2] - fit(cells.points)
-        known = np.isfinite(error) & (cells.weights > 0)
-        if known.sum() < 0.98 * (cells.weights > 0).sum():
+        is_fitted = np.isfinite(error) & (cells.weights > 0)
+        if is_fitted.sum() < 0.98 * (cells.weights > 0).sum():
             return None
-        scale = max(sigma_of(error[known]), floor)
+        scale = max(sigma_of(error[is_fitted]), floor)
         before = weights
-        robust = bisquare_weights(np.where(known, error, np.inf), BISQUARE_TUNING * scale)
+        robust = bisquare_weights(np.where(is_fitted, error, np.inf), BISQUARE_TUNING * scale)
         if widened:
-            # pairs of neighbouring cells without weight, and the neighbours of these pairs
-            image = cells.image((robust == 0).astype(float), 0.0) > 0
-            pairs = (
-                cv2.filter2D(
-                    image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT
-                )
-                >= 3
-            )
-            robust = robust * ~grown(image & pairs, 1)[cells.row, cells.column]
+            robust = robust * ~_beside_outliers(cells, robust == 0)
         weights = cells.weights * robust
         if np.abs(weights - before).max() < 0.05:
             break
     return _Shape(name, fit_to, fit, weights, wavelength)
+
+
+def _beside_outliers(cells: _Cells, is_outlier: np.ndarray) -> np.ndarray:
+    """Return which cells (c,) belong to pairs of neighbouring outliers, or touch such a pair."""
+    image = cells.image(is_outlier.astype(float), 0.0) > 0
+    counts = cv2.filter2D(
+        image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT
+    )
+    # a cell counts itself too
+    pairs = counts >= 3
+    return np.asarray(grown(image & pairs, 1)[cells.row, cells.column])
 
 
 def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
@@ -437,48 +518,59 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
 def _simplest(errors: list[np.ndarray], worth: float) -> int:
     """Return the first shape whose mean error exceeds the least by at most ``worth`` or a standard
     error."""
-    best = int(np.argmin([each.mean() for each in errors]))
-    for i, each in enumerate(errors):
-        difference = each - errors[best]
-        if each.mean() - errors[best].mean() <= max(
-            worth, float(difference.std()) / np.sqrt(len(difference))
-        ):
+    best = int(np.argmin([tile_errors.mean() for tile_errors in errors]))
+    for i, tile_errors in enumerate(errors):
+        difference = tile_errors - errors[best]
+        standard_error = float(difference.std()) / np.sqrt(len(difference))
+        if tile_errors.mean() - errors[best].mean() <= max(worth, standard_error):
             return i
     return best
 
 
 def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
-    """Return a warning if structure remains that could be mistaken for damage, else ""."""
+    """Return a warning if structure remains that could be mistaken for damage, else "", and its
+    size."""
     error = cells.points[:, 2] - fit(cells.points)
     image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
-    (noise, shared), pixel = _cell_noise(image), cells.pixel_noise
+    noise, correlation = _cell_noise(image)
+    pixel = cells.pixel_noise
     # compact findings differ from their neighbourhood's median; structure is the neighbourhood
     # itself
     valid = np.isfinite(image)
     limit = np.nanmedian(np.abs(image)) / 0.6745 * BISQUARE_TUNING
     used = valid & (np.abs(np.nan_to_num(image)) < max(limit, BISQUARE_TUNING * noise))
-    size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
-    count, total = (
-        cv2.boxFilter(each, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for each in (used.astype(float), np.where(used, image, 0.0))
-    )
-    smooth = total / np.maximum(count, 1)
+    count = _block_sums(used.astype(float))
+    smooth = _block_sums(np.where(used, image, 0.0)) / np.maximum(count, 1)
     enough = valid & (count >= 9)
-    chance = STRUCTURE_SIGMAS * noise * (1 + 2 * shared) / np.sqrt(np.maximum(count, 1))
+    chance = STRUCTURE_SIGMAS * noise * (1 + 2 * correlation) / np.sqrt(np.maximum(count, 1))
     beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * pixel))
     rms_m = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
     share = float(beyond.sum() / max(enough.sum(), 1))
-    text = f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
-    text += f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
-    text += f" {100 * share:.0f} % of the target; findings there may be due to its shape"
     # connected cells that lie far off: damage is seldom so large
     parts = cv2.connectedComponentsWithStats((valid & ~used).astype(np.uint8))[2]
     off = float(parts[1:, cv2.CC_STAT_AREA].max(initial=0) / max(valid.sum(), 1))
+    warning = ""
     if off >= MISFIT_FROM:
-        text = f"the surface does not fit here: {100 * off:.0f} % of the target lies off it ({name}), as beside a step"
-        text += " between two surfaces; findings there may be due to its shape (--crop can leave a surface out)"
-    notes = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
-    return (text if max(share, off) >= MISFIT_FROM else ""), notes
+        warning = (
+            f"the surface does not fit here: {100 * off:.0f} % of the target lies off it ({name}), "
+            "as beside a step between two surfaces; findings there may be due to its shape "
+            "(--crop can leave a surface out)"
+        )
+    elif share >= MISFIT_FROM:
+        warning = (
+            f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales "
+            f"above {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is "
+            f"{1e3 * pixel:.2g} mm, on {100 * share:.0f} % of the target; "
+            "findings there may be due to its shape"
+        )
+    return warning, {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
+
+
+def _block_sums(image: np.ndarray) -> np.ndarray:
+    """Return the sums over blocks of `STRUCTURE_CELLS` cells a side around each cell."""
+    size = (STRUCTURE_CELLS, STRUCTURE_CELLS)
+    sums = cv2.boxFilter(image, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(sums)
 
 
 def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
@@ -492,11 +584,10 @@ def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
             p = rays * fit(p)[:, None]
         return p
 
-    here = on_surface(0.0, 0.0)
-    normal = np.cross(on_surface(step, 0.0) - here, on_surface(0.0, step) - here)
-    along = np.abs((normal * here).sum(axis=1))
-    return np.asarray(
-        np.degrees(
-            np.arccos(along / (np.linalg.norm(normal, axis=1) * np.linalg.norm(here, axis=1)))
-        )
-    )
+    surface_points = on_surface(0.0, 0.0)
+    across = on_surface(step, 0.0) - surface_points
+    down = on_surface(0.0, step) - surface_points
+    normal = np.cross(across, down)
+    projection = np.abs((normal * surface_points).sum(axis=1))
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(surface_points, axis=1)
+    return np.asarray(np.degrees(np.arccos(projection / lengths)))

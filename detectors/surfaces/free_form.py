@@ -1,4 +1,4 @@
-"""The smooth free form that is added to a simple shape: penalised splines in the picture's plane."""
+"""The smooth free form that is added to a simple shape: penalised splines in the picture."""
 
 from functools import lru_cache
 
@@ -30,22 +30,21 @@ def free_form(
     third derivatives (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones
     less (as its sixth power); in units of x/z (central) or metres, as ``cell``, the spacing of the
     points."""
-    places = picture_places(points, central)
-    low = places.min(axis=0)
-    extent = np.ptp(places, axis=0)
+    positions = picture_places(points, central)
+    low = positions.min(axis=0)
+    extent = np.ptp(positions, axis=0)
     spacing = max(wavelength / KNOTS_PER_WAVELENGTH, float(extent.max()) / MOST_KNOTS)
     counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 3
     residual = points[:, 2] - base(points)
-    w = np.where(np.isfinite(residual), weights, 0.0)
-    values, numbers = _splines((places - low) / spacing, counts)
-    # w is near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem gives the
-    # factor
-    stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
+    fitted_weights = np.where(np.isfinite(residual), weights, 0.0)
+    z = np.where(fitted_weights > 0, residual, 0.0)
+    values, numbers = _splines((positions - low) / spacing, counts)
     # LAPACK's upper bands
     width = int(3 * counts[1] + 3)
-    banded, right = _normal_bands(
-        values, numbers, w, np.where(w > 0, residual, 0.0), width, int(counts.prod())
-    )
+    banded, right = _normal_bands(values, numbers, fitted_weights, z, width, int(counts.prod()))
+    # the weights are near 1: 1 / cell^2 points of weight 1 in each unit of area; Parseval's theorem
+    # gives the factor
+    stiffness = (wavelength / (2 * np.pi)) ** 6 / cell**2 / spacing**4
     penalty = _penalty(int(counts[0]), int(counts[1]))
     banded[width + penalty.row - penalty.col, penalty.col] += stiffness * penalty.data
     banded[-1] += RIDGE * float(banded[-1].max())
@@ -63,28 +62,30 @@ def picture_places(points: np.ndarray, central: bool) -> np.ndarray:
 
 
 @numba.njit(**PLAIN)
-def _spline(place: float, count: int, out: np.ndarray) -> int:
-    """Fill (4,) with the cubic splines that reach a place, the nearest on the knots, and return
+def _spline(position: float, count: int, out: np.ndarray) -> int:
+    """Fill (4,) with the cubic splines that reach a position, the nearest on the knots, and return
     the first's number."""
-    x = min(max(place, 0.0), count - 3.0) if np.isfinite(place) else 0.0
+    x = min(max(position, 0.0), count - 3.0) if np.isfinite(position) else 0.0
     first = min(int(x), count - 4)
     t = x - first
     s = 1.0 - t
-    out[0], out[3] = s**3 / 6.0, t**3 / 6.0
-    out[1], out[2] = (3 * t**3 - 6 * t**2 + 4) / 6.0, (3 * s**3 - 6 * s**2 + 4) / 6.0
+    out[0] = s**3 / 6.0
+    out[1] = (3 * t**3 - 6 * t**2 + 4) / 6.0
+    out[2] = (3 * s**3 - 6 * s**2 + 4) / 6.0
+    out[3] = t**3 / 6.0
     return first
 
 
 @numba.njit(**PLAIN)
-def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _splines(positions: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the 16 products of cubic splines that reach each place (n, 2), and their numbers."""
-    values = np.empty((len(places), 16))
-    numbers = np.empty((len(places), 16), np.int64)
+    values = np.empty((len(positions), 16))
+    numbers = np.empty((len(positions), 16), np.int64)
     down = np.empty(4)
     across = np.empty(4)
-    for i in range(len(places)):
-        row = _spline(places[i, 0], counts[0], down)
-        column = _spline(places[i, 1], counts[1], across)
+    for i in range(len(positions)):
+        row = _spline(positions[i, 0], counts[0], down)
+        column = _spline(positions[i, 1], counts[1], across)
         for k in range(16):
             values[i, k] = down[k // 4] * across[k % 4]
             numbers[i, k] = (row + k // 4) * counts[1] + column + k % 4
@@ -105,12 +106,11 @@ def _normal_bands(
     a, b = np.triu_indices(16)
     rows = numbers[:, a]
     columns = numbers[:, b]
-    places = (width + rows - columns) * size + columns
+    entries = (width + rows - columns) * size + columns
     squares = weighted[:, a] * values[:, b]
-    banded = np.bincount(places.ravel(), squares.ravel(), (width + 1) * size).reshape(
-        width + 1, size
-    )
-    return banded, np.bincount(numbers.ravel(), (weighted * z[:, None]).ravel(), size)
+    banded = np.bincount(entries.ravel(), squares.ravel(), (width + 1) * size)
+    right = np.bincount(numbers.ravel(), (weighted * z[:, None]).ravel(), size)
+    return banded.reshape(width + 1, size), right
 
 
 @numba.njit(error_model="numpy", **PLAIN)
@@ -145,11 +145,8 @@ def _penalty(rows: int, columns: int) -> sparse.coo_array:
         differences = np.diff(np.eye(count), order, axis=0)
         return np.asarray(differences.T @ differences)
 
-    whole = sum(
-        factor
-        * sparse.csr_array(
-            sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr")
-        )
-        for order, factor in enumerate((1.0, 3.0, 3.0, 1.0))
-    )
-    return sparse.coo_array(sparse.triu(whole))
+    penalty = 0
+    for order, factor in enumerate((1.0, 3.0, 3.0, 1.0)):
+        mixed = sparse.kron(squared(rows, order), squared(columns, 3 - order), format="csr")
+        penalty = penalty + factor * sparse.csr_array(mixed)
+    return sparse.coo_array(sparse.triu(penalty))

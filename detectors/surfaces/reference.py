@@ -22,14 +22,12 @@ from harness.vocabulary.meshes import front_first, read_mesh
 
 SAMPLE = 4000
 STEPS = 20
-"""Number of points used; steps by closest points (twice as many by distances follow, then as many
-by planes)."""
+"""Number of steps by closest points (twice as many by distances follow, then as many by planes)."""
 LEAST_SCALE_M = 0.1 * MM
 FAR_M = 10.0
-EDGE_PX = 1.5
+EDGE_PX = 1.5  # pixels within this distance of a step or edge of the part are not judged
 BENT = 0.5
-"""Pixels within this distance of a step or edge of the part are not judged; bend, in pixels, that
-makes an edge."""
+"""Bend, in pixels, that makes an edge."""
 # a direction with a smaller share of the largest information is not fixed by the part
 LOOSE = 1e-6
 
@@ -55,11 +53,11 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
     as `front_of` does."""
     corners, normals = front_of(reference)
     ahead = normals[:, 2] > -LOOSE
-    whole = _scene(corners)
+    part = _scene(corners)
     front = _scene(corners[ahead])
-    some = points[:: max(1, len(points) // SAMPLE)]
-    tried = (_fitted(front, corners[ahead], normals[ahead], some, turn) for turn in range(4))
-    T_part_camera, off_m, error_m = min(tried, key=lambda found: found[1])
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    poses = [_fitted(front, corners[ahead], normals[ahead], sample, turn) for turn in range(4)]
+    T_part_camera, off_m, error_m = min(poses, key=lambda pose: pose[1])
 
     flat = points / points[:, 2:] if central else points
     pitch = float(np.sqrt(np.prod(np.ptp(flat[:, :2], axis=0)) / len(flat)))
@@ -67,37 +65,41 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
     def met(rays: np.ndarray) -> np.ndarray:
         """Return z where rays meet the part: from the lens through (n, 2) at z = 1, or along z at
         (n, 2)."""
-        places = np.column_stack([rays, np.full(len(rays), 1.0 if central else -FAR_M)])
-        starts, along = (
-            (np.zeros(places.shape), places) if central else (places, np.eye(3)[[2] * len(places)])
-        )
+        if central:
+            along = np.column_stack([rays, np.full(len(rays), 1.0)])
+            starts = np.zeros(along.shape)
+        else:
+            starts = np.column_stack([rays, np.full(len(rays), -FAR_M)])
+            along = np.eye(3)[[2] * len(rays)]
         origin = transform_points(T_part_camera, starts)
         ray = rotate_vectors(T_part_camera, along)
-        hit = whole.cast_rays(np.concatenate([origin, ray], axis=1).astype(np.float32))[
-            "primitive_ids"
-        ].numpy()
-        number = np.where(there := hit != whole.INVALID_ID, hit, 0)
+        hits = part.cast_rays(np.concatenate([origin, ray], axis=1).astype(np.float32))
+        triangle = hits["primitive_ids"].numpy()
+        is_hit = triangle != part.INVALID_ID
+        number = np.where(is_hit, triangle, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.einsum("ni,ni->n", corners[number, 0] - origin, normals[number])
             reach /= np.einsum("ni,ni->n", ray, normals[number])
-            return np.where(there, starts[:, 2] + reach, np.nan)
+            return np.where(is_hit, starts[:, 2] + reach, np.nan)
 
-    def z_at(places: np.ndarray) -> np.ndarray:
+    def z_at(queries: np.ndarray) -> np.ndarray:
         """Return z of the surface; NaN within `EDGE_PX` of a step, where a camera mixes both
         sides."""
-        rays = places[:, :2] / places[:, 2:] if central else places[:, :2]
+        rays = queries[:, :2] / queries[:, 2:] if central else queries[:, :2]
         z = met(rays)
         side = EDGE_PX * pitch
-        bends = [
-            met(rays + way) + met(rays - way) - 2 * z
-            for way in (np.array([side, 0]), np.array([0, side]))
-        ]
-        return np.where(
-            np.abs(bends).max(axis=0) < BENT * pitch * (np.abs(z) if central else 1.0), z, np.nan
-        )
+        bends = []
+        for shift in ([side, 0], [0, side]):
+            bends.append(met(rays + np.array(shift)) + met(rays - np.array(shift)) - 2 * z)
+        limit = BENT * pitch * (np.abs(z) if central else 1.0)
+        return np.where(np.abs(bends).max(axis=0) < limit, z, np.nan)
 
-    lies = f"the mesh {Path(reference.file).name}, with half of the points within {off_m / MM:.2g} mm of it"
-    return f"{lies}, placed along its normals within {error_m / MM:.2g} mm (standard error)", z_at
+    text = (
+        f"the mesh {Path(reference.file).name}, with half of the points within "
+        f"{off_m / MM:.2g} mm of it, placed along its normals within "
+        f"{error_m / MM:.2g} mm (standard error)"
+    )
+    return text, z_at
 
 
 def _scene(corners: np.ndarray) -> Any:
@@ -113,41 +115,40 @@ def _fitted(
     scene: Any, corners: np.ndarray, normals: np.ndarray, points: np.ndarray, turn: int
 ) -> tuple[np.ndarray, float, float]:
     """Return T_part_camera, found from one rotation by a multiple of 90 degrees; the median
-    distance of the points (n, 3) from the part's planes; and the standard error of its place along
-    them, if the points are independent."""
+    distance of the points (n, 3) from the part's planes; and the standard error of its position
+    along them, if the points are independent."""
     c, s = np.rint([np.cos(turn * np.pi / 2), np.sin(turn * np.pi / 2)])
     T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ T[:3, :3]
     T[:3, 3] = np.median(corners.reshape(-1, 3), axis=0) - T[:3, :3] @ np.median(points, axis=0)
     pitch_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
     for step in range(4 * STEPS):
+        by_planes = step >= 3 * STEPS
         moved = transform_points(T, points)
-        found = scene.compute_closest_points(moved.astype(np.float32))
-        apart = moved - found["points"].numpy()
-        towards = normals[found["primitive_ids"].numpy()]
-        off = np.linalg.norm(apart, axis=1)
-        if step >= 3 * STEPS:
-            off = np.einsum("ni,ni->n", apart, towards)
+        closest = scene.compute_closest_points(moved.astype(np.float32))
+        offsets = moved - closest["points"].numpy()
+        towards = normals[closest["primitive_ids"].numpy()]
+        if by_planes:
+            off = np.einsum("ni,ni->n", offsets, towards)
+            least_scale_m = LEAST_SCALE_M
         else:  # a point beyond an edge attracts that edge
-            towards = np.where(
-                off[:, None] > LEAST_SCALE_M,
-                apart / np.maximum(off, LEAST_SCALE_M)[:, None],
-                towards,
-            )
-        scale_m = max(
-            float(np.median(np.abs(off))) / 0.6745, LEAST_SCALE_M if step >= 3 * STEPS else pitch_m
-        )
+            off = np.linalg.norm(offsets, axis=1)
+            lengths_m = np.maximum(off, LEAST_SCALE_M)[:, None]
+            towards = np.where(off[:, None] > LEAST_SCALE_M, offsets / lengths_m, towards)
+            least_scale_m = pitch_m
+        scale_m = max(float(np.median(np.abs(off))) / 0.6745, least_scale_m)
         weight = bisquare_weights(off, BISQUARE_TUNING * scale_m)
         if step < STEPS:
-            T = kabsch(moved, moved - apart, weight) @ T
+            T = kabsch(moved, moved - offsets, weight) @ T
             continue
-        off = np.einsum("ni,ni->n", apart, towards)
+        off = np.einsum("ni,ni->n", offsets, towards)
         middle = moved.mean(axis=0)
         slopes = np.einsum("ni,nij->nj", towards, displacement_jacobian(moved, middle))
-        information = (slopes * weight[:, None]).T @ slopes
+        weighted = (slopes * weight[:, None]).T
         # no motion along a direction that the part does not fix
-        inverse = np.linalg.pinv(information, rcond=LOOSE, hermitian=True)
-        T = moved_by(-inverse @ (slopes * weight[:, None]).T @ off, middle) @ T
+        inverse = np.linalg.pinv(weighted @ slopes, rcond=LOOSE, hermitian=True)
+        T = moved_by(-inverse @ weighted @ off, middle) @ T
     spread_m2 = float((weight * off**2).sum() / weight.sum())
-    error_m = float(np.sqrt(spread_m2 * np.einsum("ni,ij,nj->n", slopes, inverse, slopes).mean()))
+    variances = np.einsum("ni,ij,nj->n", slopes, inverse, slopes)
+    error_m = float(np.sqrt(spread_m2 * variances.mean()))
     return T, float(np.median(np.abs(off))), error_m

@@ -21,97 +21,66 @@ from detectors.pixels.masks import (
 from detectors.pixels.noise import quantile_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 
-MAX_SURFACE_TILT = 6.0
+MAX_SURFACE_TILT = 6.0  # tan(80.5 degrees): a steeper step is an edge
 STEP_SIGMAS = 6.0
-"""tan(80.5 degrees): a steeper step is an edge. A step of fewer standard deviations of a
-difference may be noise."""
+"""A step of fewer standard deviations of a difference may be noise."""
 BRIDGED_PX = 2  # largest distance from which a pixel without a return takes its point
-SMOOTH_MM = 16.0
+SMOOTH_MM = 16.0  # width of the window on a coarse grid
 MIXED_PX = 3
-"""Width of the window on a coarse grid, and half of the least number of pixels over which a bend
-is judged."""
-NORMAL_NOISE = 0.06
+"""Half of the least number of pixels over which a bend is judged."""
+NORMAL_NOISE = 0.06  # largest noise of the smoothed surface's slope, radians
 WIDEST_SMOOTH_PX = 41
-"""Largest noise of the smoothed surface's slope, radians; noisier clouds use a wider window, up to
-this one."""
+"""Widest window; noisier clouds use a wider one up to this."""
 # a surface with a smaller share of all pixels or fewer pixels is not a candidate
 LEAST_SHARE = 0.004
 LEAST_PX = 100
 LEAST_SHARED_PX = 10  # pixels that the rims of two surfaces must share to be merged
-CONTACT_MM = 5.0
+CONTACT_MM = 5.0  # two surfaces touch at a common border if their step there is smaller
 CONTACT_SIGMAS = 3.0
-"""Two surfaces touch at a common border if their step there is smaller; the noise of a difference
-raises this limit."""
-RIM_TURN_DEG = (
-    10.0  # largest turn of a rim from the surface inside it, beyond the bend of that surface
-)
+"""Least limit of such a step, in standard deviations of a difference."""
+RIM_TURN_DEG = 10.0
+"""Largest turn of a rim from the surface inside it, beyond the bend of that surface."""
 MOST_SURFACES = 8
 WIDE_PART = 0.1
-"""Most surfaces; least share of pixels at the middle of a full window: a smoothed step has no such
-pixel."""
+"""Least share of pixels at the middle of a full window: a smoothed step has no such pixel."""
 WIDEST_SLOPE = 5.7
 """tan(80 degrees): no camera sees so far off its axis; a cloud with a larger slope was not
 recorded from its origin."""
-CELL_SPACINGS = 1.5
-CELL_GROWTH = 1.25
-CELLS_FILLED = 0.99
+CELL_SPACINGS = 1.5  # least side of a raster's cell in spacings
+CELL_GROWTH = 1.25  # its growth until enough cells hold a point
+CELLS_FILLED = 0.99  # enough
 MAX_RASTER = 4096
-"""Least side of a raster's cell in spacings; its growth until this share of cells hold a point;
-most cells a side."""
+"""Most cells a side."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """``own`` (n, h, w) bool: each surface's pixels, largest core first. ``filled`` (n, h, w)
-    bool: the same with all that they enclose. ``contact_m``: smaller steps do not count.
-    ``reach_px``: smoothing's reach from an edge."""
+    """The smooth surfaces of a cloud, largest core first."""
 
+    # each surface's pixels (n, h, w) bool
     own: np.ndarray
+    # the same with all that they enclose (n, h, w) bool
     filled: np.ndarray
+    # smaller steps between surfaces do not count, metres
     contact_m: float
+    # smoothing's reach from an edge
     reach_px: int
 
 
 def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces:
     """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider in
     noisy clouds."""
-    points = np.array(cloud.points_m, np.float64)
-    seen = cloud.valid
-    valid = seen
-    if seen.any() and not seen.all():
-        apart, nearest = nearest_pixel(seen)
-        valid = apart <= BRIDGED_PX
-        gaps = valid & ~seen
-        points[gaps] = points.reshape(-1, 3)[nearest[gaps]]
-    # noise of a difference between neighbours, from the lowest quarter of the second differences
-    # of z along rows (three quarters of the picture may be rubble): they have sqrt(6) of white
-    # noise's sigma,
-    # first differences sqrt(2)
-    z = np.ascontiguousarray(cloud.points_m[..., 2])
-    bends = np.abs(z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2])
-    bends = bends[np.isfinite(bends)]
-    noise_m = quantile_of(bends, 0.25) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
-    noise_m = max(noise_m, cloud.z_step_m * np.sqrt(2.0 / 12.0))
-    # the lateral distance of neighbours in the nearest tenth of the view
-    steps = np.hypot(np.diff(points[::4, :, 0], axis=1), np.diff(points[::4, :, 1], axis=1))
-    steps = steps[np.isfinite(steps) & (steps > 0)]
-    pitch_m = quantile_of(steps, 0.1) if len(steps) else 0.0
-    window = smooth_px
-    half = max(smooth_px // 2, 1)
-    if pitch_m:
-        # a central difference of the mean of n x n pixels has noise_m / (sqrt(2) n^1.5 pitch)
-        by_noise = (noise_m / (math.sqrt(2.0) * NORMAL_NOISE * pitch_m)) ** (2.0 / 3.0)
-        wanted = max(min(smooth_px, SMOOTH_MM * MM / pitch_m), by_noise, 3.0)
-        window = min(2 * int(wanted / 2.0) + 1, max(WIDEST_SMOOTH_PX, smooth_px))
-        # a camera that interpolates spreads a step over several pixels: on a coarse grid, over
-        # more than the window
-        half = max(window // 2, min(MIXED_PX, int(0.75 * SMOOTH_MM * MM / pitch_m)), 1)
+    has_return = cloud.valid
+    points, valid = _bridged(cloud)
+    noise_m = _step_noise_m(cloud)
+    pitch_m = _pitch_m(points)
+    window, half = _windows(pitch_m, noise_m, smooth_px)
 
     size = (window, window)
     weight = cv2.blur(valid.astype(np.float64), size, borderType=cv2.BORDER_REFLECT)
-    filled = points.copy()
-    filled[~valid] = 0.0
-    smooth = cv2.blur(filled, size, borderType=cv2.BORDER_REFLECT)
+    smooth = points.copy()
+    smooth[~valid] = 0.0
+    smooth = cv2.blur(smooth, size, borderType=cv2.BORDER_REFLECT)
     smooth = np.asarray(smooth / np.maximum(weight, 1e-12)[..., None])
     # whether the grid samples rays through the origin, as a camera does
     central = cloud.projection == "central" and _before_lens(points)
@@ -119,8 +88,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
         right, down = links(points, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m, central)
     else:
         # single points would need a tolerance so wide that it joins separate surfaces
-        known = np.where(valid[..., None], smooth, np.nan)
-        right, down = links(known, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m / window, central)
+        known_m = np.where(valid[..., None], smooth, np.nan)
+        right, down = links(known_m, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m / window, central)
     normals = unit_normals(smooth)
     bent = turns(normals, half, math.cos(math.radians(crease_deg)))
     cores, sizes = components(valid & ~bent, right, down)
@@ -129,24 +98,75 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given
     # back if no step and no other surface's core separates them from the core
     reach = window // 2 + 1 + half
-    own = np.zeros((count, *valid.shape), dtype=bool)
-    for number, mask in enumerate(own, start=1):
+    masks = np.zeros((count, *valid.shape), dtype=bool)
+    for number, mask in enumerate(masks, start=1):
         core = cores == number
         free = valid & grown(core, reach) & (core | (cores == 0))
         mask[:] = core | (components(free, right, down)[0] == 1)
     local = _Smooth(points.reshape(-1, 3), smooth.reshape(-1, 3), normals.reshape(-1, 3), central)
     contact_m = max(CONTACT_MM * MM, CONTACT_SIGMAS * noise_m)
-    own = _joined(own, cores, local, contact_m, math.radians(crease_deg / 2.0))
-    _share_contested(own, cores, local)
-    _trim_rims(own, cores, seen, local, window, reach, contact_m)
-    filled = np.array([holes_filled(each) for each in own]) if len(own) else own.copy()
-    return Surfaces(own & seen, filled, contact_m, reach)
+    masks = _joined(masks, cores, local, contact_m, math.radians(crease_deg / 2.0))
+    _share_contested(masks, cores, local)
+    _trim_rims(masks, cores, has_return, local, window, reach, contact_m)
+    filled = masks.copy()
+    for number, mask in enumerate(masks):
+        filled[number] = holes_filled(mask)
+    return Surfaces(masks & has_return, filled, contact_m, reach)
+
+
+def _bridged(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (h, w, 3) with those of near pixels in small gaps, and which are valid."""
+    points = np.array(cloud.points_m, np.float64)
+    has_return = cloud.valid
+    if has_return.all() or not has_return.any():
+        return points, has_return
+    distance_px, nearest = nearest_pixel(has_return)
+    valid = distance_px <= BRIDGED_PX
+    gaps = valid & ~has_return
+    points[gaps] = points.reshape(-1, 3)[nearest[gaps]]
+    return points, valid
+
+
+def _step_noise_m(cloud: Cloud) -> float:
+    """Return the noise of a difference between neighbours, from the lowest quarter of the second
+    differences of z along rows: three quarters of the picture may be rubble."""
+    z = np.ascontiguousarray(cloud.points_m[..., 2])
+    bends = np.abs(z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2])
+    bends = bends[np.isfinite(bends)]
+    noise_m = 0.0
+    if len(bends):
+        # second differences have sqrt(6) of white noise's sigma, first differences sqrt(2)
+        noise_m = quantile_of(bends, 0.25) / 0.3186 * np.sqrt(2.0 / 6.0)
+    return max(noise_m, cloud.z_step_m * np.sqrt(2.0 / 12.0))
+
+
+def _pitch_m(points: np.ndarray) -> float:
+    """Return the lateral distance of neighbours in the nearest tenth of the view; 0 if unknown."""
+    rows = points[::4]
+    steps = np.hypot(np.diff(rows[..., 0], axis=1), np.diff(rows[..., 1], axis=1))
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    return quantile_of(steps, 0.1) if len(steps) else 0.0
+
+
+def _windows(pitch_m: float, noise_m: float, smooth_px: int) -> tuple[int, int]:
+    """Return the window of the means, and half of the pixels over which a bend is judged."""
+    if not pitch_m:
+        return smooth_px, max(smooth_px // 2, 1)
+    # a central difference of the mean of n x n pixels has noise_m / (sqrt(2) n^1.5 pitch)
+    by_noise = (noise_m / (math.sqrt(2.0) * NORMAL_NOISE * pitch_m)) ** (2.0 / 3.0)
+    wanted = max(min(smooth_px, SMOOTH_MM * MM / pitch_m), by_noise, 3.0)
+    window = min(2 * int(wanted / 2.0) + 1, max(WIDEST_SMOOTH_PX, smooth_px))
+    # a camera that interpolates spreads a step over several pixels: on a coarse grid, over more
+    # than the window
+    mixed_px = min(MIXED_PX, int(0.75 * SMOOTH_MM * MM / pitch_m))
+    return window, max(window // 2, mixed_px, 1)
 
 
 def _before_lens(points: np.ndarray) -> bool:
-    """Return whether a camera at the origin may see all finite points (..., 3), and there are any."""
+    """Return whether there are finite points (..., 3), and a camera at the origin may see all."""
     x, y, z = np.moveaxis(points, -1, 0)
-    beyond = (z <= 0) | (np.maximum(np.abs(x), np.abs(y)) >= WIDEST_SLOPE * z)
+    lateral = np.maximum(np.abs(x), np.abs(y))
+    beyond = (z <= 0) | (lateral >= WIDEST_SLOPE * z)
     return bool(np.isfinite(z).any() and not beyond.any())
 
 
@@ -161,22 +181,21 @@ def links(
     linked = np.zeros((2, h, w), np.bool_)
     for v in range(h):
         for u in range(w):
-            for way in range(2):
-                row = v + way
-                column = u + 1 - way
+            for axis in range(2):
+                row = v + axis
+                column = u + 1 - axis
                 if row < h and column < w:
-                    here = points_m[v, u]
-                    there = points_m[row, column]
+                    point = points_m[v, u]
+                    neighbour = points_m[row, column]
                     ours = 1.0
                     theirs = 1.0
                     if central:
-                        ours = min(there[2] / here[2], 1.0)
-                        theirs = min(here[2] / there[2], 1.0)
-                    dx = there[0] * theirs - here[0] * ours
-                    dy = there[1] * theirs - here[1] * ours
-                    linked[way, v, u] = (
-                        abs(there[2] - here[2]) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
-                    )
+                        ours = min(neighbour[2] / point[2], 1.0)
+                        theirs = min(point[2] / neighbour[2], 1.0)
+                    dx = neighbour[0] * theirs - point[0] * ours
+                    dy = neighbour[1] * theirs - point[1] * ours
+                    limit = tilt * math.sqrt(dx * dx + dy * dy) + noise_m
+                    linked[axis, v, u] = abs(neighbour[2] - point[2]) <= limit
     return linked[0], linked[1]
 
 
@@ -192,20 +211,18 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
         above = max(v - 1, 0)
         below = min(v + 1, h - 1)
         for u in range(w):
-            left = max(u - 1, 0)
-            right = min(u + 1, w - 1)
+            before = max(u - 1, 0)
+            after = min(u + 1, w - 1)
             for k in range(3):  # the length of either step does not matter
-                along[k] = surface_m[v, right, k] - surface_m[v, left, k]
+                along[k] = surface_m[v, after, k] - surface_m[v, before, k]
                 down[k] = surface_m[below, u, k] - surface_m[above, u, k]
             x = along[1] * down[2] - along[2] * down[1]
             y = along[2] * down[0] - along[0] * down[2]
             z = along[0] * down[1] - along[1] * down[0]
             length = max(math.sqrt(x * x + y * y + z * z), 1e-15)
-            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = (
-                x / length,
-                y / length,
-                z / length,
-            )
+            normals[v, u, 0] = x / length
+            normals[v, u, 1] = y / length
+            normals[v, u, 2] = z / length
     return normals
 
 
@@ -213,21 +230,23 @@ def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
     """Return (h, w) bool: whether the unit normals ``half`` pixels to either side enclose a wider
     angle."""
     turned = np.zeros(normals.shape[:2], dtype=bool)
-    for ahead, middle, back in (
-        (np.s_[2 * half :], np.s_[half:-half], np.s_[: -2 * half]),
-        (np.s_[:, 2 * half :], np.s_[:, half:-half], np.s_[:, : -2 * half]),
-    ):
-        turned[middle] |= np.einsum("ijk,ijk->ij", normals[ahead], normals[back]) < least_cosine
+    down = np.einsum("ijk,ijk->ij", normals[2 * half :], normals[: -2 * half])
+    turned[half:-half] |= down < least_cosine
+    across = np.einsum("ijk,ijk->ij", normals[:, 2 * half :], normals[:, : -2 * half])
+    turned[:, half:-half] |= across < least_cosine
     return turned
 
 
 class _Smooth(NamedTuple):
-    """Points (n, 3), their local means, the unit normals of the means, and whether rays meet in
-    the origin."""
+    """The smoothed surface at each pixel of a cloud."""
 
+    # points (n, 3), metres
     points_m: np.ndarray
+    # their local means (n, 3), metres
     means_m: np.ndarray
+    # unit normals of the means (n, 3)
     normals: np.ndarray
+    # whether rays meet in the origin, else they run along z
     central: bool
 
     def misses_m(self, pixels: np.ndarray, seeds: np.ndarray) -> np.ndarray:
@@ -236,8 +255,8 @@ class _Smooth(NamedTuple):
         points = self.points_m[pixels]
         normals = self.normals[seeds]
         height = ((self.means_m[seeds] - points) * normals).sum(axis=1)
-        way = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
-        return np.abs(height) / np.maximum(np.abs((normals * way).sum(axis=1)), 1e-3)
+        rays = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
+        return np.abs(height) / np.maximum(np.abs((normals * rays).sum(axis=1)), 1e-3)
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
@@ -248,8 +267,10 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
         core = cores == number
         u, v, width, height = cv2.boundingRect(core.view(np.uint8))
-        whole = holes_filled(core[v : v + height, u : u + width], rim_px=1)
-        if np.count_nonzero(shrunk(whole, window)) >= WIDE_PART * np.count_nonzero(whole):
+        filled_core = holes_filled(core[v : v + height, u : u + width], rim_px=1)
+        if np.count_nonzero(shrunk(filled_core, window)) >= WIDE_PART * np.count_nonzero(
+            filled_core
+        ):
             kept.append(number)
     if not kept and len(sizes):
         kept = [1]
@@ -261,47 +282,55 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
 
 
 def _joined(
-    own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
+    masks: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float
 ) -> np.ndarray:
-    """Return ``own`` with surfaces merged, also in ``cores``, if their rims share pixels and their
-    planes agree."""
-    stays = np.arange(len(own))
-    for i in range(len(own)):
-        for j in range(i + 1, len(own)):
-            pixels = np.flatnonzero(own[i] & own[j])
+    """Return ``masks`` with surfaces merged, also in ``cores``, if their rims share pixels and
+    their planes agree."""
+    if not len(masks):
+        return masks
+    stays = np.arange(len(masks))
+    for i in range(len(masks)):
+        for j in range(i + 1, len(masks)):
+            pixels = np.flatnonzero(masks[i] & masks[j])
             if len(pixels) < LEAST_SHARED_PX or stays[i] == stays[j]:
                 continue
-            seeds = [nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels] for number in (i, j)]
-            misses = np.maximum(*(smooth.misses_m(pixels, each) for each in seeds))
-            cosines = (smooth.normals[seeds[0]] * smooth.normals[seeds[1]]).sum(axis=1)
+            first = _seeds(cores == i + 1, pixels)
+            second = _seeds(cores == j + 1, pixels)
+            misses = np.maximum(smooth.misses_m(pixels, first), smooth.misses_m(pixels, second))
+            cosines = (smooth.normals[first] * smooth.normals[second]).sum(axis=1)
             if np.median(misses) <= apart_m and np.median(cosines) >= math.cos(turn):
                 stays[stays == stays[j]] = stays[i]
     kept = np.unique(stays)
-    numbers = np.zeros(max(len(own), int(cores.max(initial=0))) + 1, dtype=cores.dtype)
-    numbers[1 : len(own) + 1] = np.searchsorted(kept, stays) + 1
+    numbers = np.zeros(max(len(masks), int(cores.max(initial=0))) + 1, dtype=cores.dtype)
+    numbers[1 : len(masks) + 1] = np.searchsorted(kept, stays) + 1
     cores[:] = numbers[cores]
-    return np.array([own[stays == each].any(axis=0) for each in kept]) if len(own) else own
+    return np.array([masks[stays == label].any(axis=0) for label in kept])
 
 
-def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> None:
+def _seeds(core: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the core's nearest pixel to each of the pixels (n,)."""
+    return nearest_pixel(core)[1].reshape(-1)[pixels]
+
+
+def _share_contested(masks: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> None:
     """Give each pixel of several rims to the surface whose plane, extended from its core, is
     nearest."""
-    pixels = np.flatnonzero(own.sum(axis=0) > 1)
+    pixels = np.flatnonzero(masks.sum(axis=0) > 1)
     if not len(pixels):
         return
-    misses = np.full((len(own), len(pixels)), np.inf)
-    for number, mask in enumerate(own):
+    misses = np.full((len(masks), len(pixels)), np.inf)
+    for number, mask in enumerate(masks):
         holds = mask.reshape(-1)[pixels]
         if holds.any():
-            seeds = nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels[holds]]
+            seeds = _seeds(cores == number + 1, pixels[holds])
             misses[number, holds] = smooth.misses_m(pixels[holds], seeds)
     winner = misses.argmin(axis=0)
-    for number in range(len(own)):
-        own[number].reshape(-1)[pixels[winner != number]] = False
+    for number in range(len(masks)):
+        masks[number].reshape(-1)[pixels[winner != number]] = False
 
 
 def _trim_rims(
-    own: np.ndarray,
+    masks: np.ndarray,
     cores: np.ndarray,
     valid: np.ndarray,
     smooth: _Smooth,
@@ -312,34 +341,28 @@ def _trim_rims(
     """Remove the parts of each surface's rim that depart from the surface inside, and pixels
     connected only by them."""
     points, means, normals, _ = smooth
-    for number in range(len(own)):
+    h, w = valid.shape
+    for number in range(len(masks)):
         # the picture's edge is a rim too: a strip of background may lie there
-        whole = holes_filled(own[number] & valid, rim_px=1)
-        rim = own[number] & ~shrunk(whole, 2 * reach + 1)[1:-1, 1:-1]
-        inner = shrunk(whole, 2 * reach + window)[1:-1, 1:-1] & shrunk(cores == number + 1, window)
+        filled_mask = holes_filled(masks[number] & valid, rim_px=1)
+        rim = masks[number] & ~shrunk(filled_mask, 2 * reach + 1)[1:-1, 1:-1]
+        inner = shrunk(filled_mask, 2 * reach + window)[1:-1, 1:-1]
+        inner = inner & shrunk(cores == number + 1, window)
         if not inner.any():
             continue
-        apart, nearest = nearest_pixel(inner)
-        pixels = np.flatnonzero(rim & (apart <= 3 * reach))
-        leaves = _leaves(
-            pixels,
-            nearest.reshape(-1)[pixels],
-            points,
-            means,
-            normals,
-            *valid.shape,
-            reach,
-            apart_m,
-        )
-        own[number].reshape(-1)[pixels[leaves]] = False
-        own[number] = parts_with(own[number], inner, connectivity=4)
+        distance_px, nearest = nearest_pixel(inner)
+        pixels = np.flatnonzero(rim & (distance_px <= 3 * reach))
+        seeds = nearest.reshape(-1)[pixels]
+        leaves = _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m)
+        masks[number].reshape(-1)[pixels[leaves]] = False
+        masks[number] = parts_with(masks[number], inner, connectivity=4)
 
 
 @numba.njit(**PLAIN)
 def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # type: ignore[no-untyped-def]
     """Return whether each of the pixels (n,) departs from the surface at its seed (n,) farther
     inside."""
-    found = np.zeros(len(pixels), np.bool_)
+    departs = np.zeros(len(pixels), np.bool_)
     for i in range(len(pixels)):
         pixel = pixels[i]
         seed = seeds[i]
@@ -349,19 +372,23 @@ def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # typ
         across = column - pixel % w
         step = reach / max(math.sqrt(down**2 + across**2), 1.0)
         # the bend of the surface over the same distance inwards, radians per metre
-        end = min(max(round(row + down * step), 0), h - 1) * w + min(
-            max(round(column + across * step), 0), w - 1
-        )
-        off = distance = cosine = span = 0.0
+        end_row = min(max(round(row + down * step), 0), h - 1)
+        end_column = min(max(round(column + across * step), 0), w - 1)
+        end = end_row * w + end_column
+        off = 0.0
+        distance = 0.0
+        cosine = 0.0
+        span = 0.0
         for k in range(3):
             off += (points[pixel, k] - means[seed, k]) * normals[seed, k]
             distance += (points[pixel, k] - means[seed, k]) ** 2
             cosine += normals[seed, k] * normals[end, k]
             span += (means[seed, k] - means[end, k]) ** 2
         bend = math.acos(min(max(cosine, 0.0), 1.0)) / max(math.sqrt(span), 1e-9)
-        turn = min(math.radians(RIM_TURN_DEG) + bend * math.sqrt(distance) / 2.0, math.pi / 2.0)
-        found[i] = abs(off) > max(apart_m, math.sin(turn) * math.sqrt(distance))
-    return found
+        turn = math.radians(RIM_TURN_DEG) + bend * math.sqrt(distance) / 2.0
+        turn = min(turn, math.pi / 2.0)
+        departs[i] = abs(off) > max(apart_m, math.sin(turn) * math.sqrt(distance))
+    return departs
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:
@@ -370,23 +397,17 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     from scipy.spatial import cKDTree
 
     plan = points[:, :2]
-    z = points[:, 2:]
     if _before_lens(points):
-        plan = plan / z
+        plan = plan / points[:, 2:]
     # the 90th percentile of the distances to the nearest neighbour, from about 2000 places
-    some = plan[:: max(1, len(plan) // 2000)]
-    to_nearest = cKDTree(plan).query(some, k=min(2, len(plan)))[0].reshape(len(some), -1)[:, -1]
+    sample = plan[:: max(1, len(plan) // 2000)]
+    distances = cKDTree(plan).query(sample, k=min(2, len(plan)))[0]
+    to_nearest = distances.reshape(len(sample), -1)[:, -1]
     spacing = max(float(np.quantile(to_nearest, 0.9)), 1e-9)
     side = max(CELL_SPACINGS * spacing, float(np.ptp(plan, axis=0).max()) / MAX_RASTER)
     while True:
         columns, rows = np.floor((plan - plan.min(axis=0)) / side).astype(int).T
-        # share of filled cells in blocks of 2 x 2 that hold a place and whose eight neighbours do:
-        # a gap that is wider than a block does not come from a lack of points
-        held = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
-        held[rows, columns] = True
-        in_block = held.reshape(held.shape[0] // 2, 2, held.shape[1] // 2, 2).sum(axis=(1, 3))
-        inner = shrunk(np.pad(in_block > 0, 1), 3)[1:-1, 1:-1]
-        if not inner.any() or float(in_block[inner].mean()) / 4.0 >= CELLS_FILLED:
+        if _is_filled(rows, columns):
             break
         side *= CELL_GROWTH
     rows = rows + 1
@@ -399,5 +420,25 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     none = np.full(shape, np.nan)
     zeros = np.zeros(shape, dtype=np.uint8)
     region = Region(0, shape[0], 0, shape[1])
-    grid = Cloud(image, zeros, zeros.astype(int), none, region, cloud.z_step_m, cloud.n_frames)
+    grid = Cloud(
+        points_m=image,
+        reason=zeros,
+        count=zeros.astype(int),
+        variance_m2=none,
+        region=region,
+        z_step_m=cloud.z_step_m,
+        n_frames=cloud.n_frames,
+    )
     return grid, rows, columns, side / spacing
+
+
+def _is_filled(rows: np.ndarray, columns: np.ndarray) -> bool:
+    """Return whether enough cells hold a place, in blocks of 2 x 2 that hold one and whose eight
+    neighbours do: a gap that is wider than a block does not come from a lack of points."""
+    down = rows.max() // 2 + 1
+    across = columns.max() // 2 + 1
+    occupied = np.zeros((2 * down, 2 * across), dtype=bool)
+    occupied[rows, columns] = True
+    in_block = occupied.reshape(down, 2, across, 2).sum(axis=(1, 3))
+    inner = shrunk(np.pad(in_block > 0, 1), 3)[1:-1, 1:-1]
+    return not inner.any() or float(in_block[inner].mean()) / 4.0 >= CELLS_FILLED

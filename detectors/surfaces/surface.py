@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numba
 import numpy as np
@@ -25,53 +25,53 @@ from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
 
 SAMPLE_POINTS = 2048
 BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
-LTS_SAMPLE = 8192
-LTS_SMALL = 600
-LTS_STARTS = 500
-LTS_KEPT = 10
+LTS_SAMPLE = 8192  # points in FAST-LTS's large sample
+LTS_SMALL = 600  # points in its first sample
+LTS_STARTS = 500  # starts from as few points as there are coefficients
+LTS_KEPT = 10  # starts that are continued on the large sample
 LTS_STEPS = 10
-"""FAST-LTS: points in the large and in the first sample, elemental starts, continued starts and
-their steps."""
+"""Steps of each continued start."""
 LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: it tolerates up to 45 % damage
 LTS_SEED = 20201102
 LAR_THINNING = 12
 LAR_STEPS = 60
 HALVINGS = 12
-KNEES = np.array(
-    [1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6]
-)  # knees of Huber's function, in units of the median |r|
-BISQUARE_CONVERGED = 1e-2
+KNEES = np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])
+"""Knees of Huber's function, in units of the median |r|."""
+BISQUARE_CONVERGED = 1e-2  # bisquare stops below this share of a standard error of the fit
 GAP_CONVERGED = 1e-6
-"""Bisquare stops below this share of a standard error of the fit, LAR if the relative duality gap
-is this small."""
+"""LAR stops if the relative duality gap is this small."""
 TINY_M = 1e-9  # residuals below a nanometre are rounding errors
 
 Solution = tuple[np.ndarray, str]  # coefficients (p,) and a description of the fit
 
 
 class ReferenceConfig(Config):
-    """The part's own mesh, which may be open. ``front``: the axis of the file that points to the
-    camera."""
+    """The part's own mesh, which may be open."""
 
     file: Annotated[str, Field(min_length=1, max_length=1000, description=FILES)]
     unit: FileUnit = "mm"
+    # the axis of the file that points to the camera
     front: FrontAxis = "+z"
 
 
 class SurfaceConfig(Config):
-    """``shape``: ``polynomial``, of the stated total ``degree`` (3: MATLAB's poly33); ``auto``,
-    the simplest of plane, polynomials, quadric and free form that the cloud supports;
-    ``free_form``; or ``mesh``, the ``reference`` fitted to the cloud. ``scale_mm``: width above
-    which a free form follows the cloud. ``method``: ``lar`` least absolute residuals; ``bisquare``
-    Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` bisquare from a FAST-LTS
-    start, which tolerates damage of a third of the surface; ``least_squares``.
-    ``drop_cross_terms``: whether terms in both x and y are left out (as in the thesis' script)."""
+    """The kind of surface that is fitted, and how."""
 
+    # ``polynomial``, of the stated degree; ``auto``, the simplest of plane, polynomials, quadric
+    # and free form that the cloud supports; ``free_form``; ``mesh``, the reference's
     shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
+    # the mesh that is fitted to the cloud
     reference: ReferenceConfig | None = None
+    # width above which a free form follows the cloud
     scale_mm: float | None = Field(default=None, gt=0)
+    # total degree of the polynomial (3: MATLAB's poly33)
     degree: int = Field(default=3, ge=0, le=8)
+    # ``lar`` least absolute residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's
+    # semantics); ``lts`` bisquare from a FAST-LTS start, which tolerates damage of a third of the
+    # surface
     method: Literal["lar", "bisquare", "lts", "least_squares"] = "lar"
+    # whether terms in both x and y are left out (as in the thesis' script)
     drop_cross_terms: bool = False
 
     @model_validator(mode="after")
@@ -83,22 +83,29 @@ class SurfaceConfig(Config):
 
 @dataclass(frozen=True)
 class Chebyshev:
-    """Products T_a(u) T_b(v) for rows (a, b) of ``powers`` (p, 2); (u, v) = ((x, y) -
-    ``middle_m``) / ``half_m``."""
+    """Products T_a(u) T_b(v) of Chebyshev polynomials; (u, v) = ((x, y) - middle) / half."""
 
+    # orders (a, b) of each product (p, 2)
     powers: np.ndarray
+    # middle of the places (2,), metres
     middle_m: np.ndarray
+    # half of their extent (2,), metres
     half_m: np.ndarray
 
     @classmethod
     def over(cls, xy_m: np.ndarray, degree: int, cross_terms: bool = True) -> Chebyshev:
         """Return the products up to a total degree over places (n, 2), which may coincide."""
-        orders = [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
+        powers = []
+        for total in range(degree + 1):
+            for i in range(total, -1, -1):
+                j = total - i
+                # separable polynomials f(x) + g(y) stay separable under scaling of each axis
+                if cross_terms or not (i and j):
+                    powers.append((i, j))
         low = np.array([np.min(xy_m[:, 0]), np.min(xy_m[:, 1])])
         high = np.array([np.max(xy_m[:, 0]), np.max(xy_m[:, 1])])
-        # separable polynomials f(x) + g(y) stay separable under scaling of each axis
-        powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
-        return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
+        half_m = np.maximum((high - low) / 2, TINY_M)
+        return cls(np.array(powers), (low + high) / 2, half_m)
 
     def basis(self, xy_m: np.ndarray) -> np.ndarray:
         """Return the products (p, n) at places (n, 2)."""
@@ -109,15 +116,15 @@ class Chebyshev:
 
     def total(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
         """Return the sum (n,) of the products at places (n, 2), each times its coefficient (p,)."""
-        starts = range(0, max(len(xy_m), 1), AT_ONCE)
-        return np.concatenate(
-            [coefficients @ self.basis(xy_m[first : first + AT_ONCE]) for first in starts]
-        )
+        sums = []
+        for first in range(0, max(len(xy_m), 1), AT_ONCE):
+            basis = self.basis(xy_m[first : first + AT_ONCE])
+            sums.append(coefficients @ basis)
+        return np.concatenate(sums)
 
 
-# places whose products, and whose orders of u and v, stay in the caches
-AT_ONCE = 4096
-BLOCK = 512
+AT_ONCE = 4096  # places whose products stay in the caches
+BLOCK = 512  # places whose orders of u and v stay in the caches
 
 
 @numba.njit(**PLAIN)
@@ -149,30 +156,30 @@ def _write_products(xy_m, powers, middle_m, half_m, products):  # type: ignore[n
 
 @dataclass(frozen=True)
 class Surface:
-    """A fitted surface; ``coefficients`` (p,) metres."""
+    """A fitted polynomial surface z(x, y)."""
 
     chebyshev: Chebyshev
+    # one for each product (p,), metres
     coefficients: np.ndarray
+    # how it was fitted
     note: str
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return z in metres at x, y of one shape; NaN where they are NaN. Polynomials extrapolate
         badly."""
-        x, y = np.broadcast_arrays(
-            np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
-        )
-        return self.chebyshev.total(
-            self.coefficients, np.column_stack([x.ravel(), y.ravel()])
-        ).reshape(x.shape)
+        x = np.asarray(x_m, dtype=np.float64)
+        y = np.asarray(y_m, dtype=np.float64)
+        x, y = np.broadcast_arrays(x, y)
+        places_m = np.column_stack([x.ravel(), y.ravel()])
+        return self.chebyshev.total(self.coefficients, places_m).reshape(x.shape)
 
     def gradients(self, x_m: np.ndarray, y_m: np.ndarray, step_m: float) -> np.ndarray:
         """Return (..., 3) gradients of z less the surface, (-dz/dx, -dz/dy, 1), at x, y by central
         differences."""
-        ways = ((step_m, 0.0), (0.0, step_m))
-        twice = [
-            self.evaluate(x_m - dx, y_m - dy) - self.evaluate(x_m + dx, y_m + dy) for dx, dy in ways
-        ]
-        return np.stack([*(each / (2 * step_m) for each in twice), np.ones_like(twice[0])], axis=-1)
+        across = self.evaluate(x_m - step_m, y_m) - self.evaluate(x_m + step_m, y_m)
+        down = self.evaluate(x_m, y_m - step_m) - self.evaluate(x_m, y_m + step_m)
+        twice_m = 2 * step_m
+        return np.stack([across / twice_m, down / twice_m, np.ones_like(across)], axis=-1)
 
 
 def fit_surface(
@@ -182,40 +189,43 @@ def fit_surface(
     residuals, bisquare within 0.05 standard errors of the fixed point of all points.
     Deterministic. Raises UserError if there are fewer points than coefficients, or if all points
     lie on a line."""
-    terms = (
-        (2 * config.degree + 1)
-        if config.drop_cross_terms
-        else (config.degree + 1) * (config.degree + 2) // 2
-    )
+    degree = config.degree
+    terms = (degree + 1) * (degree + 2) // 2
+    if config.drop_cross_terms:
+        terms = 2 * degree + 1
     if len(z_m) < terms:
-        degree = f"a surface of degree {config.degree}"
-        what = f"{len(z_m)} valid points cannot determine the {terms} coefficients of {degree}"
-        legal = f"at least {terms} points"
-        fix = "widen the crop, lower surface.degree, or check the capture"
-        raise UserError(what, legal=legal, fix=fix)
+        raise UserError(
+            f"{len(z_m)} valid points cannot determine the {terms} coefficients "
+            f"of a surface of degree {degree}",
+            legal=f"at least {terms} points",
+            fix="widen the crop, lower surface.degree, or check the capture",
+        )
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
-    chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
+    chebyshev = Chebyshev.over(xy, degree, not config.drop_cross_terms)
     basis = chebyshev.basis(xy)
     middle = median_of(z_m[:: max(1, len(z_m) // SAMPLE_POINTS)])
     z = np.asarray(z_m, dtype=np.float64) - middle
-    plain = (
-        _solved(basis, z)
-        if config.method == "least_squares"
-        else _solved(*_thinned(basis, z, SAMPLE_POINTS))
-    )
+    if config.method == "least_squares":
+        plain = _solved(basis, z)
+    else:
+        few_basis, few_z = _thinned(basis, z, SAMPLE_POINTS)
+        plain = _solved(few_basis, few_z)
     if plain is None:
-        what = f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve"
-        raise UserError(what, fix="widen the crop, or lower surface.degree")
+        raise UserError(
+            f"the points do not determine a surface of degree {degree}: "
+            "they lie on a line or a curve",
+            fix="widen the crop, or lower surface.degree",
+        )
+    c = plain[0]
+    note = "least squares"
     if config.method == "lar":
-        c, note = _lar(basis, z, plain[0])
+        c, note = _lar(basis, z, c)
     elif config.method == "bisquare":
         c, note = _bisquare(basis, z, None, "bisquare from a least-squares start")
     elif config.method == "lts":
-        start = _lts_start(*_thinned(basis, z, LTS_SAMPLE))
+        large_basis, large_z = _thinned(basis, z, LTS_SAMPLE)
+        start = _lts_start(large_basis, large_z)
         c, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
-    else:
-        c = plain[0]
-        note = "least squares"
     c = c.copy()
     c[0] += middle
     return Surface(chebyshev, c, note)
@@ -228,24 +238,31 @@ def _solved(
     p), or None."""
     weighted = basis if weight is None else basis * weight
     factor = _factor(weighted @ basis.T)
-    return None if factor is None else (dpotrs(factor, weighted @ z, lower=True)[0], factor)
+    if factor is None:
+        return None
+    solution = dpotrs(factor, weighted @ z, lower=True)[0]
+    return solution, factor
 
 
 def _factor(gram: np.ndarray) -> np.ndarray | None:
     """Return the lower Cholesky factor; None if the matrix is singular to working precision."""
     factor, failed = dpotrf(gram, lower=True)
     size = factor.diagonal()
-    return None if failed or not size.min() > 1e-7 * size.max() else factor
+    if failed or not size.min() > 1e-7 * size.max():
+        return None
+    return np.asarray(factor)
 
 
 def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return about ``points`` of the points, evenly strided; all if these are too few for the fit."""
+    """Return about ``points`` of the points, evenly strided; all if these are too few to fit."""
     stride = len(z) // points
     if stride < 2:
         return basis, z
     few_basis = np.ascontiguousarray(basis[:, ::stride])
     few_z = np.ascontiguousarray(z[::stride])
-    return (basis, z) if _solved(few_basis, few_z) is None else (few_basis, few_z)
+    if _solved(few_basis, few_z) is None:
+        return basis, z
+    return few_basis, few_z
 
 
 def _lar(
@@ -267,10 +284,10 @@ def _lar(
         reach = max(margin * scale, 10.0 * knee)
         while True:
             far = np.abs(r) >= reach
-            near = np.flatnonzero(~far)
+            inliers = np.flatnonzero(~far)
             far_pull = basis @ np.where(far, np.sign(r), 0.0)
-            rows = np.ascontiguousarray(np.take(basis, near, axis=1).T)
-            new = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
+            rows = np.ascontiguousarray(np.take(basis, inliers, axis=1).T)
+            new = _smoothed_descent(rows, z[inliers], far_pull, c, knee, enough)
             after = z - new @ basis
             # a far point may have crossed the surface or come within its knee
             if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
@@ -313,6 +330,19 @@ def _huber(
     return value, pull, inside
 
 
+class _Descent(NamedTuple):
+    """One step of the descent that minimises the smoothed sum of absolute residuals."""
+
+    # the sum that is minimised
+    value: float
+    # coefficients (p,)
+    c: np.ndarray
+    # negative gradient of the sum (p,)
+    pull: np.ndarray
+    # lower half of the normal matrix of the points within the knee (p, p)
+    inside: np.ndarray
+
+
 def _smoothed_descent(
     rows: np.ndarray,
     z: np.ndarray,
@@ -324,37 +354,43 @@ def _smoothed_descent(
     """Minimise sum huber(r, knee) - c' far_pull by Newton steps, or by majorising steps, which
     always descend."""
 
-    def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    def state(c: np.ndarray) -> _Descent:
         value, pull, inside = _huber(rows, z, c, knee)
-        return value - float(c @ far_pull), c, pull + far_pull, inside
+        return _Descent(value - float(c @ far_pull), c, pull + far_pull, inside)
 
-    def lower(way: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
+    def lower(current: _Descent, direction: np.ndarray) -> _Descent | None:
         """Return the first of the full, half, quarter ... step that lowers the value."""
-        trials = (state(c + way * 0.5**halvings) for halvings in range(HALVINGS))
-        return next((trial for trial in trials if trial[0] < value), None)
+        for halvings in range(HALVINGS):
+            trial = state(current.c + direction * 0.5**halvings)
+            if trial.value < current.value:
+                return trial
+        return None
 
-    value, c, pull, inside = state(start)
+    current = state(start)
     for _ in range(LAR_STEPS):
-        factor = _factor(inside)
+        factor = _factor(current.inside)
         moved = None
         if factor is not None:
-            way = knee * dpotrs(factor, pull, lower=True)[0]
-            if way @ pull < enough:
-                return c
-            moved = lower(way)
+            direction = knee * dpotrs(factor, current.pull, lower=True)[0]
+            if direction @ current.pull < enough:
+                return current.c
+            moved = lower(current, direction)
         if moved is None:
             # reweighted least squares: each |r| beyond the knee under its tangent parabola
-            weighted = rows / np.maximum(np.abs(z - rows @ c), knee)[:, None]
-            moved = lower(np.linalg.lstsq(weighted.T @ rows, pull, rcond=1e-12)[0])
-        if moved is None or value - moved[0] < enough:
-            return c
-        value, c, pull, inside = moved
-    return c
+            sizes = np.maximum(np.abs(z - rows @ current.c), knee)
+            weighted = rows / sizes[:, None]
+            direction = np.linalg.lstsq(weighted.T @ rows, current.pull, rcond=1e-12)[0]
+            moved = lower(current, direction)
+        if moved is None or current.value - moved.value < enough:
+            return current.c
+        current = moved
+    return current.c
 
 
 def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
     """Return Tukey's weights (1 - (r / limit)^2)^2 inside the limit, 0 outside."""
-    return np.asarray(np.maximum(1.0 - (r / max(limit, TINY_M)) ** 2, 0.0) ** 2)
+    relative = r / max(limit, TINY_M)
+    return np.asarray(np.maximum(1.0 - relative**2, 0.0) ** 2)
 
 
 def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: str) -> Solution:
@@ -362,29 +398,31 @@ def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: 
     points."""
     few_basis, few_z = _thinned(basis, z, SAMPLE_POINTS)
     inner = _reweighted(few_basis, few_z, start, 50, note)
-    return inner if len(few_z) == len(z) else _reweighted(basis, z, inner[0], 8, note)
+    if len(few_z) == len(z):
+        return inner
+    return _reweighted(basis, z, inner[0], 8, note)
 
 
 def _reweighted(
     basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, steps: int, note: str
 ) -> Solution:
+    """Reweight least squares until it moves little, at most ``steps`` times."""
     plain = _solved(basis, z)
     assert plain is not None
     c = plain[0] if start is None else start
     terms = len(basis)
     leverage = ((np.linalg.inv(plain[1]) @ basis) ** 2).sum(axis=0)
     adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
+    # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each term
+    rank = min(terms - 1 + (len(z) - terms + 1) // 2, len(z) - 1)
     for _ in range(steps):
         adjusted = (z - c @ basis) * adjust
-        # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each
-        # term
-        sizes = np.abs(adjusted)
-        place = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
-        scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
-        found = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
-        if found is None:
+        middle = float(np.partition(np.abs(adjusted), rank)[rank])
+        scale = max(middle / 0.6745, TINY_M)
+        solution = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
+        if solution is None:
             return c, note + "; stopped: too few points kept weight"
-        new, factor = found
+        new, factor = solution
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance
         # times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
@@ -397,27 +435,32 @@ def _reweighted(
 def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return FAST-LTS's coefficients (p,) (Rousseeuw and Van Driessen 2006)."""
     few_basis, few_z = _thinned(basis, z, LTS_SMALL)
-    (terms, points), ridge = few_basis.shape, 1e-12 * np.eye(len(few_basis))
+    terms, points = few_basis.shape
+    random = np.random.default_rng(LTS_SEED).random((LTS_STARTS, points))
+    picks = np.argpartition(random, terms - 1, axis=1)[:, :terms]
+    designs = few_basis.T[picks] + 1e-12 * np.eye(terms)
+    starts = np.linalg.solve(designs, few_z[picks][..., None])[..., 0]
+    best = _concentrated(few_basis, few_z, starts, 2)[:LTS_KEPT]
+    return np.asarray(_concentrated(basis, z, best, LTS_STEPS)[0])
 
-    def concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -> np.ndarray:
-        """Return coefficients (m, p) after this many steps, those with the least sum of the
-        smallest squares first."""
-        kept = min(len(z), max(int(LTS_COVERAGE * len(z)), (len(z) + terms + 1) // 2))
-        products = (basis[:, None] * basis).reshape(-1, len(z)).T
-        for _ in range(steps):
-            squares = (z - c @ basis) ** 2
-            chosen = 1.0 * (squares <= np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept])
-            grams = (chosen @ products).reshape(-1, terms, terms)
-            c = np.linalg.solve(grams + len(z) * ridge, ((chosen * z) @ basis.T)[..., None])[..., 0]
-        sums = np.partition((z - c @ basis) ** 2, kept - 1, axis=1)[:, :kept].sum(axis=1)
-        return np.asarray(c[np.argsort(sums, kind="stable")])
 
-    picks = np.argpartition(
-        np.random.default_rng(LTS_SEED).random((LTS_STARTS, points)), terms - 1, axis=1
-    )[:, :terms]
-    starts = np.linalg.solve(few_basis.T[picks] + ridge, few_z[picks][..., None])[..., 0]
-    best = concentrated(few_basis, few_z, starts, 2)[:LTS_KEPT]
-    return np.asarray(concentrated(basis, z, best, LTS_STEPS)[0])
+def _concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -> np.ndarray:
+    """Return coefficients (m, p) after this many steps, each a fit to the points with the smallest
+    residuals; those with the least sum of the smallest squares come first."""
+    terms = len(basis)
+    ridge = 1e-12 * np.eye(terms)
+    covered = max(int(LTS_COVERAGE * len(z)), (len(z) + terms + 1) // 2)
+    kept = min(len(z), covered)
+    products = (basis[:, None] * basis).reshape(-1, len(z)).T
+    for _ in range(steps):
+        squares = (z - c @ basis) ** 2
+        limits = np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept]
+        chosen = 1.0 * (squares <= limits)
+        grams = (chosen @ products).reshape(-1, terms, terms)
+        right = (chosen * z) @ basis.T
+        c = np.linalg.solve(grams + len(z) * ridge, right[..., None])[..., 0]
+    smallest = np.partition((z - c @ basis) ** 2, kept - 1, axis=1)[:, :kept]
+    return np.asarray(c[np.argsort(smallest.sum(axis=1), kind="stable")])
 
 
 Fit = Callable[[np.ndarray], np.ndarray]
@@ -451,33 +494,13 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
     algebraic fit (1991), then Gauss-Newton. None if it has no single sheet. ``central``: rays
     leave the origin, else along z."""
     middle = np.average(points, axis=0, weights=weights)
-    size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
-    scaled = (points - middle) / size
-    along = (
-        points / points[:, 2:] if central else np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    ) / size
-    (x, y, z), (dx, dy, dz) = scaled.T, along.T
-    zero = np.zeros_like(x)
-    terms = np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, zero + 1.0], axis=1)
-    products = [
-        2 * x * dx,
-        2 * y * dy,
-        2 * z * dz,
-        x * dy + y * dx,
-        x * dz + z * dx,
-        y * dz + z * dy,
-    ]
-    slopes = np.stack([*products, dx, dy, dz, zero], axis=1)
-
-    # Taubin's fit: the least sum of F^2 for a given sum of (dF/dray)^2
-    means = np.average(terms[:, :9], axis=0, weights=weights)
-    centred = terms[:, :9] - means
-    squares = centred.T @ (weights[:, None] * centred)
-    sloped = slopes[:, :9].T @ (weights[:, None] * slopes[:, :9])
-    sloped[np.diag_indices_from(sloped)] += 1e-6 * np.trace(sloped)
-    algebraic = eigh(squares, sloped, subset_by_index=(0, 0))[1][:, 0]
-    c = np.append(algebraic, -means @ algebraic)
-    c /= np.linalg.norm(c)
+    spread = np.average(((points - middle) ** 2).sum(axis=1), weights=weights)
+    size = float(np.sqrt(spread)) or 1.0
+    rays = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    if central:
+        rays = points / points[:, 2:]
+    terms, slopes = _quadric_terms((points - middle) / size, rays / size)
+    c = _taubin(terms, slopes, weights)
     for _ in range(4):
         steep = slopes @ c
         sheet = np.sign(np.average(np.sign(steep), weights=weights)) or 1.0
@@ -489,7 +512,11 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
     if sheet == 0.0:
         return None
     matrix = np.array(
-        [[c[0], c[3] / 2, c[4] / 2], [c[3] / 2, c[1], c[5] / 2], [c[4] / 2, c[5] / 2, c[2]]]
+        [
+            [c[0], c[3] / 2, c[4] / 2],
+            [c[3] / 2, c[1], c[5] / 2],
+            [c[4] / 2, c[5] / 2, c[2]],
+        ]
     )
 
     def z_at(q: np.ndarray) -> np.ndarray:
@@ -510,3 +537,37 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
             return np.where(b * sheet > 0, 2 * k / (-b - root), (-b + root) / (2 * a))
 
     return z_at
+
+
+def _quadric_terms(places: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ten terms of a quadric F (n, 10) at places (n, 3), and their slopes (n, 10) along
+    the rays (n, 3)."""
+    x, y, z = places.T
+    dx, dy, dz = rays.T
+    zero = np.zeros_like(x)
+    terms = [x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, zero + 1.0]
+    slopes = [
+        2 * x * dx,
+        2 * y * dy,
+        2 * z * dz,
+        x * dy + y * dx,
+        x * dz + z * dx,
+        y * dz + z * dy,
+        dx,
+        dy,
+        dz,
+        zero,
+    ]
+    return np.stack(terms, axis=1), np.stack(slopes, axis=1)
+
+
+def _taubin(terms: np.ndarray, slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the coefficients (10,) with the least sum of F^2 for a given sum of (dF/dray)^2."""
+    means = np.average(terms[:, :9], axis=0, weights=weights)
+    centred = terms[:, :9] - means
+    squares = centred.T @ (weights[:, None] * centred)
+    sloped = slopes[:, :9].T @ (weights[:, None] * slopes[:, :9])
+    sloped[np.diag_indices_from(sloped)] += 1e-6 * np.trace(sloped)
+    algebraic = eigh(squares, sloped, subset_by_index=(0, 0))[1][:, 0]
+    c = np.append(algebraic, -means @ algebraic)
+    return np.asarray(c / np.linalg.norm(c))

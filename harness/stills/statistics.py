@@ -212,7 +212,8 @@ def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tupl
 
 
 def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> float:
-    """Return the correlation of deviations of pixels (lag_x, lag_y) apart; NaN if there is none."""
+    """Return the correlation of deviations of pixels (lag_x, lag_y) apart; NaN if there is
+    none."""
     product, square = covariance(d, where, lag_x, lag_y)
     return product / square if square > 0 else float("nan")
 

@@ -77,10 +77,9 @@ def averages_of(
     return {n: corrected(cloud, field) for n, cloud in clouds.items()}
 
 
-@lru_cache(maxsize=4)
-def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no
-    pixel has a range."""
+def measured_flat_field(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
+    """Measure a unit's flat field on a plane across its axis. Raises UserError if no pixel has a
+    range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -88,6 +87,10 @@ def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> F
     cloud = clouds[config.frames]
     flat = flattened(cloud, cloud.valid, "flat field")
     return separated([flat], facts.nominal_lens).field
+
+
+# all trials of a unit share its flat field
+flat_field_of = lru_cache(maxsize=4)(measured_flat_field)
 
 
 def _drawn_at_once(

@@ -57,11 +57,14 @@ def boards_of(count: int) -> list[Any]:
     from harness.experiment.load import load_experiment
     from harness.runs.plan import plan_of
 
-    damage = '"source.target.damage": [{kind: through, per_board: 8, diameter_mm: [2.0, 8.0]}, {kind: blind, '
+    damage = (
+        '"source.target.damage": [{kind: through, per_board: 8, diameter_mm: [2.0, 8.0]}, '
+        "{kind: blind, "
+    )
     damage += "per_board: 8, diameter_mm: [4.0, 20.0], depth_mm: [1.0, 12.0]}]"
-    said = [f"sweep={{{damage}}}", f"study.boards={count}", *OVERRIDES]
+    printed = [f"sweep={{{damage}}}", f"study.boards={count}", *OVERRIDES]
     plan = plan_of(
-        load_experiment(ROOT / "experiments" / "detection_limit.yaml", said), Path("unused")
+        load_experiment(ROOT / "experiments" / "detection_limit.yaml", printed), Path("unused")
     )
     jobs = [job for group in plan.groups for batch in group.batches for job in batch.renders]
     return list({job.target: job for job in jobs}.values())
@@ -103,13 +106,13 @@ def apart(first: Path, second: Path) -> np.ndarray:
     from scenes.render.cache import read_view
     from scenes.render.range_noise import range_change_m
 
-    one = read_view(first)
+    view = read_view(first)
     two = read_view(second)
-    assert one is not None and two is not None
+    assert view is not None and two is not None
     lit = np.abs(two.phasor).mean(axis=0) > 0.03
-    change = (one.phasor[:, lit] - two.phasor[:, lit]).astype(complex)
+    change = (view.phasor[:, lit] - two.phasor[:, lit]).astype(complex)
     moved_m = range_change_m(change, two.phasor[:, lit].astype(complex), two.frequencies_hz)
-    noise_m = np.hypot(one.indirect_noise_m[lit], two.indirect_noise_m[lit])
+    noise_m = np.hypot(view.indirect_noise_m[lit], two.indirect_noise_m[lit])
     return np.stack([1e3 * moved_m, 1e3 * np.maximum(noise_m, 1e-7)])
 
 
@@ -149,7 +152,7 @@ def main() -> int:
                 print(f"{name}: {done.stderr}", file=sys.stderr)
                 return 1
             spent[name] = json.loads(done.stdout.splitlines()[-1])
-        *others, last = options.variants
+        *remaining, last = options.variants
         for work in WORKS:
             warm = {name: float(np.median(spent[name][work][1:])) for name in options.variants}
             print(f"\n{work}: {len(spent[last][work])} boards")
@@ -157,9 +160,12 @@ def main() -> int:
                 first = spent[name][work][0]
                 ratio = warm[last] / seconds
                 print(
-                    f"  {name:8} {seconds:8.3f} s a board, first {first:6.2f} s, {ratio:7.2f} times as fast as {last}"
+                    (
+                        f"  {name:8} {seconds:8.3f} s a board, first {first:6.2f} s, "
+                        f"{ratio:7.2f} times as fast as {last}"
+                    )
                 )
-            for name in others:
+            for name in remaining:
                 pairs = [
                     (Path(folder) / f"{v}_{work}_{n}.npz" for v in (name, last))
                     for n in range(len(spent[last][work]))
@@ -168,8 +174,10 @@ def main() -> int:
                 beyond = float((np.abs(moved_mm) > 4 * noise_mm).mean())
                 agree &= beyond <= 0.01
                 print(
-                    f"  {name} and {last}: {np.median(np.abs(moved_mm)):.5f} mm apart (median), noise of the two "
-                    f"{np.median(noise_mm):.5f} mm, {100 * beyond:.2f} % of pixels beyond four deviations"
+                    f"  {name} and {last}: {np.median(np.abs(moved_mm)):.5f} mm apart "
+                    "(median), noise of the two "
+                    f"{np.median(noise_mm):.5f} mm, {100 * beyond:.2f} % of pixels beyond "
+                    "four deviations"
                 )
     return 0 if agree else 1
 

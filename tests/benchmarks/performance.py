@@ -293,12 +293,12 @@ def peers_of_renders(runs: int) -> None:
 
     hole = {"id": 1, "kind": "blind", "diameter_mm": 24, "depth_mm": 30, "centre_mm": [0, 0]}
     board = {"width_mm": 60, "height_mm": 60, "thickness_mm": 40}
-    at = {"distance_m": 0.5, "tilt_x_deg": 8}
+    index = {"distance_m": 0.5, "tilt_x_deg": 8}
     facts = {
         "name": "custom",
         "board": board,
         "holes": [hole],
-        "pose": at,
+        "pose": index,
         "backing": None,
         "room": None,
     }
@@ -327,7 +327,10 @@ def peers_of_renders(runs: int) -> None:
         products.append(spent * error_rad**2)
         error_mm = 1e3 * error_rad * 299_702_547 / (4 * np.pi * FREQUENCIES[0])
         print(
-            f"  {name:34} {1e3 * spent:10.1f} ms, error {error_mm:.4f} mm in {inside.sum()} pixels of a hole"
+            (
+                f"  {name:34} {1e3 * spent:10.1f} ms, error {error_mm:.4f} mm in {inside.sum()} "
+                "pixels of a hole"
+            )
         )
     print(f"  at equal error mitransient takes {products[1] / products[0]:.1f} times our time")
 
@@ -376,7 +379,10 @@ def trials(runs: int) -> None:
     study's rows; of detectors that learn nothing, as what `matched` has learned comes from boards
     of its own."""
     print(
-        "\nwhole trials of 50 frames, damaged board of 30,000 pixels with eight holes, a second and core"
+        (
+            "\nwhole trials of 50 frames, damaged board of 30,000 pixels with eight holes, a "
+            "second and core"
+        )
     )
     with tempfile.TemporaryDirectory() as folder:
         detectors = {
@@ -384,7 +390,7 @@ def trials(runs: int) -> None:
             "local": ("detector={name: local, settings: {crop: {kind: auto, inset_px: 4}}}",),
         }
         for name, detector in detectors.items():
-            for way, exact in WAYS.items():
+            for direction, exact in WAYS.items():
                 spent = seconds(
                     partial(
                         run_all, trials_of(Path(folder), 1, *detector, f"capture.exact={exact}")
@@ -392,7 +398,7 @@ def trials(runs: int) -> None:
                     runs,
                 )
                 print(
-                    f"  {name:24} {way:16} {1 / spent:8.1f} a second ({1e3 * spent:.1f} ms)",
+                    f"  {name:24} {direction:16} {1 / spent:8.1f} a second ({1e3 * spent:.1f} ms)",
                     flush=True,
                 )
 
@@ -426,12 +432,12 @@ def growth(runs: int) -> None:
         def tried(*said: str, boards: int = 1) -> Work:
             return partial(run_all, trials_of(folder, 1, *said, boards=boards))
 
-        for way, exact in WAYS.items():
+        for direction, exact in WAYS.items():
             works = {
                 n: tried(f"capture.frames={n}", f"capture.exact={exact}")
                 for n in (25, 50, 100, 200)
             }
-            exponent(f"frames: trials {way}", works, runs)
+            exponent(f"frames: trials {direction}", works, runs)
         drilled = "source.target.damage={{kind: through, per_board: {}, diameter_mm: [4.0, 8.0]}}"
         exponent(
             "holes: trials drawn at once", {n: tried(drilled.format(n)) for n in (1, 2, 4, 8)}, runs
@@ -448,7 +454,10 @@ def growth(runs: int) -> None:
             with ProcessPoolExecutor(workers, mp_context=context) as pool:
                 rates.append(sum(pool.map(rate_of, [tasks] * workers)))
         print(
-            f"  workers: two processes do {rates[1] / rates[0]:.2f} times the trials of one, by the wall clock"
+            (
+                f"  workers: two processes do {rates[1] / rates[0]:.2f} times the trials of "
+                "one, by the wall clock"
+            )
         )
 
 
@@ -527,12 +536,12 @@ def main() -> None:
         peers_of_registration,
     )
     parts = (*peers, peers_of_renders, boards, trials, growth, programs)
-    known = {part.__name__.removeprefix("peers_of_"): part for part in parts}
+    reference = {part.__name__.removeprefix("peers_of_"): part for part in parts}
     parser = argparse.ArgumentParser(
         description="Compare speed with other libraries and show how cost grows."
     )
     parser.add_argument(
-        "parts", nargs="*", metavar="PART", choices=[*known, []], help=", ".join(known)
+        "parts", nargs="*", metavar="PART", choices=[*reference, []], help=", ".join(reference)
     )
     parser.add_argument("--quick", action="store_true", help="fewer runs, less certain")
     options = parser.parse_args()
@@ -541,8 +550,8 @@ def main() -> None:
 
     load_mitsuba()
     print(f"{os.cpu_count()} cores, one thread used; load {os.getloadavg()[0]:.1f} at the start")
-    for name in options.parts or known:
-        known[name](3 if options.quick else 9)
+    for name in options.parts or reference:
+        reference[name](3 if options.quick else 9)
     print(f"\nload {os.getloadavg()[0]:.1f} at the end")
 
 

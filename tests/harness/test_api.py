@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_the_examples_of_the_docstrings_hold(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = {
+    result = {
         each.name: each
         for each in doctest.DocTestFinder().find(api, "tofpod", module=api)
         if each.examples
@@ -29,10 +29,10 @@ def test_the_examples_of_the_docstrings_hold(tmp_path, monkeypatch):
     flags = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
     runner = doctest.DocTestRunner(optionflags=flags)
     shared = {}  # examples of functions go on from the module's
-    for name in sorted(found, key=len):
-        found[name].globs = shared
-        runner.run(found[name], clear_globs=False)
-    assert runner.summarize().failed == 0 and len(found) >= 7
+    for name in sorted(result, key=len):
+        result[name].globs = shared
+        runner.run(result[name], clear_globs=False)
+    assert runner.summarize().failed == 0 and len(result) >= 7
 
 
 def test_the_module_is_the_facade():
@@ -65,10 +65,10 @@ def test_results_are_tables_and_limits(tmp_path):
     record = study_record(Study(boards=12, set_ups=(SetUp(), SetUp(frames=5, a50_mm=5.0))))
     (tmp_path / "study.json").write_text(record_text(record))
     write_table(tmp_path, LIMITS, LIMITS.frame([limit_of(each) for each in record.set_ups]))
-    found = tofpod.limits(tmp_path)
-    curves = tofpod.plot_pod(found).axes[0].get_lines()
+    result = tofpod.limits(tmp_path)
+    curves = tofpod.plot_pod(result).axes[0].get_lines()
     assert len([line for line in curves if len(line.get_xdata()) > 9]) == 2
-    assert list(tofpod.table(tmp_path, "limits")["a90_mm"]) == [limit.a90_mm for limit in found]
+    assert list(tofpod.table(tmp_path, "limits")["a90_mm"]) == [limit.a90_mm for limit in result]
     with pytest.raises(tofpod.UserError, match="limits"):
         tofpod.table(tmp_path, "limit")
 

@@ -43,9 +43,9 @@ def capture(tmp_path: Path) -> Path:
 def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The message of a run that must end with exit code 2 and print nothing else."""
     assert detect.main([str(argument) for argument in arguments]) == 2
-    said = capsys.readouterr()
-    assert said.err.startswith("error: ") and "Traceback" not in said.err
-    return said.err
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ") and "Traceback" not in captured.err
+    return captured.err
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -98,9 +98,9 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
         and " % of the view, tilted by 6" in first
     )
     assert second.startswith("  instead, with --target 2: 1.20 m away (1.20 to 1.20 m), ")
-    told = json.loads((tmp_path / "out" / "findings.json").read_text())["target"]
-    assert told["taken"] == 1 and [each["number"] for each in told["candidates"]] == [1, 2]
-    assert told["candidates"][0]["extent_mm"] == pytest.approx([300, 240], abs=8)
+    message = json.loads((tmp_path / "out" / "findings.json").read_text())["target"]
+    assert message["taken"] == 1 and [each["number"] for each in message["candidates"]] == [1, 2]
+    assert message["candidates"][0]["extent_mm"] == pytest.approx([300, 240], abs=8)
     picture = cv2.imread(str(tmp_path / "out" / "targets.png"))
     assert (picture == (255, 0, 255)).all(axis=-1).sum() > 1000
     assert [row["kind"] for row in rows_of(tmp_path / "out" / "findings.csv")] == ["hole"]
@@ -128,10 +128,10 @@ def test_it_finds_the_hole_and_writes_everything(
 ) -> None:
     out = tmp_path / "new" / "found"
     assert detect.main([str(capture), "--out", str(out), "--false-calls", "0.1", *NO_BLUR]) == 0
-    said = capsys.readouterr().out
-    assert "4 frames averaged" in said
-    assert "left out: depth/00002.png: the whole range jumps by +18" in said
-    assert "from this capture's own null: 0.1 false calls expected" in said
+    printed = capsys.readouterr().out
+    assert "4 frames averaged" in printed
+    assert "left out: depth/00002.png: the whole range jumps by +18" in printed
+    assert "from this capture's own null: 0.1 false calls expected" in printed
     assert sorted(path.name for path in out.iterdir()) == sorted(
         ("annotated.png", "blind.png", "cloud.ply", "findings.csv", "findings.json", "targets.png")
     )
@@ -143,8 +143,8 @@ def test_it_finds_the_hole_and_writes_everything(
     assert row["kind"] == "hole"
     number = {key: float(value) for key, value in row.items() if key != "kind"}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
-    place = [number["x_mm"], number["y_mm"], number["z_mm"]]
-    np.testing.assert_allclose(place, TRUE_CENTRE_MM, atol=1.0)
+    position = [number["x_mm"], number["y_mm"], number["z_mm"]]
+    np.testing.assert_allclose(position, TRUE_CENTRE_MM, atol=1.0)
     assert number["diameter_mm"] == pytest.approx(TRUE_DIAMETER_MM, rel=0.05)
     assert number["depth_mm"] == pytest.approx(plane.HOLE_DEPTH_MM, rel=0.05)
     area = np.pi / 4 * TRUE_DIAMETER_MM**2
@@ -156,13 +156,13 @@ def test_long_damage_is_told_with_length_width_and_angle(
 ) -> None:
     """A scratch of 24 x 4 mm that runs down to the right at 30 degrees, beside a round hole."""
     evidence = Evidence(np.zeros((2, 2)), np.full((2, 2), 5e-3), np.ones((2, 2)), 1e-3)
-    found = Detection(9.0, np.arange(4), np.zeros(3))
+    detection = Detection(9.0, np.arange(4), np.zeros(3))
     turned = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
     measured = Measurement(
         3.0, 4.0, 4, 9.0, 0.02, np.zeros(3), length_m=0.024, width_m=0.004, along=-turned
     )
-    scratch = finding_of(1, evidence, found, replace(measured, width_m=0.004))
-    hole = finding_of(2, evidence, found, replace(measured, width_m=0.02))
+    scratch = finding_of(1, evidence, detection, replace(measured, width_m=0.004))
+    hole = finding_of(2, evidence, detection, replace(measured, width_m=0.02))
     assert (scratch.length_mm, scratch.width_mm) == pytest.approx(
         (24, 4)
     ) and scratch.angle_deg == pytest.approx(30)
@@ -181,8 +181,8 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
         "local",
     )  # matched filters find the hole too wide for their model and measure its contour
     assert detect.main([str(capture), "--out", str(out), "--threshold", "6", *local, *NO_BLUR]) == 0
-    told = json.loads((out / "findings.json").read_text(), parse_constant=pytest.fail)
-    (finding,) = told["findings"]
+    message = json.loads((out / "findings.json").read_text(), parse_constant=pytest.fail)
+    (finding,) = message["findings"]
     row = rows_of(out / "findings.csv")[0]
     assert row["kind"] == finding["kind"] == "hole"
     for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {
@@ -196,12 +196,12 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
         == finding["model"]["diameter_mm"]
         != finding["extent"]["diameter_mm"]
     )
-    assert told["capture"]["frames_used"] == 4
-    assert told["capture"]["frames_left_out"][0]["name"] == "depth/00002.png"
-    assert told["threshold"]["k"] == 6 and told["threshold"]["from"] == "given"
-    assert told["settings"]["detector"]["settings"]["crop"]["kind"] == "auto"
-    assert told["settings"]["detector"]["settings"]["hole_model"]["blur_px"] == 1
-    digests = {Path(file["path"]).name: file["sha256"] for file in told["provenance"]["files"]}
+    assert message["capture"]["frames_used"] == 4
+    assert message["capture"]["frames_left_out"][0]["name"] == "depth/00002.png"
+    assert message["threshold"]["k"] == 6 and message["threshold"]["from"] == "given"
+    assert message["settings"]["detector"]["settings"]["crop"]["kind"] == "auto"
+    assert message["settings"]["detector"]["settings"]["hole_model"]["blur_px"] == 1
+    digests = {Path(file["path"]).name: file["sha256"] for file in message["provenance"]["files"]}
     assert set(digests) >= {"00000.png", "00004.png", "intrinsic.json"}
     assert (
         digests["intrinsic.json"]
@@ -230,8 +230,8 @@ def test_the_cloud_has_the_damage_in_magenta(capture: Path, tmp_path: Path) -> N
 
 def test_the_picture_is_a_picture(capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    named = capture.rename(capture.with_name("board $x_$"))  # which is wrong as mathematics
-    assert detect.main([str(named), "--out", str(out)]) == 0
+    by_name = capture.rename(capture.with_name("board $x_$"))  # which is wrong as mathematics
+    assert detect.main([str(by_name), "--out", str(out)]) == 0
     picture = cv2.imread(str(out / "annotated.png"))
     assert picture is not None and picture.shape[1] == 1650
     magenta = (picture == (255, 0, 255)).all(axis=-1)
@@ -244,13 +244,13 @@ def test_a_cloud_without_a_grid_works_too(
 ) -> None:
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
-    row, *others = rows_of(tmp_path / "out" / "findings.csv")
+    row, *remaining = rows_of(tmp_path / "out" / "findings.csv")
     # rounding is all the noise: too few peaks stand out to set the threshold, as the first line
     # says
     assert (
         float(row["score"]) > 100
-        and all(float(other["score"]) < 10 for other in others)
-        and len(others) < 5
+        and all(float(other["score"]) < 10 for other in remaining)
+        and len(remaining) < 5
     )
     assert row["u_px"] == "" and row["volume_mm3"] == ""
     # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to
@@ -261,12 +261,12 @@ def test_a_cloud_without_a_grid_works_too(
     finding = json.loads((tmp_path / "out" / "findings.json").read_text())["findings"][0]
     assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
     assert finding["u_px"] is None
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert re.match(
         r"warning: the capture cannot set its own threshold, 5 is used: only \d peaks of noise stand",
-        said,
+        printed,
     )
-    assert "unorganised points" in said
+    assert "unorganised points" in printed
 
 
 @pytest.mark.usefixtures("unpictured")
@@ -282,8 +282,8 @@ def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
         int(row["points"])
         == (np.hypot(u - plane.HOLE_U, v - plane.HOLE_V) < plane.HOLE_RADIUS_PX).sum()
     )
-    told = json.loads((tmp_path / "out" / "findings.json").read_text())
-    assert told["settings"]["detector"]["settings"]["crop"]["inset_px"] == 3
+    message = json.loads((tmp_path / "out" / "findings.json").read_text())
+    assert message["settings"]["detector"]["settings"]["crop"]["inset_px"] == 3
 
 
 @pytest.mark.usefixtures("unpictured")
@@ -332,8 +332,10 @@ def test_a_finding_that_the_crop_cuts_is_told_first(
 ) -> None:
     corners = f"{left_u_px},2,80,2,80,60,{left_u_px},60"
     assert detect.main([str(capture), "--crop", f"polygon:{corners}", "--threshold", "8"]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("warning: findings that reach the rim of the judged area (1)") == is_cut
+    printed = capsys.readouterr().out
+    assert (
+        printed.startswith("warning: findings that reach the rim of the judged area (1)") == is_cut
+    )
 
 
 @pytest.mark.parametrize(("blur_px", "is_doubted"), [(1, False), (5, True)])
@@ -349,17 +351,17 @@ def test_a_filter_that_hides_the_rim_of_a_hole_to_the_room_behind_is_told_first(
     assert (
         detect.main([str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "lens.json")]) == 0
     )
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert (
-        "show what lies far behind, or nothing (1), may be up to" in said.split("target 1")[0]
+        "show what lies far behind, or nothing (1), may be up to" in printed.split("target 1")[0]
     ) == is_doubted
 
 
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = ["--detector", "thesis", "--set", "scale=highest_before"]
     assert detect.main([str(capture), *own, "--average", "median"]) == 0
-    said = capsys.readouterr().out
-    assert "threshold: 1 x" in said and "the detector's own" in said
+    printed = capsys.readouterr().out
+    assert "threshold: 1 x" in printed and "the detector's own" in printed
     assert detect.main([str(capture), "--max-frames", "2"]) == 0
     assert "2 frames averaged" in capsys.readouterr().out
 
@@ -471,11 +473,14 @@ def test_a_full_disk_leaves_the_old_files_or_none(
 def test_help_is_there_without_the_heavy_libraries() -> None:
     code = "import sys; sys.argv = ['detect', '--help']\nimport harness.detect as d\n"
     code += "try: d.main()\nexcept SystemExit: pass\n"
-    code += "print([m for m in ('numpy', 'cv2', 'numba', 'matplotlib', 'open3d', 'mitsuba') if m in sys.modules])"
-    said = subprocess.run(
+    code += (
+        "print([m for m in ('numpy', 'cv2', 'numba', 'matplotlib', 'open3d', 'mitsuba') if m in "
+        "sys.modules])"
+    )
+    stdout = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
-    assert "--quiet-capture" in said and said.strip().endswith("[]")
+    assert "--quiet-capture" in stdout and stdout.strip().endswith("[]")
 
 
 # ---- parts
@@ -525,13 +530,16 @@ MOUTHS = np.array(UPPER + LOWER + LOWEST)
 def missed_and_false(findings: list[dict[str, str]], mouths: np.ndarray) -> tuple[int, int]:
     """How many mouths no hole was found at; and how many findings of the rows of mouths between
     the tags, where nothing else is, are no mouth."""
-    every = np.array(
+    all_rows = np.array(
         [(row["kind"] == "bump", float(row["u_px"]), float(row["v_px"])) for row in findings]
     )
-    found = every[every[:, 0] == 0, 1:]
-    missed = np.linalg.norm(mouths[:, None] - found[None], axis=2).min(axis=1) > 12
-    bare = every[
-        (every[:, 1] > 150) & (every[:, 1] < 500) & (every[:, 2] > 410) & (every[:, 2] < 650)
+    result = all_rows[all_rows[:, 0] == 0, 1:]
+    missed = np.linalg.norm(mouths[:, None] - result[None], axis=2).min(axis=1) > 12
+    bare = all_rows[
+        (all_rows[:, 1] > 150)
+        & (all_rows[:, 1] < 500)
+        & (all_rows[:, 2] > 410)
+        & (all_rows[:, 2] < 650)
     ]
     strays = np.linalg.norm(MOUTHS[:, None] - bare[None, :, 1:], axis=2).min(axis=0) > 12
     return int(missed.sum()), int((strays | (bare[:, 0] > 0)).sum())
@@ -549,13 +557,14 @@ def test_a_part_of_the_drilled_plate(
         )
         == 0
     )
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert (
-        "17 frames averaged" in said and "left out: depth/00003.png: the whole range jumps" in said
+        "17 frames averaged" in printed
+        and "left out: depth/00003.png: the whole range jumps" in printed
     )
     assert (
-        "from this capture's own null: 1.0 false calls expected" in said
-        and "cannot set its own" not in said
+        "from this capture's own null: 1.0 false calls expected" in printed
+        and "cannot set its own" not in printed
     )
     mouths = MOUTHS[(MOUTHS[:, 0] < 500) & (MOUTHS[:, 1] > 350)]
     missed, false = missed_and_false(rows_of(tmp_path / "findings.csv"), mouths)
@@ -568,16 +577,18 @@ def test_the_drilled_plate_as_it_stands(
 ) -> None:
     """The default command, with no setting of its own."""
     assert detect.main([str(shared_data / "azure_drilled_board"), "--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert (
-        "17 frames averaged" in said and "left out: depth/00003.png: the whole range jumps" in said
+        "17 frames averaged" in printed
+        and "left out: depth/00003.png: the whole range jumps" in printed
     )
     assert (
-        "from this capture's own null: 1.0 false calls expected" in said
-        and "cannot set its own" not in said
+        "from this capture's own null: 1.0 false calls expected" in printed
+        and "cannot set its own" not in printed
     )
     assert (
-        "the deviation of matched filters on whitened noise" in said and "own deviation" not in said
+        "the deviation of matched filters on whitened noise" in printed
+        and "own deviation" not in printed
     )
     findings = rows_of(tmp_path / "findings.csv")
     # The object on the plate stands 30 mm before the surface, and is a bump.
@@ -593,6 +604,6 @@ def test_the_recording_as_it_stands(
     assert (
         detect.main([str(shared_data / "azure_mkv" / "recording.mkv"), "--out", str(tmp_path)]) == 0
     )
-    said = capsys.readouterr().out
-    assert "1 frames averaged" in said
-    assert said.startswith("warning: it is doubtful which surface is the target")
+    printed = capsys.readouterr().out
+    assert "1 frames averaged" in printed
+    assert printed.startswith("warning: it is doubtful which surface is the target")

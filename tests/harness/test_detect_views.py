@@ -61,9 +61,9 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The message of a run that must end with exit code 2."""
     assert detect.main([str(argument) for argument in arguments]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: ") and "Traceback" not in said
-    return said
+    error_text = capsys.readouterr().err
+    assert error_text.startswith("error: ") and "Traceback" not in error_text
+    return error_text
 
 
 def findings_of(out: Path) -> list[dict[str, float]]:
@@ -89,17 +89,17 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
 ) -> None:
     out = tmp_path / "new" / "out"
     assert detect.main([*views, "--register", "marks", "--out", str(out), *SHARP]) == 0
-    said = capsys.readouterr().out
-    assert "marks: 5 of 5 are reliable" in said and "merged: 3 views" in said
+    printed = capsys.readouterr().out
+    assert "marks: 5 of 5 are reliable" in printed and "merged: 3 views" in printed
     pictures = [f"targets-{number}.png" for number in (1, 2, 3)]
     assert sorted(path.name for path in out.iterdir()) == sorted((*FILES, *pictures))
-    assert said.count("target 1 of 1: ") == 3
-    told = json.loads((out / "registrations.json").read_text(), parse_constant=pytest.fail)
-    assert [row["view"] for row in told["views"]] == ["view_0", "view_1", "view_2"] and told[
+    assert printed.count("target 1 of 1: ") == 3
+    message = json.loads((out / "registrations.json").read_text(), parse_constant=pytest.fail)
+    assert [row["view"] for row in message["views"]] == ["view_0", "view_1", "view_2"] and message[
         "reference"
     ] == "view_0"
-    assert told["results_version"] == RESULTS_VERSION
-    for number, row in enumerate(told["views"][1:], start=1):
+    assert message["results_version"] == RESULTS_VERSION
+    for number, row in enumerate(message["views"][1:], start=1):
         wrong_mm = 1e3 * np.sqrt((error_m(row["T_reference_view"], number) ** 2).sum(axis=1).mean())
         # corners lie farther out than the target's mean point: four times the prediction is beyond
         # any chance
@@ -107,12 +107,12 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
             wrong_mm < 4 * np.hypot(row["predicted_in_plane_mm"], row["predicted_across_mm"]) < 1.0
         )
         assert 0 < row["held_out_mark_mm"] < 1.0 and row["pairs"] == 5
-    (found,) = findings_of(out)
-    place_mm = np.array([found[f"{axis}_mm"] for axis in "xyz"])
-    in_first_mm = 1e3 * transform_points(np.array(told["T_reference_cloud"]), 1e-3 * place_mm)
+    (result,) = findings_of(out)
+    place_mm = np.array([result[f"{axis}_mm"] for axis in "xyz"])
+    in_first_mm = 1e3 * transform_points(np.array(message["T_reference_cloud"]), 1e-3 * place_mm)
     np.testing.assert_allclose(in_first_mm, 1e3 * HOLE_M, atol=0.5)
-    assert found["diameter_mm"] == pytest.approx(2e3 * board.HOLE_RADIUS_M, rel=0.05)
-    assert found["depth_mm"] == pytest.approx(1e3 * board.HOLE_DEPTH_M, rel=0.05)
+    assert result["diameter_mm"] == pytest.approx(2e3 * board.HOLE_RADIUS_M, rel=0.05)
+    assert result["depth_mm"] == pytest.approx(1e3 * board.HOLE_DEPTH_M, rel=0.05)
     facts = json.loads((out / "findings.json").read_text(), parse_constant=pytest.fail)
     assert [capture["view"] for capture in facts["captures"]] == ["view_0", "view_1", "view_2"]
     assert facts["settings"]["mapping"]["registration"]["method"] == "marks"
@@ -120,10 +120,12 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     assert len(facts["provenance"]["files"]) == 3 * (3 + 3 + 1)
     # the fused map states each cell's deviation, and the text says so; the ring is named like its
     # row, in the page too
-    (cell_mm,) = re.findall(r"cells of ([0-9.]+) mm", said)
+    (cell_mm,) = re.findall(r"cells of ([0-9.]+) mm", printed)
     assert facts["merged"]["cell_mm"] == pytest.approx(float(cell_mm), rel=0.01)
-    assert "one unit of score is the deviation of matched filters" in said and " u cell " in said
-    assert f'"1: {found["diameter_mm"]:.1f}"' in (out / "view3d.html").read_text()
+    assert (
+        "one unit of score is the deviation of matched filters" in printed and " u cell " in printed
+    )
+    assert f'"1: {result["diameter_mm"]:.1f}"' in (out / "view3d.html").read_text()
 
 
 @pytest.mark.usefixtures("unpictured")
@@ -157,16 +159,17 @@ def test_every_merge_finds_the_hole(
 def test_other_methods_start_from_the_marks_where_nobody_says_where_views_stand(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:
-    few = ["--false-calls", "0.01"]
+    subset = ["--false-calls", "0.01"]
     assert (
-        detect.main([*views[:2], "--register", method, "--out", str(tmp_path / "out"), *few]) == 0
+        detect.main([*views[:2], "--register", method, "--out", str(tmp_path / "out"), *subset])
+        == 0
     )
     assert "starts from the pose of" not in capsys.readouterr().out
     row = json.loads((tmp_path / "out" / "registrations.json").read_text())["views"][1]
     assert row["method"] == method
     assert np.abs(error_m(row["T_reference_view"], 1)).max() < 2e-3
-    (found,) = findings_of(tmp_path / "out")
-    assert found["diameter_mm"] == pytest.approx(2e3 * board.HOLE_RADIUS_M, rel=0.15)
+    (result,) = findings_of(tmp_path / "out")
+    assert result["diameter_mm"] == pytest.approx(2e3 * board.HOLE_RADIUS_M, rel=0.15)
 
 
 @pytest.mark.usefixtures("unpictured")
@@ -186,9 +189,9 @@ def test_poses_may_be_stated_and_nominal_takes_them_as_they_are(
         str(tmp_path / "out"),
     ]
     assert detect.main([*arguments, *SHARP]) == 0
-    told = json.loads((tmp_path / "out" / "registrations.json").read_text())["views"][1]
-    np.testing.assert_allclose(told["T_reference_view"], T_FIRST_VIEW[1], atol=1e-12)
-    assert told["predicted_in_plane_mm"] is None
+    message = json.loads((tmp_path / "out" / "registrations.json").read_text())["views"][1]
+    np.testing.assert_allclose(message["T_reference_view"], T_FIRST_VIEW[1], atol=1e-12)
+    assert message["predicted_in_plane_mm"] is None
     files = json.loads((tmp_path / "out" / "findings.json").read_text())["provenance"]["files"]
     assert (
         files[-1]["path"] == str(poses)
@@ -205,8 +208,8 @@ def test_settings_reach_the_way_from_views_to_a_cloud(views: list[str], tmp_path
         "mapping.crop.inset_px=5",
         "surface.degree=1",
     )
-    more = [word for setting in settings for word in ("--set", setting)]
-    assert detect.main([*views, "--register", "marks", "--out", str(out), *more]) == 0
+    additional = [word for setting in settings for word in ("--set", setting)]
+    assert detect.main([*views, "--register", "marks", "--out", str(out), *additional]) == 0
     facts = json.loads((out / "findings.json").read_text())["settings"]
     assert facts["mapping"]["merge"]["cell_mm"] == 4 and facts["mapping"]["crop"]["inset_px"] == 5
     assert facts["detector"]["settings"]["surface"]["degree"] == 1
@@ -230,8 +233,8 @@ def test_the_picture_tells_which_view_a_point_is_of() -> None:
         [*np.meshgrid(np.arange(10.0), np.arange(4.0)), np.full((4, 10), 1.0)], axis=-1
     )
     second = first + np.array([5.0, 0.01, 0.0])
-    both = np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3), [[np.nan] * 3]])[None]
-    merged = Merged(_cloud(both), np.eye(4), ("a", "b"), 0.0)
+    pair = np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3), [[np.nan] * 3]])[None]
+    merged = Merged(_cloud(pair), np.eye(4), ("a", "b"), 0.0)
     prepared = tuple(
         PreparedView(
             View(name, _cloud(points), None), np.ones((4, 10), bool), MarkSet((), np.zeros(0, int))
@@ -239,9 +242,9 @@ def test_the_picture_tells_which_view_a_point_is_of() -> None:
         for name, points in (("a", first), ("b", second))
     )
     placed = tuple(reference_registration(name, "nominal") for name in "ab")
-    told = Mapped(prepared, placed, merged).view_of_points()
+    message = Mapped(prepared, placed, merged).view_of_points()
     expected = [*([0] * 10 * 4), *([1] * 10 * 4), -1]
-    np.testing.assert_array_equal(told, expected)
+    np.testing.assert_array_equal(message, expected)
     halfway = Merged(
         _cloud((first + np.array([0.0, 0.005, 0.0]))[:, 5:]), np.eye(4), ("a", "b"), 0.0
     )
@@ -271,14 +274,14 @@ def test_a_view_with_hidden_marks_is_named_with_what_is_missing(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hidden = board.write_view(tmp_path / "hidden", POSES[1], seed=5, hidden=(0, 2, 4))
-    said = failed(
+    printed = failed(
         capsys, views[0], hidden, views[2], "--register", "marks", "--out", tmp_path / "out"
     )
-    assert "one view cannot be registered to view_0" in said
+    assert "one view cannot be registered to view_0" in printed
     assert (
-        "\n  hidden: 2 marks found, 3 needed" in said
-        and "view_2" not in said
-        and "(--poses)" in said
+        "\n  hidden: 2 marks found, 3 needed" in printed
+        and "view_2" not in printed
+        and "(--poses)" in printed
     )
     assert not (tmp_path / "out").exists()
 
@@ -286,11 +289,11 @@ def test_a_view_with_hidden_marks_is_named_with_what_is_missing(
 def test_views_of_another_target_are_refused(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    others = ((-0.15, -0.06), (0.05, 0.02), (0.16, -0.02), (-0.05, 0.07))
-    other = board.write_view(tmp_path / "other", POSES[1], seed=6, strips=others)
+    remaining = ((-0.15, -0.06), (0.05, 0.02), (0.16, -0.02), (-0.05, 0.07))
+    view = board.write_view(tmp_path / "other", POSES[1], seed=6, strips=remaining)
     for method in ("marks", "joint"):
-        said = failed(capsys, views[0], other, "--register", method, "--out", tmp_path / "out")
-        assert "one view cannot be registered to view_0" in said and "\n  other: " in said
+        printed = failed(capsys, views[0], view, "--register", method, "--out", tmp_path / "out")
+        assert "one view cannot be registered to view_0" in printed and "\n  other: " in printed
     assert not (tmp_path / "out").exists()
 
 
@@ -301,10 +304,10 @@ def test_views_without_overlap_are_refused(
     far = np.eye(4)
     far[0, 3] = 1.0
     poses.write_text(json.dumps([np.eye(4).tolist(), far.tolist()]))
-    said = failed(
+    printed = failed(
         capsys, *views[:2], "--register", "nominal", "--poses", poses, "--out", tmp_path / "out"
     )
-    assert "view_1: the views do not overlap: 0 %" in said and "correct --poses" in said
+    assert "view_1: the views do not overlap: 0 %" in printed and "correct --poses" in printed
     assert not (tmp_path / "out").exists()
 
 
@@ -353,8 +356,10 @@ def test_one_view_is_none_too_many(views: list[str], capsys: pytest.CaptureFixtu
 def test_several_captures_are_no_list_of_frames_and_no_capture_counts_twice(
     views: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = failed(capsys, *views[:2])
-    assert f"2 PATHs, but {views[0]} is a whole capture" in said and "--register marks|" in said
+    printed = failed(capsys, *views[:2])
+    assert (
+        f"2 PATHs, but {views[0]} is a whole capture" in printed and "--register marks|" in printed
+    )
     assert f"{views[0]}: is named twice" in failed(
         capsys, views[0], views[1], views[0] + "/", "--register", "marks"
     )
@@ -371,8 +376,8 @@ def test_a_full_disk_leaves_nothing(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("harness.report.view3d.write_text", full)
-    said = failed(capsys, *views[:2], "--register", "marks", "--out", tmp_path / "out", *SHARP)
-    assert "the disk is full" in said and not (tmp_path / "out").exists()
+    printed = failed(capsys, *views[:2], "--register", "marks", "--out", tmp_path / "out", *SHARP)
+    assert "the disk is full" in printed and not (tmp_path / "out").exists()
 
 
 # ---- poses
@@ -443,9 +448,9 @@ def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, told: str) -
     (tmp_path / "poses").write_text(text)
     with pytest.raises(UserError) as caught:
         read_poses(tmp_path / "poses", 2)
-    said = str(caught.value)
+    printed = str(caught.value)
     for part in told.split(" .. "):
-        assert part in said
+        assert part in printed
 
 
 # ---- a real capture
@@ -454,9 +459,9 @@ def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, told: str) -
 
 def _halves(source: Path, folder: Path) -> list[str]:
     """The first and last frames of a capture as two, every second row and column of each."""
-    told = json.loads((source / "intrinsic.json").read_text())
-    told["width"], told["height"] = told["width"] // 2, told["height"] // 2
-    told["intrinsic_matrix"] = [0.5 * value for value in told["intrinsic_matrix"][:8]] + [1.0]
+    message = json.loads((source / "intrinsic.json").read_text())
+    message["width"], message["height"] = message["width"] // 2, message["height"] // 2
+    message["intrinsic_matrix"] = [0.5 * value for value in message["intrinsic_matrix"][:8]] + [1.0]
     colour = cv2.imread(str(source / "color" / "00000.jpg"))[::2, ::2]
     depths = sorted((source / "depth").iterdir())
     for name, part in (("first", depths[:4]), ("second", depths[-4:])):
@@ -466,7 +471,7 @@ def _halves(source: Path, folder: Path) -> list[str]:
             stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             cv2.imwrite(str(folder / name / "depth" / path.name), stored[::2, ::2])
         cv2.imwrite(str(folder / name / "color" / f"{part[0].stem}.png"), colour)
-        (folder / name / "intrinsic.json").write_text(json.dumps(told))
+        (folder / name / "intrinsic.json").write_text(json.dumps(message))
     return [str(folder / "first"), str(folder / "second")]
 
 

@@ -25,8 +25,8 @@ def test_every_program_is_in_the_documents(capsys):
     shown = capsys.readouterr().out
     assert all(command in shown for _, command in TASKS) and all(name in shown for name in names)
     for _, command in TASKS:
-        _, name, *rest = command.split()
-        importlib.import_module(MODULES[name]).main.parser().parse_args(rest)
+        _, name, *remainder = command.split()
+        importlib.import_module(MODULES[name]).main.parser().parse_args(remainder)
 
 
 def test_a_program_runs_with_its_own_arguments_and_exit_code(tmp_path, capsys):
@@ -57,14 +57,14 @@ def test_completion_is_a_script_that_knows_programs_and_options(capsys):
     assert main(["completion", "bash"]) == 0
     script = capsys.readouterr().out
     ask = 'COMP_WORDS=(tofpod {}); COMP_CWORD={}; _tofpod; echo "${{COMPREPLY[@]}}"'
-    for words, place, wanted in (
+    for words, position, wanted in (
         ("sw", 1, "sweep"),
         ("sweep --ca", 2, "--calibration --cache-limit"),
         ("sweep aver", 2, "averaging"),
         ("ask --camera kinect_v2_", 3, "kinect_v2_libfreenect2"),
     ):
         ran = subprocess.run(
-            ["bash", "-c", script + ask.format(words, place)],
+            ["bash", "-c", script + ask.format(words, position)],
             capture_output=True,
             text=True,
             check=True,

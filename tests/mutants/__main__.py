@@ -25,7 +25,7 @@ Records = dict[tuple[str, ...], tuple[str, str]]
 
 def options() -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(prog="python -m mutants", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__)
     add = parser.add_argument
     add("--sample", type=int, default=300, metavar="N", help="number of mutants (default 300)")
     add("--seed", type=int, default=1, metavar="S", help="seed of the draw (default 1)")

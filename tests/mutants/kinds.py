@@ -172,9 +172,9 @@ def _constants(source: Source, node: ast.AST) -> Iterator[Edit]:
     value = node.value
     is_guard = 0 < value <= GUARD
     values = [value + 1] if is_guard else [2 * value, value + 1, 0 * value]
-    for other in dict.fromkeys(values):
-        if other != value:
-            yield _whole(source, node, repr(other))
+    for fromkey in dict.fromkeys(values):
+        if fromkey != value:
+            yield _whole(source, node, repr(fromkey))
 
 
 def _comparisons(source: Source, node: ast.AST) -> Iterator[Edit]:

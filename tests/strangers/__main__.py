@@ -23,9 +23,9 @@ def made(kind: str, seed: int, folder: Path) -> Score:
     stranger = KINDS[kind](rng)
     stack, view, truths = recorded(stranger, rng)
     path = written(stranger, stack, folder / "in")
-    code, said, rows = answered(path, folder / "out", stranger.format.arguments)
-    score = scored(stranger, view, truths, code, said, rows)
-    (folder / "answer.txt").write_text(f"{score.verdict}: {'; '.join(score.why)}\n{said}")
+    code, printed, rows = answered(path, folder / "out", stranger.format.arguments)
+    score = scored(stranger, view, truths, code, printed, rows)
+    (folder / "answer.txt").write_text(f"{score.verdict}: {'; '.join(score.why)}\n{printed}")
     return score
 
 

@@ -58,10 +58,10 @@ def board(
 ) -> Surface:  # fmt: skip
     """A board about the image's middle; ``share``: of the view's width and height that it spans."""
     d = rng.uniform(*distance)
-    at = rng.uniform(-0.05, 0.05, 2) * d * np.array([cam.width, cam.height]) / cam.f_px
+    index = rng.uniform(-0.05, 0.05, 2) * d * np.array([cam.width, cam.height]) / cam.f_px
     half = 0.5 * d * np.array([cam.width, cam.height]) / cam.f_px * rng.uniform(*share, 2)
     r = turned(rng.uniform(*tilt), rng.uniform(0, 360), rng.uniform(*spin))
-    return Surface(np.array([*at, d]), r, half[0], half[1], is_target=True)
+    return Surface(np.array([*index, d]), r, half[0], half[1], is_target=True)
 
 
 def filling(
@@ -86,8 +86,8 @@ def wall(
     x = 0.999 * surface.half_x_m if surface.half_x_m < 5 else 0.0
     y = 0.999 * surface.half_y_m if surface.half_y_m < 5 else 0.0
     corners = [surface.point_m(i * x, j * y)[2] for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    at = np.array([*surface.origin_m[:2], np.nanmax(corners) + gap_m])
-    return Surface(at, turned(tilt_deg, towards_deg), 9.0, 9.0)
+    index = np.array([*surface.origin_m[:2], np.nanmax(corners) + gap_m])
+    return Surface(index, turned(tilt_deg, towards_deg), 9.0, 9.0)
 
 
 def damaged(
@@ -146,13 +146,13 @@ def plate(rng: Rng, n: int = 4, cam: Camera | None = None, **more: object) -> St
     """A damaged board before a wall with ordinary noise: what most kinds vary."""
     cam = cam or camera(rng)
     target = damaged(rng, cam, board(rng, cam), n)
-    made = Stranger(
+    stranger = Stranger(
         [target, wall(target, rng.uniform(0.15, 0.8))],
         cam,
         usual(rng),
         frames=int(rng.integers(4, 12)),
     )
-    return replace(made, **more)  # type: ignore[arg-type]
+    return replace(stranger, **more)  # type: ignore[arg-type]
 
 
 def blotch(rng: Rng, cam: Camera, share: float, n: int = 1) -> np.ndarray:
@@ -160,9 +160,12 @@ def blotch(rng: Rng, cam: Camera, share: float, n: int = 1) -> np.ndarray:
     image = np.zeros((cam.height, cam.width), np.uint8)
     size = np.sqrt(share * cam.width * cam.height / np.pi / n)
     for _ in range(n):
-        at = (int(rng.uniform(0.25, 0.75) * cam.width), int(rng.uniform(0.25, 0.75) * cam.height))
+        index = (
+            int(rng.uniform(0.25, 0.75) * cam.width),
+            int(rng.uniform(0.25, 0.75) * cam.height),
+        )
         axes = (max(2, int(size * rng.uniform(0.6, 1.6))), max(2, int(size)))
-        cv2.ellipse(image, at, axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
+        cv2.ellipse(image, index, axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
     return image > 0
 
 
@@ -352,16 +355,16 @@ def corrugated(rng: Rng) -> Stranger:
 
 def _objects(target: Surface, rng: Rng) -> list[Surface]:
     """A box, a tape or a cable that lies on a board, clear of its damages."""
-    made: list[Surface] = []
+    created: list[Surface] = []
     for _ in range(200):
-        what = str(rng.choice(["box", "tape", "cable"]))
+        content = str(rng.choice(["box", "tape", "cable"]))
         halves = {
             "box": rng.uniform(0.015, 0.05, 2),
             "tape": (rng.uniform(0.04, 0.1), 0.012),
             "cable": (0.1, 0.004),
         }
-        half = halves[what]
-        high = {"box": rng.uniform(0.01, 0.06), "tape": 0.0003, "cable": 0.008}[what]
+        half = halves[content]
+        high = {"box": rng.uniform(0.01, 0.06), "tape": 0.0003, "cable": 0.008}[content]
         reach = float(np.hypot(*half))
         x = rng.uniform(-0.8, 0.8) * target.half_x_m
         y = rng.uniform(-0.8, 0.8) * target.half_y_m
@@ -370,12 +373,12 @@ def _objects(target: Surface, rng: Rng) -> list[Surface]:
             for d in target.damages
         ):
             continue
-        at = target.origin_m + target.R @ np.array([x, y, -high])
+        index = target.origin_m + target.R @ np.array([x, y, -high])
         turn = cv2.Rodrigues(np.array([0, 0, rng.uniform(0, np.pi)]))[0]
-        made.append(Surface(at, target.R @ turn, half[0], half[1], is_object=True))
-        if len(made) == 2:
+        created.append(Surface(index, target.R @ turn, half[0], half[1], is_object=True))
+        if len(created) == 2:
             break
-    return made
+    return created
 
 
 @kind
@@ -391,19 +394,19 @@ def object_on_plate(rng: Rng) -> Stranger:
 def tags(rng: Rng) -> Stranger:
     """Printed tags with black squares that a measures 1 to 3 mm off; findings there are not
     judged."""
-    made = plate(rng)
-    cam = made.camera
-    target = made.surfaces[0]
+    created = plate(rng)
+    cam = created.camera
+    target = created.surfaces[0]
     offset = np.zeros((cam.height, cam.width))
     for sx, sy in ((-0.8, -0.8), (0.8, -0.8), (-0.8, 0.8), (0.8, 0.8)):
-        at = target.point_m(sx * target.half_x_m, sy * target.half_y_m)
-        u = int(cam.f_px * at[0] / at[2] + cam.cx_px)
-        v = int(cam.f_px * at[1] / at[2] + cam.cy_px)
+        index = target.point_m(sx * target.half_x_m, sy * target.half_y_m)
+        u = int(cam.f_px * index[0] / index[2] + cam.cx_px)
+        v = int(cam.f_px * index[1] / index[2] + cam.cy_px)
         pattern = rng.integers(0, 2, (4, 4)).repeat(3, 0).repeat(3, 1) * rng.uniform(1e-3, 3e-3)
         window = offset[max(v, 0) : v + 12, max(u, 0) : u + 12]
         window[:] = pattern[: window.shape[0], : window.shape[1]]
-    near = cv2.dilate((offset > 0).astype(np.uint8), np.ones((7, 7))) > 0
-    return replace(made, offset_m=offset, ignored=near)
+    nearby = cv2.dilate((offset > 0).astype(np.uint8), np.ones((7, 7))) > 0
+    return replace(created, offset_m=offset, ignored=nearby)
 
 
 @kind
@@ -413,13 +416,15 @@ def foreground(rng: Rng) -> Stranger:
     target = damaged(rng, cam, board(rng, cam, (0.6, 0.95), share=(0.7, 0.95)), 3)
     d = 0.55 * target.origin_m[2]
     if rng.random() < 0.5:
-        at = np.array([rng.choice([-1, 1]) * 0.25 * d, 0, d])
-        before = [Surface(at, turned(5, 0, rng.uniform(-15, 15)), 0.0149, 1.0, "cylinder", 0.015)]
+        index = np.array([rng.choice([-1, 1]) * 0.25 * d, 0, d])
+        before = [
+            Surface(index, turned(5, 0, rng.uniform(-15, 15)), 0.0149, 1.0, "cylinder", 0.015)
+        ]
     else:
-        at = np.array([0.35 * d, 0.35 * d, d])
-        before = [Surface(at, turned(20, 30, rng.uniform(0, 90)), 0.045, 0.06, outline="disc")]
+        index = np.array([0.35 * d, 0.35 * d, d])
+        before = [Surface(index, turned(20, 30, rng.uniform(0, 90)), 0.045, 0.06, outline="disc")]
         for i in range(4):
-            finger = at + np.array([-0.06, -0.02 * i, 0.01])
+            finger = index + np.array([-0.06, -0.02 * i, 0.01])
             before.append(Surface(finger, turned(10, 10, 90 + 12 * i), 0.008, 0.04))
     return Stranger([target, *before, wall(target, rng.uniform(0.2, 0.8))], cam, usual(rng))
 
@@ -428,27 +433,32 @@ def foreground(rng: Rng) -> Stranger:
 def white_millimetre(rng: Rng) -> Stranger:
     """Another kind's scene before the simplest camera: 1 mm of white noise, nothing mixed at
     edges, some pixels lost; stored in millimetres or finer, with 0 or 65535 for no return."""
-    named = "before_wall on_floor corner tilted fills_view pipe_outside pipe_inside sphere dome bent_sheet drilled"
-    made = KINDS[str(rng.choice([*named.split(), "dents", "no_return", "object_on_plate"]))](rng)
+    by_name = (
+        "before_wall on_floor corner tilted fills_view pipe_outside pipe_inside sphere dome "
+        "bent_sheet drilled"
+    )
+    created = KINDS[str(rng.choice([*by_name.split(), "dents", "no_return", "object_on_plate"]))](
+        rng
+    )
     form = Format(
         unit_m=float(rng.choice([1e-3, 1e-3, 1e-3, 0.25e-3])),
         invalid=float(rng.choice([0, 0, 65535])),
     )
     noise = Noise(1e-3, dropout=float(rng.choice([0, 0, 0.1])))
-    return replace(made, camera=Camera(640, 576, 504.6, 321.7, 333.3), noise=noise, format=form)
+    return replace(created, camera=Camera(640, 576, 504.6, 321.7, 333.3), noise=noise, format=form)
 
 
 @kind
 def camera_model(rng: Rng) -> Stranger:
     """Another kind's scene before the project's own model of an Azure Kinect or a Kinect v2."""
-    named = "before_wall tilted fills_view pipe_outside dome drilled object_on_plate on_floor"
-    made = KINDS[str(rng.choice(named.split()))](rng)
+    by_name = "before_wall tilted fills_view pipe_outside dome drilled object_on_plate on_floor"
+    created = KINDS[str(rng.choice(by_name.split()))](rng)
     model, cam, noise_m = (
         ("azure_kinect_nfov", Camera(640, 576, 504.6, 321.7, 333.3), 0.8e-3),
         ("kinect_v2", Camera(512, 424, 365.0, 256.0, 208.0), 1.5e-3),
     )[int(rng.integers(2))]
     noise = Noise(noise_m, blur_px=1.0, fixed_m=0.6e-3, fixed_px=1.5)
-    return replace(made, camera=cam, noise=noise, model=model, frames=int(rng.integers(1, 9)))
+    return replace(created, camera=cam, noise=noise, model=model, frames=int(rng.integers(1, 9)))
 
 
 # ---- damage
@@ -509,44 +519,46 @@ def no_return(rng: Rng) -> Stranger:
 
 @kind
 def dropouts(rng: Rng) -> Stranger:
-    made = plate(rng)
-    return replace(made, noise=replace(made.noise, dropout=rng.uniform(0.02, 0.35)))
+    created = plate(rng)
+    return replace(created, noise=replace(created.noise, dropout=rng.uniform(0.02, 0.35)))
 
 
 @kind
 def clustered_dropouts(rng: Rng) -> Stranger:
     """Ragged spots of 4 to 12 pixels without return: called or not, both may be right."""
-    made = plate(rng)
-    gone = np.zeros((made.camera.height, made.camera.width), bool)
+    created = plate(rng)
+    gone = np.zeros((created.camera.height, created.camera.width), bool)
     for _ in range(int(rng.integers(2, 8))):
-        gone |= blotch(rng, made.camera, 8e-4)
+        gone |= blotch(rng, created.camera, 8e-4)
     gone &= rng.random(gone.shape) < 0.7
-    return replace(made, gone=gone, ignored=cv2.dilate(gone.astype(np.uint8), np.ones((5, 5))) > 0)
+    return replace(
+        created, gone=gone, ignored=cv2.dilate(gone.astype(np.uint8), np.ones((5, 5))) > 0
+    )
 
 
 @kind
 def dark_patch(rng: Rng) -> Stranger:
     """A dark patch: three to five times the noise."""
-    made = plate(rng)
-    patch = blotch(rng, made.camera, rng.uniform(0.01, 0.05))
-    return replace(made, louder=np.where(patch, rng.uniform(3, 5), 1.0))
+    created = plate(rng)
+    patch = blotch(rng, created.camera, rng.uniform(0.01, 0.05))
+    return replace(created, louder=np.where(patch, rng.uniform(3, 5), 1.0))
 
 
 @kind
 def specular(rng: Rng) -> Stranger:
     """A highlight that saturates: nothing returns from a patch; calling it is right, calling it
     not too."""
-    made = plate(rng)
-    patch = blotch(rng, made.camera, rng.uniform(0.001, 0.01))
+    created = plate(rng)
+    patch = blotch(rng, created.camera, rng.uniform(0.001, 0.01))
     return replace(
-        made, gone=patch, ignored=cv2.dilate(patch.astype(np.uint8), np.ones((9, 9))) > 0
+        created, gone=patch, ignored=cv2.dilate(patch.astype(np.uint8), np.ones((9, 9))) > 0
     )
 
 
 @kind
 def flying_pixels(rng: Rng) -> Stranger:
-    made = plate(rng)
-    return replace(made, noise=replace(made.noise, mixing_px=rng.uniform(0.8, 1.5)))
+    created = plate(rng)
+    return replace(created, noise=replace(created.noise, mixing_px=rng.uniform(0.8, 1.5)))
 
 
 # ---- noise
@@ -555,31 +567,37 @@ def flying_pixels(rng: Rng) -> Stranger:
 
 @kind
 def white_noise(rng: Rng) -> Stranger:
-    made = plate(rng)
+    created = plate(rng)
     return replace(
-        made,
-        noise=replace(made.noise, white_m=float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))),
+        created,
+        noise=replace(
+            created.noise, white_m=float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))
+        ),
     )
 
 
 @kind
 def correlated_noise(rng: Rng) -> Stranger:
-    made = plate(rng)
-    noise = replace(made.noise, white_m=rng.uniform(0.4e-3, 1.5e-3), blur_px=rng.uniform(0.7, 1.2))
-    return replace(made, noise=noise)
+    created = plate(rng)
+    noise = replace(
+        created.noise, white_m=rng.uniform(0.4e-3, 1.5e-3), blur_px=rng.uniform(0.7, 1.2)
+    )
+    return replace(created, noise=noise)
 
 
 @kind
 def fixed_pattern(rng: Rng) -> Stranger:
-    made = plate(rng)
-    noise = replace(made.noise, fixed_m=rng.uniform(0.3e-3, 0.8e-3), fixed_px=rng.uniform(0.7, 2.5))
-    return replace(made, noise=noise, frames=int(rng.integers(5, 20)))
+    created = plate(rng)
+    noise = replace(
+        created.noise, fixed_m=rng.uniform(0.3e-3, 0.8e-3), fixed_px=rng.uniform(0.7, 2.5)
+    )
+    return replace(created, noise=noise, frames=int(rng.integers(5, 20)))
 
 
 @kind
 def heavy_tails(rng: Rng) -> Stranger:
-    made = plate(rng)
-    return replace(made, noise=replace(made.noise, tail=True))
+    created = plate(rng)
+    return replace(created, noise=replace(created.noise, tail=True))
 
 
 @kind
@@ -599,37 +617,39 @@ def fifty_frames(rng: Rng) -> Stranger:
 @kind
 def frame_jump(rng: Rng) -> Stranger:
     """One frame reads 5 to 30 mm off, as after an interrupted exposure."""
-    at = int(rng.integers(8))
+    index = int(rng.integers(8))
     off = float(rng.choice([-1, 1])) * rng.uniform(5e-3, 30e-3)
-    return replace(plate(rng), frames=8, per_frame=lambda k, depth: depth + off * (k == at))
+    return replace(plate(rng), frames=8, per_frame=lambda k, depth: depth + off * (k == index))
 
 
 @kind
 def moved_camera(rng: Rng) -> Stranger:
     """The camera is knocked half way: the picture shifts by 5 to 20 pixels."""
-    made = plate(rng)
-    by = int(rng.integers(5, 20)) * made.camera.width // 320
+    created = plate(rng)
+    key = int(rng.integers(5, 20)) * created.camera.width // 320
     return replace(
-        made, frames=8, per_frame=lambda k, depth: np.roll(depth, by, axis=1) if k >= 5 else depth
+        created,
+        frames=8,
+        per_frame=lambda k, depth: np.roll(depth, key, axis=1) if k >= 5 else depth,
     )
 
 
 @kind
 def passer_by(rng: Rng) -> Stranger:
     """Somebody walks through the view in two of ten frames."""
-    made = plate(rng)
-    h = made.camera.height
-    w = made.camera.width
-    near = 0.6 * made.surfaces[0].origin_m[2]
+    created = plate(rng)
+    h = created.camera.height
+    w = created.camera.width
+    nearby = 0.6 * created.surfaces[0].origin_m[2]
 
     def walks(k: int, depth: np.ndarray) -> np.ndarray:
         if k not in (4, 5):
             return depth
         v, u = np.mgrid[:h, :w]
         body = np.hypot((u - w * (0.3 + 0.3 * (k - 4))) / (0.12 * w), (v - 0.6 * h) / (0.5 * h)) < 1
-        return np.where(body, near, depth)
+        return np.where(body, nearby, depth)
 
-    return replace(made, frames=10, per_frame=walks)
+    return replace(created, frames=10, per_frame=walks)
 
 
 # ---- cameras and files
@@ -693,8 +713,8 @@ def millimetres_float(rng: Rng) -> Stranger:
 
 @kind
 def invalid_values(rng: Rng) -> Stranger:
-    made = no_return(rng) if rng.random() < 0.5 else dropouts(rng)
-    return replace(made, format=Format(invalid=float(rng.choice([65535, 65534, 4095]))))
+    created = no_return(rng) if rng.random() < 0.5 else dropouts(rng)
+    return replace(created, format=Format(invalid=float(rng.choice([65535, 65534, 4095]))))
 
 
 @kind
@@ -721,9 +741,12 @@ def clouds_mm(rng: Rng) -> Stranger:
 
 @kind
 def undamaged(rng: Rng) -> Stranger:
-    named = "before_wall fills_view pipe_outside sphere bent_sheet tilted correlated_noise on_floor fixed_pattern"
-    made = KINDS[str(rng.choice(named.split()))](rng)
-    return replace(made, surfaces=[replace(surface, damages=()) for surface in made.surfaces])
+    by_name = (
+        "before_wall fills_view pipe_outside sphere bent_sheet tilted correlated_noise on_floor "
+        "fixed_pattern"
+    )
+    created = KINDS[str(rng.choice(by_name.split()))](rng)
+    return replace(created, surfaces=[replace(surface, damages=()) for surface in created.surfaces])
 
 
 @kind
@@ -734,8 +757,8 @@ def rubble(rng: Rng) -> Stranger:
     for _ in range(60):
         d = rng.uniform(0.5, 0.9)
         radius = rng.uniform(0.02, 0.07)
-        at = np.array(
+        index = np.array(
             [*(rng.uniform(-0.6, 0.6, 2) * d * np.array([cam.width, cam.height]) / cam.f_px), d]
         )
-        stones.append(Surface(at, np.eye(3), radius, radius, "sphere", radius, outline="disc"))
+        stones.append(Surface(index, np.eye(3), radius, radius, "sphere", radius, outline="disc"))
     return Stranger(stones, cam, usual(rng), doubtful=True)

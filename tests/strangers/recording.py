@@ -187,9 +187,9 @@ def _mixed(depth: np.ndarray, blur_px: float) -> np.ndarray:
     goes on straight."""
     beyond = 4
     depth = np.pad(depth, beyond, mode="reflect", reflect_type="odd")
-    known = np.isfinite(depth)
-    weight = cv2.GaussianBlur(known.astype(float), (0, 0), blur_px)
-    total = cv2.GaussianBlur(np.where(known, depth, 0.0), (0, 0), blur_px)
+    reference = np.isfinite(depth)
+    weight = cv2.GaussianBlur(reference.astype(float), (0, 0), blur_px)
+    total = cv2.GaussianBlur(np.where(reference, depth, 0.0), (0, 0), blur_px)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(weight > 0.5, total / weight, np.nan)[beyond:-beyond, beyond:-beyond]
 
@@ -231,20 +231,32 @@ def _truths(stranger: Stranger, view: View) -> tuple[Truth, ...]:
             (pixels, signal), hidden = view.footprints[i], view.hidden[i]
             i += 1
             lost = ~np.isfinite(signal)
-            whole = hidden < 0.05 and pixels.size and not gone.reshape(-1)[pixels].any()
+            complete = hidden < 0.05 and pixels.size and not gone.reshape(-1)[pixels].any()
             loud = float(louder.reshape(-1)[pixels].mean()) if pixels.size else 1.0
-            known = signal[~lost]
+            reference = signal[~lost]
             absent = lost.sum() > 0.5 * max(pixels.size, 1)
             if absent:
-                seen = (
+                observed = (
                     lost.sum() >= CLEAR_PIXELS and lost.sum() * np.log(1 / rate) >= CLEAR_LOG_ODDS
                 )
             else:
-                d = np.sqrt(np.sum(known**2)) / broad / loud if known.size else 0.0
-                peak = float(np.percentile(np.abs(known), 90)) / pixel / loud if known.size else 0.0
-                seen = d >= CLEAR_D and peak >= CLEAR_PEAK and known.size >= CLEAR_PIXELS
+                d = np.sqrt(np.sum(reference**2)) / broad / loud if reference.size else 0.0
+                peak = (
+                    float(np.percentile(np.abs(reference), 90)) / pixel / loud
+                    if reference.size
+                    else 0.0
+                )
+                observed = d >= CLEAR_D and peak >= CLEAR_PEAK and reference.size >= CLEAR_PIXELS
             truths.append(
-                _truth(surface, damage, known, absent, bool(whole and seen), half, pixel * loud)
+                _truth(
+                    surface,
+                    damage,
+                    reference,
+                    absent,
+                    bool(complete and observed),
+                    half,
+                    pixel * loud,
+                )
             )
     return tuple(truths)
 
@@ -342,7 +354,10 @@ def _clouds(stranger: Stranger, stored: np.ndarray, folder: Path) -> Path:
         path = folder / f"cloud_{k:03d}.{kind}"
         if kind == "ply":
             names = "".join(f"property float {axis}\n" for axis in "xyz")
-            head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{names}end_header\n"
+            head = (
+                "ply\nformat binary_little_endian 1.0\nelement vertex "
+                f"{len(points)}\n{names}end_header\n"
+            )
             path.write_bytes(head.encode() + points.tobytes())
         elif kind == "pcd":
             head = (

@@ -50,18 +50,18 @@ def answered(
 ) -> tuple[int, str, list[dict[str, str]]]:
     """(exit code, all that was printed, rows of findings.csv) of the default command; a traceback
     is code 1."""
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    string_io = io.StringIO()
+    with contextlib.redirect_stdout(string_io), contextlib.redirect_stderr(string_io):
         try:
             code = detect.main([str(path), "--out", str(out), *arguments])
         except SystemExit as exit_:
             code = int(exit_.code or 0)
         except Exception:
-            said.write(traceback.format_exc())
+            string_io.write(traceback.format_exc())
             code = 1
     table = out / "findings.csv"
     rows = list(csv.DictReader(table.open())) if code == 0 and table.is_file() else []
-    return code, said.getvalue(), rows
+    return code, string_io.getvalue(), rows
 
 
 def scored(
@@ -84,8 +84,8 @@ def scored(
         return Score("warned", ("refused",), (), said, len(clear), 0, 0)
     why = [] if code == 0 else [f"exit {code}"]
     matched = [_match(row, truths) for row in rows]
-    found = {id(truth) for truth in matched if truth is not None}
-    missed = [truth for truth in clear if id(truth) not in found]
+    result = {id(truth) for truth in matched if truth is not None}
+    missed = [truth for truth in clear if id(truth) not in result]
     if missed:
         shown = ", ".join(_shown(truth) for truth in missed[:3])
         why.append(f"{len(missed)} of {len(clear)} missed ({shown})")
@@ -120,21 +120,21 @@ def _place(row: dict[str, str]) -> np.ndarray:
 def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
     """The nearest damage whose centre is within its radius, at least 12 mm, across the line of
     sight."""
-    place = _place(row)
+    position = _place(row)
     best = None
     least = math.inf
     for truth in truths:
         centre = 1e3 * np.array(truth.centre_m)
         # an error of the camera's range moves a place along its line of sight
-        apart = float(np.hypot(*(place[:2] * centre[2] / place[2] - centre[:2])))
+        separation = float(np.hypot(*(position[:2] * centre[2] / position[2] - centre[:2])))
         deep = 0.0 if not math.isfinite(truth.depth_m[1]) else 1e3 * truth.depth_m[1]
         if (
-            apart < max(NEAR_MM, 1e3 * truth.radius_m)
-            and abs(place[2] - centre[2]) < 50 + deep
-            and apart < least
+            separation < max(NEAR_MM, 1e3 * truth.radius_m)
+            and abs(position[2] - centre[2]) < 50 + deep
+            and separation < least
         ):
             best = truth
-            least = apart
+            least = separation
     return best
 
 
@@ -151,12 +151,12 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
         else:
             at_u = cam.f_px * x / z + cam.cx_px
             at_v = cam.f_px * y / z + cam.cy_px
-        near = np.hypot(u - at_u, v - at_v) <= RIM_PX
-        if stranger.ignored is not None and (near & stranger.ignored).any():
+        nearby = np.hypot(u - at_u, v - at_v) <= RIM_PX
+        if stranger.ignored is not None and (nearby & stranger.ignored).any():
             continue
-        if (near & view.on_object).any() and row["kind"] != "hole":
+        if (nearby & view.on_object).any() and row["kind"] != "hole":
             continue
-        if near.any() and not (near & view.on_target).any():
+        if nearby.any() and not (nearby & view.on_target).any():
             elsewhere += 1
         else:
             false += 1

@@ -31,13 +31,13 @@ class Camera:
 
     def slopes(self, finer: int = 1) -> np.ndarray:
         """(finer h, finer w, 2) x/z and y/z of the rays; ``finer`` rays a pixel across and down."""
-        at = [(np.arange(finer * n) + 0.5) / finer - 0.5 for n in (self.width, self.height)]
-        u, v = np.meshgrid(*at)
+        index = [(np.arange(finer * n) + 0.5) / finer - 0.5 for n in (self.width, self.height)]
+        u, v = np.meshgrid(*index)
         if not any(self.distortion):
             return np.dstack([(u - self.cx_px) / self.f_px, (v - self.cy_px) / self.f_px])
-        seen = np.dstack([(u - self.cx_px) / self.f_px, (v - self.cy_px) / self.f_px])
+        observed = np.dstack([(u - self.cx_px) / self.f_px, (v - self.cy_px) / self.f_px])
         k1, k2, p1, p2, k3 = self.distortion
-        rays = seen
+        rays = observed
         for _ in range(
             50
         ):  # OpenCV's own way: divide what is seen by the distortion of the last guess
@@ -47,7 +47,7 @@ class Camera:
             aside = np.dstack(
                 [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
             )
-            rays = (seen - aside) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))[..., None]
+            rays = (observed - aside) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))[..., None]
         return rays
 
 
@@ -193,7 +193,7 @@ def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
     depth = z.min(axis=0)
     feet = []
     hidden = []
-    seen = np.isfinite(depth)
+    observed = np.isfinite(depth)
     for i, surface in enumerate(surfaces):
         behind = (
             np.delete(z, i, axis=0).min(axis=0)
@@ -201,13 +201,13 @@ def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
             else np.full(depth.shape, np.inf)
         )
         for damage in surface.damages:
-            mine, signal = _signal(surface, hits[i], damage, behind)
-            visible = mine & (nearest == i)
+            own_rows, signal = _signal(surface, hits[i], damage, behind)
+            visible = own_rows & (nearest == i)
             feet.append((np.flatnonzero(visible), signal[visible]))
-            hidden.append(1 - visible.sum() / max(mine.sum(), 1))
+            hidden.append(1 - visible.sum() / max(own_rows.sum(), 1))
             depth = np.where(visible, depth + np.where(np.isfinite(signal), signal, np.inf), depth)
-    target = seen & np.array([s.is_target for s in surfaces])[nearest]
-    objects = seen & np.array([s.is_object for s in surfaces])[nearest]
+    target = observed & np.array([s.is_target for s in surfaces])[nearest]
+    objects = observed & np.array([s.is_object for s in surfaces])[nearest]
     depth = np.where(np.isfinite(depth), depth, np.nan)
     return View(depth, target, objects, tuple(feet), tuple(hidden))
 

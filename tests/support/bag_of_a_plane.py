@@ -195,18 +195,18 @@ def rvl(values: np.ndarray) -> bytes:
                 return
 
     flat = values.ravel().tolist()
-    at = 0
+    index = 0
     previous = 0
-    while at < len(flat):
-        start = at
-        while at < len(flat) and flat[at] == 0:
-            at += 1
-        put(at - start)
-        start = at
-        while at < len(flat) and flat[at] != 0:
-            at += 1
-        put(at - start)
-        for value in flat[start:at]:
+    while index < len(flat):
+        start = index
+        while index < len(flat) and flat[index] == 0:
+            index += 1
+        put(index - start)
+        start = index
+        while index < len(flat) and flat[index] != 0:
+            index += 1
+        put(index - start)
+        for value in flat[start:index]:
             delta = value - previous
             previous = value
             put((delta << 1) ^ (delta >> 31))
@@ -229,21 +229,21 @@ def write_ros1(
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression.upper()])
     with writer:
-        made: dict[str, Any] = {}
+        connections: dict[str, Any] = {}
         for i, (topic, kind, message) in enumerate(messages):
-            if topic not in made:
-                made[topic] = writer.add_connection(
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
                     topic, kind, typestore=types_of(Stores.ROS1_NOETIC)
                 )
             content = types_of(Stores.ROS1_NOETIC).serialize_ros1(_in_ros1(message), kind)
-            writer.write(made[topic], 10**9 + i * 33_333_333, content)
+            writer.write(connections[topic], 10**9 + i * 33_333_333, content)
     return path
 
 
 def _in_ros1(message: Any) -> Any:
     """A message of ROS 2 as one of ROS 1."""
     if not hasattr(message, "__msgtype__"):
-        return [_in_ros1(one) for one in message] if isinstance(message, list) else message
+        return [_in_ros1(item) for item in message] if isinstance(message, list) else message
     kind = types_of(Stores.ROS1_NOETIC).types[message.__msgtype__]
     values = {
         name: _in_ros1(getattr(message, name, getattr(message, name.lower(), 0)))
@@ -269,12 +269,12 @@ def write_bag(
     )
     writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
-        made: dict[str, Any] = {}
+        connections: dict[str, Any] = {}
         for i, (topic, kind, message) in enumerate(messages):
-            if topic not in made:
-                made[topic] = writer.add_connection(topic, kind, typestore=types_of())
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=types_of())
             writer.write(
-                made[topic], 10**9 + i * 33_333_333, types_of().serialize_cdr(message, kind)
+                connections[topic], 10**9 + i * 33_333_333, types_of().serialize_cdr(message, kind)
             )
     return folder
 

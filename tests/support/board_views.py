@@ -85,12 +85,12 @@ def board_view(
     marks = tuple(
         _mark(points, labels, k, noise_m) for k in range(len(tapes_m)) if (labels == k).sum() >= 10
     )
-    found = MarkSet(
+    mark_set = MarkSet(
         marks,
         np.flatnonzero(labels >= 0),
         "" if len(marks) >= 3 else f"{len(marks)} marks found, 3 needed",
     )
-    return BoardView(PreparedView(View("view", cloud, guess), inside, found), T_camera_board)
+    return BoardView(PreparedView(View("view", cloud, guess), inside, mark_set), T_camera_board)
 
 
 def views(
@@ -103,17 +103,17 @@ def views(
 ) -> list[BoardView]:
     """Views of one board, named view 0, 1, ...; guesses are the truth, times ``guess_error`` (4,
     4) after the first."""
-    made = []
+    created = []
     for i, T_camera_board in enumerate(poses):
         guess = poses[0] @ invert(T_camera_board) if i else np.eye(4)
         if i and guess_error is not None:
             guess = guess_error @ guess
         one = board_view(T_camera_board, guess, noise_m=noise_m, seed=1000 * seed + i, **more)
         view = View(f"view {i}", one.prepared.view.cloud, guess)
-        made.append(
+        created.append(
             BoardView(PreparedView(view, one.prepared.inside, one.prepared.marks), T_camera_board)
         )
-    return made
+    return created
 
 
 def usual_error() -> np.ndarray:

@@ -42,7 +42,7 @@ class Processes:
     def worker(self, *options: str, search: Path = ROOT) -> subprocess.Popen[bytes]:
         """``search``: where tofpod is."""
         local = ["--local-directory", self.folder / "scratch"]
-        given = [
+        arguments = [
             "--scheduler-file",
             self._file,
             "--nthreads",
@@ -52,7 +52,7 @@ class Processes:
             *local,
             *options,
         ]
-        self.workers.append(self._start("worker", *given, search=search))
+        self.workers.append(self._start("worker", *arguments, search=search))
         return self.workers[-1]
 
     def _start(self, kind: str, *options: object, search: Path = ROOT) -> subprocess.Popen[bytes]:

@@ -53,8 +53,10 @@ class Oracle:
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return the damages, in the truth's order, below a threshold of 1; nothing from 1 on."""
-        known = self._known() if threshold < 1.0 else ()
-        return tuple(Detection(1.0, np.sort(damage.pixels), damage.centre_m) for damage in known)
+        reference = self._known() if threshold < 1.0 else ()
+        return tuple(
+            Detection(1.0, np.sort(damage.pixels), damage.centre_m) for damage in reference
+        )
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return 1 where there is damage, 0 on a hole-free board."""
@@ -75,9 +77,12 @@ class Oracle:
 
     def _known(self) -> tuple[TrueDamage, ...]:
         if self._truth is None:
-            what = "the detector 'oracle' has not received the truth: it tests studies on simulated boards alone"
+            content = (
+                "the detector 'oracle' has not received the truth: it tests studies on "
+                "simulated boards alone"
+            )
             raise UserError(
-                what,
+                content,
                 fix="use it in an experiment with a simulated source, or choose another detector",
             )
         return self._truth
@@ -115,10 +120,10 @@ class BlindDetector:
         random = random_stream(self.settings.seed, "blind", content)
         area_m2 = judged_area_m2(cloud, mask)
         guesses = min(int(random.poisson(self.settings.guesses_per_m2 * area_m2)), int(mask.sum()))
-        places = random.choice(np.flatnonzero(mask), guesses, replace=False)
+        positions = random.choice(np.flatnonzero(mask), guesses, replace=False)
         residual_m = np.where(mask, 0.0, np.nan)
         score = residual_m.copy()
-        score.reshape(-1)[places] = random.exponential(size=guesses)
+        score.reshape(-1)[positions] = random.exponential(size=guesses)
         surface_z_m = np.where(mask, cloud.points_m[..., 2], np.nan)
         return Evidence(
             score, residual_m, surface_z_m, UNIT_M, {"guesses": guesses, "area_m2": area_m2}
@@ -156,12 +161,12 @@ def judged_area_m2(cloud: Cloud, mask: np.ndarray) -> float:
     middle = np.stack([x - x.mean(), y - y.mean(), np.ones(len(z))], axis=-1)
     slope_x, slope_y, _ = np.linalg.lstsq(middle, z, rcond=None)[0]
     if cloud.organised:
-        whole = mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
+        complete = mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
         xy = np.where(mask[..., None], cloud.points_m[..., :2], 0.0)
         falling = xy[1:, 1:] - xy[:-1, :-1]
         rising = xy[1:, :-1] - xy[:-1, 1:]
         areas = 0.5 * (falling[..., 0] * rising[..., 1] - falling[..., 1] * rising[..., 0])
-        across = float(abs(areas[whole].sum()))
+        across = float(abs(areas[complete].sum()))
     else:
         try:
             across = float(ConvexHull(np.stack([x, y], axis=-1)).volume)

@@ -16,12 +16,12 @@ from harness.tables.study import STUDY_TABLES
 def assert_declared(folder: Path) -> None:
     """Every file of a folder of results, and every column of its tables that is no axis."""
     for path in folder.iterdir():
-        known = (
+        reference = (
             path.name == JOURNAL
             or LOCK_NAME.fullmatch(path.name)
             or is_output(path.name, "results")
         )
-        assert known, (
+        assert reference, (
             f"{path.name} is not declared, so harness.programs.keeping.clean would leave it"
         )
     for table in (*STORED, *SUMMARISED, *STUDY_TABLES):

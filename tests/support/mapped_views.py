@@ -134,7 +134,7 @@ def seen(
             variance = noise_m**2 * rng.chisquare(frames - 1, shape) / (frames - 1)
     if pattern_m is not None:
         z = z + pattern_m
-    given: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         "points_m": np.concatenate([slopes * z[..., None], z[..., None]], axis=-1),
         "reason": np.zeros(shape, dtype=np.uint8),
         "count": np.full(shape, frames, dtype=np.int32),
@@ -144,7 +144,7 @@ def seen(
         "n_frames": frames,
         "lens": lens,
     }
-    cloud = Cloud(**(given | fields))
+    cloud = Cloud(**(arguments | fields))
     return prepared(cloud, cloud.valid, T_reference_view, name)
 
 
@@ -156,10 +156,10 @@ def registered(
     name: str, T_reference_view: np.ndarray, covariance: np.ndarray | None = None, failure: str = ""
 ) -> Registration:
     """A registration that is right; exact where no covariance is given."""
-    known = np.zeros((6, 6)) if covariance is None else covariance
+    reference = np.zeros((6, 6)) if covariance is None else covariance
     centre = np.array([0.0, 0.0, DISTANCE_M])
     return Registration(
-        name, "truth", T_reference_view, known, centre, 0.0, 1.0, 4, 1, True, 0.0, failure
+        name, "truth", T_reference_view, reference, centre, 0.0, 1.0, 4, 1, True, 0.0, failure
     )
 
 

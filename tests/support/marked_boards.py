@@ -87,10 +87,10 @@ def marked_cloud(
         scaled = np.stack([2 * u / lens.width - 1, 2 * v / lens.height - 1], axis=-1)
         colours = colours * light(scaled)
     slopes = lens.slopes(u, v)
-    places = _board_places(T_camera_board, slopes)
-    z = transform_points(T_camera_board, places)[..., 2]
+    positions = _board_places(T_camera_board, slopes)
+    z = transform_points(T_camera_board, positions)[..., 2]
     if behind_m is not None:
-        z = z + behind_m(places[..., :2])
+        z = z + behind_m(positions[..., :2])
     if rng is not None:
         # the mean of 5 x 5 independent values has a fifth of their deviation
         z = z + cv2.blur(rng.standard_normal(z.shape), (5, 5)) * 5.0 * sigma_m
@@ -121,5 +121,5 @@ def _board_places(T_camera_board: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     normal = T_camera_board[:3, 2]
     origin = T_camera_board[:3, 3]
     points = rays * ((origin @ normal) / (rays @ normal))[..., None]
-    places: np.ndarray = transform_points(invert(T_camera_board), points)
-    return places
+    positions: np.ndarray = transform_points(invert(T_camera_board), points)
+    return positions

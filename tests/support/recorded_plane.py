@@ -78,7 +78,8 @@ def write_pcd(path: Path, points: np.ndarray, organised: bool = True, cut: int =
     height, width = points.shape[:2] if organised else (1, points[..., 0].size)
     header = (
         "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-        f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {width * height}\nDATA binary\n"
+        f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS "
+        f"{width * height}\nDATA binary\n"
     )
     rows = np.zeros(width * height, dtype=[("xyz", "<f4", 3), ("rgb", "<u4")])
     rows["xyz"] = points.reshape(-1, 3)
@@ -109,18 +110,18 @@ def write_points(
     path: Path,
     points: np.ndarray,
     head: str = "",
-    apart: str = " ",
-    rest: str = "",
+    separator: str = " ",
+    ending: str = "",
     decimal: str = ".",
     before: str = "",
 ) -> Path:
     """A point a line, with something ``before`` and after its three numbers."""
     rows = (
-        apart.join(f"{x:.9f}".replace(".", decimal) for x in point)
+        separator.join(f"{x:.9f}".replace(".", decimal) for x in point)
         for point in points.reshape(-1, 3).tolist()
     )
     path.write_text(
-        head + "".join(f"{before}{apart if before else ''}{row}{rest}\n" for row in rows)
+        head + "".join(f"{before}{separator if before else ''}{row}{ending}\n" for row in rows)
     )
     return path
 

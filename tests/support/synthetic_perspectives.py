@@ -76,7 +76,7 @@ def perspectives(
 ) -> Tables:
     """All set-ups of an experiment over views, registration and merging."""
     world = world or MapWorld()
-    whole = joined(
+    complete = joined(
         *(
             placed(mapped(world, views, method, merge, frames), views, method, merge)
             for views in counts
@@ -86,7 +86,7 @@ def perspectives(
     )
     rows = [registrations(world, counts, method, frames, merges[0]) for method in methods]
     return replace(
-        whole,
+        complete,
         axes=MAP_AXES,
         noise=pd.DataFrame(),
         registrations=pd.concat(rows, ignore_index=True),
@@ -157,14 +157,14 @@ def mapped(
 def placed(
     part: Tables, views: int, method: str, merge: str, of: str = "", is_variation: bool = False
 ) -> Tables:
-    place = {VIEWS: float(views), REGISTRATION: method, MERGE: merge}
-    named = part.variants.assign(
+    position = {VIEWS: float(views), REGISTRATION: method, MERGE: merge}
+    by_name = part.variants.assign(
         is_variation=is_variation, reference=of or part.variants["variant"]
     )
-    part = replace(part, axes=MAP_AXES, variants=named)
+    part = replace(part, axes=MAP_AXES, variants=by_name)
     return replace(
         part,
-        **{t: getattr(part, t).assign(**place) for t in ("holes", "runs", "probes", "variants")},
+        **{t: getattr(part, t).assign(**position) for t in ("holes", "runs", "probes", "variants")},
     )
 
 
@@ -180,9 +180,9 @@ def registrations(
     rng = np.random.default_rng(3 + sum(method.encode()))
     plane, across = world.tre_mm[method]
     rows = []
-    known = 1
+    reference = 1
     for views in sorted(counts):
-        for view in range(known, views):
+        for view in range(reference, views):
             for n in frames:
                 for role in ("damaged", "hole_free"):
                     for repeat in range(world.repeats):
@@ -219,7 +219,7 @@ def registrations(
                                 MERGE: merge,
                             }
                         )
-        known = max(known, views)
+        reference = max(reference, views)
     return pd.DataFrame(rows)
 
 

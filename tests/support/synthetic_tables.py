@@ -109,7 +109,7 @@ CAMERA_AXES = pd.DataFrame(
 def placed(part: Tables, camera: str, distance_m: float, of: str = "") -> Tables:
     """One variant's tables as a set-up of the camera comparison, or as a variation of the set-up
     called ``of``."""
-    place = {"source.camera.name": camera, "source.target.distance_m": distance_m}
+    position = {"source.camera.name": camera, "source.target.distance_m": distance_m}
     name = set_up_name(camera, distance_m)
     part = replace(
         part,
@@ -117,7 +117,7 @@ def placed(part: Tables, camera: str, distance_m: float, of: str = "") -> Tables
         variants=part.variants.assign(is_variation=bool(of), reference=of or name),
     )
     names = ("holes", "runs", "probes", "variants", "noise")
-    return replace(part, **{name: getattr(part, name).assign(**place) for name in names})
+    return replace(part, **{name: getattr(part, name).assign(**position) for name in names})
 
 
 def set_up_name(camera: str, distance_m: float) -> str:
@@ -237,7 +237,7 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
         detected = np.arange(n) < round(world.rate(number, frames) * n)
         size = _exactly(rng, n, diameter + world.size_bias_mm(diameter), world.size_std_mm)
         model = _exactly(rng, n, diameter + world.model_bias_mm, 0.3)
-        place = (
+        position = (
             _exactly(rng, n, offset + world.place_bias_mm, world.place_std_mm)
             if offset
             else np.zeros(n)
@@ -246,8 +246,8 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
             "score": np.full(n, 9.0),
             "points": np.full(n, float(max(round(diameter**2 / 4), 1))),
             "extent_diameter_mm": size,
-            "extent_offset_mm": place,
-            "extent_error_mm": np.abs(place - offset) + 0.5,
+            "extent_offset_mm": position,
+            "extent_error_mm": np.abs(position - offset) + 0.5,
             "model_diameter_mm": model,
             "model_diameter_se_mm": np.full(n, 0.3),
             "model_depth_mm": np.full(n, 10.0),
@@ -301,8 +301,8 @@ def _runs(world: World, rng: np.random.Generator, variant: str, frames: int) -> 
 
 def _noise(world: World, variant: str, frames: int) -> pd.DataFrame:
     grain = {
-        f"correlation_{way}{lag}": 1 - (0.2 if way == "u" else 0.3) * lag
-        for way in "uv"
+        f"correlation_{direction}{lag}": 1 - (0.2 if direction == "u" else 0.3) * lag
+        for direction in "uv"
         for lag in (1, 2, 3)
     }
     return pd.DataFrame(

@@ -59,8 +59,8 @@ class Scene:
         )
         down = np.cross(normal, across)
         with np.errstate(invalid="ignore"):
-            apart = rays * np.where(np.isfinite(z), z, 1e9)[..., None] - centre
-        return z, apart @ across, apart @ down
+            separation = rays * np.where(np.isfinite(z), z, 1e9)[..., None] - centre
+        return z, separation @ across, separation @ down
 
     def board(
         self,
@@ -142,9 +142,9 @@ class Scene:
         z = self.z.copy()
         nothing = ~np.isfinite(z)
         if mix_px > 1:
-            known = np.where(nothing, 0.0, z)
+            reference = np.where(nothing, 0.0, z)
             share = cv2.blur((~nothing).astype(float), (mix_px, mix_px))
-            mixed = cv2.blur(known, (mix_px, mix_px)) / np.maximum(share, 1e-9)
+            mixed = cv2.blur(reference, (mix_px, mix_px)) / np.maximum(share, 1e-9)
             parted = cv2.dilate(np.where(nothing, 0, z), np.ones((mix_px, mix_px))) - cv2.erode(
                 np.where(nothing, 1e9, z), np.ones((mix_px, mix_px))
             )
@@ -178,13 +178,13 @@ def _board(random, scene, distance=None, most_tilt=35.0, size=None, holes=True):
     distance = random.uniform(0.5, 1.0) if distance is None else distance
     size = size or (random.uniform(0.2, 0.45), random.uniform(0.15, 0.35))
     centre = np.array([*_pair(random, -0.06, 0.06), distance])
-    some = (
+    sample = (
         tuple((*_pair(random, -0.06, 0.06), random.uniform(0.002, 0.02)) for _ in range(3))
         if holes
         else ()
     )
     normal = tilted(random, most_tilt)
-    scene.board(1, centre, normal, size, random.uniform(-15, 15), some)
+    scene.board(1, centre, normal, size, random.uniform(-15, 15), sample)
     return centre, normal, size
 
 
@@ -227,10 +227,12 @@ def object_on_plate(random, scene):
     scene.add(1, scene.plane(centre, normal)[0])
     side = random.uniform(0.02, 0.07)
     height = random.uniform(0.004, 0.05)
-    place = centre + np.array([*_pair(random, -0.2, 0.2), 0]) * centre[2]
+    position = centre + np.array([*_pair(random, -0.2, 0.2), 0]) * centre[2]
     # where the ray to that place meets the plate
-    place *= (centre @ normal) / (place @ normal)
-    scene.board(1, place + height * normal, normal, (side, side * random.uniform(0.6, 1.0)), 20.0)
+    position *= (centre @ normal) / (position @ normal)
+    scene.board(
+        1, position + height * normal, normal, (side, side * random.uniform(0.6, 1.0)), 20.0
+    )
 
 
 def object_on_board_before_wall(random, scene):
@@ -245,8 +247,8 @@ def plate_with_large_holes(random, scene):
     normal = tilted(random, 25)
     centre = np.array([0, 0, random.uniform(0.5, 0.9)])
     holes = tuple((*_pair(random, -0.12, 0.12), random.uniform(0.02, 0.07)) for _ in range(3))
-    whole = random.random() < 0.5
-    scene.board(1, centre, normal, (3.0, 3.0) if whole else (0.5, 0.4), 0.0, holes)
+    complete = random.random() < 0.5
+    scene.board(1, centre, normal, (3.0, 3.0) if complete else (0.5, 0.4), 0.0, holes)
     scene.wall(0, centre[2] + random.uniform(0.2, 1.0))
 
 
@@ -286,9 +288,9 @@ def box_in_front(random, scene):
     centre, _, _ = _board(
         random, scene, distance=random.uniform(0.7, 1.0), size=(0.4, 0.3), most_tilt=20
     )
-    place = centre * random.uniform(0.5, 0.7) + np.array([*_pair(random, -0.06, 0.06), 0])
+    position = centre * random.uniform(0.5, 0.7) + np.array([*_pair(random, -0.06, 0.06), 0])
     scene.board(
-        2, place, tilted(random, 20), (random.uniform(0.03, 0.07), random.uniform(0.03, 0.07))
+        2, position, tilted(random, 20), (random.uniform(0.03, 0.07), random.uniform(0.03, 0.07))
     )
     scene.wall(0, centre[2] + random.uniform(0.3, 1.5))
 
@@ -329,12 +331,12 @@ def two_boards(random, scene):
     """Alike, side by side: either may be meant."""
     away = random.uniform(0.7, 0.9)
     for number, side in ((1, -1.0), (2, 1.0)):
-        place = [
+        position = [
             side * random.uniform(0.14, 0.16),
             random.uniform(-0.03, 0.03),
             away + random.uniform(0, 0.04),
         ]
-        scene.board(number, place, tilted(random, 10), (0.22, 0.26))
+        scene.board(number, position, tilted(random, 10), (0.22, 0.26))
     scene.wall(0, away + random.uniform(0.3, 1.0))
 
 

@@ -67,11 +67,11 @@ class Done:
 
 def sweep(yaml: Path, out: Path, *arguments: str) -> Done:
     """Run the program to its end in this process, its workers in processes of their own."""
-    told = io.StringIO()
+    string_io = io.StringIO()
     warned = io.StringIO()
-    with redirect_stdout(told), redirect_stderr(warned):
+    with redirect_stdout(string_io), redirect_stderr(warned):
         code = main([str(yaml), "--out", str(out), *arguments])
-    return Done(code, told.getvalue(), warned.getvalue())
+    return Done(code, string_io.getvalue(), warned.getvalue())
 
 
 def finished(home: Path, text: str, *arguments: str) -> Path:
@@ -85,25 +85,25 @@ def finished(home: Path, text: str, *arguments: str) -> Path:
 
 def results(out: Path) -> Path:
     """The one folder of results."""
-    (found,) = (out / "tiny").glob("[0-9a-f]*")
-    return found
+    (result,) = (out / "tiny").glob("[0-9a-f]*")
+    return result
 
 
 def content(folder: Path) -> dict[str, str]:
     """Every table and record of a folder of results as text, every digit of every number in it;
     timings left out, and of a study's record what names the run."""
-    found = {}
+    result = {}
     for path in sorted(folder.glob("*.parquet")):
         table = pd.read_parquet(path)
         numbers = table.drop(
             columns=[column for column in table if str(column).startswith("seconds")]
         )
-        found[path.name] = numbers.to_csv(index=False, float_format="%.17g")
+        result[path.name] = numbers.to_csv(index=False, float_format="%.17g")
     if (folder / "summary.csv").exists():
-        found["summary.csv"] = (folder / "summary.csv").read_text()
+        result["summary.csv"] = (folder / "summary.csv").read_text()
     if (folder / "study.json").exists():
         record = json.loads((folder / "study.json").read_text())
         del record["provenance"]
-        found["study.json"] = json.dumps(record)
-    assert "trials.parquet" in found
-    return found
+        result["study.json"] = json.dumps(record)
+    assert "trials.parquet" in result
+    return result

@@ -69,17 +69,17 @@ def drawn(
 
 def row(pixels: np.ndarray, frames: tuple[np.ndarray, ...], at_once: tuple[np.ndarray, ...]) -> str:
     """A group's line of the table."""
-    known = pixels & np.isfinite(frames[0]).all(axis=0) & np.isfinite(at_once[0]).all(axis=0)
+    reference = pixels & np.isfinite(frames[0]).all(axis=0) & np.isfinite(at_once[0]).all(axis=0)
     z = [one[0] - one[0].mean(axis=0) for one in (frames, at_once)]
-    variances = [one[:, known].var(axis=0, ddof=1) for one in z]
+    variances = [one[:, reference].var(axis=0, ddof=1) for one in z]
     deviation = np.sqrt(sum(variances) / 2)
     error = np.sqrt(sum(variances) / len(z[0]))
-    off = (frames[0][:, known].mean(axis=0) - at_once[0][:, known].mean(axis=0)) / error
-    beyond = [(np.abs(one[:, known]) > 3 * deviation).mean() for one in z]
-    inner = [np.nanmean(one[2][:, known]) for one in (frames, at_once)]
+    off = (frames[0][:, reference].mean(axis=0) - at_once[0][:, reference].mean(axis=0)) / error
+    beyond = [(np.abs(one[:, reference]) > 3 * deviation).mean() for one in z]
+    inner = [np.nanmean(one[2][:, reference]) for one in (frames, at_once)]
     lags = []
     for lag in (1, 2, 3, 4):
-        pairs = known[:, lag:] & known[:, :-lag]
+        pairs = reference[:, lag:] & reference[:, :-lag]
         each = [
             np.median((one[:, :, lag:] * one[:, :, :-lag])[:, pairs].mean(axis=0)
             / np.sqrt(one[:, :, lag:][:, pairs].var(axis=0) * one[:, :, :-lag][:, pairs].var(axis=0)))
@@ -93,10 +93,13 @@ def row(pixels: np.ndarray, frames: tuple[np.ndarray, ...], at_once: tuple[np.nd
         errors = np.sqrt(
             sum(one[:, loose].var(axis=0, ddof=1) for one in scatter) / len(scatter[0])
         )
-        apart = (scatter[0][:, loose].mean(axis=0) - scatter[1][:, loose].mean(axis=0)) / errors
-        counts = f"{np.sqrt((apart**2).mean()):.2f}, {np.abs(apart).max():.1f}"
+        separation = (
+            scatter[0][:, loose].mean(axis=0) - scatter[1][:, loose].mean(axis=0)
+        ) / errors
+        counts = f"{np.sqrt((separation**2).mean()):.2f}, {np.abs(separation).max():.1f}"
     return (
-        f"{known.sum():6d} | {np.median(variances[1] / variances[0]):.3f} | {inner[1] / inner[0]:.3f} |"
+        f"{reference.sum():6d} | {np.median(variances[1] / variances[0]):.3f} | "
+        f"{inner[1] / inner[0]:.3f} |"
         f" {beyond[1] / max(beyond[0], 1e-12):.2f} | {' '.join(lags)} |"
         f" {np.sqrt((off**2).mean()):.2f}, {np.abs(off).max():.1f} | {counts}"
     )
@@ -110,7 +113,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--boards", nargs="+", default=list(BOARDS), choices=list(BOARDS))
     options = parser.parse_args(arguments)
     print(
-        "camera, board, pixels | variance | sample variance | beyond 3 | lags 1 to 4 | mean | count"
+        (
+            "camera, board, pixels | variance | sample variance | beyond 3 | lags 1 to 4 | mean "
+            "| count"
+        )
     )
     for name in options.cameras:
         for board in options.boards:

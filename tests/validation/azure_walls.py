@@ -235,8 +235,8 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
         sigma_bins(wall, z_m, wall.inner, average, BIN_M),
         sigma_bins(wall, z_m, wall.mask, wall.angle_deg, 2.0),
         {
-            (who, jitter): correlations(deviations(z, wall.mask, jitter), wall.mask)
-            for who, z in (("measured", wall.z_m), ("simulated", z_m))
+            (holder, jitter): correlations(deviations(z, wall.mask, jitter), wall.mask)
+            for holder, z in (("measured", wall.z_m), ("simulated", z_m))
             for jitter in (True, False)
         },
         (
@@ -273,13 +273,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, default=Path("docs"), help="where the page and figure go (docs)"
     )
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
 
     def body() -> int:
-        checks = check_folder(given.folder)
+        checks = check_folder(args.folder)
         print(table(checks))
-        write_text(given.out / "azure_walls.svg", figure(checks))
-        write_text(given.out / "azure_walls.md", page(checks, walls_camera()))
+        write_text(args.out / "azure_walls.svg", figure(checks))
+        write_text(args.out / "azure_walls.md", page(checks, walls_camera()))
         return 0
 
     return exit_code_of(body)

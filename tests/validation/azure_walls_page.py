@@ -41,10 +41,10 @@ def length_px(pattern: FixedPattern) -> float:
     """Length l of a Gaussian autocorrelation exp(-k^2 / 2 l^2) over lags 0 to 12."""
     lag = np.arange(13)
     relative = pattern.covariance_m2[:13] / pattern.covariance_m2[0]
-    found = optimize.least_squares(
+    result = optimize.least_squares(
         lambda p: p[0] * np.exp(-(lag**2) / (2 * p[1] ** 2)) - relative, [1.0, 5.0]
     )
-    return float(abs(found.x[1]))
+    return float(abs(result.x[1]))
 
 
 def _mm(value_m: float, digits: int = 2) -> str:
@@ -81,8 +81,8 @@ def _sigma_rows(check: WallCheck) -> list[list[str]]:
             if lit
             else ["-"] * 4
         )
-        whole = [str(b.pixels), _mm(b.measured_m), _mm(b.simulated_m), f"{b.ratio:.2f}"]
-        rows.append([check.wall.name, f"{b.at - 0.05:.1f}-{b.at + 0.05:.1f}", *cells, *whole])
+        complete = [str(b.pixels), _mm(b.measured_m), _mm(b.simulated_m), f"{b.ratio:.2f}"]
+        rows.append([check.wall.name, f"{b.at - 0.05:.1f}-{b.at + 0.05:.1f}", *cells, *complete])
     return rows
 
 
@@ -104,9 +104,9 @@ PATTERN_HEAD = ["wall", "quantity", "measured", "simulated, units 1 to 5", "meas
 
 def _correlation_rows(check: WallCheck) -> list[list[str]]:
     columns = [
-        check.correlation[who, jitter]
+        check.correlation[holder, jitter]
         for jitter in (True, False)
-        for who in ("measured", "simulated")
+        for holder in ("measured", "simulated")
     ]
     return [
         [
@@ -173,7 +173,10 @@ def figure(checks: Sequence[WallCheck]) -> str:
             _draw_correlation(grid[0, column], check)
             _draw_pattern(grid[1, column], check)
 
-    text = "Temporal deviation, its correlation and the fixed pattern of real walls beside their simulation"
+    text = (
+        "Temporal deviation, its correlation and the fixed pattern of real walls beside their "
+        "simulation"
+    )
     return canvas.svg("azure-walls", (13.0, 8.0), text, draw)
 
 
@@ -222,12 +225,17 @@ def _draw_ratio(axes: Any, checks: Sequence[WallCheck]) -> None:
 def _draw_correlation(axes: Any, check: WallCheck) -> None:
     lags = np.arange(1, check.correlation["measured", True].shape[1] + 1)
     axes.plot(lags, np.clip(1 - lags / 5, 0, None), ":", color=GREY, label="box of 5, no rounding")
-    for who, colour in COLOURS.items():
+    for holder, colour in COLOURS.items():
         for axis, marker, shift in ((0, "o", -0.06), (1, "s", 0.06)):
-            c = check.correlation[who, False][axis]
+            c = check.correlation[holder, False][axis]
             face = colour if axis == 0 else "white"
             axes.plot(
-                lags + shift, c, marker, color=colour, mfc=face, label=f"{who}, along {'xy'[axis]}"
+                lags + shift,
+                c,
+                marker,
+                color=colour,
+                mfc=face,
+                label=f"{holder}, along {'xy'[axis]}",
             )
     axes.set(
         title=f"Temporal noise, {check.wall.name} wall, jitter off",
@@ -287,7 +295,8 @@ def _set_up(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     albedo = camera.photons.calibration_albedo.value
     planes = _listed(
         f"the {c.wall.name} wall is {c.wall.z_m[:, c.wall.mask].mean(0).min():.2f} to "
-        f"{c.wall.z_m[:, c.wall.mask].mean(0).max():.2f} m away and {_tilt_deg(c):.0f} degrees from frontal "
+        f"{c.wall.z_m[:, c.wall.mask].mean(0).max():.2f} m away and {_tilt_deg(c):.0f} "
+        "degrees from frontal "
         f"({c.wall.mask.sum():,} pixels)"
         for c in checks
     )
@@ -315,7 +324,10 @@ To repeat the comparison:
     python tests/validation/azure_walls.py FOLDER"""
 
 
-_ALT = "Six panels: temporal deviation against range and angle, correlation and fixed pattern of both walls"
+_ALT = (
+    "Six panels: temporal deviation against range and angle, correlation and fixed pattern of "
+    "both walls"
+)
 
 
 def _tilt_deg(check: WallCheck) -> float:
@@ -325,7 +337,7 @@ def _tilt_deg(check: WallCheck) -> float:
 
 def _temporal(checks: Sequence[WallCheck]) -> str:
     inner = _listed(f"{_span([b.ratio for b in c.by_range_inner])} ({c.wall.name})" for c in checks)
-    whole = _listed(f"{_span([b.ratio for b in c.by_range])} ({c.wall.name})" for c in checks)
+    complete = _listed(f"{_span([b.ratio for b in c.by_range])} ({c.wall.name})" for c in checks)
     needed = _listed(f"{c.needed_albedo:.2f} ({c.wall.name})" for c in checks)
     rows = [row for check in checks for row in _sigma_rows(check)]
     ratios = [np.array([b.ratio for b in c.by_range_inner]) for c in checks]
@@ -337,7 +349,7 @@ than 300 pixels are left out. The ratio is simulated to measured.
 
 {_markdown(SIGMA_HEAD, rows)}
 
-The ratio of simulated to measured deviation is {inner} in the lit cone and {whole} over whole walls. The simulated
+The ratio of simulated to measured deviation is {inner} in the lit cone and {complete} over whole walls. The simulated
 deviation grows with range like the measured one (each wall's ratios in the lit cone lie within {100 * spread:.0f} % of
 their mean), but it is too small. With an albedo of {needed} instead of the assumed one, the deviations in the lit cone
 would be equal; these albedos are reported, but not used."""

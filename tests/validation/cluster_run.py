@@ -63,13 +63,15 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name, processes(Path(name) / "cluster") as cluster:
         for _ in range(options.workers):
             cluster.worker("--memory-limit", "2GB")
-        said = measured(Path(name), cluster, options.trials, options.workers)
-    print(json.dumps(said, indent=2))
+        printed = measured(Path(name), cluster, options.trials, options.workers)
+    print(json.dumps(printed, indent=2))
     print("\nA million trials, hours, by what bounds them (one render for a thousand trials):")
     for cores in (1, 64, 1024):
         print(
             f"{cores:5} cores: "
-            + ", ".join(f"{what} {hours:.2f}" for what, hours in scaled(said, cores).items())
+            + ", ".join(
+                f"{content} {hours:.2f}" for content, hours in scaled(printed, cores).items()
+            )
         )
     return 0
 
@@ -87,7 +89,7 @@ def scaled(
         "scheduler": trials * said["scheduler_ms_per_trial"] / 1e3,
         "report": trials * said["read_and_tables_ms"] / 1e3,
     }
-    return {what: seconds / 3600 for what, seconds in hours.items()}
+    return {content: seconds / 3600 for content, seconds in hours.items()}
 
 
 def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[str, float]:
@@ -106,10 +108,10 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
 
         def look(now: Outcome) -> None:
             if now.trials.done:
-                mine = processor_s(psutil.Process())
+                own_rows = processor_s(psutil.Process())
                 theirs = processor_s(scheduler)
                 steady[1:] = [
-                    Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)
+                    Look(time.monotonic(), now.trials.done, now.trials.seconds, own_rows, theirs)
                 ]
 
         outcome = run_plan(plan, journal, engine, look)
@@ -152,12 +154,12 @@ class Look:
 def bare_rate(engine: ClusterEngine, count: int = 4000) -> float:
     """Jobs a second that do nothing; bundles have grown by the time that it counts."""
     began = 0.0
-    left = 2 * count
+    left_over = 2 * count
     ended = 0
     while ended < 2 * count:
-        while left > 0 and engine.room("trials") > 0:
-            engine.submit(Job(f"empty {left}", "trials", square, (left,)))
-            left -= 1
+        while left_over > 0 and engine.room("trials") > 0:
+            engine.submit(Job(f"empty {left_over}", "trials", square, (left_over,)))
+            left_over -= 1
         ended += len(engine.ended())
         began = began or (time.monotonic() if ended >= count else 0.0)
     return count / (time.monotonic() - began)

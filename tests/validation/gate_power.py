@@ -99,7 +99,7 @@ class Change:
 def study(size: Size, boards_seed: int, noise_seed: int, change: Change = Change()) -> StudyRecord:
     """A study of the detector as it is, or as it became by ``change``."""
     set_ups = tuple(
-        _set_up(size, boards_seed, noise_seed, place, change) for place in range(size.set_ups)
+        _set_up(size, boards_seed, noise_seed, position, change) for position in range(size.set_ups)
     )
     return StudyRecord("model", "", 15.0, RATE_PER_M2, {}, set_ups)
 
@@ -110,13 +110,13 @@ def _set_up(
     model = MODELS[number % len(MODELS)]
     # ln(a90 / a50) is the 90th percentile of the luck's logarithm over the power with which scores
     # grow.
-    place = model.place + model.power * np.log(change.flatter) / NORMAL_90
+    position = model.place + model.power * np.log(change.flatter) / NORMAL_90
     of_boards = np.random.default_rng((boards_seed, 1))
     noise = np.random.default_rng((boards_seed, noise_seed, number, 2))
     n = size.boards * size.holes
     board = np.repeat(np.arange(size.boards), size.holes)
     size_mm = of_boards.uniform(*model.sizes_mm, n)
-    luck = place * of_boards.standard_normal(n)
+    luck = position * of_boards.standard_normal(n)
     luck += model.of_board * of_boards.standard_normal(size.boards)[board]
     signal = model.score / change.noise * (size_mm / model.size_mm) ** model.power * np.exp(luck)
     signal = np.abs(signal + model.noise * noise.standard_normal(n))
@@ -192,14 +192,17 @@ def main() -> None:
         },
         **{f"finds at {shift:.2f} of its threshold": Change(bias=shift) for shift in SHIFTS},
     }
-    for what, change in changes.items():
+    for content, change in changes.items():
         print(
-            f"{what}: {share(size, options.changed, change):.2f} of {options.changed} checks fail",
+            f"{content}: {share(size, options.changed, change):.2f} of {options.changed} checks fail",
             flush=True,
         )
     print(f"another noise: {share(size, options.quiet):.4f} of {options.quiet}", flush=True)
     print(
-        f"other boards: {share(size, options.changed, other_boards=True):.3f} of {options.changed}",
+        (
+            f"other boards: {share(size, options.changed, other_boards=True):.3f} of "
+            f"{options.changed}"
+        ),
         flush=True,
     )
     print(f"{time.perf_counter() - began:.0f} s")

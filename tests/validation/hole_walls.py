@@ -36,14 +36,14 @@ def seen(angle_deg: float, diffuse: float, mirrored: float) -> tuple[float, floa
     radius = DIAMETER_MM / 2
     turn = random.uniform(0, 2 * np.pi, RAYS)
     out = radius * np.sqrt(random.uniform(0, 1, RAYS))
-    place = np.stack([out * np.cos(turn), out * np.sin(turn), np.zeros(RAYS)], axis=1)
+    position = np.stack([out * np.cos(turn), out * np.sin(turn), np.zeros(RAYS)], axis=1)
     slant = np.radians(angle_deg)
     along = np.tile([np.sin(slant), 0.0, np.cos(slant)], (RAYS, 1))
     far = np.zeros(RAYS)
     light = np.ones(RAYS)
     total = weighted = 0.0
     for _ in range(MOST_MIRRORED):
-        across = place[:, :2]
+        across = position[:, :2]
         onward = along[:, :2]
         square = (onward**2).sum(axis=1)
         cross = (across * onward).sum(axis=1)
@@ -51,27 +51,27 @@ def seen(angle_deg: float, diffuse: float, mirrored: float) -> tuple[float, floa
             -cross
             + np.sqrt(np.maximum(cross**2 + square * (radius**2 - (across**2).sum(axis=1)), 0.0))
         ) / square
-        to_bottom = (DEPTH_MM - place[:, 2]) / along[:, 2]
+        to_bottom = (DEPTH_MM - position[:, 2]) / along[:, 2]
         ends = step > to_bottom
         back = light[ends] * FACE * along[ends, 2]
         total = total + back.sum()
         weighted = weighted + (back * (far + to_bottom)[ends]).sum()
-        place = place[~ends]
+        position = position[~ends]
         along = along[~ends]
         far = far[~ends]
         light = light[~ends]
         if not len(far):
             break
-        place = place + step[~ends, None] * along
+        position = position + step[~ends, None] * along
         far = far + step[~ends]
-        inward = -np.column_stack([place[:, :2] / radius, np.zeros(len(far))])
+        inward = -np.column_stack([position[:, :2] / radius, np.zeros(len(far))])
         cosine = np.maximum(-(along * inward).sum(axis=1), 0.0)
         back = light * diffuse * cosine
         total = total + back.sum()
         weighted = weighted + (back * far).sum()
         along = along + 2 * cosine[:, None] * inward
         light = light * mirrored**2
-        place[:, :2] *= 1 - 1e-9
+        position[:, :2] *= 1 - 1e-9
     depth_mm = weighted / total
     bright = total / RAYS / (FACE * np.cos(slant))
     share = SHARE * np.cos(slant)

@@ -95,8 +95,8 @@ def combined_limits(study: PodStatement, size: np.ndarray, hits: np.ndarray) -> 
     for fit in study.fits:
         if fit.curve.size_at(0.5) > 0:
             transfer = Transfer(fit.curve, size, hits[0], np.full(len(size), "all"))
-            found, missed = transfer.logs
-            value = hits @ found.T + ~hits @ missed.T + transfer.log_prior
+            result, missed = transfer.logs
+            value = hits @ result.T + ~hits @ missed.T + transfer.log_prior
             sizes = transfer.sizes_at(0.9)
             order = np.argsort(sizes, kind="stable")
             weights = np.exp(value - value.max(axis=1, keepdims=True))[:, order]
@@ -162,12 +162,12 @@ def main() -> int:
     )
     parser.add_argument("--link", default="logit")
     parser.add_argument("--log", action=argparse.BooleanOptionalAction, default=True)
-    given = parser.parse_args()
-    curve = curve_through(4.0, 5.0, given.link, log_size=given.log)
+    args = parser.parse_args()
+    curve = curve_through(4.0, 5.0, args.link, log_size=args.log)
     print("   k    w  holes  covered (95 % interval)  median  90 %  measured", flush=True)
-    for holes in given.holes:
+    for holes in args.holes:
         cases = list(product((1.0, 1.25, 1.5, 2.0), (0.6, 1.0, 1.6)))
-        for row in coverage(curve, cases, holes, campaigns=given.campaigns, targets=given.targets):
+        for row in coverage(curve, cases, holes, campaigns=args.campaigns, targets=args.targets):
             low, high = clopper_pearson(round(row.covered * row.campaigns), row.campaigns)
             share = f"{row.covered:8.3f} ({low:.3f} to {high:.3f})"
             sizes = f"{row.median:7.2f} {row.high:5.2f} {row.measured:9.2f}"

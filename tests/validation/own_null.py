@@ -105,13 +105,13 @@ def boards(camera_name: str, kind: str, number: int, cache: Path) -> dict[int, B
 
 def holes_near(target: TargetConfig, cloud: Cloud) -> np.ndarray:
     """(h, w) bool: within `HIT_M` of a hole's centre, across the line of sight."""
-    near = np.zeros(cloud.valid.shape, bool)
+    nearby = np.zeros(cloud.valid.shape, bool)
     for damage in truth_of(target, target.pose.T_camera_board):
         centre = transform_points(target.pose.T_camera_board, damage.centre_board_m)
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
         with np.errstate(invalid="ignore"):
-            near |= np.hypot(*np.moveaxis(slopes * centre[2] - centre[:2], -1, 0)) < HIT_M
-    return near
+            nearby |= np.hypot(*np.moveaxis(slopes * centre[2] - centre[:2], -1, 0)) < HIT_M
+    return nearby
 
 
 def with_objects(cloud: Cloud, target: TargetConfig, number: int) -> Board:
@@ -124,11 +124,11 @@ def with_objects(cloud: Cloud, target: TargetConfig, number: int) -> Board:
     covered = np.zeros((height, width), bool)
     v, u = np.mgrid[:height, :width] * pixel_m
     for _ in range(int(random.integers(1, 4))):
-        place = random.uniform(0.25, 0.75, 2) * (height * pixel_m, width * pixel_m)
+        position = random.uniform(0.25, 0.75, 2) * (height * pixel_m, width * pixel_m)
         half = random.uniform(6 * MM, 20 * MM, 2)
         turn = random.uniform(0, np.pi)
-        along = (v - place[0]) * np.cos(turn) + (u - place[1]) * np.sin(turn)
-        across = (u - place[1]) * np.cos(turn) - (v - place[0]) * np.sin(turn)
+        along = (v - position[0]) * np.cos(turn) + (u - position[1]) * np.sin(turn)
+        across = (u - position[1]) * np.cos(turn) - (v - position[0]) * np.sin(turn)
         inside = (np.abs(along) < half[0]) & (np.abs(across) < half[1])
         thick_m = random.uniform(4 * MM, 30 * MM) * (
             1.0 + random.uniform(-0.4, 0.4) * along / half[0]
@@ -156,9 +156,9 @@ def counts(board: Board, detector: Detector) -> Iterator[tuple[float, int] | Non
             continue
         judged = np.isfinite(own.evidence.score)
         share = float((judged & ~board.excused).sum() / judged.sum())
-        found = detector.find(board.cloud, own.evidence, own.threshold)
+        result = detector.find(board.cloud, own.evidence, own.threshold)
         excused = board.excused.reshape(-1)
-        yield own.expected * share, sum(not excused[each.pixels].any() for each in found)
+        yield own.expected * share, sum(not excused[each.pixels].any() for each in result)
 
 
 def main(arguments: list[str]) -> int:
@@ -175,16 +175,21 @@ def main(arguments: list[str]) -> int:
     detector = load_detector(options.detector, {"crop": {"kind": "auto"}})
     options.cache.mkdir(parents=True, exist_ok=True)
     print(
-        "camera, kind, frames | asked | boards | refused | expected | counted | ratio +- standard error"
+        (
+            "camera, kind, frames | asked | boards | refused | expected | counted | ratio +- "
+            "standard error"
+        )
     )
     for name in options.cameras:
         for kind in options.kinds:
-            every = [boards(name, kind, number, options.cache) for number in range(options.boards)]
+            all_rows = [
+                boards(name, kind, number, options.cache) for number in range(options.boards)
+            ]
             for frames in FRAMES:
-                told = [list(counts(board[frames], detector)) for board in every]
+                message = [list(counts(board[frames], detector)) for board in all_rows]
                 for number, asked in enumerate(ASKED):
                     rows = np.array(
-                        [row[number] for row in told if row[number] is not None], float
+                        [row[number] for row in message if row[number] is not None], float
                     ).reshape(-1, 2)
                     expected, counted = rows.sum(axis=0)
                     error = (
@@ -193,8 +198,10 @@ def main(arguments: list[str]) -> int:
                         else np.nan
                     )
                     print(
-                        f"{name}, {kind}, {frames} | {asked:g} | {len(rows)} | {len(told) - len(rows)} |"
-                        f" {expected:.1f} | {counted:.0f} | {counted / expected:.2f} +- {error:.2f}",
+                        f"{name}, {kind}, {frames} | {asked:g} | {len(rows)} | "
+                        f"{len(message) - len(rows)} |"
+                        f" {expected:.1f} | {counted:.0f} | {counted / expected:.2f} +- "
+                        f"{error:.2f}",
                         flush=True,
                     )
     return 0

@@ -347,7 +347,7 @@ def _refuse_kind(damage: str, kind: str, in_atlas: Sequence[str]) -> None:
 
 
 def _meant(name: str, candidates: Sequence[str]) -> str:
-    from harness.vocabulary.declaration.diagnose import nearest
+    from harness.vocabulary.words import nearest
 
     word = nearest(name, candidates)
     return f"; did you mean {word!r}?" if word and word != name else ""

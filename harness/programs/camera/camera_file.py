@@ -65,9 +65,9 @@ def camera_of_size(lens: Lens) -> str:
         for name, size in sizes.items()
         if (size.width, size.height) == (lens.width, lens.height)
     ]
-    known = [name for name in fitting if not guessed_precision(load_camera(name))]
-    if len(known or fitting) == 1:
-        return (known or fitting)[0]
+    measured_cameras = [name for name in fitting if not guessed_precision(load_camera(name))]
+    if len(measured_cameras or fitting) == 1:
+        return (measured_cameras or fitting)[0]
     wrong = f"{lens.width} x {lens.height} pixels"
     size = "record the camera's own depth images, not those of a"
     raise UserError(
@@ -84,11 +84,13 @@ def camera_of_size(lens: Lens) -> str:
 def with_lens(name: str, lens: Lens) -> AnyCamera:
     """Return a known camera with the capture's lens. Raises UserError for an unknown camera or
     another size."""
-    own = load_camera(name).nominal_lens
-    if (own.width, own.height) != (lens.width, lens.height):
+    nominal = load_camera(name).nominal_lens
+    if (nominal.width, nominal.height) != (lens.width, lens.height):
         raise UserError(
-            f"the capture has {lens.width} x {lens.height} pixels, but {name} has {own.width} x {own.height}",
-            legal="a capture in the simulated mode of the camera, not aligned to another camera's pixels",
+            f"the capture has {lens.width} x {lens.height} pixels, but {name} has {nominal.width} "
+            f"x {nominal.height}",
+            legal="a capture in the simulated mode of the camera, not aligned to another "
+            "camera's pixels",
             fix="name the capture's camera, or record the camera's own depth images",
         )
     return camera_of(CameraConfig(name=name, numbers=numbers_of_lens(lens)))
@@ -105,27 +107,32 @@ class Stated(NamedTuple):
 
 
 def write_camera(
-    path: Path, title: str, like: str | None, found: Characteristics, albedo: float, rate: Stated
+    path: Path, title: str, like: str | None, measured: Characteristics, albedo: float, rate: Stated
 ) -> AnyCamera:
     """Write the camera file, refitted from a known camera ``like`` or empirical, and return the
     camera. Raises UserError if the known camera has another image size, or if the file cannot be
     written."""
-    names = ", ".join(capture.name for capture in found.captures)
+    names = ", ".join(capture.name for capture in measured.captures)
     source = f"measured by tofpod characterise on {names}, {date.today().isoformat()}"
-    own = _refitted(like, found, albedo, source) if like else _empirical(found, albedo, source)
-    facts = [*_of_unit(found, source), *own]
+    declared = (
+        _refitted(like, measured, albedo, source) if like else _empirical(measured, albedo, source)
+    )
+    facts = [*_of_unit(measured, source), *declared]
     if like and is_camera_path(like):
         like = os.path.relpath(like, path.parent)  # a path is relative to the file that names it
     lines = [
         "# Tags: O measured on the owner's captures, M assumed.",
-        *(f"# {doubt}" for doubt in found.doubts),
+        *(f"# {doubt}" for doubt in measured.doubts),
     ]
     kind = f"like: {json.dumps(like)}" if like else "kind: empirical"
     lines += [f"name: {path.stem}", f"title: {json.dumps(title)}", kind]
     for section in dict.fromkeys(fact.section for fact in (*facts, rate)):
         lines += [f"{section}:"] if section else []
         for fact in (*facts, rate):
-            text = f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: {json.dumps(fact.source)}}}"
+            text = (
+                f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: "
+                f"{json.dumps(fact.source)}}}"
+            )
             lines += (
                 [f"{'  ' if section else ''}{fact.key}: {text}"] if fact.section == section else []
             )
@@ -139,10 +146,10 @@ def _text(value: Any) -> str:
     return str(value) if isinstance(value, int) else repr(float(f"{float(value):.5g}"))
 
 
-def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
+def _of_unit(measured: Characteristics, source: str) -> Iterator[Stated]:
     """Yield the numbers that files of both kinds take from the captures."""
-    lens = found.captures[0].lens
-    jumps_m = found.jumps_m
+    lens = measured.captures[0].lens
+    jumps_m = measured.jumps_m
     for key in ("width", "height", "fx", "fy", "cx", "cy"):
         yield Stated("lens", f"{key}_px", getattr(lens, key), f"lens of the recording; {source}")
     distortion = lens.distortion if any(lens.distortion) else ()
@@ -150,25 +157,27 @@ def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
     yield Stated(
         "unit",
         "jump_rate",
-        len(jumps_m) / found.frames,
-        f"{len(jumps_m)} of {found.frames} frames; {source}",
+        len(jumps_m) / measured.frames,
+        f"{len(jumps_m)} of {measured.frames} frames; {source}",
     )
     yield Stated("unit", "jump_mm", jumps_m.mean() / MM if len(jumps_m) else 0.0, source)
-    yield Stated("unit", "jitter_mm", found.jitter_m / MM, source)
-    yield Stated("engine", "output_step_mm", _step_mm(found), f"step of the stored depth; {source}")
+    yield Stated("unit", "jitter_mm", measured.jitter_m / MM, source)
+    yield Stated(
+        "engine", "output_step_mm", _step_mm(measured), f"step of the stored depth; {source}"
+    )
 
 
-def _step_mm(found: Characteristics) -> float:
+def _step_mm(measured: Characteristics) -> float:
     """Return the rounding step of the stored captures; a micrometre for numbers that are not
     rounded."""
-    return found.captures[0].step_m / MM or 1e-3
+    return measured.captures[0].step_m / MM or 1e-3
 
 
-def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
-    law = found.law
-    pattern = found.pattern
-    drops = found.dropouts
-    edge = found.edge
+def _empirical(measured: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
+    law = measured.law
+    pattern = measured.pattern
+    drops = measured.dropouts
+    edge = measured.edge
     yield Stated(
         "", "wavelength_nm", 850.0, f"selects the albedo of simulated surfaces; {UNKNOWN}", "M"
     )
@@ -183,7 +192,7 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
         )
     recorded = (
         (law.light_at_1m, source)
-        if found.has_amplitude
+        if measured.has_amplitude
         else (1.0, "amplitudes are not recorded", "M")
     )
     yield Stated("light", "amplitude_at_1m", *recorded)
@@ -207,13 +216,15 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
     yield Stated(
         "fixed_pattern", "deviation_mm", 0.0 if pattern is None else pattern.field.rms_m / MM, doubt
     )
-    shared = np.ones((2, 1)) if found.pattern_correlation is None else found.pattern_correlation
-    for section, both, reason in (
-        ("noise", found.correlation, source),
+    shared = (
+        np.ones((2, 1)) if measured.pattern_correlation is None else measured.pattern_correlation
+    )
+    for section, lag_table, reason in (
+        ("noise", measured.correlation, source),
         ("fixed_pattern", shared, doubt),
     ):
-        yield Stated(section, "rows", taps_of(both[1]), reason)
-        yield Stated(section, "columns", taps_of(both[0]), reason)
+        yield Stated(section, "rows", taps_of(lag_table[1]), reason)
+        yield Stated(section, "columns", taps_of(lag_table[0]), reason)
     yield Stated("dropouts", "amplitude", np.nan_to_num(drops.amplitude, nan=1.0), source)
     yield Stated(
         "dropouts",
@@ -248,22 +259,22 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
 # ---------------------------------------------------------------- a known camera's model, refitted
 
 
-def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
-    camera = with_lens(like, found.captures[0].lens)
-    if isinstance(camera, EmpiricalCamera) or not found.surfaces:
-        what = (
+def _refitted(like: str, measured: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
+    camera = with_lens(like, measured.captures[0].lens)
+    if isinstance(camera, EmpiricalCamera) or not measured.surfaces:
+        reason = (
             "is an empirical camera"
-            if found.surfaces
+            if measured.surfaces
             else "needs flat surfaces for the fit, but none was found"
         )
         raise UserError(
-            f"--like {like}: {what}", fix="leave out --like to write an empirical camera"
+            f"--like {like}: {reason}", fix="leave out --like to write an empirical camera"
         )
-    for key, value in _field(camera, found) if isinstance(camera, AmcwCamera) else ():
+    for key, value in _field(camera, measured) if isinstance(camera, AmcwCamera) else ():
         camera = with_number(camera, "emitter", key, value)
         yield Stated("emitter", key, value, f"covers every pixel with a return; {source}")
     camera, gain = _gain(
-        with_number(camera, "engine", "output_step_mm", _step_mm(found)), found, albedo
+        with_number(camera, "engine", "output_step_mm", _step_mm(measured)), measured, albedo
     )
     yield Stated(
         "photons",
@@ -271,22 +282,22 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
         gain,
         f"gives the temporal noise at albedo {albedo:g}; {source}",
     )
-    again = simulated(camera, found, albedo, FEW_FRAMES)
-    own = measure.characteristics(again).pattern
-    if found.pattern is not None and own is not None:
-        times = found.pattern.field.rms_m / max(own.field.rms_m, 1e-9)
+    again = simulated(camera, measured, albedo, FEW_FRAMES)
+    simulated_pattern = measure.characteristics(again).pattern
+    if measured.pattern is not None and simulated_pattern is not None:
+        times = measured.pattern.field.rms_m / max(simulated_pattern.field.rms_m, 1e-9)
         doubt = "; ".join(
-            (f"{times:.3g} times the known camera's; {source}", *found.pattern.field.warnings)
+            (f"{times:.3g} times the known camera's; {source}", *measured.pattern.field.warnings)
         )
         for key, fact in camera.fixed_pattern.to_data().items():
             if key.endswith("_mm"):
                 yield Stated("fixed_pattern", key, fact["value"] * times, doubt)
-    level = found.dropouts.amplitude
-    share = found.dropouts.share
+    level = measured.dropouts.amplitude
+    share = measured.dropouts.share
     if share.max() >= 0.5 > share.min() and isinstance(camera, AmcwCamera):
         falling = np.argsort(-share)
         faint = float(np.exp(np.interp(-0.5, -share[falling], np.log(level[falling]))))
-        pairs = zip(found.captures, again, strict=True)
+        pairs = zip(measured.captures, again, strict=True)
         ratios = [(a.amplitude / b.amplitude)[a.steady & b.steady] for a, b in pairs]  # type: ignore[operator]
         origin = f"half of the pixels with amplitude {faint:.4g} have no return; {source}"
         yield Stated(
@@ -297,37 +308,40 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
         )
 
 
-def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, Any]]:
+def _field(camera: AmcwCamera, measured: Characteristics) -> Iterator[tuple[str, Any]]:
     """Yield the emitter's numbers that exclude pixels with a return, widened: the lit polygon, and
     the angle at which the cone's light ends; the light fades over as many degrees as before."""
-    often = [np.isfinite(capture.z_m).mean(axis=0) >= 0.5 for capture in found.captures]
-    seen = np.concatenate(
-        [capture.slopes[mask] for capture, mask in zip(found.captures, often, strict=True)]
+    often = [np.isfinite(capture.z_m).mean(axis=0) >= 0.5 for capture in measured.captures]
+    used_slopes = np.concatenate(
+        [capture.slopes[mask] for capture, mask in zip(measured.captures, often, strict=True)]
     )
     if camera.emitter.mask_slopes is not None:
-        around = ConvexHull(np.round([*camera.emitter.mask_slopes.value, *seen], 3))
+        around = ConvexHull(np.round([*camera.emitter.mask_slopes.value, *used_slopes], 3))
         yield "mask_slopes", tuple(map(tuple, around.points[around.vertices]))
     full_deg = camera.emitter.full_half_angle_deg.value
     cutoff_deg = camera.emitter.cutoff_half_angle_deg.value
-    widest_deg = float(np.degrees(np.arctan(np.linalg.norm(seen, axis=1).max())))
+    widest_deg = float(np.degrees(np.arctan(np.linalg.norm(used_slopes, axis=1).max())))
     if widest_deg > cutoff_deg:
         yield "cutoff_half_angle_deg", widest_deg + cutoff_deg - full_deg
 
 
-def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
+def _gain(camera: Any, measured: Characteristics, albedo: float) -> tuple[Any, float]:
     """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on
     the logarithms."""
-    wanted = {(face.capture, face.number): face.temporal.value for face in found.surfaces}
+    wanted = {(face.capture, face.number): face.temporal.value for face in measured.surfaces}
     tried = []
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):
         camera = with_number(camera, "photons", "signal_electrons", gain)
-        own = [
+        simulated_surfaces = [
             face
-            for stack in simulated(camera, found, albedo, FEW_FRAMES)
+            for stack in simulated(camera, measured, albedo, FEW_FRAMES)
             for face in measure.surfaces_of(stack)
         ]
-        ratios = [np.log(face.temporal.value / wanted[face.capture, face.number]) for face in own]
+        ratios = [
+            np.log(face.temporal.value / wanted[face.capture, face.number])
+            for face in simulated_surfaces
+        ]
         tried.append(
             (np.log(gain), float(np.mean(ratios)) if ratios else 1.0)
         )  # too dim counts as too noisy
@@ -344,7 +358,7 @@ def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, floa
 
 
 def simulated(
-    camera: AnyCamera, found: Characteristics, albedo: float, frames: int | None = None
+    camera: AnyCamera, measured: Characteristics, albedo: float, frames: int | None = None
 ) -> list[StillCapture]:
     """Return the captures as a unit of the camera would have recorded them: the same surfaces (by
     smooth fits) with the recorded brightness and the same number of frames, or ``frames``. Not
@@ -352,7 +366,7 @@ def simulated(
     edge, and the scene beside the surfaces."""
     return [
         _again(camera, still, albedo, frames or len(still.z_m), n)
-        for n, still in enumerate(found.captures)
+        for n, still in enumerate(measured.captures)
     ]
 
 
@@ -364,8 +378,8 @@ def _again(
     config = UNIT.model_copy(update={"name": camera.name})
     if capture.planes:
         labels = np.zeros(z_m.shape, int)
-        for place, (_, mask) in enumerate(capture.planes, start=1):
-            labels[mask] = place
+        for label, (_, mask) in enumerate(capture.planes, start=1):
+            labels[mask] = label
         distance, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
         labels = np.where(distance <= measure.WIDEST_PX / 2, labels[tuple(nearest)], 0)
         halves = labels[None]
@@ -374,8 +388,8 @@ def _again(
             # all positions of edges
             halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
         z_m = np.full(halves.shape, np.nan)
-        for place, shape_m in enumerate(capture.shapes_m, start=1):
-            z_m = np.where(halves == place, shape_m, z_m)
+        for label, shape_m in enumerate(capture.shapes_m, start=1):
+            z_m = np.where(halves == label, shape_m, z_m)
     light = (
         albedo * capture.cosine / (z_m * capture.stretch) ** 2 / (z_m.size / capture.cosine.size)
     )

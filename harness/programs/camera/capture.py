@@ -32,34 +32,37 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}", legal="a number above 0, up to 1")
     first = slice(options.frames) if options.frames else None
-    known = options.camera[0] if options.camera else None
+    camera_name = options.camera[0] if options.camera else None
     recording = opened_as(
-        known, options.capture, options.intrinsics, frames=first, **reading_of(options)
+        camera_name, options.capture, options.intrinsics, frames=first, **reading_of(options)
     )
     capture = read_still(recording, None if options.mask is None else read_mask(options.mask))
-    name = known or camera_of_size(capture.lens)
+    name = camera_name or camera_of_size(capture.lens)
     camera = with_lens(name, capture.lens)
-    found = characteristics([capture])
-    if not found.surfaces:
+    measured = characteristics([capture])
+    if not measured.surfaces:
         legal = "walls, boards, tables: flat surfaces that the simulation can repeat"
         fix = "check the lens (--intrinsics), or exclude other objects with --mask"
         raise UserError(f"{capture.name}: shows no flat surface", legal=legal, fix=fix)
-    warnings = (*recording.warnings, *found.doubts)
+    warnings = (*recording.warnings, *measured.doubts)
     print_warnings(warnings)
     print_notes(recording.notes)
-    twin = characteristics(simulated(camera, found, options.albedo))
-    rows = beside(found, twin, None)
+    twin = characteristics(simulated(camera, measured, options.albedo))
+    rows = beside(measured, twin, None)
     ratios = ", ".join(
         f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise"
     )
-    answer = f"Ratio of simulated to measured pixel noise: {ratios}. Albedo {options.albedo:g} is assumed."
+    answer = (
+        f"Ratio of simulated to measured pixel noise: {ratios}. Albedo {options.albedo:g} is "
+        "assumed."
+    )
     title = f"{capture.name} compared with the simulated {camera.title}"
     facts = {
         "camera": name,
         "files": [str(path) for path in recording.files],
         "notes": recording.notes,
     }
-    sources = {MEASURED: found, SIMULATED: twin}
+    sources = {MEASURED: measured, SIMULATED: twin}
     write_page(
         options.out / "capture.html", sources, rows, title, answer, "", command, facts, warnings
     )

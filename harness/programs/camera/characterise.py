@@ -25,7 +25,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the page, the tables and my_camera.yaml",
     )
-    like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
+    like = (
+        "refit this camera's model (a name or a .yaml file); without it, the file is an empirical "
+        "camera"
+    )
     add("--like", metavar="CAMERA", help=like)
     add_reading(add)
     add(
@@ -51,19 +54,26 @@ def _options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write also a certificate of two pages, certificate.html and .json",
     )
-    study = "results folder of a study (tofpod sweep or tofpod implant), whose limits the certificate quotes"
+    study = (
+        "results folder of a study (tofpod sweep or tofpod implant), whose limits the certificate "
+        "quotes"
+    )
     add("--study", type=Path, metavar="DIR", help=study)
-    about = "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
-    add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
+    fact_help = (
+        "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be "
+        "repeated"
+    )
+    add("--about", action="append", default=[], metavar="KEY=TEXT", help=fact_help)
 
 
 @program(
     _options,
-    "Measure a depth camera on static captures, preferably of a matte wall that fills the view: noise "
-    "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
-    "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
-    "Each PATH is a capture of 50 frames or more, in any format that tofpod detect reads, in order of time. Captures "
-    "at several distances, with the camera moved sideways by 30 mm or more, show the most.",
+    "Measure a depth camera on static captures, preferably of a matte wall that fills the view: "
+    "noise against range, angle and amplitude, correlation, dropouts, displaced frames, fixed "
+    "pattern, fill rate, edges. Write a page, tables, and my_camera.yaml, a camera for "
+    "experiments (source.camera.name: ./my_camera.yaml). Each PATH is a capture of 50 frames or "
+    "more, in any format that tofpod detect reads, in order of time. Captures at several "
+    "distances, with the camera moved sideways by 30 mm or more, show the most.",
     epilog="example: tofpod characterise near far --like azure_kinect_nfov --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -109,7 +119,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         with_lens(
             options.like, captures[0].lens
         )  # a camera with another image size cannot be refitted
-    found = characteristics(captures, poses)
+    measured = characteristics(captures, poses)
     rate_of = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
     if options.like and not options.rate:
         rate_of = (
@@ -121,33 +131,36 @@ def main(options: argparse.Namespace, command: str) -> int:
     names = ", ".join(capture.name for capture in captures)
     print("fitting the camera file ..", file=sys.stderr)
     camera = write_camera(
-        options.out / CAMERA_FILE, options.title, options.like, found, options.albedo, rate
+        options.out / CAMERA_FILE, options.title, options.like, measured, options.albedo, rate
     )
     print("simulating the captures from it ..", file=sys.stderr)
-    twin = characteristics(simulated(camera, found, options.albedo), poses)
-    sources = {MEASURED: found, SIMULATED: twin}
-    known = options.like
+    twin = characteristics(simulated(camera, measured, options.albedo), poses)
+    sources = {MEASURED: measured, SIMULATED: twin}
+    known_camera = options.like
     with suppress(UserError):  # no camera has this image size, or it sees none of the surfaces
-        known = known or camera_of_size(captures[0].lens)
+        known_camera = known_camera or camera_of_size(captures[0].lens)
         sources[KNOWN] = characteristics(
-            simulated(with_lens(known, captures[0].lens), found, options.albedo), poses
+            simulated(with_lens(known_camera, captures[0].lens), measured, options.albedo), poses
         )
-    rows = beside(found, twin, sources.get(KNOWN))
-    label = load_camera(known).title if known else ""
+    rows = beside(measured, twin, sources.get(KNOWN))
+    label = load_camera(known_camera).title if known_camera else ""
     noise = ", ".join(
-        f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in found.surfaces[:3]
+        f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in measured.surfaces[:3]
     )
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     warnings = [
         *(warning for recording in recordings for warning in recording.warnings),
-        *found.doubts,
+        *measured.doubts,
     ]
     repeated = []
     for figure in ("fill rate", "temporal noise"):
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
         worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
         if worst > REPEATED:
-            wrong = f"the {figure} of {CAMERA_FILE} differs from the captures by up to {100 * worst:.0f} %"
+            wrong = (
+                f"the {figure} of {CAMERA_FILE} differs from the captures by up to "
+                f"{100 * worst:.0f} %"
+            )
             warnings.insert(0, f"{wrong}: limits that are simulated with it are also wrong")
         elif noise:
             repeated.append(f"the {figure} within {100 * worst:.1g} %")
@@ -165,14 +178,14 @@ def main(options: argparse.Namespace, command: str) -> int:
         size = f"{lens.width} x {lens.height} pixels" + (
             f", as {options.like}" if options.like else ""
         )
-        about = {
+        unit_facts = {
             "unit": options.title,
             "mode": size,
             "firmware": "not recorded",
             "warm-up": "not stated",
         }
-        about |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
-        write_certificate(options.out, found, about, poses, study, command)
+        unit_facts |= {"captures": names} | dict(text.split("=", 1) for text in options.about)
+        write_certificate(options.out, measured, unit_facts, poses, study, command)
     return 0
 
 

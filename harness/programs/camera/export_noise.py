@@ -62,11 +62,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     write_text(
         options.out / "depth_noise.py", Path(str(tabled.__file__)).read_text(encoding="utf-8")
     )
-    seen = table["seen"] > 0.5
-    low = 1000.0 * float(table["sigma_m"][seen][-1])
-    high = 1000.0 * float(table["sigma_m"][seen][0])
-    print(f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern of a unit "
-          f"{1e3 * float(table['pattern_m']):.3g} mm")  # fmt: skip
+    is_returned = table["seen"] > 0.5
+    low = 1000.0 * float(table["sigma_m"][is_returned][-1])
+    high = 1000.0 * float(table["sigma_m"][is_returned][0])
+    print(
+        f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern "
+        f"of a unit {1e3 * float(table['pattern_m']):.3g} mm"
+    )
     print(f"wrote {options.out / camera.name}.npz, depth_noise.py")
     return 0
 
@@ -88,14 +90,14 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
         np.log2(DARKEST / farthest_m**2), np.log2(1.0 / nearest_m**2), 1.0 / MEASURED
     )
     measured = [_before_plane(fine, level, nearest_m, farthest_m) for level in levels]
-    sigma_m, seen = np.array([row[:2] for row in measured]).T
-    known = np.isfinite(sigma_m)
-    places = np.arange(levels[0], levels[-1], 1.0 / PER_OCTAVE)
-    sigma_m = np.exp(np.interp(places, levels[known], np.log(sigma_m[known])))
-    at = int(
+    sigma_m, return_share = np.array([row[:2] for row in measured]).T
+    has_sigma = np.isfinite(sigma_m)
+    fine_levels = np.arange(levels[0], levels[-1], 1.0 / PER_OCTAVE)
+    sigma_m = np.exp(np.interp(fine_levels, levels[has_sigma], np.log(sigma_m[has_sigma])))
+    middle_index = int(
         np.argmin(np.abs(levels - np.log2(ALBEDO / np.sqrt(nearest_m * min(farthest_m, 4.0)) ** 2)))
     )
-    stack_m = _stack_m(fine, levels[at], nearest_m, farthest_m, FRAMES_OF_CORRELATION)
+    stack_m = _stack_m(fine, levels[middle_index], nearest_m, farthest_m, FRAMES_OF_CORRELATION)
     residuals = stack_m - np.nanmean(stack_m, axis=0)
     pattern = _pattern_m(fine)
     slopes, falloff = _pixels(camera)
@@ -103,7 +105,7 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
         "first": np.float32(levels[0]),
         "per_octave": np.float32(PER_OCTAVE),
         "sigma_m": sigma_m.astype(np.float32),
-        "seen": np.interp(places, levels, seen).astype(np.float32),
+        "seen": np.interp(fine_levels, levels, return_share).astype(np.float32),
         **dict(
             zip(("rows", "columns"), (_filter(residuals, axis) for axis in (1, 2)), strict=True)
         ),
@@ -126,7 +128,8 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
 def _stack_m(
     camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int
 ) -> np.ndarray:
-    """Return ranges (frames, h, w), NaN without a return, of a plane whose light has this level."""
+    """Return ranges (frames, h, w), NaN without a return, of a plane whose light has this
+    level."""
     from scenes.sensor.calibration import unit_before_plane
 
     distance_m = float(np.clip(np.sqrt(ALBEDO / 2.0**level), nearest_m, farthest_m))
@@ -149,9 +152,11 @@ def _before_plane(
         return float("nan"), float(valid.mean())
     # a robust deviation excludes ranges with a wrong period, which are rare and far off
     middle = np.nanmedian(range_m[:, often], axis=0)
-    apart = np.abs(range_m[:, often] - middle)
-    kept = apart < 8.0 * np.nanmedian(apart) / 0.6745
-    return float(np.sqrt(np.mean(apart[kept] ** 2) * FRAMES / (FRAMES - 1))), float(valid.mean())
+    deviation_m = np.abs(range_m[:, often] - middle)
+    kept = deviation_m < 8.0 * np.nanmedian(deviation_m) / 0.6745
+    return float(np.sqrt(np.mean(deviation_m[kept] ** 2) * FRAMES / (FRAMES - 1))), float(
+        valid.mean()
+    )
 
 
 def _pattern_m(camera: AnyCamera) -> np.ndarray:
@@ -169,17 +174,17 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
     view = plane_view(
         camera, Region(row - half_h, row + half_h, column - half_w, column + half_w), 1.0, ALBEDO
     )
-    found = []
+    patterns_m = []
     for seed in (1, 2, 3):
         ranges = []
-        for on in (True, False):
-            effects = NO_EFFECTS.model_copy(update={"fixed_pattern": on})
+        for has_pattern in (True, False):
+            effects = NO_EFFECTS.model_copy(update={"fixed_pattern": has_pattern})
             unit = SimulatedUnit(
                 camera, CameraConfig(name=camera.name, unit_seed=seed, effects=effects), view
             )
             ranges.append(next(iter(unit.capture(1, 1).frames())).z_m.astype(float))
-        found.append(ranges[0] - ranges[1])
-    return np.asarray(found)
+        patterns_m.append(ranges[0] - ranges[1])
+    return np.asarray(patterns_m)
 
 
 def _filter(images: np.ndarray, axis: int) -> np.ndarray:

@@ -55,10 +55,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel that is the same in every "
-    "frame. Each PATH is a capture of 50 frames or more of a matte wall that fills the view. Record with a warm "
-    "camera, several times at each of two distances, and move it by 30 mm or more between captures. Name the "
-    "captures in the order of recording.",
+    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel that is "
+    "the same in every frame. Each PATH is a capture of 50 frames or more of a matte wall that "
+    "fills the view. Record with a warm camera, several times at each of two distances, and move "
+    "it by 30 mm or more between captures. Name the captures in the order of recording.",
     epilog="example: tofpod flatfield near1 near2 far1 far2 --out unit.npz, then "
     "tofpod detect captures/board --flat-field unit.npz",
 )
@@ -79,12 +79,17 @@ def main(options: argparse.Namespace, command: str) -> int:
             f"--out {options.out}: is not a name for a flat field", legal="a name that ends in .npz"
         )
     lens, captures, doubted = _captures(options)
-    found = separated(captures, lens)
-    field = replace(found.field, warnings=(*doubted, *found.field.warnings))
-    near, far = field.distances_m
-    at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
-    answer = f"fixed pattern {mm(field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
-    figures = list(figures_of(found))
+    separated_field = separated(captures, lens)
+    field = replace(separated_field.field, warnings=(*doubted, *separated_field.field.warnings))
+    nearest_m, far = field.distances_m
+    distance_text = (
+        f"{nearest_m:.2f} m" if far < nearest_m * 1.01 else f"{nearest_m:.2f} to {far:.2f} m"
+    )
+    answer = (
+        f"fixed pattern {mm(field.rms_m)} rms at {distance_text}, known to "
+        f"{mm(separated_field.noise_m)}"
+    )
+    figures = list(figures_of(separated_field))
     error_m = field.error_m
     print_warnings(field.warnings)
     print(answer)
@@ -92,9 +97,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     data = options.out.with_suffix(".json")
     picture = options.out.with_suffix(".png")
     save_flat_field(options.out, field)
-    about = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
-    about |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
-    write_json(data, {**about, "provenance": record(command)})
+    provenance = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
+    provenance |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
+    write_json(data, {**provenance, "provenance": record(command)})
     save_png(picture, (7.0, 5.4), lambda figure: _draw(figure, error_m, answer))
     print(f"wrote {options.out}, {data.name}, {picture.name}")
     return 0
@@ -145,13 +150,13 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
                 f"{path}: has another lens than {options.paths[0]}",
                 legal="captures of one unit and mode",
             )
-    found = []
+    captures = []
     for recording, pose in zip(recordings, poses, strict=True):
         for part in _halves(recording) if len(recordings) == 1 else (recording,):
             cloud = average(part, RECORDED)
-            found.append(flattened(cloud, crop(cloud, config), part.name, pose))
+            captures.append(flattened(cloud, crop(cloud, config), part.name, pose))
     assert first.lens is not None
-    return first.lens, found, [doubt for recording in recordings for doubt in recording.warnings]
+    return first.lens, captures, [doubt for recording in recordings for doubt in recording.warnings]
 
 
 def _halves(recording: Recording) -> Iterator[Recording]:

@@ -50,17 +50,18 @@ FREQUENCIES = np.linspace(0, 0.5, 41)
 SHOWN_LAGS = (1, 2, 3, 5)
 SHOWN_PATTERN_LAGS = (1, 3, 5, 10)
 CAPTION = (
-    "The surfaces that were found; temporal noise against range, angle and amplitude (a dot stands for pixels with "
-    "similar values of all three); correlation of noise and of fixed pattern along x and y, and their spectra (1 for "
-    "white noise); displacement of whole frames; dropouts. Orange is the simulation from the camera file."
+    "The surfaces that were found; temporal noise against range, angle and amplitude (a dot "
+    "stands for pixels with similar values of all three); correlation of noise and of fixed "
+    "pattern along x and y, and their spectra (1 for white noise); displacement of whole frames; "
+    "dropouts. Orange is the simulation from the camera file."
 )
 FigureRow = tuple[str, str, str, float, str]  # name, place, unit, value and meaning of a figure
 
 
-def own_figures(found: Characteristics) -> Iterator[FigureRow]:
+def own_figures(measured: Characteristics) -> Iterator[FigureRow]:
     """Yield the figures of each surface and of the camera; all sources give the same figures in
     the same order."""
-    for face in found.surfaces:
+    for face in measured.surfaces:
         relief = "includes the surface's own shape and the lens's error"
         yield (
             "temporal noise",
@@ -100,22 +101,22 @@ def own_figures(found: Characteristics) -> Iterator[FigureRow]:
             face.fill_rate,
             "share of pixels and frames with a return",
         )
-    yield from shared_figures(found)
+    yield from shared_figures(measured)
 
 
-def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
+def shared_figures(measured: Characteristics) -> Iterator[FigureRow]:
     """Yield the figures that do not belong to a single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
-            alike = float(found.correlation[axis, lag])
+            pattern_correlation = float(measured.correlation[axis, lag])
             yield (
                 "noise correlation",
                 f"{name}, lag {lag}",
                 "1",
-                alike,
+                pattern_correlation,
                 "correlation of neighbours' noise",
             )
-        power = np.cumsum(density_of(found.correlation[axis]))
+        power = np.cumsum(density_of(measured.correlation[axis]))
         half = float(np.interp(0.5 * power[-1], power, FREQUENCIES))
         yield (
             "noise spectrum",
@@ -128,10 +129,10 @@ def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
         "frame jitter",
         "all",
         "mm",
-        found.jitter_m / MM,
+        measured.jitter_m / MM,
         "standard deviation of frames' displacement",
     )
-    for capture in found.captures:
+    for capture in measured.captures:
         yield (
             "drift",
             capture.name,
@@ -139,11 +140,11 @@ def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
             capture.drift_m / MM,
             "change of the distance from first to last frame",
         )
-    yield "rounding step", "all", "mm", found.captures[0].step_m / MM, "step of the stored z"
-    share = len(found.jumps_m) / found.frames
+    yield "rounding step", "all", "mm", measured.captures[0].step_m / MM, "step of the stored z"
+    share = len(measured.jumps_m) / measured.frames
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
-    if found.pattern is not None:
-        rms_mm = found.pattern.field.rms_m / MM
+    if measured.pattern is not None:
+        rms_mm = measured.pattern.field.rms_m / MM
         yield (
             "fixed pattern",
             "all",
@@ -151,55 +152,55 @@ def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
             rms_mm,
             "error of range that all frames share, minus a smooth fit",
         )
-    if found.pattern_correlation is not None:
+    if measured.pattern_correlation is not None:
         for axis, name in enumerate("xy"):
             for lag in SHOWN_PATTERN_LAGS:
-                alike = float(found.pattern_correlation[axis, lag])
+                pattern_correlation = float(measured.pattern_correlation[axis, lag])
                 yield (
                     "pattern correlation",
                     f"{name}, lag {lag}",
                     "1",
-                    alike,
+                    pattern_correlation,
                     "correlation of the pattern",
                 )
-    if found.edge is not None:
+    if measured.edge is not None:
         where = "steps of depth"
         yield (
             "gap at an edge",
             where,
             "px",
-            found.edge.gap_px,
+            measured.edge.gap_px,
             "pixels without a return across an edge",
         )
         yield (
             "flying pixels",
             where,
             "px",
-            found.edge.flying_px,
+            measured.edge.flying_px,
             "pixels with a range on neither surface",
         )
 
 
 def beside(
-    found: Characteristics, twin: Characteristics, known: Characteristics | None
+    captured: Characteristics, twin: Characteristics, nearest_known: Characteristics | None
 ) -> list[OwnFigure]:
     """Return each figure of the captures with those of the simulations; surfaces are matched by
     their numbers."""
-    every = (found, twin, known)
-    places = [
-        {face.where: (face.capture, face.number) for face in each.surfaces} if each else {}
-        for each in every
+    sources = (captured, twin, nearest_known)
+    positions = [
+        {face.where: (face.capture, face.number) for face in source.surfaces} if source else {}
+        for source in sources
     ]
     values = [
-        {(row[0], position.get(row[1], row[1])): row[3] for row in own_figures(each)}
-        if each
+        {(row[0], position.get(row[1], row[1])): row[3] for row in own_figures(source)}
+        if source
         else {}
-        for each, position in zip(every, places, strict=True)
+        for source, position in zip(sources, positions, strict=True)
     ]
-    ends = {("temporal noise", face.where): face.temporal.interval for face in found.surfaces}
+    ends = {("temporal noise", face.where): face.temporal.interval for face in captured.surfaces}
     rows = []
-    for name, where, unit, value, meaning in own_figures(found):
-        key = name, places[0].get(where, where)
+    for name, where, unit, value, meaning in own_figures(captured):
+        key = name, positions[0].get(where, where)
         simulated, of_known = (value_of.get(key, float("nan")) for value_of in values[1:])
         interval = ends.get((name, where), UNKNOWN)
         measured = Estimate(value, interval.low, interval.high)
@@ -213,7 +214,7 @@ def write_page(
     rows: list[OwnFigure],
     title: str,
     answer: str,
-    known: str,
+    known_title: str,
     command: str,
     facts: Mapping[str, Any],
     warnings: Sequence[str],
@@ -221,18 +222,19 @@ def write_page(
     """Print the figures; write a page, its tables and provenance.json with further ``facts``.
     ``sources`` are measured, simulated, and perhaps those of the ``known`` camera. Raises
     UserError if they cannot be written."""
-    found = sources[MEASURED]
+    measured = sources[MEASURED]
     folder = path.parent
-    heads = {"known camera": known, "its ratio": known and "its ratio"}
+    heads = {"known camera": known_title, "its ratio": known_title and "its ratio"}
     show([OWN_FIGURES.grid(rows, terminal=True, heads=heads)])
     print(answer)
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
     curves = [row for source, figures in sources.items() for row in _curves(source, figures)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
-    drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, found, curves))
+    drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, measured, curves))
     notes = (
-        "The simulated frames show the same surfaces, with the smooth shape of the captures, by the camera file; they "
-        "are analysed like the captures. A ratio of 1 means that the file reproduces the camera."
+        "The simulated frames show the same surfaces, with the smooth shape of the captures, by "
+        "the camera file; they are analysed like the captures. A ratio of 1 means that the file "
+        "reproduces the camera."
     )
     body = [
         figure({"captures": drawn}, "captures", CAPTION),
@@ -246,13 +248,13 @@ def write_page(
     print(f"wrote {path} and the tables")
 
 
-def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
+def _curves(source: str, measured: Characteristics) -> Iterator[dict[str, Any]]:
     """Yield the points of all diagrams for a source."""
 
     def point(diagram: str, series: str, x: float, y: float) -> dict[str, Any]:
         return {"diagram": diagram, "source": source, "series": series, "x": x, "y": y}
 
-    for cell in found.cells:
+    for cell in measured.cells:
         for diagram, x in (
             (RANGE, cell.range_m),
             (ANGLE, cell.angle_deg),
@@ -261,23 +263,25 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
             if np.isfinite(x):
                 yield point(diagram, cell.capture, x, cell.sigma_m / MM)
     pairs = (
-        (NEIGHBOURS, SPECTRUM, found.correlation),
-        (PATTERN, OF_PATTERN, found.pattern_correlation),
+        (NEIGHBOURS, SPECTRUM, measured.correlation),
+        (PATTERN, OF_PATTERN, measured.pattern_correlation),
     )
-    for diagram, spectrum, both in pairs:
-        for axis, along in zip("xy", [] if both is None else both, strict=False):
-            yield from (point(diagram, axis, *each) for each in enumerate(along.tolist()))
+    for diagram, spectrum, correlations in pairs:
+        for axis, along in zip("xy", [] if correlations is None else correlations, strict=False):
             yield from (
-                point(spectrum, axis, *each)
-                for each in zip(FREQUENCIES, density_of(along), strict=True)
+                point(diagram, axis, *lag_and_value) for lag_and_value in enumerate(along.tolist())
             )
-    for capture in found.captures:
+            yield from (
+                point(spectrum, axis, *frequency_and_density)
+                for frequency_and_density in zip(FREQUENCIES, density_of(along), strict=True)
+            )
+    for capture in measured.captures:
         yield from (
             point(FRAMES, capture.name, k, off / MM)
             for k, off in enumerate(capture.offsets_m.tolist())
         )
     for level, share in zip(
-        found.dropouts.amplitude.tolist(), found.dropouts.share.tolist(), strict=True
+        measured.dropouts.amplitude.tolist(), measured.dropouts.share.tolist(), strict=True
     ):
         if np.isfinite(level):
             yield point(DROPPED, "all", level, share)
@@ -294,9 +298,9 @@ def density_of(correlation: np.ndarray) -> np.ndarray:
     )
 
 
-def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) -> None:
+def _draw(canvas: Figure, measured: Characteristics, curves: list[dict[str, Any]]) -> None:
     axes = canvas.subplots(5, 2).ravel()
-    first = found.captures[0]
+    first = measured.captures[0]
     labels = np.full(first.stretch.shape, np.nan)
     for number, (_, mask) in enumerate(first.planes):
         labels[mask] = number
@@ -304,9 +308,9 @@ def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) 
     axes[0].imshow(labels, cmap="tab10", vmin=0, vmax=9, alpha=0.5, interpolation="nearest")
     axes[0].set(title=f"{len(first.planes)} flat surfaces, {first.name[:24]}", xticks=[], yticks=[])
     for axis, diagram in zip(axes[1:], SHOWN, strict=True):
-        own = [row for row in curves if row["diagram"] == diagram]
+        diagram_rows = [row for row in curves if row["diagram"] == diagram]
         for source, (colour, marker) in LOOKS.items():
-            points = [(row["x"], row["y"]) for row in own if row["source"] == source]
+            points = [(row["x"], row["y"]) for row in diagram_rows if row["source"] == source]
             if points and not (diagram == FRAMES and source != MEASURED):
                 axis.plot(
                     *zip(*points, strict=True), marker, color=colour, markersize=4, label=source
@@ -315,7 +319,7 @@ def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) 
         axis.set(
             xlabel=x, ylabel=y, yscale="log" if diagram in (SPECTRUM, OF_PATTERN) else "linear"
         )
-        if not own:
+        if not diagram_rows:
             axis.text(
                 0.5,
                 0.5,

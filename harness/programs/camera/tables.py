@@ -93,11 +93,13 @@ OWN_CURVES = Table(
         Column("series", note="capture, or direction"),
         Column(
             "x",
-            note="value on the x axis; the diagram decides whether m, degrees, amplitude, px, 1/px or frames",
+            note="value on the x axis; the diagram decides whether m, degrees, amplitude, px, "
+            "1/px or frames",
         ),
         Column(
             "y",
-            note="value on the y axis; the diagram decides whether mm, share, correlation or density",
+            note="value on the y axis; the diagram decides whether mm, share, correlation or "
+            "density",
         ),
     ),
     formats=("csv",),
@@ -155,15 +157,31 @@ FLAT_CAPTURES = Table(
     (
         Column("capture", "capture", "name", "name of the capture"),
         Column("frames", "frames", "frames", "number of averaged frames"),
-        Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
-        Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
+        Column(
+            "distance_m", "distance (m)", "distance_m", "median distance along the optical axis"
+        ),
+        Column(
+            "tilt_deg",
+            "tilt (°)",
+            "tilt_deg",
+            "angle between the optical axis and the surface's normal",
+        ),
         Column("pixels", "pixels", "pixels", "number of pixels used"),
-        Column("noise_mm", "noise (mm)", lambda row: row.noise_m / MM, "temporal noise of the averaged distance"),
-        Column("residual_mm", "residual (mm)", lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
-               "rms difference between the range and a smooth fit: pattern, shape and noise"),
+        Column(
+            "noise_mm",
+            "noise (mm)",
+            lambda row: row.noise_m / MM,
+            "temporal noise of the averaged distance",
+        ),
+        Column(
+            "residual_mm",
+            "residual (mm)",
+            lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
+            "rms difference between the range and a smooth fit: pattern, shape and noise",
+        ),
     ),
     formats=("csv",),
-)  # fmt: skip
+)
 
 FLAT_FIGURES = Table(
     "flat_field",
@@ -179,7 +197,7 @@ FLAT_FIGURES = Table(
 )
 
 
-def figures_of(found: Any) -> Iterator[dict[str, Any]]:
+def figures_of(separated: Any) -> Iterator[dict[str, Any]]:
     """Yield the rows of `FLAT_FIGURES` for a `detectors.averages.flat_captures.Separated`."""
 
     def row(figure: str, value: float | None, meaning: str, unit: str = "mm") -> dict[str, Any]:
@@ -187,30 +205,32 @@ def figures_of(found: Any) -> Iterator[dict[str, Any]]:
 
     yield row(
         "pattern",
-        found.field.rms_m / MM,
+        separated.field.rms_m / MM,
         "rms of the unit's fixed pattern, corrected for the map's noise",
     )
-    yield row("noise of the map", found.noise_m / MM, "rms of the map's standard deviation")
+    yield row("noise of the map", separated.noise_m / MM, "rms of the map's standard deviation")
     shape = (
         "the surface's shape"
-        if found.separated
+        if separated.separated
         else "the surface's shape, or a part of the pattern that changes"
     )
     yield row(
         "between captures",
-        found.surface_m / MM,
+        separated.surface_m / MM,
         f"deviation between captures beyond their noise: {shape}",
     )
-    for part, what in (
-        (found.in_time, "first and last captures"),
-        (found.in_range, "near and far captures"),
+    for part, compared in (
+        (separated.in_time, "first and last captures"),
+        (separated.in_range, "near and far captures"),
     ):
         excess, correlation = (
             (None, None) if part is None else (part.excess_m / MM, part.correlation)
         )
         yield row(
-            f"change, {what}",
+            f"change, {compared}",
             excess,
-            f"rms of the difference of the maps of {what} beyond their noise",
+            f"rms of the difference of the maps of {compared} beyond their noise",
         )
-        yield row(f"correlation, {what}", correlation, f"correlation of the maps of {what}", "1")
+        yield row(
+            f"correlation, {compared}", correlation, f"correlation of the maps of {compared}", "1"
+        )

@@ -78,7 +78,8 @@ class Sample:
 
 
 def categories_of(experiment: Experiment) -> dict[str, Point]:
-    """Return the points whose clouds differ, by names formed from the axes of source and capture."""
+    """Return the points whose clouds differ, by names formed from the axes of source and
+    capture."""
     points: dict[str, Point] = {}
     for point in experiment.points:
         if not point.is_variation:
@@ -89,21 +90,25 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     values = {path: [point.values[path] for point in points.values()] for path in axes}
     axes = [path for path in axes if any(value != values[path][0] for value in values[path])]
     names = names_of(axes)
-    found = dict[str, Point]()
+    points_by_name = dict[str, Point]()
     for point in points.values():
         words = []
-        for path, own in ((path, point.values[path]) for path in axes):
+        for path, axis_value in ((path, point.values[path]) for path in axes):
             text = value_text(
-                path, differing(own, (value for value in values[path] if value != own))
+                path,
+                differing(axis_value, (value for value in values[path] if value != axis_value)),
             )
             words.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
         name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(words)).strip("_.") or experiment.config.name
-        found[name if name not in found else f"{name}_{len(found)}"] = point
-    return found
+        points_by_name[name if name not in points_by_name else f"{name}_{len(points_by_name)}"] = (
+            point
+        )
+    return points_by_name
 
 
 def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]:
-    """Plan the boards of every category. Raises UserError if the experiment has no random boards."""
+    """Plan the boards of every category. Raises UserError if the experiment has no random
+    boards."""
     samples = []
     for category, point in categories_of(experiment).items():
         source = point.config.simulated
@@ -154,16 +159,16 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     allow resuming."""
     (point,) = sample.task.points
     set_up = load_board(sample.task.views[0])
-    known = set_up.labelled(cloud_of(sample.task, point))
-    cloud = known.cloud
-    truth = () if sample.task.hole_free else known.truth
+    labelled = set_up.labelled(cloud_of(sample.task, point))
+    cloud = labelled.cloud
+    truth = () if sample.task.hole_free else labelled.truth
 
     def put(values: np.ndarray, outside: float) -> np.ndarray:
         return on_window(values, cloud.region, window, outside)
 
     damage = np.zeros(cloud.region.shape, np.uint16)
     for flaw in truth:
-        damage.ravel()[known.outlines[flaw.id]] = flaw.id
+        damage.ravel()[labelled.outlines[flaw.id]] = flaw.id
     intensity = (
         np.zeros(damage.shape) if cloud.amplitude is None else np.nan_to_num(cloud.amplitude)
     )
@@ -173,8 +178,8 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "reason": put(cloud.reason, Reason.OUTSIDE_MASK),
         "count": put(cloud.count.astype(np.uint16), 0),
         "damage": put(damage, 0),
-        "inspected": put(shrunk(np.isfinite(known.places_m[..., 0]), 2 * INSET_PX + 1), False),
-        "board_xy_m": put(known.places_m.astype(np.float32), np.nan),
+        "inspected": put(shrunk(np.isfinite(labelled.places_m[..., 0]), 2 * INSET_PX + 1), False),
+        "board_xy_m": put(labelled.places_m.astype(np.float32), np.nan),
     }
     mask = arrays["damage"]
     points = arrays["points_m"]
@@ -183,18 +188,18 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     shown = np.clip(arrays["intensity"] / white, 0, 1)
     grey = np.repeat(np.rint(255 * shown).astype(np.uint8)[..., None], 3, axis=2)
     file = f"{sample.number:04d}"
-    place = out / "boards" / Path(sample.name).parent
+    folder = out / "boards" / Path(sample.name).parent
     mvtec = out / "." / Path(sample.name).parent
     stored = io.BytesIO()
     np.savez_compressed(stored, **arrays)  # type: ignore[arg-type]
     files = {
-        place / file / CLOUD: stored.getvalue(),
-        place / file / "depth.png": picture_bytes(".png", depth_units(points[..., 2])),
-        place / file / "intensity.png": picture_bytes(
+        folder / file / CLOUD: stored.getvalue(),
+        folder / file / "depth.png": picture_bytes(".png", depth_units(points[..., 2])),
+        folder / file / "intensity.png": picture_bytes(
             ".png", np.rint(65535 * shown).astype(np.uint16)
         ),
-        place / file / "valid.png": picture_bytes(".png", np.uint8(255) * valid),
-        place / file / "mask.png": picture_bytes(".png", mask),
+        folder / file / "valid.png": picture_bytes(".png", np.uint8(255) * valid),
+        folder / file / "mask.png": picture_bytes(".png", mask),
         mvtec / "rgb" / f"{file}.png": picture_bytes(".png", grey),
         mvtec / "xyz" / f"{file}.tiff": picture_bytes(
             ".tiff", np.where(valid[..., None], points, 0)[..., ::-1]
@@ -207,18 +212,18 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     camera = sample.task.views[0].camera
     damages = []
     for flaw in truth:
-        own = np.zeros(damage.shape, bool)
-        own.ravel()[known.outlines[flaw.id]] = True
-        rows, columns = np.nonzero(own := put(own, False))
+        damage_mask = np.zeros(damage.shape, bool)
+        damage_mask.ravel()[labelled.outlines[flaw.id]] = True
+        rows, columns = np.nonzero(damage_mask := put(damage_mask, False))
         box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
         facts = {
             "pixels": len(rows),
             "bbox": box,
-            "run_lengths": run_lengths(own),
+            "run_lengths": run_lengths(damage_mask),
             "line_m": flaw.line_m.tolist(),
         }
         damages.append(
-            {**flaw.to_row(), "seen_depth_mm": known.seen_depth_m[flaw.id] / MM, **facts}
+            {**flaw.to_row(), "seen_depth_mm": labelled.seen_depth_m[flaw.id] / MM, **facts}
         )
     facts_of_board = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
@@ -235,7 +240,7 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "damages": damages,
     }
     write_text(
-        place / file / TRUTH, json.dumps(facts_of_board, allow_nan=False) + "\n", durable=False
+        folder / file / TRUTH, json.dumps(facts_of_board, allow_nan=False) + "\n", durable=False
     )
 
 
@@ -252,9 +257,9 @@ def read_truth(folder: Path, name: str) -> dict[str, Any]:
     return _read_json(folder / "boards" / name / TRUTH, TEXT_BYTES, AGAIN)
 
 
-def _read_json(file: Path, most: int, fix: str) -> dict[str, Any]:
+def _read_json(file: Path, most_bytes: int, fix: str) -> dict[str, Any]:
     try:
-        return dict(strict_json(bounded_bytes(file, most)))
+        return dict(strict_json(bounded_bytes(file, most_bytes)))
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"{file}: cannot be read ({error})", fix=fix) from error
 
@@ -265,4 +270,4 @@ def read_arrays(folder: Path, name: str, *wanted: str) -> list[np.ndarray]:
     stored = load_npz(file)
     if missing := set(wanted) - stored.keys():
         raise UserError(f"{file}: lacks {', '.join(sorted(missing))}", fix=AGAIN)
-    return [stored[each] for each in wanted]
+    return [stored[array_name] for array_name in wanted]

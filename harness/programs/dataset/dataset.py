@@ -55,7 +55,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="the licence that the card states (default: CC-BY-4.0)",
     )
-    results = "results folder of experiments, whose stored renders are used and extended (default: results)"
+    results = (
+        "results folder of experiments, whose stored renders are used and extended (default: "
+        "results)"
+    )
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     add("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     add("--serial", action="store_true", help="run everything in this process, for a debugger")
@@ -63,8 +66,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Write a data set of simulated boards with organised clouds, depth, intensity, validity, masks and "
-    "truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
+    "Write a data set of simulated boards with organised clouds, depth, intensity, validity, "
+    "masks and truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
     epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
     "tofpod score states the detection limit of any anomaly maps on it.",
 )
@@ -81,16 +84,19 @@ def main(options: argparse.Namespace, command: str) -> int:
     out = options.out
     cache = options.results / ".cache" / "renders"
     samples = samples_of(experiment, options.boards, cache)
-    about = _about(experiment, options.licence, samples, command)
+    facts = _about(experiment, options.licence, samples, command)
     if (out / INDEX).exists():
-        if read_index(out)["content"] != about["content"]:
-            what = f"{out}: holds a data set of another experiment, number of boards or version of the code"
-            raise UserError(what, fix="name a new folder with --out")
+        if read_index(out)["content"] != facts["content"]:
+            problem = (
+                f"{out}: holds a data set of another experiment, number of boards or version of "
+                "the code"
+            )
+            raise UserError(problem, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
         raise UserError(
             f"{out}: is not empty, and no file is overwritten", fix="name a new folder with --out"
         )
-    write_text(out / INDEX, json.dumps({**about, "samples": None}, indent=1) + "\n")
+    write_text(out / INDEX, json.dumps({**facts, "samples": None}, indent=1) + "\n")
     write_text(out / "experiment.yaml", resolved_yaml(experiment))
     with (
         in_use(cache),
@@ -102,9 +108,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         print(f"{len(failures)} jobs failed; the first failure: {failures[0]}", file=sys.stderr)
         print("run the same command again to write the missing boards", file=sys.stderr)
         return 1
-    _finish(out, samples, about)
+    _finish(out, samples, facts)
     print(
-        f"wrote {out}: {len(samples)} boards in {len(about['categories'])} categories; README.md there explains them"
+        f"wrote {out}: {len(samples)} boards in {len(facts['categories'])} categories; README.md "
+        "there explains them"
     )
     return 0
 
@@ -121,13 +128,15 @@ def _about(
 
     categories: dict[str, Any] = {}
     for name, point in categories_of(experiment).items():
-        own = [sample for sample in samples if sample.category == name]
-        cameras = [sample.task.views[0].camera for sample in own]
+        category_samples = [sample for sample in samples if sample.category == name]
+        cameras = [sample.task.views[0].camera for sample in category_samples]
         categories[name] = {
             "camera": cameras[0].name,
             "units": len({camera.unit_seed for camera in cameras}),
             "frames": point.config.capture.frames,
-            "boards": dict(Counter(f"{sample.split}/{sample.label}" for sample in own)),
+            "boards": dict(
+                Counter(f"{sample.split}/{sample.label}" for sample in category_samples)
+            ),
         }
     calibrate = experiment.config.threshold.calibrate
     boards = [[sample.name, sample.render.path.stem] for sample in samples]
@@ -179,7 +188,9 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
         by_category: dict[str, list[Any]] = {}
         for sample in samples:
             by_category.setdefault(sample.category, []).append(regions[sample.render.path.stem])
-        windows = {category: reduce(Region.joined, seen) for category, seen in by_category.items()}
+        windows = {
+            category: reduce(Region.joined, regions) for category, regions in by_category.items()
+        }
         boards = [
             Job(board.name, "trials", write_board, (out, board, windows[board.category]))
             for board in missing
@@ -188,8 +199,9 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     return failures
 
 
-def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
-    """Write the COCO files, the card, and finally the index, which marks the data set as complete."""
+def _finish(out: Path, samples: list[Sample], facts: dict[str, Any]) -> None:
+    """Write the COCO files, the card, and finally the index, which marks the data set as
+    complete."""
     from harness.programs.dataset.boards import INDEX, INSET_PX, SPLITS, read_truth
     from harness.programs.dataset.exchange import coco_data
     from harness.report.blocks import template
@@ -197,8 +209,8 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
 
     truths = {sample.name: read_truth(out, sample.name) for sample in samples}
     kinds = sorted({damage["kind"] for truth in truths.values() for damage in truth["damages"]})
-    info = {"description": about["name"], "license": about["licence"]}
-    for category in about["categories"]:
+    info = {"description": facts["name"], "license": facts["licence"]}
+    for category in facts["categories"]:
         for split in dict.fromkeys(split for split, _, _ in SPLITS):
             pictures = [
                 truths[sample.name]
@@ -210,10 +222,10 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
     write_text(
         out / "README.md",
         template("dataset_card.md", Path(__file__).parent).render(
-            about=about, inset=INSET_PX, title=camera_title
+            about=facts, inset=INSET_PX, title=camera_title
         ),
     )
-    write_text(out / INDEX, json.dumps({**about, "samples": [*truths]}, indent=1) + "\n")
+    write_text(out / INDEX, json.dumps({**facts, "samples": [*truths]}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -72,9 +72,9 @@ class ExportedView:
 def on_window(values: np.ndarray, region: Region, window: Region, outside: float) -> np.ndarray:
     """Return values (h, w, ...) of a sensor region on a ``window`` that contains it, with
     ``outside`` elsewhere."""
-    whole = np.full((*window.shape, *values.shape[2:]), outside, values.dtype)
-    whole[region.within(window)] = values
-    return whole
+    image = np.full((*window.shape, *values.shape[2:]), outside, values.dtype)
+    image[region.within(window)] = values
+    return image
 
 
 def in_turn(
@@ -83,7 +83,8 @@ def in_turn(
     n_frames: int,
     frames_per_second: float,
 ) -> tuple[ExportedView, ...]:
-    """Put views in sequence, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
+    """Put views in sequence, named ``view_00`` and so on; ``poses`` are their
+    ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
     starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
@@ -130,7 +131,7 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         "associations.txt": [],
     }
     for view in views:
-        place = " ".join(
+        pose_text = " ".join(
             f"{value:.9g}"
             for value in (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
         )
@@ -143,7 +144,7 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
                 )
                 lines[f"{name}.txt"].append(f"{time} {name}/{time}.png")
             lines["associations.txt"].append(f"{time} rgb/{time}.png {time} depth/{time}.png")
-            lines["groundtruth.txt"].append(f"{time} {place}")
+            lines["groundtruth.txt"].append(f"{time} {pose_text}")
     for name, text in lines.items():
         (folder / name).write_text("\n".join((*text, "")), encoding="utf-8")
     (folder / CALIBRATION).write_text(calibration_text(lens), encoding="utf-8")
@@ -153,8 +154,10 @@ def depth_units(z_m: np.ndarray) -> np.ndarray:
     """Return (h, w) uint16 in units of 0.2 mm; 0 without range, or beyond the 13.1 m that 16 bits
     hold."""
     with np.errstate(invalid="ignore"):
-        held = (z_m > 0) & (z_m <= FARTHEST_M)
-    return np.rint(np.where(held, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(np.uint16)
+        is_storable = (z_m > 0) & (z_m <= FARTHEST_M)
+    return np.rint(np.where(is_storable, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(
+        np.uint16
+    )
 
 
 def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
@@ -169,7 +172,8 @@ def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
 
 
 def seconds_text(stamp_ns: int) -> str:
-    """Return a time in the benchmark's format: seconds with six digits, exact to the microsecond."""
+    """Return a time in the benchmark's format: seconds with six digits, exact to the
+    microsecond."""
     microseconds = (stamp_ns + 500) // 1000
     return f"{microseconds // 10**6}.{microseconds % 10**6:06d}"
 
@@ -362,7 +366,7 @@ def run_lengths(mask: np.ndarray) -> list[int]:
 
 
 def coco_data(
-    pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: dict[str, Any]
+    pictures: Sequence[dict[str, Any]], kinds: Sequence[str], licence_facts: dict[str, Any]
 ) -> dict[str, Any]:
     """Return a COCO file's content. Each of the ``pictures`` has ``file_name``, ``width``,
     ``height`` and ``damages``, which have ``kind``, ``run_lengths``, ``bbox`` (left, top, width,
@@ -385,4 +389,9 @@ def coco_data(
             ids = {"image_id": number, "category_id": numbers[damage["kind"]]}
             annotations.append({"id": len(annotations) + 1, **ids, **facts})
     categories = [{"id": number, "name": kind} for kind, number in numbers.items()]
-    return {"info": about, "images": images, "annotations": annotations, "categories": categories}
+    return {
+        "info": licence_facts,
+        "images": images,
+        "annotations": annotations,
+        "categories": categories,
+    }

@@ -44,15 +44,20 @@ def _options(parser: argparse.ArgumentParser) -> None:
     frames = "frames of each view (default: the experiment's capture.frames)"
     add("--frames", type=whole_number(10_000), metavar="N", help=frames)
     add("--hole-free", action="store_true", help="export the same target without its damage")
-    results = "results folder of experiments, whose stored renders are used and extended (default: results)"
+    results = (
+        "results folder of experiments, whose stored renders are used and extended (default: "
+        "results)"
+    )
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
 
 
 @program(
     _options,
-    "Render and simulate the views of an experiment, and write them with their true poses and damages"
-    " as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and tf_static.",
-    epilog="example: tofpod export experiments/perspectives.yaml --format mcap --views 3 --out bags/",
+    "Render and simulate the views of an experiment, and write them with their true poses and "
+    "damages as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and "
+    "tf_static.",
+    epilog="example: tofpod export experiments/perspectives.yaml --format mcap --views 3 "
+    "--out bags/",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -80,9 +85,10 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     captures = []
     with atomic_folder(arguments.out) as folder:
         for number, job in enumerate(batch.renders[:count]):
-            view, found = cached_view(job.target, camera.optics, job.config, cache)
+            view, from_cache = cached_view(job.target, camera.optics, job.config, cache)
             print(
-                f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}"
+                f"view {number}: "
+                f"{'render from the cache' if from_cache else f'rendered in {view.seconds:.1f} s'}"
             )
             unit = SimulatedUnit(camera, job.camera, view)
             labels = ("view", number) if number else ()
@@ -98,11 +104,13 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:
         print(
-            f"note: {', '.join(swept)}: the value of `source` is used, not the axis; --set chooses another value"
+            f"note: {', '.join(swept)}: the value of `source` is used, not the axis; --set "
+            "chooses another value"
         )
     size_mb = sum(path.stat().st_size for path in arguments.out.rglob("*") if path.is_file()) / 1e6
     print(
-        f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, with truth.json"
+        f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, with "
+        "truth.json"
     )
     return 0
 
@@ -115,7 +123,8 @@ def _write_beside(
     views: tuple[ExportedView, ...],
     command: str,
 ) -> None:
-    """Write the truth, the nominal poses for a registration, the declaration, and the provenance."""
+    """Write the truth, the nominal poses for a registration, the declaration, and the
+    provenance."""
     import numpy as np
 
     from harness.experiment.load import resolved_yaml
@@ -134,7 +143,8 @@ def _write_beside(
             for n in range(len(poses))
         ]
     frames = {
-        "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
+        "board": "x along the row of holes, y up the face, z out of it to the camera, origin "
+        "at its centre",
         "camera": "x right, y down, z along the optical axis; for damages, the first view's camera",
     }
     damages = truth_of(targets[0], targets[0].pose.T_camera_board)
@@ -156,7 +166,8 @@ def _write_beside(
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [
-                "The target turns as on a turntable: the poses of all views hold for the target, not for the room.",
+                "The target turns as on a turntable: the poses of all views hold for the target, "
+                "not for the room.",
                 "Pixels outside the simulated region of each image have no range and are black.",
                 "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
             ],

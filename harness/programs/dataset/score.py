@@ -66,11 +66,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "State the detection limit (a90, a90/95) of anomaly maps on a data set of tofpod dataset, with "
-    "AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
-    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for likely damage.",
-    epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares two such "
-    "folders of results.",
+    "State the detection limit (a90, a90/95) of anomaly maps on a data set of tofpod dataset, "
+    "with AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
+    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for "
+    "likely damage.",
+    epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares "
+    "two such folders of results.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""
@@ -145,10 +146,14 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
             faults.setdefault("invalid", []).append(f"{name} ({fault})")
     if faults:
         lines = [
-            f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
-            for what, names in faults.items()
+            f"{len(names)} maps are {fault}: "
+            f"{', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
+            for fault, names in faults.items()
         ]
-        legal = "a .npy or .tiff of real numbers with the pictures' size for each board of validation and test"
+        legal = (
+            "a .npy or .tiff of real numbers with the pictures' size for each board of validation "
+            "and test"
+        )
         raise UserError(
             f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards again"
         )
@@ -162,7 +167,10 @@ def _fault(path: Path, inspected: np.ndarray) -> str:
     except UserError:
         return "cannot be read as an array of numbers"
     if scores.shape != inspected.shape:
-        return f"{' x '.join(map(str, scores.shape))} instead of {' x '.join(map(str, inspected.shape))}"
+        return (
+            f"{' x '.join(map(str, scores.shape))} instead of "
+            f"{' x '.join(map(str, inspected.shape))}"
+        )
     lacking = int((~np.isfinite(scores[inspected])).sum())
     return (
         f"no finite number at {lacking} inspected pixels; write the lowest score there"
@@ -177,15 +185,15 @@ def _read(path: Path) -> np.ndarray:
 
     from detectors.recordings.arrays import load_npy
 
-    found: np.ndarray | None
+    values: np.ndarray | None
     if path.suffix.lower() == ".npy":
-        (found,) = load_npy(path).values()
+        (values,) = load_npy(path).values()
     else:
         content = np.frombuffer(bounded_bytes(path, PICTURE_BYTES), np.uint8)
-        found = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
-    if found is None or found.dtype.kind not in "fiu":
+        values = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    if values is None or values.dtype.kind not in "fiu":
         raise UserError(f"{path}: holds no real numbers")
-    return np.asarray(found, float)
+    return np.asarray(values, float)
 
 
 def _judged(
@@ -210,9 +218,9 @@ def _judged(
         """Yield the boards of a split: name, scores (NaN if not inspected), places, damage,
         inspected area."""
         for sample in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
-            inspected, places, damage = read_arrays(options.dataset, sample, *JUDGED_BY)
+            inspected, board_xy_m, damage = read_arrays(options.dataset, sample, *JUDGED_BY)
             scores = np.where(inspected, _read(maps[sample]), np.nan)
-            places_m = places.astype(float)
+            places_m = board_xy_m.astype(float)
             yield (
                 sample,
                 scores,
@@ -238,11 +246,11 @@ def _judged(
         board = truth["board"]
         truths.append([board, damages])
         lines = [np.array(flaw["line_m"]) for flaw in damages]
-        found = _findings(places_m, scores > threshold)
+        findings = _findings(places_m, scores > threshold)
         outlines = [np.flatnonzero(damage == flaw["id"]) for flaw in damages]
         areas = [] if overlap is None else smeared(outlines, damage.shape)
         ((pairs, parts),) = matched_places(
-            lines, areas, lambda centres_m: centres_m, [found], radius_m, overlap
+            lines, areas, lambda centres_m: centres_m, [findings], radius_m, overlap
         )
         signals = highest_within(places_m, scores, lines, radius_m)
         common: dict[str, Any] = {
@@ -252,13 +260,13 @@ def _judged(
             "scale_mm": np.nan,
         }
         calls = {
-            "false_calls": len(found.scores) - len(pairs) - parts,
+            "false_calls": len(findings.scores) - len(pairs) - parts,
             "no_return_calls": 0,
             "inspected_m2": area_m2,
         }
         runs.append({**common, "role": "hole_free" if "/good/" in name else "damaged", **calls})
         for number, flaw in enumerate(damages):
-            place = {
+            measurements = {
                 "true_x_mm": flaw["x_board_mm"],
                 "true_y_mm": flaw["y_board_mm"],
                 "signal": float(signals[number]),
@@ -269,7 +277,7 @@ def _judged(
                 "no_return": False,
                 "size_of": flaw.get("size_of", "diameter"),
             }
-            holes.append({**common, "hole": str(flaw["id"]), **sizes, **place, **hit})
+            holes.append({**common, "hole": str(flaw["id"]), **sizes, **measurements, **hit})
         scored = np.isfinite(scores)
         pixels.append(scores[scored])
         regions.append(
@@ -317,14 +325,14 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 
 
 def area_under(
-    scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0
+    scores: np.ndarray, true_weight: np.ndarray, false: np.ndarray, limit: float = 1.0
 ) -> float:
     """Return the area under the share of the weights ``found`` (n,) above a threshold against the
     share of ``false`` (n,), up to ``limit`` and divided by it; NaN if either has no weight. Equal
     scores form a single threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
-    up = np.append(0.0, np.cumsum(found[order])[last])
+    up = np.append(0.0, np.cumsum(true_weight[order])[last])
     across = np.append(0.0, np.cumsum(false[order])[last])
     if not (up[-1] > 0 and across[-1] > 0):
         return float("nan")

@@ -1,1 +1,1 @@
-"""`tofpod pod`, `design` and `gauge`: limits of real inspections, and how many targets they need."""
+"""`tofpod pod`, `design`, `gauge`: limits of real inspections, and the targets that they need."""

@@ -86,10 +86,10 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 @program(
     _options,
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
-    "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, and which "
-    "sizes to make.",
-    epilog="example: tofpod design --a50 5 --a90 7 --sizes 2 12 --goal 9. A simulated study takes about "
-    "5 ms.",
+    "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, "
+    "and which sizes to make.",
+    epilog="example: tofpod design --a50 5 --a90 7 --sizes 2 12 --goal 9. A simulated study "
+    "takes about 5 ms.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130
@@ -114,9 +114,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     # refused before the simulation, which takes a minute; `_check` has required the area
     free = plan.hole_free(wanted, board_m2 or 0.0) if wanted is not None else None
     plans = plan.design(curve, sorted(set(options.targets)), sizes, studies=options.studies, seed=1)
-    found = (plans, *plan.recommend(plans, options.goal), options.goal, free)
+    outcome = (plans, *plan.recommend(plans, options.goal), options.goal, free)
     design = StudyDesign(
-        curve, origin, "mm" if options.unit is None else options.unit, sizes, *found
+        curve, origin, "mm" if options.unit is None else options.unit, sizes, *outcome
     )
     show(design_parts(design))
     if options.out is not None:
@@ -144,12 +144,15 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
     missing = [f"--{name}" for name in ("a50", "a90", "sizes") if getattr(options, name) is None]
     if options.study is None and missing:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
-        fix = "make a careful guess; a study that is planned for an optimistic guess demonstrates nothing"
+        fix = (
+            "make a careful guess; a study that is planned for an optimistic guess demonstrates "
+            "nothing"
+        )
         raise UserError(f"{', '.join(missing)}: not stated", legal=legal, fix=fix)
     for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
-        given = getattr(options, name.replace("-", "_"))
+        value = getattr(options, name.replace("-", "_"))
         owner_value = getattr(options, owner.replace("-", "_"))
-        if given is not None and owner_value is None:
+        if value is not None and owner_value is None:
             raise UserError(f"--{name} belongs to --{owner}", fix=f"add --{owner}, or leave it out")
 
 
@@ -168,13 +171,16 @@ def _guess(options: argparse.Namespace) -> Guess:
     record = set_up_named(study, options.set_up)
     limit = limit_of(record)
     if limit.statement is None:
-        fix = "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
+        fix = (
+            "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name "
+            "another set-up"
+        )
         raise UserError(f"{options.study}: {record.label} has no curve: {limit.why}", fix=fix)
     curve = limit.statement.curve
     origin = f"fitted to {study.name}, {record.label}"
-    seen = record.inspected.size_mm
+    inspected_mm = record.inspected.size_mm
     boards = record.unflawed.area_m2
-    sizes = options.sizes or (float(seen.min()), float(seen.max()))
+    sizes = options.sizes or (float(inspected_mm.min()), float(inspected_mm.max()))
     return curve, origin, tuple(sizes), float(boards.mean()) if len(boards) else None
 
 
@@ -208,13 +214,16 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
             f"{LEAST} to {MOST_STUDIES}",
         ),
     )
-    for holds, what, legal in rules:
+    for holds, problem, legal in rules:
         if not holds:
-            raise UserError(what, legal=legal)
+            raise UserError(problem, legal=legal)
     if options.goal is not None and not options.goal > a90:
-        fix = "no study can demonstrate a limit below the true a90: improve the detector, or state a larger goal"
-        what = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
-        raise UserError(what, legal=f"more than {a90:.4g}", fix=fix)
+        fix = (
+            "no study can demonstrate a limit below the true a90: improve the detector, or state "
+            "a larger goal"
+        )
+        problem = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
+        raise UserError(problem, legal=f"more than {a90:.4g}", fix=fix)
     if options.false_calls_per_m2 is not None and options.board_m2 is None and board_m2 is None:
         raise UserError(
             "--false-calls-per-m2 needs --board-m2, the area of a board", legal="square metres"

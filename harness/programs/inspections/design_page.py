@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEDIANS = (
-    'Median and 10 % and 90 % quantiles of the simulated studies; "none" means that so many studies demonstrate no '
-    "limit. *: recommended."
+    'Median and 10 % and 90 % quantiles of the simulated studies; "none" means that so many '
+    "studies demonstrate no limit. *: recommended."
 )
 WIDE = 110
 SIZE_IN = (11.5, 4.9)
@@ -66,8 +66,9 @@ def design_html(design: StudyDesign, command: str) -> str:
     """Return the page as text: answer, figure, plans and sizes, hole-free area; it needs no
     network."""
     caption = (
-        "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below which a "
-        "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
+        "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below "
+        "which a limit should not fall. Right: the guessed curve and the sizes of the recommended "
+        "plan."
     )
     drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
     body = [blocks.heading("What to expect"), blocks.figure({"design": drawn}, "design", caption)]
@@ -182,8 +183,9 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
     sure = f"{area.confidence:.0%} confidence".replace("%", " %")
     return [
         *lines,
-        f"a threshold for {area.rate_per_m2:g} false calls per m2 needs at least {area.calibration_boards} "
-        f"hole-free boards of {area.board_m2:g} m2; its rate is then at most {area.upper_per_m2:.3g} with {sure}",
+        f"a threshold for {area.rate_per_m2:g} false calls per m2 needs at least "
+        f"{area.calibration_boards} hole-free boards of {area.board_m2:g} m2; its rate is then at "
+        f"most {area.upper_per_m2:.3g} with {sure}",
         f"to show at most {area.rate_per_m2:g} per m2 with {sure}, no false call may occur on "
         f"{area.silent_m2:.4g} m2, which is {area.silent_boards} other boards",
     ]
@@ -191,31 +193,36 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
 
 def notes(design: StudyDesign) -> list[str]:
     """Return the handbook's minima, the Monte Carlo error, and the assumptions of the plan."""
-    plan, (low, high), found = design.recommended, design.range_of_sizes, []
+    plan, (low, high), texts = design.recommended, design.range_of_sizes, []
     if not low <= plan.true_size <= high:
-        found.append("the guess's own a90 lies outside the range: it is extrapolated")
+        texts.append("the guess's own a90 lies outside the range: it is extrapolated")
     if design.reaches is False and design.goal is not None and np.isfinite(plan.high):
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
-        found.append(
-            "the limit approaches the guess's own a90 roughly with the inverse square root of the number of targets: "
-            f"{design.text(design.goal)} needs about {float(f'{wanted:.2g}'):.0f} targets"
+        texts.append(
+            "the limit approaches the guess's own a90 roughly with the inverse square root of "
+            f"the number of targets: {design.text(design.goal)} needs about "
+            f"{float(f'{wanted:.2g}'):.0f} targets"
         )
     if high < plan.bound < np.inf:
-        found.append(
-            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, where it depends on the "
-            "assumed shape of the curve; make larger targets"
+        texts.append(
+            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, where it "
+            "depends on the assumed shape of the curve; make larger targets"
         )
     if plan.targets < LEAST_TARGETS:
-        found.append(
-            f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of signals)"
+        texts.append(
+            f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of "
+            "signals)"
         )
     return [
-        *found,
-        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by {METHOD}; the standard error "
-        f"of the share that demonstrates a limit is at most {50 / np.sqrt(plan.studies):.1f} percentage points",
-        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count as 8 targets",
-        "the plan is only as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
+        *texts,
+        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by "
+        f"{METHOD}; the standard error of the share that demonstrates a limit is at most "
+        f"{50 / np.sqrt(plan.studies):.1f} percentage points",
+        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count "
+        "as 8 targets",
+        "the plan is only as good as the guess: a study whose sizes miss the rise of the true "
+        "curve demonstrates less",
     ]
 
 
@@ -258,19 +265,21 @@ def save_design_png(path: Path, design: StudyDesign) -> None:
 def _draw(canvas: Figure, design: StudyDesign) -> None:
     """Draw the expected limit against the number of targets (median, 10-90 %), and the sizes on
     the guessed curve."""
-    (left, right), (low, high), plan = (
+    (limits_axes, right), (low, high), plan = (
         canvas.subplots(1, 2),
         design.range_of_sizes,
         design.recommended,
     )
-    places = np.arange(len(design.plans))
+    plan_rows = np.arange(len(design.plans))
     true_size = plan.true_size
     # a bound that is not demonstrated is infinite
     lows, bounds, ends = np.array([(plan.low, plan.bound, plan.high) for plan in design.plans]).T
     top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])
-    left.vlines(places, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2)
-    left.plot(
-        places,
+    limits_axes.vlines(
+        plan_rows, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2
+    )
+    limits_axes.plot(
+        plan_rows,
         np.minimum(bounds, 9 * top),
         "o",
         color=blocks.BLUE,
@@ -278,21 +287,21 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
         mec="white",
         label="median, 10–90 %",
     )
-    for position, bound, end in zip(places, bounds, ends, strict=True):
+    for position, bound, end in zip(plan_rows, bounds, ends, strict=True):
         label = "none" if not np.isfinite(bound) else "↑" if end > top else ""
-        left.text(position, top, label, ha="center", va="top", color=blocks.BLUE)
+        limits_axes.text(position, top, label, ha="center", va="top", color=blocks.BLUE)
     label = plain(f"the guess's a90: {design.text(true_size)}")
-    left.axhline(true_size, color=blocks.RED, lw=1.2, label=label)
+    limits_axes.axhline(true_size, color=blocks.RED, lw=1.2, label=label)
     if design.goal is not None:
         label = plain(f"wanted: {design.text(design.goal)}")
-        left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=label)
-    left.set(
-        xlim=(-0.6, len(places) - 0.4),
+        limits_axes.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=label)
+    limits_axes.set(
+        xlim=(-0.6, len(plan_rows) - 0.4),
         ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))),
     )
-    left.set_xticks(places, [str(plan.targets) for plan in design.plans])
-    left.set(xlabel="targets", ylabel=axis_text("expected a90/95", design.unit))
-    left.set_title(f"{plan.studies} simulated studies each")
+    limits_axes.set_xticks(plan_rows, [str(plan.targets) for plan in design.plans])
+    limits_axes.set(xlabel="targets", ylabel=axis_text("expected a90/95", design.unit))
+    limits_axes.set_title(f"{plan.studies} simulated studies each")
     sizes = np.linspace(low, high, 241)[1:]
     right.plot(
         sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}"
@@ -302,13 +311,13 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
         plan.sizes, np.full(plan.targets, -0.08), "|", label=f"{plan.targets} targets", **style
     )
     for pod in (0.5, POD):
-        at = design.guess.size_at(pod)
-        right.plot([at, at], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
+        size = design.guess.size_at(pod)
+        right.plot([size, size], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
     right.set(ylim=(-0.16, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))
     right.set(
         xlabel=axis_text("size", design.unit),
         ylabel="probability of detection",
         title="Sizes to make",
     )
-    for axes in (left, right):
+    for axes in (limits_axes, right):
         axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=1, borderaxespad=0)

@@ -38,9 +38,9 @@ def curve_through(
     """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (same unit); its
     covariance is zero. Raises UserError if it would not rise, or if a size is not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
-        what = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
+        problem = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
         raise UserError(
-            what,
+            problem,
             legal="0 < a50 < a90",
             fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger",
         )
@@ -96,10 +96,10 @@ def recommend(
     """Return the plan with the fewest targets, at least `LEAST_TARGETS` if any plan has them, in
     which 90 % of the studies demonstrate ``goal``, and True; else the plan with the most targets,
     and False. No goal: (fewest, None)."""
-    most = max(plan.targets for plan in plans)
+    most_targets = max(plan.targets for plan in plans)
     # below the handbook's minimum, the largest number of targets is nearest to it
     allowed = sorted(
-        (plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)),
+        (plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most_targets)),
         key=lambda p: p.targets,
     )
     reaching = [plan for plan in allowed if goal is None or plan.high <= goal]

@@ -89,12 +89,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the limit that "
-    "tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG for each board, and "
-    "gauge.json, the truth that tofpod gauge read needs.",
-    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
-    "gauge, then drill, record, and tofpod gauge read captures/gauge --gauge gauge/gauge.json --out "
-    "found",
+    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the "
+    "limit that tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), "
+    "an SVG for each board, and gauge.json, the truth that tofpod gauge read needs.",
+    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 "
+    "frames' --out gauge, then drill, record, and tofpod gauge read captures/gauge --gauge "
+    "gauge/gauge.json --out found",
     further={"read": READ},
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -121,9 +121,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     # curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
-        were = f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is {wrong_mm:.3g} mm"
+        were = (
+            f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is "
+            f"{wrong_mm:.3g} mm"
+        )
         print(
-            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other --diameters"
+            f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other "
+            "--diameters"
         )
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
@@ -137,10 +141,12 @@ def main(options: argparse.Namespace, command: str) -> int:
         "no a90/95" if chosen.bound == float("inf") else f"a90/95 of about {chosen.bound:.3g} mm"
     )
     print(
-        f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for each: {sheets}"
+        f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for "
+        f"each: {sheets}"
     )
     print(
-        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines them with a study"
+        f"expected from real hits and misses alone: {expected}; tofpod pod --prior combines them "
+        "with a study"
     )
     print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
     print(
@@ -178,31 +184,31 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
 
     try:
         width, height = map(float, options.board.lower().split("x"))
-        if not all(0 < each < LARGEST_MM for each in (width, height)):
+        if not all(0 < length_mm < LARGEST_MM for length_mm in (width, height)):
             raise ValueError("no size of a board")
     except ValueError as error:
         raise UserError(
             f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
         ) from error
     side = MARK_MM
-    apart = options.apart
-    if not 0 < options.diameters[1] < apart - 4:
-        what = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm overlap"
-        raise UserError(what, legal="at least their diameter plus 5 mm")
+    spacing = options.apart
+    if not 0 < options.diameters[1] < spacing - 4:
+        problem = f"--apart {spacing:g}: holes of {options.diameters[1]:g} mm overlap"
+        raise UserError(problem, legal="at least their diameter plus 5 mm")
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
     rim = options.diameters[1] / 2 + EDGE_MM
     room = [size - 2 * rim for size in (width, height)]
     xs, ys = (
-        np.linspace(-size / 2, size / 2, max(int(size // apart) + 1, 2)).round(2).tolist()
+        np.linspace(-size / 2, size / 2, max(int(size // spacing) + 1, 2)).round(2).tolist()
         for size in room
     )
     clear = side / 2 + options.diameters[1] / 2 + CLEAR_MM
-    places = [
+    free_mm = [
         (x, y) for y in ys for x in xs if (np.abs(corners - (x, y)).max(axis=1) >= clear).all()
     ]
-    count = -(-len(sizes) // max(len(places), 1))
-    if not places or min(*inset, *room) <= side or 4 * count > CODES:
+    count = -(-len(sizes) // max(len(free_mm), 1))
+    if not free_mm or min(*inset, *room) <= side or 4 * count > CODES:
         fix = "a larger --board, a smaller --apart, or fewer --targets"
         raise UserError(
             f"{len(sizes)} holes need {count} boards of {width:g} x {height:g} mm", fix=fix
@@ -211,23 +217,23 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
     boards = []
     for number in range(count):
         stream = random_stream(SEED, "gauge board", number)
-        own = drilled[number::count]
-        chosen = stream.permutation(len(places))[: len(own)]
-        deep: list[float | None] = [None] * len(own)
+        sheet_holes = drilled[number::count]
+        chosen = stream.permutation(len(free_mm))[: len(sheet_holes)]
+        deep: list[float | None] = [None] * len(sheet_holes)
         if options.depths:
-            parts = (stream.permutation(len(own)) + 0.5) / len(own)
+            parts = (stream.permutation(len(sheet_holes)) + 0.5) / len(sheet_holes)
             deep = np.round(
                 options.depths[0] + parts * (options.depths[1] - options.depths[0]), 1
             ).tolist()
         holes = tuple(
             GaugeHole(
                 id=k + 1,
-                diameter_mm=float(own[k]),
+                diameter_mm=float(sheet_holes[k]),
                 depth_mm=deep[k],
-                x_mm=places[at][0],
-                y_mm=places[at][1],
+                x_mm=free_mm[position][0],
+                y_mm=free_mm[position][1],
             )
-            for k, at in enumerate(chosen.tolist())
+            for k, position in enumerate(chosen.tolist())
         )
         corner = enumerate(corners.tolist(), start=4 * number)
         marks = tuple(GaugeMark(code=code, x_mm=x, y_mm=y, side_mm=side) for code, (x, y) in corner)
@@ -235,7 +241,7 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         boards.append(
             GaugeBoard(name=name, width_mm=width, height_mm=height, marks=marks, holes=holes)
         )
-    return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * apart, boards=tuple(boards))
+    return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * spacing, boards=tuple(boards))
 
 
 if __name__ == "__main__":

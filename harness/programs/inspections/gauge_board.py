@@ -179,17 +179,17 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
     counted = (detector, threshold, gauge.hit_radius_mm)
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # infrared images show printed codes too
-        known = cloud.amplitude[np.isfinite(cloud.amplitude)]
+        amplitudes = cloud.amplitude[np.isfinite(cloud.amplitude)]
         scaled = (
             255
             * np.nan_to_num(cloud.amplitude)
-            / max(float(np.quantile(known, 0.99)) if known.size else 0, 1e-9)
+            / max(float(np.quantile(amplitudes, 0.99)) if amplitudes.size else 0, 1e-9)
         )
         cloud = replace(
             cloud, rgb=np.repeat(np.clip(scaled, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
         )
-    found = find_marks(cloud, cloud.valid, CodedMarks(dictionary=gauge.dictionary))
-    by_code = {mark.code: mark for mark in found.trusted}
+    marks_read = find_marks(cloud, cloud.valid, CodedMarks(dictionary=gauge.dictionary))
+    by_code = {mark.code: mark for mark in marks_read.trusted}
     rows: list[GaugeRow] = []
     warnings = []
     notes = []
@@ -204,22 +204,31 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         apart_m = np.linalg.norm(transform_points(T_camera_board, on_board) - in_camera, axis=-1)
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
         notes.append(
-            f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on the board"
+            f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on the "
+            "board"
         )
         if fit_mm > WORST_FIT_MM:
             doubt = (
                 f"its marks are {fit_mm:.1f} mm off: check that it is flat and was printed at 100 %"
             )
             warnings.append(f"{board.name}: {doubt}")
-        own, beside = _matched(board, counted, judged, invert(T_camera_board))
-        if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
-            outside = "is too close to the edge of the judged area, so it counts neither as a hit nor as a miss"
+        hits, beside = _matched(board, counted, judged, invert(T_camera_board))
+        if unjudged := [str(row.hole.id) for row in hits if row.found == "NA"]:
+            outside = (
+                "is too close to the edge of the judged area, so it counts neither as a hit nor "
+                "as a miss"
+            )
             warnings.append(f"{board.name}: hole {', '.join(unjudged)} {outside}")
-        rows += own
+        rows += hits
         calls += beside
     if not rows:
-        why = found.problem or f"{len(by_code)} codes were read, but no board has three of them"
-        fix = "show the whole board, closer to the camera, in the image that is recorded with the depth"
+        why = (
+            marks_read.problem or f"{len(by_code)} codes were read, but no board has three of them"
+        )
+        fix = (
+            "show the whole board, closer to the camera, in the image that is recorded with the "
+            "depth"
+        )
         raise UserError(f"--gauge: no board is recognised: {why}", fix=fix)
     return GaugeSeen(tuple(rows), calls, tuple(warnings), tuple(notes))
 
@@ -239,15 +248,15 @@ def _matched(
             (lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2]
         )
 
-    places = on_face(np.array([detection.centre_m for detection in judged.detections]))
+    centres_mm = on_face(np.array([detection.centre_m for detection in judged.detections]))
     centres = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes]) * MM
-    pairs = match(centres, places, radius_m)
+    pairs = match(centres, centres_mm, radius_m)
     score = judged.evidence.score
     points = judged.cloud.points_m
-    seen = on_face(points[np.isfinite(score) & np.isfinite(points[..., 2])])
+    judged_mm = on_face(points[np.isfinite(score) & np.isfinite(points[..., 2])])
     rows = []
     for number, (hole, centre) in enumerate(zip(board.holes, centres, strict=True)):
-        away = seen - centre
+        away = judged_mm - centre
         away = away[np.linalg.norm(away, axis=-1) < radius_m + hole.diameter_mm / 2 * MM]
         sides = (
             np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi / SIDES)).astype(int) % SIDES
@@ -256,12 +265,14 @@ def _matched(
         if len(np.unique(sides)) < SIDES:
             outcome = ("NA", None, None)
         elif number in pairs:
-            offset_mm = float(np.linalg.norm(places[pairs[number]] - centre)) / MM
+            offset_mm = float(np.linalg.norm(centres_mm[pairs[number]] - centre)) / MM
             outcome = ("hit", offset_mm, judged.detections[pairs[number]].score)
         rows.append(GaugeRow(board.name, hole, counted, *outcome))
-    inside = (np.abs(places) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(axis=-1)
+    inside = (np.abs(centres_mm) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(
+        axis=-1
+    )
     for mark in board.marks:
-        inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(
-            axis=-1
-        )
+        inside &= (
+            np.abs(centres_mm - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM
+        ).any(axis=-1)
     return rows, int(inside.sum()) - sum(bool(inside[finding]) for finding in pairs.values())

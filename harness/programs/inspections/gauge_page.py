@@ -41,9 +41,9 @@ def tiles_of(
             ) / 2  # the board lies in the middle of all sheets
             axes_of_tiles.append([k * (has - OVERLAP_MM) - beside for k in range(count)])
         xs, ys = axes_of_tiles
-        places = [(x, y) for y in reversed(ys) for x in xs]
-        if best is None or len(places) < len(best[1]):
-            best = (sheet, places)
+        corners = [(x, y) for y in reversed(ys) for x in xs]
+        if best is None or len(corners) < len(best[1]):
+            best = (sheet, corners)
     assert best is not None
     return best
 
@@ -56,10 +56,10 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
 
     corner = (-board.width_mm / 2, -board.height_mm / 2)
     axes.add_patch(Rectangle(corner, board.width_mm, board.height_mm, fill=False, ec=INK, lw=0.6))
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    marker_codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     for mark in board.marks:
-        modules = known.markerSize + 2
-        picture = cv2.aruco.generateImageMarker(known, mark.code, modules)
+        modules = marker_codes.markerSize + 2
+        picture = cv2.aruco.generateImageMarker(marker_codes, mark.code, modules)
         step = mark.side_mm / modules
         for row, column in np.argwhere(picture == 0).tolist():
             corner = (
@@ -105,43 +105,47 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
     buffer = io.BytesIO()
     with PdfPages(buffer, metadata={"CreationDate": None}) as pages:
         for board in boards:
-            sheet, places = tiles_of(board.width_mm, board.height_mm, paper)
-            for number, (x, y) in enumerate(places, start=1):
-                left = x - board.width_mm / 2
+            sheet, tile_corners = tiles_of(board.width_mm, board.height_mm, paper)
+            for number, (x, y) in enumerate(tile_corners, start=1):
+                left_mm = x - board.width_mm / 2
                 low = y - board.height_mm / 2
                 figure, axes = _sheet(
-                    (left - MARGIN_MM, low - MARGIN_MM - FOOT_MM, *sheet), board.name
+                    (left_mm - MARGIN_MM, low - MARGIN_MM - FOOT_MM, *sheet), board.name
                 )
                 draw_board(axes, board, dictionary)
-                title = f"{board.name}, tile {number} of {len(places)}: print at 100 %"
+                title = f"{board.name}, tile {number} of {len(tile_corners)}: print at 100 %"
                 _frame(
                     axes,
-                    (left, low, sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM),
+                    (left_mm, low, sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM),
                     title,
                 )
                 pages.savefig(figure)
     return buffer.getvalue()
 
 
-def _frame(axes: Axes, at: tuple[float, float, float, float], title: str) -> None:
+def _frame(axes: Axes, box_mm: tuple[float, float, float, float], title: str) -> None:
     """Clip what lies beyond a tile, and draw its crop marks, scale bar and name."""
     from matplotlib.patches import Rectangle
 
-    left, low, wide, high = at
-    clip = Rectangle((left - 0.5, low - 0.5), wide + 1, high + 1, transform=axes.transData)
+    left_mm, low, wide, high = box_mm
+    clip = Rectangle((left_mm - 0.5, low - 0.5), wide + 1, high + 1, transform=axes.transData)
     for artist in (*axes.patches, *axes.lines, *axes.texts):
         artist.set_clip_path(clip)
         artist.set_clip_on(True)
-    for x in (left, left + wide):
+    for x in (left_mm, left_mm + wide):
         for y in (low, low + high):
             axes.plot([x - 4, x + 4], [y, y], color=GREY, lw=0.4)
             axes.plot([x, x], [y - 4, y + 4], color=GREY, lw=0.4)
     bar = low - FOOT_MM + 3
-    axes.plot([left, left + SCALE_MM], [bar, bar], color=INK, lw=0.8)
+    axes.plot([left_mm, left_mm + SCALE_MM], [bar, bar], color=INK, lw=0.8)
     for tick in np.arange(0, SCALE_MM + 1, 10):
-        axes.plot([left + tick] * 2, [bar, bar + 2], color=INK, lw=0.5)
+        axes.plot([left_mm + tick] * 2, [bar, bar + 2], color=INK, lw=0.5)
     axes.annotate(
-        f"{SCALE_MM:g} mm   {title}", (left + SCALE_MM + 3, bar), fontsize=7, color=INK, va="center"
+        f"{SCALE_MM:g} mm   {title}",
+        (left_mm + SCALE_MM + 3, bar),
+        fontsize=7,
+        color=INK,
+        va="center",
     )
 
 
@@ -152,9 +156,9 @@ def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figur
     from matplotlib.figure import Figure
 
     rcParams["svg.hashsalt"] = name
-    left, low, wide, high = view_mm
+    left_mm, low, wide, high = view_mm
     figure = Figure(figsize=(wide / MM_PER_INCH, high / MM_PER_INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
-    axes.set(xlim=(left, left + wide), ylim=(low, low + high))
+    axes.set(xlim=(left_mm, left_mm + wide), ylim=(low, low + high))
     return figure, axes

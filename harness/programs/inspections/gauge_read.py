@@ -24,13 +24,13 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
     gauge = read_gauge(arguments.gauge)
     inspection = inspected(arguments)
     detector = f"{inspection.detector.name} {inspection.detector.version}"
-    seen = seen_on(gauge, inspection.result, detector, inspection.threshold)
-    print_inspection(inspection, further_warnings=seen.warnings)
-    output.print_notes(seen.notes)
-    show([HITS_AND_MISSES.grid(seen.rows, terminal=True)])
-    print(seen.answer)
+    reading = seen_on(gauge, inspection.result, detector, inspection.threshold)
+    print_inspection(inspection, further_warnings=reading.warnings)
+    output.print_notes(reading.notes)
+    show([HITS_AND_MISSES.grid(reading.rows, terminal=True)])
+    print(reading.answer)
     if arguments.out is not None:
-        frame = HITS_AND_MISSES.frame(seen.rows)
+        frame = HITS_AND_MISSES.frame(reading.rows)
         table = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
         write_inspection(
             inspection,
@@ -48,7 +48,7 @@ READ = Program(
     options=_options,
     run=_run,
     description="Find the boards of a gauge in a capture by their marks, inspect the capture as "
-    "tofpod detect does, and count which holes are hit. Write the findings, and hits and misses to "
-    "gauge.csv, which tofpod pod reads.",
+    "tofpod detect does, and count which holes are hit. Write the findings, and hits and misses "
+    "to gauge.csv, which tofpod pod reads.",
     epilog="example: tofpod gauge read captures/gauge --gauge gauge/gauge.json --out found",
 )

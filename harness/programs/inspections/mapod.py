@@ -101,7 +101,7 @@ class Transfer:
         """The nodes (g, 2) of ln k and ln w."""
         reach = REACH * np.sqrt(np.diag(self.scale))
         k, w = (np.linspace(-end, end, nodes) for end, nodes in zip(reach, NODES, strict=True))
-        return np.stack([each.ravel() for each in np.meshgrid(k, w, indexing="ij")], axis=1)
+        return np.stack([values.ravel() for values in np.meshgrid(k, w, indexing="ij")], axis=1)
 
     @cached_property
     def logs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -113,8 +113,8 @@ class Transfer:
         scaled = np.log if self.curve.log_size else np.positive
         k, w = np.exp(nodes.T)[..., None]
         above = scaled(sizes / k) - scaled(self.curve.size_at(0.5))
-        found, missed, _ = logs_of_link(self.curve.link, half + above / (self.curve.sigma * w))
-        return found, missed
+        log_hit, missed, _ = logs_of_link(self.curve.link, half + above / (self.curve.sigma * w))
+        return log_hit, missed
 
     def sizes_at(self, pod: float) -> np.ndarray:
         """Return the size (g,) with this POD at each node."""
@@ -136,7 +136,8 @@ class Transfer:
 
     @cached_property
     def log_prior(self) -> np.ndarray:
-        """The logarithms (g,) of the nodes' weights before any real inspection, minus a constant."""
+        """The logarithms (g,) of the nodes' weights before any real inspection, minus a
+        constant."""
         steeper = stats.norm.logcdf(self.grid[:, 1] / np.sqrt(self.own_spread[1, 1]))
         return np.asarray(
             stats.multivariate_t(np.zeros(2), self.scale, df=FREEDOM).logpdf(self.grid) + steeper
@@ -145,24 +146,24 @@ class Transfer:
     def posterior(self, rows: np.ndarray) -> np.ndarray:
         """Return the weights (g,) of the nodes after the inspections ``rows`` (n,) bool; their sum
         is 1."""
-        found, missed = self.logs
-        value = found @ (rows & self.hit) + missed @ (rows & ~self.hit) + self.log_prior
+        log_hit, missed = self.logs
+        value = log_hit @ (rows & self.hit) + missed @ (rows & ~self.hit) + self.log_prior
         weight = np.exp(value - value.max())
         return np.asarray(weight / weight.sum())
 
     def steps(self) -> tuple[BoardStep, ...]:
         """Return the estimates before any board and after each, in the order of the rows."""
-        found = []
-        seen = np.zeros(len(self.size), bool)
+        steps = []
+        is_used = np.zeros(len(self.size), bool)
         for board in ("none", *dict.fromkeys(self.board.tolist())):
-            seen = seen | (self.board == board)
-            weight = self.posterior(seen)
+            is_used = is_used | (self.board == board)
+            weight = self.posterior(is_used)
             ends = [
-                quantile(self.sizes_at(pod), weight, at)
-                for pod, at in ((0.5, 0.5), (POD, 0.5), (POD, LIMIT_AT))
+                quantile(self.sizes_at(pod), weight, level)
+                for pod, level in ((0.5, 0.5), (POD, 0.5), (POD, LIMIT_AT))
             ]
-            found.append(BoardStep(board, int(seen.sum()), int(self.hit[seen].sum()), *ends))
-        return tuple(found)
+            steps.append(BoardStep(board, int(is_used.sum()), int(self.hit[is_used].sum()), *ends))
+        return tuple(steps)
 
     def band(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the posterior's median POD at ``sizes`` (m,), and its quantiles 1 - `LIMIT_AT`
@@ -182,20 +183,20 @@ class Transfer:
         least as far from it as these. The statistic is the largest likelihood over the grid
         divided by the mean likelihood over the curves that the study's own uncertainty allows; its
         distribution is simulated at the same sizes."""
-        found, missed = self.logs
+        log_hit, missed = self.logs
         weight = stats.multivariate_normal(np.zeros(2), self.own_spread).pdf(self.grid)
         weight /= weight.sum()
         stream = random_stream(seed, "agreement", len(self.size))
         nodes = stream.choice(len(weight), DRAWS, p=weight)
         campaigns = np.vstack(
-            [self.hit, stream.random((DRAWS, len(self.size))) < np.exp(found[nodes])]
+            [self.hit, stream.random((DRAWS, len(self.size))) < np.exp(log_hit[nodes])]
         )
         statistic = []
         for block in np.array_split(campaigns, -(-len(campaigns) * len(weight) // (CELLS * 64))):
-            value = block @ found.T + ~block @ missed.T
+            value = block @ log_hit.T + ~block @ missed.T
             statistic.append(-np.log(np.exp(value - value.max(axis=1, keepdims=True)) @ weight))
-        own, *others = np.concatenate(statistic).tolist()
-        return float((1 + (np.array(others) >= own - 1e-9).sum()) / (1 + DRAWS))
+        observed, *simulated_values = np.concatenate(statistic).tolist()
+        return float((1 + (np.array(simulated_values) >= observed - 1e-9).sum()) / (1 + DRAWS))
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
@@ -231,9 +232,14 @@ class Mapod:
 
     @classmethod
     def of(
-        cls, set_up: str, simulated: PodStatement | None, why: str, read: Inspections, boards: np.ndarray | None = None,
+        cls,
+        set_up: str,
+        simulated: PodStatement | None,
+        why: str,
+        read: Inspections,
+        boards: np.ndarray | None = None,
         unlike: str = "",
-    ) -> Mapod:  # fmt: skip
+    ) -> Mapod:
         """Correct a study's curve. Raises UserError if the study has no curve, with the reason
         ``why``."""
         if simulated is None:

@@ -37,124 +37,137 @@ BOARDS = Table(
 )
 
 
-def answer(found: Mapod) -> str:
+def answer(mapod: Mapod) -> str:
     """State in two sentences whether simulation and reality agree, and the limit to quote."""
-    agrees = f"(p = {found.agrees:.2g})"
+    agrees = f"(p = {mapod.agrees:.2g})"
     first = f"The real hits and misses do not contradict the simulation {agrees}."
-    if found.contradicted:
-        first = f"The real hits and misses contradict the simulation {agrees}: the larger of the two limits counts."
-    if not np.isfinite(found.a90_95):
+    if mapod.contradicted:
+        first = (
+            f"The real hits and misses contradict the simulation {agrees}: the larger of the two "
+            "limits counts."
+        )
+    if not np.isfinite(mapod.a90_95):
         return f"{first} The real targets do not demonstrate a90/95, so no limit is stated."
-    return f"{first} A flaw of {sized(found.a90_95, 'mm')} is found 90 % of the time, with 95 % confidence (a90/95)."
+    return (
+        f"{first} A flaw of {sized(mapod.a90_95, 'mm')} is found 90 % of the time, with 95 % "
+        "confidence (a90/95)."
+    )
 
 
-def sizes_grid(found: Mapod) -> Grid:
+def sizes_grid(mapod: Mapod) -> Grid:
     """Return the table of simulated, measured and combined sizes."""
-    last = found.steps[-1]
+    last = mapod.steps[-1]
     rows = list[tuple[str, ...]]()
-    for name, sizes in (("simulated", found.simulated), ("measured", found.measured)):
+    for name, sizes in (("simulated", mapod.simulated), ("measured", mapod.measured)):
         if sizes is not None:
             bound = sized(sizes.bound.value, "") if sizes.bound.demonstrated else "not demonstrated"
             rows.append((name, sized(sizes.a50, ""), sized(sizes.a90, ""), bound, sizes.counts))
         else:
-            rows.append((name, "-", "-", "not demonstrated", found.why))
-    both = f"{found.set_up}, corrected by {last.targets} real targets"
+            rows.append((name, "-", "-", "not demonstrated", mapod.why))
+    combined_label = f"{mapod.set_up}, corrected by {last.targets} real targets"
     rows.append(
-        ("combined", *(sized(size, "") for size in (last.a50, last.a90, last.a90_95)), both)
+        (
+            "combined",
+            *(sized(size, "") for size in (last.a50, last.a90, last.a90_95)),
+            combined_label,
+        )
     )
     return Grid.of(("", "a50 (mm)", "a90 (mm)", "a90/95 (mm)", "from"), rows, left=1)
 
 
-def notes(found: Mapod) -> list[str]:
+def notes(mapod: Mapod) -> list[str]:
     """Return sentences on the prior, the tests and the stopping rule."""
     lines = [
-        "Transfer function: real damage of size k a is found as easily as simulated damage of size a, and the rise "
-        f"of the curve is w times as wide. Prior: ln k and ln w follow Student's distribution about 0 with {FREEDOM:g} "
-        f"degrees of freedom and scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, plus "
-        "the simulated curve's own uncertainty; w is below 1 only within that uncertainty.",
-        "Combined: medians of the posterior, and its 97.5 % quantile for a90/95 (for simulated and for measured hits, "
-        "a90/95 is the handbook's likelihood ratio bound); the largest over the models that fit the simulated hits "
-        "about equally well. If the simulation is contradicted, the larger of combined and measured limit counts.",
-        "If the simulated curve were right, hits and misses at least as far from it would occur with probability "
-        f"{found.agrees:.2g}; a probability below 0.05 counts as a contradiction.",
-        f"Stopping rule: stop when a90/95 is at most {ENOUGH:g} times a90. The rule was fixed before any board.",
+        "Transfer function: real damage of size k a is found as easily as simulated damage of "
+        "size a, and the rise of the curve is w times as wide. Prior: ln k and ln w follow "
+        f"Student's distribution about 0 with {FREEDOM:g} degrees of freedom and scales of a "
+        f"factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, plus the simulated curve's own "
+        "uncertainty; w is below 1 only within that uncertainty.",
+        "Combined: medians of the posterior, and its 97.5 % quantile for a90/95 (for simulated "
+        "and for measured hits, a90/95 is the handbook's likelihood ratio bound); the largest "
+        "over the models that fit the simulated hits about equally well. If the simulation is "
+        "contradicted, the larger of combined and measured limit counts.",
+        "If the simulated curve were right, hits and misses at least as far from it would occur "
+        f"with probability {mapod.agrees:.2g}; a probability below 0.05 counts as a contradiction.",
+        f"Stopping rule: stop when a90/95 is at most {ENOUGH:g} times a90. The rule was fixed "
+        "before any board.",
     ]
-    return [*lines, *found.read.notes, VALIDITY]
+    return [*lines, *mapod.read.notes, VALIDITY]
 
 
-def doubts(found: Mapod) -> list[str]:
+def doubts(mapod: Mapod) -> list[str]:
     """Return the reasons to doubt the combined limit."""
     texts = (
-        [f"{found.unlike}: a difference counts as an error of the simulation"]
-        if found.unlike
+        [f"{mapod.unlike}: a difference counts as an error of the simulation"]
+        if mapod.unlike
         else []
     )
-    return texts + ["the real hits and misses contradict the simulation"] * found.contradicted
+    return texts + ["the real hits and misses contradict the simulation"] * mapod.contradicted
 
 
-def mapod_parts(found: Mapod) -> list[str | Grid]:
+def mapod_parts(mapod: Mapod) -> list[str | Grid]:
     """Return the parts for a terminal; reasons to doubt the limit come first."""
-    shown: list[str | Grid] = [f"warning: {text}" for text in doubts(found)]
+    shown: list[str | Grid] = [f"warning: {text}" for text in doubts(mapod)]
     shown += [
-        sizes_grid(found),
+        sizes_grid(mapod),
         "",
-        BOARDS.grid(found.steps),
+        BOARDS.grid(mapod.steps),
         "",
-        *(f"note: {text}" for text in notes(found)),
+        *(f"note: {text}" for text in notes(mapod)),
     ]
-    return [*shown, "", answer(found)]
+    return [*shown, "", answer(mapod)]
 
 
-def mapod_html(found: Mapod, command: str) -> str:
+def mapod_html(mapod: Mapod, command: str) -> str:
     """Return the page as text; it needs no network."""
     caption = (
-        "The simulated curve, the curve of the real hits (above) and misses (below) alone, and the combined curve with "
-        "its 95 % credible band, the widest over all simulated models."
+        "The simulated curve, the curve of the real hits (above) and misses (below) alone, and "
+        "the combined curve with its 95 % credible band, the widest over all simulated models."
     )
-    drawn = blocks.svg("mapod", SIZE_IN, answer(found), lambda figure: _draw(figure, found))
-    body = [blocks.heading("Simulated, measured, combined"), sizes_grid(found).html()]
+    drawn = blocks.svg("mapod", SIZE_IN, answer(mapod), lambda figure: _draw(figure, mapod))
+    body = [blocks.heading("Simulated, measured, combined"), sizes_grid(mapod).html()]
     body += [blocks.figure({"mapod": drawn}, "mapod", caption)]
-    body += [blocks.heading("After each board"), BOARDS.grid(found.steps).html()]
-    body += [blocks.heading("Notes"), blocks.bullets(notes(found)), *blocks.command_of(command)]
-    title = f"Model-assisted probability of detection: {found.read.path.name}"
-    return blocks.page(title, answer(found), body, warnings=doubts(found))
+    body += [blocks.heading("After each board"), BOARDS.grid(mapod.steps).html()]
+    body += [blocks.heading("Notes"), blocks.bullets(notes(mapod)), *blocks.command_of(command)]
+    title = f"Model-assisted probability of detection: {mapod.read.path.name}"
+    return blocks.page(title, answer(mapod), body, warnings=doubts(mapod))
 
 
-def save_mapod_png(path: Path, found: Mapod) -> None:
+def save_mapod_png(path: Path, mapod: Mapod) -> None:
     """Write the figure as a PNG to ``path``."""
-    blocks.save_png(path, SIZE_IN, lambda figure: _draw(figure, found))
+    blocks.save_png(path, SIZE_IN, lambda figure: _draw(figure, mapod))
 
 
-def _draw(figure: Figure, found: Mapod) -> None:
+def _draw(figure: Figure, mapod: Mapod) -> None:
     curves = figure.subplots()
-    middle, low, high = found.band
-    curves.fill_between(found.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
-    curves.plot(found.sizes, middle, color=BLUE, lw=2.2, label="combined")
+    middle, low, high = mapod.band
+    curves.fill_between(mapod.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
+    curves.plot(mapod.sizes, middle, color=BLUE, lw=2.2, label="combined")
     curves.plot(
-        found.sizes,
-        found.simulated.curve.pod(found.sizes),
+        mapod.sizes,
+        mapod.simulated.curve.pod(mapod.sizes),
         color=PURPLE,
         ls="--",
         label="simulated",
     )
-    if found.measured is not None:
+    if mapod.measured is not None:
         curves.plot(
-            found.sizes,
-            found.measured.curve.pod(found.sizes),
+            mapod.sizes,
+            mapod.measured.curve.pod(mapod.sizes),
             color=ORANGE,
             ls=":",
             lw=2,
             label="measured",
         )
-    draw_hits(curves, found.read.size, found.read.response == 1)
+    draw_hits(curves, mapod.read.size, mapod.read.response == 1)
     curves.axhline(POD, color=GREY, lw=0.8, ls=":")
-    if found.sizes[0] < found.a90_95 < found.sizes[-1]:
+    if mapod.sizes[0] < mapod.a90_95 < mapod.sizes[-1]:
         curves.plot(
-            [found.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(found.a90_95, 'mm')}"
+            [mapod.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(mapod.a90_95, 'mm')}"
         )
     hits_in_view(curves)
     curves.set(
-        xlim=(found.sizes[0], found.sizes[-1]),
+        xlim=(mapod.sizes[0], mapod.sizes[-1]),
         xlabel="size (mm)",
         ylabel="probability of detection",
     )

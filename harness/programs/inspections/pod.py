@@ -30,7 +30,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="CSV or Excel (.xlsx): a header row, then one row per inspection",
     )
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
-    hits = "column with 1 (found) and 0 (missed), yes and no, or hit and miss; give it once for each inspector"
+    hits = (
+        "column with 1 (found) and 0 (missed), yes and no, or hit and miss; give it once for each "
+        "inspector"
+    )
     add("--hit", metavar="COL", action="append", help=hits)
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
     add(
@@ -73,8 +76,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="signals at or above this value are censored (saturation)",
     )
     put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
-    about = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
-    put = parser.add_argument_group(about).add_argument
+    prior_help = (
+        "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and "
+        "misses"
+    )
+    put = parser.add_argument_group(prior_help).add_argument
     prior = "folder of a study, simulated or by virtual damage (tofpod implant)"
     put("--prior", type=Path, metavar="STUDY", help=prior)
     put("--set-up", metavar="NAME", help='set-up of the study: "50 frames"')
@@ -87,8 +93,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Fit a probability of detection curve to inspections, one per row of a table, and state the size that is "
-    "found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png and pod.html.",
+    "Fit a probability of detection curve to inspections, one per row of a table, and state the "
+    "size that is found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png "
+    "and pod.html.",
     epilog="example: tofpod pod blades.csv --hit found --size length --target blade --unit mm",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -100,18 +107,20 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.provenance import RESULTS_VERSION
     from harness.vocabulary.text import show
 
-    found: Any = _stated(options) if options.prior is None else _corrected(options)
+    statement: Any = _stated(options) if options.prior is None else _corrected(options)
     alone = (pod_parts, save_pod_png, pod_html)
     combined = (mapod_parts, save_mapod_png, mapod_html)
     parts, save_png, html = alone if options.prior is None else combined
-    show(parts(found))
+    show(parts(statement))
     stem = "pod" if options.prior is None else "mapod"
     data = options.out / f"{stem}.{'json'}"
     picture = options.out / f"{stem}.{'png'}"
     page = options.out / f"{stem}.{'html'}"
-    write_json(data, {"results_version": RESULTS_VERSION, **found.to_data(), "command": command})
-    save_png(picture, found)
-    write_text(page, html(found, command))
+    write_json(
+        data, {"results_version": RESULTS_VERSION, **statement.to_data(), "command": command}
+    )
+    save_png(picture, statement)
+    write_text(page, html(statement, command))
     print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
@@ -150,15 +159,20 @@ def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
     from harness.evaluation.pod.inspections import texts_of
 
     counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"
-    own = counted.format(f"{study.detector} {study.detector_version}", study.threshold, radius_mm)
+    study_rule = counted.format(
+        f"{study.detector} {study.detector_version}", study.threshold, radius_mm
+    )
     real = {f"in a way that {read.path.name} does not state"}
     with suppress(UserError, ValueError):
         columns = [texts_of(read, name) for name in ("detector", "threshold", "hit_radius_mm")]
-        real = {counted.format(by, float(k), float(mm)) for by, k, mm in zip(*columns, strict=True)}
+        real = {
+            counted.format(detector, float(k), float(mm))
+            for detector, k, mm in zip(*columns, strict=True)
+        }
     return (
         ""
-        if real == {own}
-        else f"real hits were counted {'; '.join(sorted(real))}; those of the study {own}"
+        if real == {study_rule}
+        else f"real hits were counted {'; '.join(sorted(real))}; those of the study {study_rule}"
     )
 
 
@@ -174,9 +188,9 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     of_hits = options.hit is not None
     legal = "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
-        what = "one of them, not both" if of_hits else "no column states what was found"
+        problem = "one of them, not both" if of_hits else "no column states what was found"
         raise UserError(
-            f"--hit and --ahat: {what}",
+            f"--hit and --ahat: {problem}",
             legal=legal,
             fix="name one column; the program does not guess",
         )
@@ -196,9 +210,9 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     )
     if of_hits and read.response.min() == read.response.max():
         kind = "hits" if read.response[0] else "misses"
-        what = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
+        problem = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
         raise UserError(
-            f"{what}, but a curve needs both hits and misses", fix="add targets of other sizes"
+            f"{problem}, but a curve needs both hits and misses", fix="add targets of other sizes"
         )
     if options.log:
         table.require_positive(read, response=False, why="--log")

@@ -57,15 +57,17 @@ PATTERN_PX = (3, 6, 12)
 ANGLES_DEG = (0, 20, 35, 60)
 CLOSE = 0.3  # largest difference of a ratio from 1 that counts as agreement
 HOW = (
-    "The board is declared, its view is rendered with light between its surfaces, the camera is simulated from its "
-    "unchanged file, and the frames are resampled to the capture's pixels. The same analysis is applied to both: a "
-    "quadratic surface is fitted to a ring of 6.5 to 13.5 mm around each hole, and the hole's peak is the largest "
-    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not simulated: objects on the board, "
-    "its relief, and the maker's treatment of pixels between surfaces. Detectors see whole images, at one threshold."
+    "The board is declared, its view is rendered with light between its surfaces, the camera is "
+    "simulated from its unchanged file, and the frames are resampled to the capture's pixels. The "
+    "same analysis is applied to both: a quadratic surface is fitted to a ring of 6.5 to 13.5 mm "
+    "around each hole, and the hole's peak is the largest deviation from it within 6 mm of the "
+    "centre. No other parameter is fitted. Not simulated: objects on the board, its relief, and "
+    "the maker's treatment of pixels between surfaces. Detectors see whole images, at one "
+    "threshold."
 )
 CAPTION = (
-    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; temporal deviations "
-    "have those of a jackknife over frames."
+    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; "
+    "temporal deviations have those of a jackknife over frames."
 )
 Readings = dict[tuple[str, str, str], tuple[Reading, int]]
 """Readings with their numbers of pixels or holes, by quantity, condition and unit."""
@@ -103,25 +105,33 @@ class Image:
         plane = np.concatenate([self.plan_mm * MM, np.zeros((*self.lens.whole.shape, 1))], axis=-1)
         in_depth = transform_points(invert(self.T_image_depth) @ self.T_image_board, plane)
         u, v = np.moveaxis(camera.nominal_lens.project(in_depth).astype(np.float32), -1, 0)
-        own = Image(camera.nominal_lens, np.eye(4), np.eye(4)).rays @ self.T_image_depth[2, :3]
-        moved = [(z * own + self.T_image_depth[2, 3]).astype(np.float32) for z in z_m]
-        seen = [cv2.remap(z, u, v, cv2.INTER_LINEAR, borderValue=float("nan")) for z in moved]
-        return np.asarray(np.round(np.stack(seen) / camera.z_step_m) * camera.z_step_m)
+        depth_per_z = (
+            Image(camera.nominal_lens, np.eye(4), np.eye(4)).rays @ self.T_image_depth[2, :3]
+        )
+        moved = [(z * depth_per_z + self.T_image_depth[2, 3]).astype(np.float32) for z in z_m]
+        remapped = [cv2.remap(z, u, v, cv2.INTER_LINEAR, borderValue=float("nan")) for z in moved]
+        return np.asarray(np.round(np.stack(remapped) / camera.z_step_m) * camera.z_step_m)
 
 
 def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Image:
     """Return the image to compare: the depth camera's own if there is no capture or the capture
     has its size, otherwise that of the camera's colour camera. Raises UserError if the camera's
     file has no colour camera."""
-    own = camera.nominal_lens
+    depth_lens = camera.nominal_lens
     T_depth_board = target.pose.T_camera_board
-    if lens is None or (lens.width, lens.height) == (own.width, own.height):
-        return Image(lens or own, T_depth_board, np.eye(4))
+    if lens is None or (lens.width, lens.height) == (depth_lens.width, depth_lens.height):
+        return Image(lens or depth_lens, T_depth_board, np.eye(4))
     colour = getattr(camera, "colour", None)
     if colour is None:
-        what = f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has {own.width} x {own.height}"
-        legal = "the camera's own depth images, or images aligned to a colour camera that its file places"
-        raise UserError(what, legal=legal)
+        problem = (
+            f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has "
+            f"{depth_lens.width} x {depth_lens.height}"
+        )
+        legal = (
+            "the camera's own depth images, or images aligned to a colour camera that its file "
+            "places"
+        )
+        raise UserError(problem, legal=legal)
     lens = (
         lens if any(lens.distortion) else replace(lens, distortion=tuple(colour.distortion.value))
     )
@@ -173,46 +183,48 @@ def measured(
         peaks[number] = float(np.nanmax(residual_mm[from_centre < PEAK_MM]))
         noises.append(z_m[:, *cut][:, ring])
         for size, pattern in patterns.items():
-            whole = ndimage.uniform_filter(ring.astype(float), size) > 1 - 1e-6
-            pattern.append(ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)[whole])
+            is_inside = ndimage.uniform_filter(ring.astype(float), size) > 1 - 1e-6
+            pattern.append(
+                ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)[is_inside]
+            )
     if not noises:
         raise UserError(
             "no hole is in view together with the face around it", fix="check the declared pose"
         )
     flat = np.concatenate(noises, axis=1)[:, None]
-    seen = np.isfinite(peaks)
+    in_view = np.isfinite(peaks)
     angles = _angles_deg(target)
     noise = jackknifed(flat, lambda z: temporal_sigma_m(z) / MM)
     readings: Readings = {("temporal deviation", "on the face", "mm"): (noise, flat.shape[2])}
     for size, parts in patterns.items():
         values = np.concatenate(parts)
         if values.size:
-            at = f"means over {size} x {size} px"
-            readings["fixed pattern", at, "mm"] = Reading(float(values.std())), values.size
+            condition = f"means over {size} x {size} px"
+            readings["fixed pattern", condition, "mm"] = Reading(float(values.std())), values.size
     for low, high in (*pairwise(ANGLES_DEG), (0, 90)):
-        at = "all" if high == 90 else f"{low} to {high} degrees off the axis"
-        chosen = peaks[(angles >= low) & (angles < high) & seen]
-        readings["peak of a hole", at, "mm"] = mean_of(chosen), chosen.size
+        condition = "all" if high == 90 else f"{low} to {high} degrees off the axis"
+        chosen = peaks[(angles >= low) & (angles < high) & in_view]
+        readings["peak of a hole", condition, "mm"] = mean_of(chosen), chosen.size
     for name, settings in detectors.items():
         detector = load_detector(name, settings)
         findings = detector.find(cloud, detector.analyse(cloud), config.threshold.k or 0.0)
         at_mm = np.array(
             [image.plan_mm.reshape(-1, 2)[spot.pixels].mean(axis=0) for spot in findings]
         ).reshape(-1, 2)
-        hits = len(match(centres[seen], at_mm, config.matching.radius_mm))
+        hits = len(match(centres[in_view], at_mm, config.matching.radius_mm))
         readings["share of holes found", name, ""] = (
-            Reading(hits / int(seen.sum())),
-            int(seen.sum()),
+            Reading(hits / int(in_view.sum())),
+            int(in_view.sum()),
         )
     return readings, peaks
 
 
 def _angles_deg(target: TargetConfig) -> np.ndarray:
     """Return the angle (n,) of each hole from the depth camera's axis."""
-    places = transform_points(
+    centres_m = transform_points(
         target.pose.T_camera_board, np.array([[*hole.centre_m, 0.0] for hole in target.holes])
     )
-    return np.degrees(np.arctan2(np.linalg.norm(places[:, :2], axis=-1), places[:, 2]))
+    return np.degrees(np.arctan2(np.linalg.norm(centres_m[:, :2], axis=-1), centres_m[:, 2]))
 
 
 def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
@@ -247,9 +259,12 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     source = points[0].config.simulated
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
-        what = f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k"
+        problem = (
+            f"{options.board}: declares no drilled board in front of a simulated camera, or no "
+            "threshold k"
+        )
         legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
-        raise UserError(what, legal=legal)
+        raise UserError(problem, legal=legal)
     camera = camera_of(source.camera)
     frames = config.capture.frames
     remarks = []
@@ -257,7 +272,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     image = image_of(target, camera, recording.lens if recording else None)
     judged = {}
     if recording is not None:
-        left_out = {left.name: left.why for left in average(recording, AverageConfig()).left_out}
+        left_out = {frame.name: frame.why for frame in average(recording, AverageConfig()).left_out}
         remarks = [f"{name} is left out: {why}" for name, why in left_out.items()]
         z_m = np.stack(
             [frame.z_m for frame in recording.frames() if frame.name not in left_out]
@@ -271,8 +286,8 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
         )
         real = judged["capture"][0] if recording else {}
         for key, (value, count) in judged[label][0].items():
-            known = real[key][0] if key in real else Reading(float("nan"))
-            rows.append(Beside(label, *key, count, known, value))
+            recorded = real[key][0] if key in real else Reading(float("nan"))
+            rows.append(Beside(label, *key, count, recorded, value))
         print(f"simulated: {label}", flush=True)
     answer = (
         _answer(rows) if recording else "No capture is given, so there is nothing to compare with."
@@ -313,14 +328,15 @@ def _simulated(point: Point, image: Image, frames: int, options: argparse.Namesp
     view, _ = cached_view(target, camera.optics, source.render, options.out / ".cache" / "renders")
     unit = SimulatedUnit(camera, source.camera, view)
     z_m = np.full((frames, *camera.nominal_lens.whole.shape), np.nan)
-    place = unit.region.within(camera.nominal_lens.whole)
+    region = unit.region.within(camera.nominal_lens.whole)
     for number, frame in enumerate(unit.capture(frames, point.config.seed, "board").frames()):
-        z_m[number, *place] = frame.z_m
+        z_m[number, *region] = frame.z_m
     return z_m if np.array_equal(image.T_image_depth, np.eye(4)) else image.resampled(z_m, camera)
 
 
 def _answer(rows: list[Beside]) -> str:
-    """Return a sentence that names the set-up closest to the capture and its figures that differ."""
+    """Return a sentence that names the set-up closest to the capture and its figures that
+    differ."""
     ratios: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.measured.value > 0 and np.isfinite(row.simulated.value):
@@ -335,9 +351,14 @@ def _answer(rows: list[Beside]) -> str:
         off,
         key=lambda where: (len(off[where]), sum(abs(np.log(r)) for r in ratios[where].values())),
     )
-    share = f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within {100 * CLOSE:.0f} %"
-    rest = "".join(f"; {what}: {ratio:.2f} of the capture's" for what, ratio in off[best].items())
-    return f"Of {len(ratios)} set-ups, {best} is closest: {share} of the capture{rest}."
+    share = (
+        f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within "
+        f"{100 * CLOSE:.0f} %"
+    )
+    other_ratios = "".join(
+        f"; {quantity}: {ratio:.2f} of the capture's" for quantity, ratio in off[best].items()
+    )
+    return f"Of {len(ratios)} set-ups, {best} is closest: {share} of the capture{other_ratios}."
 
 
 def _draw(

@@ -70,10 +70,10 @@ class Published(Config):
         low, high = (self.above, self.below) if self.value is None else (self.value, self.value)
         return (-float("inf") if low is None else low), (float("inf") if high is None else high)
 
-    def limits(self, near: float, tolerance: float = 0.0) -> tuple[float, float]:
+    def limits(self, nearest: float, tolerance: float = 0.0) -> tuple[float, float]:
         """Return the lowest and highest value that pass: ``tolerance`` beyond the ends, or a share
         ``near`` if more."""
-        slack = max(tolerance, near * abs(self.value or 0.0))
+        slack = max(tolerance, nearest * abs(self.value or 0.0))
         return self.ends[0] - slack, self.ends[1] + slack
 
     def in_words(self) -> str:
@@ -151,13 +151,13 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
     for number, data in enumerate(entries if isinstance(entries, list) else []):
         for key, legal in (("quantity", QUANTITIES), ("camera", camera_names())):
             word = child(data, key)
-            at = ("figures", number, key)
+            yaml_path = ("figures", number, key)
             if (
                 isinstance(word, str)
                 and word not in legal
                 and not (key == "camera" and word.endswith(".yaml"))
             ):
-                problems.append(wrong_choice(at, word, legal, source.place_of(at)))
+                problems.append(wrong_choice(yaml_path, word, legal, source.place_of(yaml_path)))
         quantity = child(data, "quantity")
         name = child(data, "name")
         if (
@@ -167,19 +167,19 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
         ):
             splices["figures", number, "conditions"] = QUANTITIES[quantity].conditions
         if isinstance(name, str) and first.setdefault(name, number) != number:
-            place = source.place_of(("figures", number, "name"))
+            location = source.place_of(("figures", number, "name"))
             used = source.place_of(("figures", first[name], "name"))
             problems.append(
                 Problem(
                     f"two figures have the name {name}",
-                    place,
+                    location,
                     other=used,
                     other_says="first used at",
                 )
             )
-    file, found = validated(FiguresFile, source, splices)
+    file, declared = validated(FiguresFile, source, splices)
     if problems or file is None:
-        raise DeclarationError(str(path), [*problems, *found])
+        raise DeclarationError(str(path), [*problems, *declared])
     return file.figures
 
 
@@ -306,8 +306,8 @@ def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
 
 
 def _ratio(row: Beside) -> str:
-    known = row.unit == "mm" and row.measured.value > 0 and np.isfinite(row.simulated.value)
-    return f"{row.simulated.value / row.measured.value:.2f}" if known else "–"
+    is_comparable = row.unit == "mm" and row.measured.value > 0 and np.isfinite(row.simulated.value)
+    return f"{row.simulated.value / row.measured.value:.2f}" if is_comparable else "–"
 
 
 def _named(score: Score) -> str:

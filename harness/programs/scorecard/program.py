@@ -39,20 +39,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 HOW = (
-    "Each quantity is measured on simulated frames as it was on the real camera, under the conditions of the source. "
-    "A figure of a real camera passes if the simulated value lies within 25 % of the published value; if the source "
-    "states a wider tolerance, that applies, and the verdict says so. A bound must hold. Blind: nothing was fitted to "
-    "the figure. Calibration: the camera file was, or may have been, fitted to it, so it is not a test. Tags of "
-    "sources: R read for this project in the named public source, D derived from such a source, S a single secondary "
-    "source, W measured on public captures, M from memory or a guess."
+    "Each quantity is measured on simulated frames as it was on the real camera, under the "
+    "conditions of the source. A figure of a real camera passes if the simulated value lies "
+    "within 25 % of the published value; if the source states a wider tolerance, that applies, "
+    "and the verdict says so. A bound must hold. Blind: nothing was fitted to the figure. "
+    "Calibration: the camera file was, or may have been, fitted to it, so it is not a test. Tags "
+    "of sources: R read for this project in the named public source, D derived from such a "
+    "source, S a single secondary source, W measured on public captures, M from memory or a guess."
 )
 CHECKS = (
-    "These checks compare the program with the arithmetic of a stated filter, gate or limit of the camera file. They "
-    "say nothing about real cameras and pass only within their tolerance."
+    "These checks compare the program with the arithmetic of a stated filter, gate or limit of "
+    "the camera file. They say nothing about real cameras and pass only within their tolerance."
 )
 CAPTION = (
-    "Simulated divided by published value with its 95 % interval; the band extends 25 % to either side. Blue passes, "
-    "red fails; hollow marks are figures to which the camera file was fitted. Bounds and values of 0 have no ratio."
+    "Simulated divided by published value with its 95 % interval; the band extends 25 % to either "
+    "side. Blue passes, red fails; hollow marks are figures to which the camera file was fitted. "
+    "Bounds and values of 0 have no ratio."
 )
 FAMILIES = {
     "azure": "Azure Kinect",
@@ -69,14 +71,14 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     that cannot be written."""
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
-    every = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
-    names = dict.fromkeys(options.camera) or dict.fromkeys(each.camera for each in every)
+    all_figures = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
+    names = dict.fromkeys(options.camera) or dict.fromkeys(figure.camera for figure in all_figures)
     titles = {name: load_camera(name).title for name in names}
-    figures = [each for each in every if each.camera in titles]
-    found = scoring.measured(
+    figures = [figure for figure in all_figures if figure.camera in titles]
+    readings = scoring.measured(
         dict.fromkeys(figure.request for figure in figures), FULL, options.jobs
     )
-    scores = [scoring.Score(figure, found[figure.request]) for figure in figures]
+    scores = [scoring.Score(figure, readings[figure.request]) for figure in figures]
     provenance = {
         "results_version": RESULTS_VERSION,
         **record(command),
@@ -156,12 +158,12 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
     axis.axvspan(1 - scoring.NEAR, 1 + scoring.NEAR, color=BLUE, alpha=0.12)
     axis.axvline(1, color=BLUE, linewidth=0.8)
     for row, score in enumerate(scores):
-        known = score.simulated.interval
+        interval = score.simulated.interval
         value = score.figure.published.value
         colour = BLUE if score.passes else RED
-        if known.known and value:
+        if interval.known and value:
             axis.plot(
-                np.maximum([known.low / value, known.high / value], 1e-3),
+                np.maximum([interval.low / value, interval.high / value], 1e-3),
                 [row, row],
                 color=colour,
                 linewidth=1,
@@ -205,8 +207,14 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     values = [score for score in blind if score.figure.published.value is not None]
     bounds = [score for score in blind if score.figure.published.value is None]
     wide = sum(score.passes_by_tolerance for score in blind)
-    text = f"{share(blind)} blind figures pass{f' ({by_family})' if len(families) > 1 else ''}: {share(values)} values "
-    text += f"within 25 %{f' ({wide} by a wider tolerance of the source)' if wide else ''}, {share(bounds)} bounds; "
+    text = (
+        f"{share(blind)} blind figures pass{f' ({by_family})' if len(families) > 1 else ''}: "
+        f"{share(values)} values "
+    )
+    text += (
+        f"within 25 %{f' ({wide} by a wider tolerance of the source)' if wide else ''}, "
+        f"{share(bounds)} bounds; "
+    )
     text += f"{share(by_use['calibration'])} figures that calibrated a camera pass; "
     text += f"{share(by_use['code'])} checks of the code pass."
     new = [score.figure.name for score in scores if score.fell_behind]

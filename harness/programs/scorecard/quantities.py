@@ -258,7 +258,8 @@ def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
-    """Return one frame's z (h, w) for each of several units, cached for all patches of this plane."""
+    """Return one frame's z (h, w) for each of several units, cached for all patches of this
+    plane."""
     units = range(1, bench.effort.few_frames + 1)
     return tuple(plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] for unit in units)
 
@@ -268,18 +269,18 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
     product at the lag."""
     n = c.patch_px
     k = c.apart_px
-    found = []
+    products = []
     for z_m in _single_frames(bench, _plane(c)):
         stored_m = (
             np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
         )
-        left = _left_of_patches(stored_m, n)
-        beside = left[:, :, k:] * left[:, :, : n - k]
-        below = left[:, k:] * left[:, : n - k]
-        found.append(
-            (left.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2)
+        residual_m = _left_of_patches(stored_m, n)
+        beside = residual_m[:, :, k:] * residual_m[:, :, : n - k]
+        below = residual_m[:, k:] * residual_m[:, : n - k]
+        products.append(
+            (residual_m.var(axis=(1, 2)), (beside.mean(axis=(1, 2)) + below.mean(axis=(1, 2))) / 2)
         )
-    variance, product = np.transpose(found, (1, 0, 2))
+    variance, product = np.transpose(products, (1, 0, 2))
     return variance, product
 
 
@@ -294,15 +295,15 @@ def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
 def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Standard deviation about the patch's own plane that two averages of different frames share:
     rms over patches, mean over units."""
-    found = []
+    deviations_mm = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         z_m = plane_stack(
             bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
         ).z_m
         even = _left_of_patches(z_m[::2].mean(axis=0), c.patch_px)
         odd = _left_of_patches(z_m[1::2].mean(axis=0), c.patch_px)
-        found.append(float(np.sqrt(max((even * odd).mean(), 0.0))))
-    return mean_of(found)
+        deviations_mm.append(float(np.sqrt(max((even * odd).mean(), 0.0))))
+    return mean_of(deviations_mm)
 
 
 @_quantity("correlation within patches", PatchConditions)
@@ -329,17 +330,17 @@ def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
 def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over pixels of the average minus a smooth surface and the remaining
     noise, mean of 5 units."""
-    found = []
+    deviations_mm = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         stack = plane_stack(
             bench, c, PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH
         )
         where = np.isfinite(stack.z_m).all(axis=0)
         if where.mean() > 0.5:
-            found.append(
+            deviations_mm.append(
                 fixed_pattern(np.nan_to_num(stack.z_m), where, stack.slopes, lags=12).std_m / MM
             )
-    return mean_of(found)
+    return mean_of(deviations_mm)
 
 
 @lru_cache(maxsize=4)
@@ -398,5 +399,6 @@ def flying_share(bench: Bench, c: StepConditions) -> Reading:
 
 @_quantity("height of a step", StepConditions)
 def step_height_mm(bench: Bench, c: StepConditions) -> Reading:
-    """Mean z of the back minus that of the front, more than 8 pixels from the edge, noise alone."""
+    """Mean z of the back minus that of the front, more than 8 pixels from the edge, noise
+    alone."""
     return mean_of(_widths(bench, c)["height"] / MM)

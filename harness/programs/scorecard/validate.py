@@ -66,9 +66,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the simulated cameras like real cameras, and compare each published figure with the simulated figure. "
-    "With --capture: compare a real capture of a static scene with the simulation of the planes and edges in it.",
-    epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives no reason.",
+    "Measure the simulated cameras like real cameras, and compare each published figure with the "
+    "simulated figure. With --capture: compare a real capture of a static scene with the "
+    "simulation of the planes and edges in it.",
+    epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives "
+    "no reason.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if a figure fails without a reason, 2 for a user's mistake,
@@ -84,7 +86,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
         if options.camera or options.mask:
             raise UserError(
-                "--camera and --mask cannot be combined with --board: the experiment names the camera"
+                "--camera and --mask cannot be combined with --board: the experiment names the "
+                "camera"
             )
         reading = {
             **reading_of(options),

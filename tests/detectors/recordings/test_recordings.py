@@ -220,8 +220,8 @@ def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None
     for number, path in enumerate(pictures):
         path.rename(path.with_stem(str(100 + number)))
     recording = open_capture([folder])
-    told = f"{len(pictures)} colour pictures: 2 depth pictures have no colour"
-    assert any(told in note for note in recording.notes) and next(recording.frames()).rgb is None
+    message = f"{len(pictures)} colour pictures: 2 depth pictures have no colour"
+    assert any(message in note for note in recording.notes) and next(recording.frames()).rgb is None
 
 
 def test_colour_of_another_size_is_left_out_and_said(tmp_path: Path) -> None:
@@ -472,7 +472,7 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("head", "apart", "rest"),
+    ("head", "separator", "ending"),
     (
         ("", " ", ""),
         ("//X,Y,Z,R,G,B\n", ",", ",16,32,48"),
@@ -482,14 +482,16 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
         ("", " ", " 0.5 -0.5 0.7"),
     ),
 )
-def test_lists_of_points_in_every_dialect(tmp_path: Path, head: str, apart: str, rest: str) -> None:
-    path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, apart, rest)
+def test_lists_of_points_in_every_dialect(
+    tmp_path: Path, head: str, separator: str, ending: str
+) -> None:
+    path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, separator, ending)
     recording = open_capture([path])
     frame = next(recording.frames())
     assert not recording.organised and "unorganised points" in recording.notes[0]
     np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
-    assert (frame.rgb is not None) == ("16" in rest) and (frame.amplitude is not None) == (
-        "7" in rest.split("0.7")[0]
+    assert (frame.rgb is not None) == ("16" in ending) and (frame.amplitude is not None) == (
+        "7" in ending.split("0.7")[0]
     )
     if frame.rgb is not None:
         assert (frame.rgb == (16, 32, 48)).all()

@@ -99,21 +99,21 @@ def test_whole_millimetres_are_read_in_their_unit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     (
         ({"leave_out": "z"}, "has no field z; its fields: x (type 7, count 1), y"),
         ({"cut": 1}, "is truncated"),
         ({"cut": 10_000, "row_padding": 8}, "is truncated"),
     ),
 )
-def test_a_broken_cloud_is_refused(options: dict[str, Any], told: str) -> None:
+def test_a_broken_cloud_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match="the cloud: ") as caught:
         frame_of_message("the cloud", bags.cloud(POINTS, **options), 1.0)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_layouts_that_contradict_themselves_are_refused() -> None:
-    def told(**changes: Any) -> str:
+    def refusal_of(**changes: Any) -> str:
         message = bags.cloud(POINTS)
         for key, value in changes.items():
             setattr(message, key, value)
@@ -122,11 +122,13 @@ def test_layouts_that_contradict_themselves_are_refused() -> None:
         return str(caught.value)
 
     message = bags.cloud(POINTS)
-    assert "cannot hold 96 of" in told(row_step=100)
-    assert "holds no points (0 x 72)" in told(width=0)
-    assert "ends at byte 12 of points of 8 bytes" in told(point_step=8)
-    assert "x (type 9" in told(fields=[type(f)(f.name, f.offset, 9, 1) for f in message.fields])
-    assert "count 3" in told(fields=[type(f)(f.name, f.offset, 7, 3) for f in message.fields])
+    assert "cannot hold 96 of" in refusal_of(row_step=100)
+    assert "holds no points (0 x 72)" in refusal_of(width=0)
+    assert "ends at byte 12 of points of 8 bytes" in refusal_of(point_step=8)
+    assert "x (type 9" in refusal_of(
+        fields=[type(f)(f.name, f.offset, 9, 1) for f in message.fields]
+    )
+    assert "count 3" in refusal_of(fields=[type(f)(f.name, f.offset, 7, 3) for f in message.fields])
 
 
 # ---- a bag
@@ -182,9 +184,9 @@ def test_compressed_chunks_and_messages_are_unpacked(
 def test_a_lens_counts_only_where_the_points_lie_on_its_rays(tmp_path: Path) -> None:
     points = bags.clouds(2)
     beside = [("/a", bags.INFO, bags.info(shift_px=0.02)), ("/b", bags.INFO, bags.info(width=97))]
-    apart = open_capture([bags.write_bag(tmp_path / "apart", [*beside, *points])])
-    assert apart.lens is None and "no CameraInfo in the bag fits" in apart.notes[0]
-    assert next(apart.frames()).xy_m is not None
+    separate = open_capture([bags.write_bag(tmp_path / "apart", [*beside, *points])])
+    assert separate.lens is None and "no CameraInfo in the bag fits" in separate.notes[0]
+    assert next(separate.frames()).xy_m is not None
     right = [*beside, ("/c", bags.INFO, bags.info(shift_px=0.005))]
     assert open_capture([bags.write_bag(tmp_path / "right", [*right, *points])]).lens is not None
     # both ways give the same points, to what float32 leaves of x and y
@@ -192,7 +194,7 @@ def test_a_lens_counts_only_where_the_points_lie_on_its_rays(tmp_path: Path) -> 
         [bags.write_bag(tmp_path / "exact", [("/c", bags.INFO, bags.info()), *points])]
     )
     by_lens = average(exact, AverageConfig()).points_m
-    by_points = average(apart, AverageConfig()).points_m
+    by_points = average(separate, AverageConfig()).points_m
     np.testing.assert_allclose(by_lens, by_points, atol=3e-8)
 
 
@@ -268,20 +270,20 @@ def test_a_bag_of_depth_images_has_their_lens(tmp_path: Path, kind: str, compres
     pictures = [
         (DEPTH, bags.IMAGE, bags.depth_image(plane.depth_mm(i, noise_mm=0.6))) for i in range(3)
     ]
-    others = [
+    unrelated = [
         ("/camera/color/camera_info", bags.INFO, bags.info(shift_px=9.0)),
         ("/camera/ir/image_raw", bags.IMAGE, bags.depth_image(STORED, "mono16")),
         (LENS_TOPIC, bags.INFO, bags.info()),
     ]
     if kind == "ros1":
         path = bags.write_ros1(
-            tmp_path / "a.bag", [*others, *pictures], "lz4" if compressed else None
+            tmp_path / "a.bag", [*unrelated, *pictures], "lz4" if compressed else None
         )
     else:
         storage = CompressionMode.STORAGE if kind == "mcap" else CompressionMode.MESSAGE
         mode = storage if compressed else CompressionMode.NONE
         path = bags.write_bag(
-            tmp_path / "a", [*others, *pictures], mcap=kind == "mcap", compression=mode
+            tmp_path / "a", [*unrelated, *pictures], mcap=kind == "mcap", compression=mode
         )
     recording = open_capture([path])
     assert recording.lens == plane.LENS and recording.z_step_m == 1e-3
@@ -304,12 +306,12 @@ def test_clouds_of_ros_1_are_read(tmp_path: Path) -> None:
 def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None:
     picture = (DEPTH, bags.IMAGE, bags.depth_image(STORED))
     lens = (LENS_TOPIC, bags.INFO, bags.info())
-    both = bags.write_bag(tmp_path / "both", [picture, lens, *bags.clouds(1)])
-    recording = open_capture([both])
+    combined = bags.write_bag(tmp_path / "both", [picture, lens, *bags.clouds(1)])
+    recording = open_capture([combined])
     assert (
         next(recording.frames()).rgb is None and "not the clouds on /points2" in recording.notes[0]
     )
-    assert next(open_capture([both], topic="points2").frames()).rgb is not None
+    assert next(open_capture([combined], topic="points2").frames()).rgb is not None
     lacking = bags.write_bag(tmp_path / "lacking", [picture, *bags.clouds(1)])
     assert "the clouds on /points2 are read" in open_capture([lacking]).notes[0]
     several = [
@@ -317,8 +319,8 @@ def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None
         ("/camera/aligned_depth_to_color/image_raw", bags.IMAGE, bags.depth_image(STORED)),
         lens,
     ]
-    said = refusal(bags.write_bag(tmp_path / "several", several))
-    assert "2 topics hold depth images" in said and f"instance --topic {DEPTH}" in said
+    message = refusal(bags.write_bag(tmp_path / "several", several))
+    assert "2 topics hold depth images" in message and f"instance --topic {DEPTH}" in message
     copies = [picture, (f"{DEPTH}/compressedDepth", bags.PACKED, bags.packed_depth(STORED)), lens]
     assert open_capture([bags.write_bag(tmp_path / "copies", copies)]).lens == plane.LENS
 
@@ -385,15 +387,15 @@ def test_depth_images_without_their_lens_are_refused(tmp_path: Path) -> None:
 @given(
     form=st.sampled_from(("png", "rvl")),
     cut=st.floats(0, 1),
-    place=st.floats(0, 1),
+    share=st.floats(0, 1),
     byte=st.integers(0, 255),
 )
 def test_a_damaged_compressed_image_is_read_or_told(
-    form: str, cut: float, place: float, byte: int
+    form: str, cut: float, share: float, byte: int
 ) -> None:
     message = bags.packed_depth(STORED, "16UC1", form)
     data = message.data.copy()
-    data[int(place * (data.size - 1))] ^= byte
+    data[int(share * (data.size - 1))] ^= byte
     message.data = data[: int(cut * data.size)]
     try:
         assert stored_depth("m", message).dtype == np.uint16
@@ -410,13 +412,13 @@ def test_a_truncated_bag_of_ros_1_is_named(tmp_path: Path, part: float) -> None:
 
 
 @settings(max_examples=12, deadline=None)
-@given(place=st.floats(0, 1), byte=st.integers(1, 255))
+@given(share=st.floats(0, 1), byte=st.integers(1, 255))
 def test_a_changed_byte_of_ros_1_is_read_or_told(
-    tmp_path_factory: pytest.TempPathFactory, place: float, byte: int
+    tmp_path_factory: pytest.TempPathFactory, share: float, byte: int
 ) -> None:
     path = bags.write_ros1(tmp_path_factory.mktemp("ros1") / "a.bag", bags.clouds(1))
     content = bytearray(path.read_bytes())
-    content[int(place * (len(content) - 1))] ^= byte
+    content[int(share * (len(content) - 1))] ^= byte
     path.write_bytes(content)
     try:
         assert len(list(open_capture([path]).frames())) <= 1
@@ -443,11 +445,11 @@ def test_a_chunk_of_ros_1_may_not_fill_the_memory(
 def test_a_missing_topic_lists_those_that_are_there(tmp_path: Path) -> None:
     none = bags.write_bag(tmp_path / "none", [("/picture", bags.IMAGE, bags.image())])
     assert "or depth images; its topics: /picture (sensor_msgs/msg/Image)" in refusal(none)
-    some = bags.write_bag(
+    bag = bags.write_bag(
         tmp_path / "some", [("/picture", bags.IMAGE, bags.image()), *bags.clouds(1)]
     )
-    assert "no topic points; its topics: /picture" in refusal(some, topic="points")
-    assert "/picture message 0: holds 'mono8' pictures, not depth" in refusal(some, topic="picture")
+    assert "no topic points; its topics: /picture" in refusal(bag, topic="points")
+    assert "/picture message 0: holds 'mono8' pictures, not depth" in refusal(bag, topic="picture")
     np.save(tmp_path / "d.npy", plane.depth_mm())
     assert "is not a ROS bag" in refusal(tmp_path / "d.npy", topic="points2", lens=plane.LENS)
 
@@ -507,14 +509,14 @@ def test_a_truncated_file_is_named(tmp_path: Path, mcap: bool, part: float) -> N
 
 
 @settings(max_examples=12, deadline=None)
-@given(place=st.floats(0, 1), byte=st.integers(1, 255), mcap=st.booleans())
+@given(share=st.floats(0, 1), byte=st.integers(1, 255), mcap=st.booleans())
 def test_a_changed_byte_is_read_or_told(
-    tmp_path_factory: pytest.TempPathFactory, place: float, byte: int, mcap: bool
+    tmp_path_factory: pytest.TempPathFactory, share: float, byte: int, mcap: bool
 ) -> None:
     folder = bags.write_bag(tmp_path_factory.mktemp("bags") / "bag", bags.clouds(1), mcap=mcap)
     file = folder / f"bag.{'mcap' if mcap else 'db3'}"
     content = bytearray(file.read_bytes())
-    content[int(place * (len(content) - 1))] ^= byte
+    content[int(share * (len(content) - 1))] ^= byte
     file.write_bytes(content)
     try:
         frames = list(open_capture([file]).frames())
@@ -547,7 +549,7 @@ def test_a_chunk_that_unpacks_to_another_size_than_it_states_is_refused(tmp_path
     content = bytearray(file.read_bytes())
     # the index repeats the size: op 8, eight bytes of length, .., and at its end the sizes, packed
     # and unpacked
-    start = next(at for at in _records(content) if content[at] == CHUNK_INDEX)
+    start = next(start for start in _records(content) if content[start] == CHUNK_INDEX)
     end = start + 9 + struct.unpack_from("<Q", content, start + 1)[0]
     (promised,) = struct.unpack_from("<Q", content, end - 8)
     struct.pack_into("<Q", content, end - 8, promised - 1)
@@ -566,9 +568,9 @@ def test_a_message_may_not_be_larger_than_a_cloud(
 
 def _records(content: bytearray) -> list[int]:
     """Where the records of an MCAP begin."""
-    at = MAGIC_BYTES
-    found = []
-    while at < len(content) - MAGIC_BYTES:
-        found.append(at)
-        at += 9 + struct.unpack_from("<Q", content, at + 1)[0]
-    return found
+    start = MAGIC_BYTES
+    starts = []
+    while start < len(content) - MAGIC_BYTES:
+        starts.append(start)
+        start += 9 + struct.unpack_from("<Q", content, start + 1)[0]
+    return starts

@@ -44,7 +44,7 @@ def test_the_nfov_lens_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "other", "scale", "shift"),
+    ("mode", "second_mode", "scale", "shift"),
     (
         ("NFOV_UNBINNED", "WFOV_UNBINNED", 1, (192, 180)),
         ("NFOV_2X2BINNED", "NFOV_UNBINNED", 2, (0, 0)),
@@ -52,28 +52,28 @@ def test_the_nfov_lens_by_hand() -> None:
     ),
 )
 def test_modes_look_along_the_same_rays(
-    mode: str, other: str, scale: int, shift: tuple[int, int]
+    mode: str, second_mode: str, scale: int, shift: tuple[int, int]
 ) -> None:
     """A pixel of a crop, or the middle of four binned pixels, sees what it sees on the whole
     sensor."""
     u, v = np.meshgrid(np.linspace(100, 200, 5), np.linspace(100, 200, 5))
     there_u = scale * u + (scale - 1) / 2 + shift[0]
     there_v = scale * v + (scale - 1) / 2 + shift[1]
-    here = depth_lens("test", CAMERAS, mode).slopes(u, v)
+    slopes = depth_lens("test", CAMERAS, mode).slopes(u, v)
     np.testing.assert_allclose(
-        here, depth_lens("test", CAMERAS, other).slopes(there_u, there_v), atol=1e-9
+        slopes, depth_lens("test", CAMERAS, second_mode).slopes(there_u, there_v), atol=1e-9
     )
 
 
 def test_colour_modes_are_crops_of_one_picture() -> None:
-    whole = colour_camera("test", CAMERAS, 4096, 3072)
+    full_sensor = colour_camera("test", CAMERAS, 4096, 3072)
     cropped = colour_camera("test", CAMERAS, 1280, 720)
-    assert whole is not None and cropped is not None
+    assert full_sensor is not None and cropped is not None
     # 1280 x 960 scaled down from 4096 x 3072, then rows 120 to 839
     u = 300.0
     v = 200.0
     scale = 3.2
-    expected = whole.lens.slopes(
+    expected = full_sensor.lens.slopes(
         np.array((u + 0.5) * scale - 0.5), np.array((v + 120 + 0.5) * scale - 0.5)
     )
     np.testing.assert_allclose(cropped.lens.slopes(np.array(u), np.array(v)), expected, atol=1e-12)
@@ -93,7 +93,7 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "told"),
+    ("path", "value", "message"),
     (
         (("Intrinsics", "ModelType"), "CALIBRATION_LensDistortionModelOther", "ModelOther"),
         (("Intrinsics", "ModelParameters"), [1.0], "1 parameters"),
@@ -103,14 +103,14 @@ def test_the_early_wide_calibration_is_the_same_camera() -> None:
     ),
 )
 def test_a_calibration_that_is_not_understood_is_refused(
-    path: tuple[str, ...], value: object, told: str
+    path: tuple[str, ...], value: object, message: str
 ) -> None:
     data = json.loads(plane.calibration().rstrip(b"\0"))
-    place = data["CalibrationInformation"]["Cameras"][0]
+    camera = data["CalibrationInformation"]["Cameras"][0]
     for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = value
-    with pytest.raises(UserError, match=told):
+        camera = camera[key]
+    camera[path[-1]] = value
+    with pytest.raises(UserError, match=message):
         depth_lens("test", parse_calibration("test", json.dumps(data).encode()), "NFOV_UNBINNED")
 
 
@@ -166,10 +166,10 @@ def test_captures_without_depth_are_skipped(tmp_path: Path) -> None:
 
 
 def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
-    whole = plane.write_mkv(
+    intact = plane.write_mkv(
         tmp_path / "r.mkv", [{"DEPTH": DEPTH}] * 3, attached=plane.calibration()
     )
-    content = whole.read_bytes()
+    content = intact.read_bytes()
     for part in (0.0, 0.001, 0.3, 0.7, 0.99):
         (tmp_path / "cut.mkv").write_bytes(content[: int(part * len(content))])
         assert "cut.mkv" in refusal(tmp_path / "cut.mkv") and "truncated" in refusal(

@@ -74,11 +74,13 @@ def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:
         refusal(tmp_path).splitlines()[0] == f"{tmp_path}: contains no capture; it holds notes.txt"
     )
     bag = bags.write_bag(tmp_path / "left", bags.clouds(1))
-    other = tmp_path / "other.mkv"
-    other.touch()
+    second = tmp_path / "other.mkv"
+    second.touch()
     plane.write_open3d_folder(tmp_path / "right", 1)
-    said = refusal(tmp_path)
-    assert f"to do: name one of {bag}, {other}, {tmp_path / 'right'}" in said and ".npz" in said
+    message = refusal(tmp_path)
+    assert (
+        f"to do: name one of {bag}, {second}, {tmp_path / 'right'}" in message and ".npz" in message
+    )
 
 
 @pytest.mark.parametrize("part", (0.0, 0.02, 0.5, 0.98))
@@ -98,16 +100,16 @@ def test_a_damaged_picture_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stored", "told"),
+    ("stored", "picture_kind"),
     ((np.zeros((72, 96), np.uint8), "8 bits"), (np.ones((72, 96, 3), np.uint16), "RGB")),
 )
 def test_a_picture_that_is_no_depth_image_is_named(
-    tmp_path: Path, stored: np.ndarray, told: str
+    tmp_path: Path, stored: np.ndarray, picture_kind: str
 ) -> None:
     png(tmp_path / "1.png")
     png(tmp_path / "2.png", stored)
     message = refusal(tmp_path, lens=plane.LENS)
-    assert "2.png" in message and told in message and "16-bit" in message
+    assert "2.png" in message and picture_kind in message and "16-bit" in message
     assert "2.png" in refusal(tmp_path / "2.png", lens=plane.LENS)
 
 
@@ -177,7 +179,7 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("array", "told"),
+    ("array", "message"),
     (
         (np.zeros((4, 5), np.uint8), "8-bit"),
         (np.zeros((4, 5), bool), "bool"),
@@ -190,10 +192,10 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
     ),
 )
 def test_an_array_that_is_no_capture_is_refused(
-    tmp_path: Path, array: np.ndarray, told: str
+    tmp_path: Path, array: np.ndarray, message: str
 ) -> None:
     np.save(tmp_path / "a.npy", array)
-    assert told in refusal(tmp_path / "a.npy", lens=plane.LENS)
+    assert message in refusal(tmp_path / "a.npy", lens=plane.LENS)
 
 
 @pytest.mark.parametrize("planes", ("x y z", "red green blue depth", "depth confidence"))
@@ -274,9 +276,9 @@ def test_a_folder_whose_depth_lies_in_arrays_beside_pictures_names_them(tmp_path
 
 
 def test_files_that_are_not_read_are_told_how_to_be_converted(tmp_path: Path) -> None:
-    for name, told in (("a.exr", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
+    for name, message in (("a.exr", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
         (tmp_path / name).write_bytes(b"abc")
-        assert told in refusal(tmp_path / name)
+        assert message in refusal(tmp_path / name)
 
 
 def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
@@ -302,7 +304,7 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     (
         ("", "no line of numbers"),
         ("x y z\n", "no line of numbers"),
@@ -314,9 +316,9 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
         ("9" * 400 + " 1 1\n", "wrong unit|no valid pixel|finite"),
     ),
 )
-def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, told: str) -> None:
+def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "a.xyz").write_text(text)
-    assert re.search(told, refusal(tmp_path / "a.xyz"))
+    assert re.search(message, refusal(tmp_path / "a.xyz"))
 
 
 def test_a_height_map_that_is_none_is_explained(tmp_path: Path) -> None:
@@ -385,9 +387,9 @@ def test_a_truncated_cloud_is_named(
     missing: int,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    whole = write(tmp_path / f"c.{suffix}", plane.points_m(STORED)).stat().st_size
+    intact_bytes = write(tmp_path / f"c.{suffix}", plane.points_m(STORED)).stat().st_size
     message = refusal(
-        write(tmp_path / f"c.{suffix}", plane.points_m(STORED), cut=min(missing, whole))
+        write(tmp_path / f"c.{suffix}", plane.points_m(STORED), cut=min(missing, intact_bytes))
     )
     assert f"c.{suffix}" in message
     assert capfd.readouterr().out == ""
@@ -417,7 +419,7 @@ def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     (
         ('{"fx": 500, "fy": 500, "cx": 300}', "its keys: fx, fy, cx"),
         ('{"fx": 500, "fx": 500, "fy": 500, "cx": 300, "cy": 200}', "fx occurs twice"),
@@ -446,12 +448,12 @@ def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> Non
         ("just text", "no keys"),
     ),
 )
-def test_a_faulty_lens_file_is_explained(tmp_path: Path, text: str, told: str) -> None:
+def test_a_faulty_lens_file_is_explained(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "lens.txt"
     path.write_text(text)
     with pytest.raises(UserError) as caught:
         read_lens(path, 640, 576)
-    assert told in str(caught.value) and "lens.txt" in str(caught.value)
+    assert message in str(caught.value) and "lens.txt" in str(caught.value)
 
 
 def test_a_missing_lens_file_is_named(tmp_path: Path) -> None:

@@ -183,10 +183,10 @@ def test_inches_are_asked_for_and_read(tmp_path: Path) -> None:
 def test_lengths_along_the_rays_are_told_from_z(tmp_path: Path) -> None:
     z_m = 0.7 + np.random.default_rng(2).normal(0, 1e-4, (72, 96)) + 0.1 * plane.slopes()[..., 0]
     along = z_m * np.linalg.norm(np.dstack([plane.slopes(), np.ones_like(z_m)]), axis=-1)
-    for name, stored, told in (("z", z_m, 0), ("range", along, 1)):
+    for name, stored, doubts in (("z", z_m, 0), ("range", along, 1)):
         np.save(tmp_path / f"{name}.npy", stored)
         warnings = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS).warnings
-        assert sum("lengths along the rays" in text for text in warnings) == told
+        assert sum("lengths along the rays" in text for text in warnings) == doubts
 
 
 def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
@@ -245,12 +245,12 @@ def test_modes_look_along_the_directions_of_the_factory_calibration() -> None:
         "azure_kinect_wfov_unbinned",
         "realsense_l515_vga",
     }
-    whole = lens_named("azure_kinect_wfov_unbinned")
+    wide = lens_named("azure_kinect_wfov_unbinned")
     binned = lens_named("azure_kinect_wfov_binned")
-    np.testing.assert_allclose(binned.slopes(100, 200), whole.slopes(200.5, 400.5), atol=1e-6)
+    np.testing.assert_allclose(binned.slopes(100, 200), wide.slopes(200.5, 400.5), atol=1e-6)
     narrow = lens_named("azure_kinect_nfov")
     small = lens_named("azure_kinect_nfov_binned")
-    np.testing.assert_allclose(narrow.slopes(8, 20), whole.slopes(200, 200), atol=1e-6)
+    np.testing.assert_allclose(narrow.slopes(8, 20), wide.slopes(200, 200), atol=1e-6)
     np.testing.assert_allclose(small.slopes(8, 20), narrow.slopes(16.5, 40.5), atol=1e-6)
 
 
@@ -279,15 +279,16 @@ def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: 
     ):
         (tmp_path / "lens.json").write_text(json.dumps(lens))
         np.save(tmp_path / "d.npy", plane.depth_mm())
-        said = open_capture([tmp_path / "d.npy"], intrinsics=tmp_path / "lens.json").warnings
-        assert any("principal point" in each for each in said) == is_doubted
+        warnings = open_capture([tmp_path / "d.npy"], intrinsics=tmp_path / "lens.json").warnings
+        assert any("principal point" in warning for warning in warnings) == is_doubted
 
 
 @pytest.mark.parametrize(
-    ("side", "finer", "least", "most"), ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10))
+    ("side", "finer", "least", "largest"),
+    ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10)),
 )
 def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
-    side: int, finer: int, least: int, most: int
+    side: int, finer: int, least: int, largest: int
 ) -> None:
     rng = np.random.default_rng(3)
     frames = []
@@ -297,7 +298,7 @@ def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
             0.7 + noise, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR
         ).astype(np.float32)
         frames.append(Frame(str(number), z_m, np.zeros(z_m.shape, np.uint8)))
-    assert least <= noise_reach_px(frames, 0.0) <= most
+    assert least <= noise_reach_px(frames, 0.0) <= largest
     assert noise_reach_px([frames[0], frames[0]], 0.0) == 0.0
 
 
@@ -322,8 +323,8 @@ def test_a_lone_frame_shows_the_reach_of_its_noise_beside_edges(side, reach_px, 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs the real captures")
 def test_real_depth_that_was_aligned_to_colour_is_told_from_the_cameras_own() -> None:
     aligned = list(islice(open_capture([DATA / "azure_drilled_board"]).frames(), 6))
-    own = list(islice(open_capture(walls(), lens=lens_named("azure_kinect_nfov")).frames(), 6))
-    assert noise_reach_px(own, 1e-3) == 5.0  # the depth engine's filter
+    native = list(islice(open_capture(walls(), lens=lens_named("azure_kinect_nfov")).frames(), 6))
+    assert noise_reach_px(native, 1e-3) == 5.0  # the depth engine's filter
     assert (
         noise_reach_px(aligned, 1e-3) > 7.0
     )  # 5 pixels of 252 px focal length in an image of 601 px
@@ -358,7 +359,7 @@ def test_units_of_many_scenes_are_right_or_asked_for() -> None:
 
 def verdicts(unit_mm: float, scenes: int = 200) -> Counter[str]:
     rng = np.random.default_rng(11)
-    found = Counter[str]()
+    counts = Counter[str]()
     for _ in range(scenes):
         near_m = rng.uniform(0.3, 1.5)
         share = rng.uniform(0.1, 1.0)
@@ -376,8 +377,8 @@ def verdicts(unit_mm: float, scenes: int = 200) -> Counter[str]:
         try:
             unit = decided_unit("x", stored, 1e-3, (int(size[0]), int(size[1])))
         except UserError:
-            found["asked"] += 1
+            counts["asked"] += 1
             continue
         right = unit.scale_m == pytest.approx(unit_mm * 1e-3)
-        found[("" if unit.warning else "silently ") + ("right" if right else "wrong")] += 1
-    return found
+        counts[("" if unit.warning else "silently ") + ("right" if right else "wrong")] += 1
+    return counts

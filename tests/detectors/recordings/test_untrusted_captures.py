@@ -53,8 +53,8 @@ def npz(
         archive.writestr("depth.npy", content)
     if stated is not None:
         raw = bytearray(path.read_bytes())
-        at = raw.rindex(b"PK\x01\x02")
-        raw[at + 24 : at + 28] = struct.pack("<I", stated)
+        start = raw.rindex(b"PK\x01\x02")
+        raw[start + 24 : start + 28] = struct.pack("<I", stated)
         path.write_bytes(raw)
     return path
 
@@ -68,7 +68,7 @@ def test_an_archive_that_says_ten_gigabytes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "stated", "told"),
+    ("content", "stated", "message"),
     [
         (
             npy_header("(30000, 60000)") + bytes(100),
@@ -89,8 +89,8 @@ def test_an_archive_that_says_ten_gigabytes(tmp_path):
         (b"", None, "not numbers"),
     ],
 )
-def test_arrays_whose_header_lies(tmp_path, content, stated, told):
-    assert told in capture_refusal(npz(tmp_path / "a.npz", content, stated))
+def test_arrays_whose_header_lies(tmp_path, content, stated, message):
+    assert message in capture_refusal(npz(tmp_path / "a.npz", content, stated))
 
 
 def test_a_bomb_of_zeros(tmp_path, monkeypatch):
@@ -156,7 +156,7 @@ def mat_variable(rows: int, columns: int, stated: int, numbers: bytes = b"") -> 
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (mat_variable(30_000, 60_000, 0xFFFFFFF0), "not enough memory for the size that it states"),
         (mat_variable(3, 4, 0xFFFFFFF0, bytes(96)), "cannot be read"),
@@ -164,9 +164,9 @@ def mat_variable(rows: int, columns: int, stated: int, numbers: bytes = b"") -> 
         (element(15, b"no zlib")[:-1], "while decompressing"),
     ],
 )
-def test_hostile_matlab_files(tmp_path, content, told):
+def test_hostile_matlab_files(tmp_path, content, message):
     (tmp_path / "a.mat").write_bytes(MAT_HEAD + content)
-    assert told in capture_refusal(tmp_path / "a.mat")
+    assert message in capture_refusal(tmp_path / "a.mat")
 
 
 def test_a_compressed_matlab_bomb(tmp_path, monkeypatch):
@@ -241,15 +241,15 @@ def png_of(width: int, height: int) -> bytes:
 def test_a_png_of_60000_x_60000(tmp_path):
     path = tmp_path / "1.png"
     path.write_bytes(png_of(60_000, 60_000))
-    told = "60000 x 60000 pixels\n  legal: 1 to 64 million"
-    assert told in refusal(lambda: read_depth_png(path)) and told in capture_refusal(path)
-    assert told in refusal(lambda: decoded("a", path.read_bytes(), 1))
+    message = "60000 x 60000 pixels\n  legal: 1 to 64 million"
+    assert message in refusal(lambda: read_depth_png(path)) and message in capture_refusal(path)
+    assert message in refusal(lambda: decoded("a", path.read_bytes(), 1))
     path.write_bytes(png_of(0, 5))
     assert "0 x 5 pixels" in capture_refusal(path)
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (
             b"\xff\xd8\xff\xe0\x00\x04ab\xff\xc2\x00\x11\x08\xff\xff\xff\xff\x03"
@@ -262,8 +262,8 @@ def test_a_png_of_60000_x_60000(tmp_path):
         (b"\xff\xd8\xff\xff\xff\xff", "truncated"),
     ],
 )
-def test_pictures_are_decoded_only_as_what_they_are(content, told):
-    assert told in refusal(lambda: decoded("a.jpg", content, 1))
+def test_pictures_are_decoded_only_as_what_they_are(content, message):
+    assert message in refusal(lambda: decoded("a.jpg", content, 1))
 
 
 def test_the_sizes_of_true_pictures():
@@ -288,7 +288,7 @@ XYZ = ("property float x", "property float y", "property float z")
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (ply("element vertex 4000000000", *XYZ), "4000000000 x 1 pixels"),
         (ply("element vertex 40000000", *XYZ), "truncated"),
@@ -300,9 +300,9 @@ XYZ = ("property float x", "property float y", "property float z")
         (ply(f"comment width {'9' * 5000}", "element vertex 1", *XYZ), "truncated"),
     ],
 )
-def test_hostile_ply(tmp_path, content, told):
+def test_hostile_ply(tmp_path, content, message):
     (tmp_path / "a.ply").write_bytes(content)
-    assert told in capture_refusal(tmp_path / "a.ply")
+    assert message in capture_refusal(tmp_path / "a.ply")
 
 
 def pcd(
@@ -320,7 +320,7 @@ def pcd(
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (pcd(100_000, 100_000), "100000 x 100000 pixels"),
         (pcd(1000, 1000), "truncated"),
@@ -340,9 +340,9 @@ def pcd(
         ),
     ],
 )
-def test_hostile_pcd(tmp_path, content, told):
+def test_hostile_pcd(tmp_path, content, message):
     (tmp_path / "a.pcd").write_bytes(content)
-    assert told in capture_refusal(tmp_path / "a.pcd")
+    assert message in capture_refusal(tmp_path / "a.pcd")
 
 
 # ---- recordings
@@ -402,12 +402,14 @@ def test_a_recording_of_too_large_pictures(tmp_path):
 def test_a_bag_whose_description_is_hostile(tmp_path):
     folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
     described = folder / "metadata.yaml"
-    whole = described.read_text()
+    description = described.read_text()
     for text in (
         BOMB + "rosbag2_bagfile_information: *a20\n",
         "rosbag2_bagfile_information: !!python/name:os.system\n",
     ):
         described.write_text(text)
         assert "metadata.yaml" in capture_refusal(folder)
-    described.write_text(whole.replace(next(folder.glob("*.db3")).name, "../../../etc/passwd"))
+    described.write_text(
+        description.replace(next(folder.glob("*.db3")).name, "../../../etc/passwd")
+    )
     assert "passwd, which is missing" in capture_refusal(folder)

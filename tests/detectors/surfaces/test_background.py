@@ -68,15 +68,15 @@ def measured(
     z: np.ndarray, seed: int = 0, correlated_px: float = 0.0, damage: tuple = DAMAGE
 ) -> np.ndarray:
     """The surface with damage and noise."""
-    seen = z.copy()
+    noisy_z = z.copy()
     for x, y, diameter, depth in damage:
         part = np.hypot(X * z - x, Y * z - y) / (diameter / 2)
-        seen = seen + depth * np.maximum(1 - part**2, 0)
+        noisy_z = noisy_z + depth * np.maximum(1 - part**2, 0)
     noise = np.random.default_rng(seed).standard_normal(SHAPE)
     if correlated_px:
         noise = cv2.GaussianBlur(noise, (0, 0), correlated_px)
         noise /= noise.std()
-    return seen + NOISE_M * noise
+    return noisy_z + NOISE_M * noise
 
 
 def found(z: np.ndarray, **settings: object) -> Background:
@@ -115,9 +115,9 @@ def test_a_free_form_says_its_scale_and_does_not_swallow_damage() -> None:
         and f"wider than {1e3 * answer.scale_m:.0f} mm" in answer.description
     )
     for x, y, _, depth in deep:
-        at = np.unravel_index(np.argmin(np.hypot(X * z - x, Y * z - y)), SHAPE)
+        pixel = np.unravel_index(np.argmin(np.hypot(X * z - x, Y * z - y)), SHAPE)
         # a sixth of the depth: what is left of a dent 12 pixels wide that the weights leave out
-        assert abs(answer.surface_z_m[at] - z[at]) < abs(depth) / 6
+        assert abs(answer.surface_z_m[pixel] - z[pixel]) < abs(depth) / 6
 
 
 @pytest.mark.parametrize(
@@ -127,8 +127,8 @@ def test_a_stated_degree_that_does_not_fit_is_warned_of(z: np.ndarray, degree: i
     answer = found(measured(z), shape="polynomial", degree=degree)
     assert answer.warning.startswith("the surface does not fit here: degree")
     assert answer.notes["misfit_share"] > 0.1 and answer.notes["misfit_rms_m"] > 0.5 * NOISE_M
-    said = misfit(cloud_of(measured(z)), answer.residual_m, "it")
-    assert said.startswith("the surface does not fit here: it leaves")
+    warning = misfit(cloud_of(measured(z)), answer.residual_m, "it")
+    assert warning.startswith("the surface does not fit here: it leaves")
 
 
 def test_a_board_on_a_floor_taken_for_one_surface_is_warned_of() -> None:
@@ -155,11 +155,11 @@ def test_flat_boards_stay_planes_and_without_warning(correlated_px: float) -> No
 
 def test_missing_pixels_change_little() -> None:
     z = measured(pipe(), seed=3)
-    whole = found(z)
+    complete = found(z)
     z[np.random.default_rng(1).random(SHAPE) < 0.35] = np.nan
     answer = found(z)
     assert answer.notes["shape"] == "quadric" and np.isnan(answer.residual_m[np.isnan(z)]).all()
-    assert np.nanquantile(np.abs(answer.surface_z_m - whole.surface_z_m), 0.9) < 0.2 * NOISE_M
+    assert np.nanquantile(np.abs(answer.surface_z_m - complete.surface_z_m), 0.9) < 0.2 * NOISE_M
 
 
 def test_what_is_seen_too_obliquely_is_left_out_and_said() -> None:
@@ -198,11 +198,11 @@ def test_a_cloud_without_a_grid_and_a_map_are_no_different() -> None:
 
 
 def test_few_points_are_a_plane_and_said_to_be_few() -> None:
-    few = np.full(SHAPE, np.nan)
-    few[10:14, 10:14] = measured(plane())[10:14, 10:14]
-    answer = found(few)
+    sparse = np.full(SHAPE, np.nan)
+    sparse[10:14, 10:14] = measured(plane())[10:14, 10:14]
+    answer = found(sparse)
     assert "16 points are too few" in answer.warning
-    few[:] = np.nan
-    few[5, 5] = 0.7
+    sparse[:] = np.nan
+    sparse[5, 5] = 0.7
     with pytest.raises(UserError, match="1 valid points cannot determine"):
-        found(few)
+        found(sparse)

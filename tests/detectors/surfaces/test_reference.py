@@ -50,8 +50,8 @@ def seen(path: Path, T_camera_part: np.ndarray, noise_mm: float, dent_mm: float 
         "t_hit"
     ].numpy()
     z_m = np.where(np.isfinite(z_m), z_m, np.nan).astype(float)
-    place = transform_points(np.linalg.inv(T_camera_part), rays * z_m[..., None])
-    z_m += dent_mm * MM * (np.hypot(place[..., 0], place[..., 1] - 15 * MM) < 8 * MM)
+    points_part = transform_points(np.linalg.inv(T_camera_part), rays * z_m[..., None])
+    z_m += dent_mm * MM * (np.hypot(points_part[..., 0], points_part[..., 1] - 15 * MM) < 8 * MM)
     z_m += np.random.default_rng(1).normal(0, noise_mm * MM, z_m.shape)
     reason = np.where(np.isfinite(z_m), 0, Reason.LOW_AMPLITUDE).astype(np.uint8)
     return replace(blank(), points_m=rays * z_m[..., None], reason=reason)
@@ -93,12 +93,12 @@ def test_a_part_is_found_where_it_lies(
     cloud = seen(path, T, 0.5, dent_mm=3.0)
     true = seen(path, T, 0.0)
     points = cloud.points_m[cloud.valid]
-    said, surface = laid_on(points, ReferenceConfig(file=str(path)), central=True)
+    note, surface = laid_on(points, ReferenceConfig(file=str(path)), central=True)
     off_m = surface(points) - true.points_m[cloud.valid][:, 2]
     assert np.isnan(off_m).mean() < 0.25  # along outline, steps and edges
     assert np.nanmedian(np.abs(off_m)) < 0.05 * MM  # a tenth of the noise of a pixel
     assert np.nanquantile(np.abs(off_m), 0.95) < 0.1 * MM
-    assert "casting.stl" in said
+    assert "casting.stl" in note
     _, level = laid_on(points, ReferenceConfig(file=str(path)), central=False)  # of a map, along z
     assert np.nanmedian(np.abs(level(points) - points[:, 2])) == pytest.approx(
         0.6745 * 0.5 * MM, rel=0.15
@@ -118,15 +118,15 @@ def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> Non
     T = stood((6, -8, 3))
     cloud = seen(path, T, 0.5, dent_mm=3.0)
 
-    def found(surface: dict[str, object]) -> list[np.ndarray]:
-        one = load_detector(detector, {"crop": {"kind": "none"}, "surface": surface})
-        findings = one.find(cloud, one.analyse(cloud), 6.0)
-        return [transform_points(np.linalg.inv(T), each.centre_m) / MM for each in findings]
+    def damage_mm(surface: dict[str, object]) -> list[np.ndarray]:
+        measuring = load_detector(detector, {"crop": {"kind": "none"}, "surface": surface})
+        findings = measuring.find(cloud, measuring.analyse(cloud), 6.0)
+        return [transform_points(np.linalg.inv(T), finding.centre_m) / MM for finding in findings]
 
-    (centre,) = found({"shape": "mesh", "reference": {"file": str(path)}})
+    (centre,) = damage_mm({"shape": "mesh", "reference": {"file": str(path)}})
     assert np.linalg.norm(centre[:2] - (0, 15)) < 3.0
     assert (
-        len(found({"shape": "auto"})) > 1
+        len(damage_mm({"shape": "auto"})) > 1
     )  # ribs pass for damage where nothing is known of the part
 
 
@@ -140,10 +140,10 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
         front_of(ReferenceConfig(file=str(tmp_path / "away.stl")))
     with pytest.raises(UserError, match="cannot be read"):
         front_of(ReferenceConfig(file=str(tmp_path / "none.stl")))
-    given = ["capture", "--reference", str(path), "--set", "surface.reference.unit=cm"]
+    arguments = ["capture", "--reference", str(path), "--set", "surface.reference.unit=cm"]
     _, settings = detector_of(
-        main.parser().parse_args(given), "none", ["surface.reference.unit=cm"]
+        main.parser().parse_args(arguments), "none", ["surface.reference.unit=cm"]
     )
     assert settings["surface"]["reference"] == {"file": str(path), "unit": "cm", "front": "+z"}
     with pytest.raises(UserError, match="has no surface setting"):
-        detector_of(main.parser().parse_args([*given, "--detector", "plane_ransac"]), "none", [])
+        detector_of(main.parser().parse_args([*arguments, "--detector", "plane_ransac"]), "none", [])

@@ -91,7 +91,10 @@ def only(text: str, splices: shape.Splices | None = None) -> str:
 def test_a_valid_text_has_no_problem() -> None:
     assert (
         messages(
-            "name: a\nboard: {damages: [{kind: dimple, depth_mm: 1}], body: {radius: 1}, loose: [1, 2]}"
+            (
+                "name: a\nboard: {damages: [{kind: dimple, depth_mm: 1}], body: {radius: 1}, "
+                "loose: [1, 2]}"
+            )
         )
         == []
     )
@@ -236,11 +239,14 @@ def test_board_that_is_no_mapping() -> None:
 
 
 def test_all_problems_at_once() -> None:
-    found = messages(
-        "nam: a\nboard: {width_mm: 1, damages: [{kind: hole}, {kind: dent, depth_mm: x}], flag: 2}\n"
+    result = messages(
+        (
+            "nam: a\nboard: {width_mm: 1, damages: [{kind: hole}, {kind: dent, depth_mm: x}], "
+            "flag: 2}\n"
+        )
     )
-    assert len(found) == 6
-    text = "\n".join(found)
+    assert len(result) == 6
+    text = "\n".join(result)
     for words in (
         "unknown key `nam`",
         "lacks the key `name`",
@@ -253,9 +259,9 @@ def test_all_problems_at_once() -> None:
 
 
 def test_spliced_settings_are_checked_with_the_rest_and_completed() -> None:
-    found = messages("board: {free: {scale: mat, gan: 2}}\n", SPLICES)
-    text = "\n".join(found)
-    assert len(found) == 3
+    result = messages("board: {free: {scale: mat, gan: 2}}\n", SPLICES)
+    text = "\n".join(result)
+    assert len(result) == 3
     assert 'x.yaml:1:23: `board.free.scale` is "mat", which is none of the legal values' in text
     assert "did you mean: mad" in text
     assert "x.yaml:1:28: unknown key `gan` in `board.free`" in text

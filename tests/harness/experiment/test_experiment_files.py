@@ -61,13 +61,13 @@ def test_a_quick_run_has_few_repeats_or_boards_and_says_that_it_is_a_first_look(
     assert first.config.repeats == 5 and first.config.threshold.calibrate.repeats == 7  # type: ignore[union-attr]
     assert first.config.sensitivity is None and {point.variant for point in first.points} == {MAIN}
     assert first.config.title == f"{experiment('averaging').config.title} (a first look)"
-    whole = load_experiment(FOLDER / "detection_limit.yaml", quick=False).config
+    config = load_experiment(FOLDER / "detection_limit.yaml", quick=False).config
     study = load_experiment(FOLDER / "detection_limit.yaml", quick=True).config
     boards = [
         [c.study.boards, c.study.hole_free_boards, c.threshold.calibrate.boards]
-        for c in (whole, study)
+        for c in (config, study)
     ]  # type: ignore[union-attr]
-    assert boards == [[36, 36, 60], [12, 12, 20]] and study.repeats == whole.repeats == 1
+    assert boards == [[36, 36, 60], [12, 12, 20]] and study.repeats == config.repeats == 1
 
 
 def test_every_variation_of_averaging_changes_something() -> None:

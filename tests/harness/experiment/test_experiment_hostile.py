@@ -57,8 +57,8 @@ def in_plain_words(said: str) -> bool:
 def test_an_odd_value_anywhere(tmp_path: Path, name: str, value: Any, draw: st.DataObject) -> None:
     path = draw.draw(st.sampled_from(paths_in(WRITTEN[name])))
     (tmp_path / "x.yaml").write_text(to_yaml(set_path(WRITTEN[name], path, value)))
-    said = told(tmp_path / "x.yaml")
-    assert in_plain_words(said) and (not said or "x.yaml" in said)
+    printed = told(tmp_path / "x.yaml")
+    assert in_plain_words(printed) and (not printed or "x.yaml" in printed)
 
 
 @settings(
@@ -81,8 +81,8 @@ def test_odd_variations(tmp_path: Path, vary: str, frames: str) -> None:
         + f"\nsensitivity: {{repeats: 1, frames: {frames}, vary: {vary}}}\n"
     )
     (tmp_path / "x.yaml").write_text(text)
-    said = told(tmp_path / "x.yaml")
-    assert "`sensitivity" in said and in_plain_words(said)
+    printed = told(tmp_path / "x.yaml")
+    assert "`sensitivity" in printed and in_plain_words(printed)
 
 
 @pytest.mark.parametrize(
@@ -92,5 +92,5 @@ def test_odd_variations(tmp_path: Path, vary: str, frames: str) -> None:
     "path", ["capture.frames", "source.target", "sweep", "seed", "..", "detector.settings"]
 )
 def test_an_odd_override(path: str, written: str) -> None:
-    said = told(FOLDER / "smoke.yaml", f"{path}={written}")
-    assert "--set" in said and in_plain_words(said)
+    printed = told(FOLDER / "smoke.yaml", f"{path}={written}")
+    assert "--set" in printed and in_plain_words(printed)

@@ -83,12 +83,12 @@ def test_set_then_get_and_nothing_else_changes(
     assert shape.get(changed, path) == value
     assert data == before
     assert set_path(changed, path, old) == before
-    others = [
+    remaining = [
         other
         for other in paths_in(data)
         if other[: len(path)] != path and path[: len(other)] != other
     ]
-    assert all(shape.get(changed, other) is shape.get(data, other) for other in others)
+    assert all(shape.get(changed, other) is shape.get(data, other) for other in remaining)
     assert key_path(".".join(map(str, path))) == path
 
 
@@ -162,7 +162,10 @@ def test_override_values_are_yaml_and_have_their_place() -> None:
     [
         (
             "frmes=3",
-            "--set: unknown path `frmes`: unknown key `frmes`\n      | frmes=3\n      | ^~~~~\n  did you mean: frames",
+            (
+                "--set: unknown path `frmes`: unknown key `frmes`\n      | frmes=3\n      | "
+                "^~~~~\n  did you mean: frames"
+            ),
         ),
         ("target.bakcing.albedo=1", "did you mean: target.backing.albedo"),
         (

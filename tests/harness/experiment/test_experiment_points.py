@@ -155,10 +155,12 @@ def test_what_changes_no_number_changes_no_digest(folder: Path, override: str) -
 
 def test_spelling_out_a_default_or_another_order_changes_no_digest(folder: Path) -> None:
     reordered = (
-        "threshold: {calibrate: {repeats: 4}}\nrepeats: 3\nmatching: {radius_mm: 15}\nname: trial\n"
+        "threshold: {calibrate: {repeats: 4}}\nrepeats: 3\nmatching: {radius_mm: 15}\nname: "
+        "trial\n"
         "capture: {average: {method: mean}, frames: 5}\nseed: 7\n"
         "detector: {settings: {scale: residual_std, degree: 2}, name: trial}\n"
-        "source:\n  camera: {unit_seed: 1}\n  target: {distance_m: 0.7, hole_kind: through, name: thesis}\n"
+        "source:\n  camera: {unit_seed: 1}\n  target: {distance_m: 0.7, hole_kind: through, "
+        "name: thesis}\n"
         "  kind: simulated\n"
     )
     assert loaded(folder, reordered).points[0].digest == loaded(folder, BASE).points[0].digest
@@ -408,16 +410,19 @@ def test_too_many_points(folder: Path) -> None:
 
 
 def test_a_combination_that_cannot_be_is_named(folder: Path) -> None:
-    sweep = "sweep:\n  source.target.board_width_mm: [609.6, 700.0]\n  source.target.tape_x_mm: [200.0, 325.0]\n"
+    sweep = (
+        "sweep:\n  source.target.board_width_mm: [609.6, 700.0]\n  source.target.tape_x_mm: "
+        "[200.0, 325.0]\n"
+    )
     alone = refused(folder, BASE + sweep)
     assert "x.yaml:14:36: with source.target.tape_x_mm=325.0: the target cannot be built" in alone
     base = BASE.replace("distance_m: 0.7", "board_width_mm: 700.0, tape_x_mm: 200.0")
     message = refused(folder, base + sweep)
     assert "1 problem" in message
     assert (
-        "with source.target.board_width_mm=609.6, source.target.tape_x_mm=325.0: the target cannot be built"
-        in message
-    )
+        "with source.target.board_width_mm=609.6, source.target.tape_x_mm=325.0: the target "
+        "cannot be built"
+    ) in message
 
 
 @pytest.mark.parametrize(
@@ -480,5 +485,5 @@ def test_problems_of_file_axes_study_and_overrides_come_together_in_order(folder
     assert heads[0].startswith("x.yaml: 6 problems; nothing was run")
     assert heads[1].startswith("--set: unknown path `captur.frames`")
     assert heads[2].startswith('--set: `repeats` is "none"')
-    places = [head.split(": ")[0] for head in heads[3:]]
-    assert places == ["x.yaml:2:1", "x.yaml:13:20", "x.yaml:17:12", "x.yaml:20:21"]
+    positions = [head.split(": ")[0] for head in heads[3:]]
+    assert positions == ["x.yaml:2:1", "x.yaml:13:20", "x.yaml:17:12", "x.yaml:20:21"]

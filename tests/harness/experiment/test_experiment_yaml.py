@@ -74,12 +74,12 @@ def test_nan_is_read_as_a_number() -> None:
 
 def test_places_of_keys_and_values() -> None:
     source = parse_yaml("a:\n  b: [10, {c: 'x'}]\n  é: 3\n", "x.yaml")
-    places = {
+    positions = {
         path: (value.line, value.column, value.width) for path, value in source.values.items()
     }
-    assert places[("a", "b", 0)] == (2, 7, 2)
-    assert places[("a", "b", 1, "c")] == (2, 15, 3)
-    assert places[("a", "é")] == (3, 6, 1)
+    assert positions[("a", "b", 0)] == (2, 7, 2)
+    assert positions[("a", "b", 1, "c")] == (2, 15, 3)
+    assert positions[("a", "é")] == (3, 6, 1)
     assert (source.keys[("a", "b", 1, "c")].line, source.keys[("a", "b", 1, "c")].column) == (2, 12)
     assert source.key_place_of(("a", "é")).head == "x.yaml:3:3"
 

@@ -64,7 +64,10 @@ def test_averaging_alone_is_one_set_up_whose_digest_does_not_know_of_others(tmp_
 
 
 def test_each_combination_of_the_other_axes_is_a_set_up_with_its_own_frames(tmp_path):
-    text = "sweep: {source.camera.unit_seed: [1, 2], capture.frames: [1, 5], source.target.distance_m: [0.6, 0.9]}\n"
+    text = (
+        "sweep: {source.camera.unit_seed: [1, 2], capture.frames: [1, 5], "
+        "source.target.distance_m: [0.6, 0.9]}\n"
+    )
     experiment = loaded(tmp_path, BASE + text)
     assert set_ups(experiment) == [
         "unit seed=1, distance=0.6 m",
@@ -74,8 +77,8 @@ def test_each_combination_of_the_other_axes_is_a_set_up_with_its_own_frames(tmp_
     ]
     assert len({point.frames_key for point in experiment.points}) == 4
     # one number of frames more changes no other point
-    more = loaded(tmp_path, BASE + text.replace("[1, 5]", "[1, 2, 5]"))
-    assert {p.digest for p in experiment.points} < {p.digest for p in more.points}
+    additional = loaded(tmp_path, BASE + text.replace("[1, 5]", "[1, 2, 5]"))
+    assert {p.digest for p in experiment.points} < {p.digest for p in additional.points}
     assert experiment.points[0].axes == {
         "source.camera.unit_seed": 1,
         "source.target.distance_m": 0.6,
@@ -119,7 +122,10 @@ def test_switches_are_none_each_alone_all_but_each_and_all(tmp_path):
         ("switches: source.camera\n", ["does not hold switches", "true or false"]),
         ("switches: source.camra.effects\n", ["does not hold switches"]),
         (
-            "switches: source.camera.effects\nsweep: {source.camera.effects.noise: [true, false]}\n",
+            (
+                "switches: source.camera.effects\nsweep: {source.camera.effects.noise: [true, "
+                "false]}\n"
+            ),
             ["set the same key"],
         ),
         (
@@ -131,10 +137,10 @@ def test_switches_are_none_each_alone_all_but_each_and_all(tmp_path):
     ],
 )
 def test_what_cannot_be_told_apart_is_refused_with_its_place(tmp_path, text, expected):
-    said = problems(tmp_path, BASE + text)
-    assert "x.yaml:" in said
+    printed = problems(tmp_path, BASE + text)
+    assert "x.yaml:" in printed
     for part in expected:
-        assert part in said
+        assert part in printed
 
 
 def test_names_of_paths_and_values():

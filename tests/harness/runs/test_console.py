@@ -140,7 +140,7 @@ def shown_on_terminal(program: str, columns: int) -> str:
         [sys.executable, "-c", program], cwd=ROOT, stderr=theirs, env=environment
     )
     os.close(theirs)
-    said = b""
+    printed = b""
     while select.select([ours], [], [], 60)[0]:
         try:
             content = os.read(ours, 65536)
@@ -148,7 +148,7 @@ def shown_on_terminal(program: str, columns: int) -> str:
             break
         if not content:
             break
-        said += content
+        printed += content
     os.close(ours)
     assert process.wait(timeout=600) == 0
-    return said.decode()
+    return printed.decode()

@@ -41,7 +41,9 @@ if TYPE_CHECKING:
 def recorded(folder: Path, role: str) -> list[str]:
     """Keys of the trials of a role that are in the journal by now."""
     keys = [
-        key for found in folder.glob("tiny/[0-9a-f]*/journal") for key in trial_keys(Journal(found))
+        key
+        for result in folder.glob("tiny/[0-9a-f]*/journal")
+        for key in trial_keys(Journal(result))
     ]
     return [key for key in keys if key.startswith(role)]
 
@@ -91,15 +93,15 @@ def test_a_sweep_leaves_all_its_files(finished):
 
 
 def test_provenance_is_stored(finished):
-    said = json.loads((results(finished) / "provenance.json").read_text())
-    assert said["seed"] == 3
-    assert said["command"].startswith("tofpod sweep ")
-    assert said["versions"]["mitsuba"]
-    assert set(said) >= {"commit", "dirty", "machine", "failures", "seconds"}
+    printed = json.loads((results(finished) / "provenance.json").read_text())
+    assert printed["seed"] == 3
+    assert printed["command"].startswith("tofpod sweep ")
+    assert printed["versions"]["mitsuba"]
+    assert set(printed) >= {"commit", "dirty", "machine", "failures", "seconds"}
     import pyarrow.parquet as pq
 
     inside = json.loads(pq.read_schema(results(finished) / "trials.parquet").metadata[b"tofpod"])
-    assert inside["digest"] == said["digest"]
+    assert inside["digest"] == printed["digest"]
 
 
 def test_report_is_one_file_without_outside_links(finished):
@@ -133,9 +135,9 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
     (folder / "trials.parquet").unlink()
     done = sweep(finished.parent / "tiny.yaml", half, "--serial")
     assert done.returncode == 0, done.stderr
-    said = json.loads((folder / "provenance.json").read_text())
-    assert said["trials"] == {"done": 3, "resumed": 1, "failed": 0}
-    assert said["renders"] == {"done": 0, "cached": 2, "failed": 0}
+    printed = json.loads((folder / "provenance.json").read_text())
+    assert printed["trials"] == {"done": 3, "resumed": 1, "failed": 0}
+    assert printed["renders"] == {"done": 0, "cached": 2, "failed": 0}
     pd.testing.assert_frame_equal(trials(finished), trials(half), check_exact=True)
 
 
@@ -198,7 +200,7 @@ def test_workers_end_with_a_driver_that_is_killed(finished, tmp_path):
 
 def processes_marked(mark: str) -> list[int]:
     """Living processes whose environment holds the mark."""
-    found = []
+    result = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             environment = (folder / "environ").read_bytes()
@@ -206,8 +208,8 @@ def processes_marked(mark: str) -> list[int]:
         except OSError:
             continue
         if f"TOFPOD_TEST_OF={mark}".encode() in environment and state != "Z":
-            found.append(int(folder.name))
-    return found
+            result.append(int(folder.name))
+    return result
 
 
 def test_dry_run_counts_and_runs_nothing(finished, tmp_path):
@@ -348,10 +350,10 @@ def test_a_bug_in_every_trial_keeps_its_traceback_once(finished, monkeypatch, ca
         )
         == 1
     )
-    told = capsys.readouterr().err
-    assert told.count("Traceback (most recent call last)") == 1
-    assert "ValueError: a bug of the detector" in told
-    assert told.rstrip().endswith(
+    error_text = capsys.readouterr().err
+    assert error_text.count("Traceback (most recent call last)") == 1
+    assert "ValueError: a bug of the detector" in error_text
+    assert error_text.rstrip().endswith(
         "no trial of tiny succeeded; 4 failed, the first as above (detector 'thesis')"
     )
     assert not list(out.glob("tiny/[0-9a-f]*/report.html"))
@@ -392,5 +394,5 @@ def test_matching_places_findings_on_a_curved_face():
     vars(set_up).update(
         {"outlines": pixels, "intact": one > 0, "seen_depth_m": {1: 0.0}, "on_face_m": one}
     )
-    known = set_up.labelled(cast("Cloud", SimpleNamespace(projection="central")))
-    assert known.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)
+    reference = set_up.labelled(cast("Cloud", SimpleNamespace(projection="central")))
+    assert reference.on_board(deeper)[0] == pytest.approx(damage.centre_board_m[:2], abs=1e-5)

@@ -119,15 +119,15 @@ def test_faults_in_trials_are_told_and_mended(home):
         and "--retry-failed" in done.stderr
     )
     folder = results(home / "disturbed")
-    said = json.loads((folder / "provenance.json").read_text())
-    assert sorted(one["state"] for one in said["failures"]) == [
+    printed = json.loads((folder / "provenance.json").read_text())
+    assert sorted(one["state"] for one in printed["failures"]) == [
         "crashed",
         "failed",
         "failed",
         "timed out",
     ]
     # all else ran: six hole-free trials and six damaged ones, less four, whichever they were
-    assert said["trials"] == {"done": 8, "resumed": 0, "failed": 4}
+    assert printed["trials"] == {"done": 8, "resumed": 0, "failed": 4}
     again = run(home, "disturbed", *limits)
     assert again.returncode == 1
     assert json.loads((folder / "provenance.json").read_text())["trials"] == {
@@ -157,8 +157,8 @@ def test_a_killed_driver_costs_what_was_under_way(home):
     process.wait()
     done = run(home, "killed")
     assert done.returncode == 0, done.stderr
-    said = json.loads((results(out) / "provenance.json").read_text())["trials"]
-    assert said["resumed"] >= 6 + len(kept) and said["done"] + said["resumed"] == 12
+    printed = json.loads((results(out) / "provenance.json").read_text())["trials"]
+    assert printed["resumed"] >= 6 + len(kept) and printed["done"] + printed["resumed"] == 12
     assert content(results(out)) == content(results(home / "calm"))
 
 
@@ -182,9 +182,9 @@ def test_damaged_files_are_noticed_and_made_anew(home):
     journal.write_text("\n".join(lines) + "\n")
     done = run(home, "damaged")
     assert done.returncode == 0, done.stderr
-    said = json.loads((results(out) / "provenance.json").read_text())
-    assert said["renders"] == {"done": 2, "cached": 0, "failed": 0}
-    assert said["trials"] == {"done": 2, "resumed": 10, "failed": 0}
+    printed = json.loads((results(out) / "provenance.json").read_text())
+    assert printed["renders"] == {"done": 2, "cached": 0, "failed": 0}
+    assert printed["trials"] == {"done": 2, "resumed": 10, "failed": 0}
     assert content(results(out)) == content(results(home / "calm"))
 
 

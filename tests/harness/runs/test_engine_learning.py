@@ -158,8 +158,8 @@ def test_a_detector_that_learns_nothing_costs_itself_only(study_out, tmp_path):
     )
     outcome = run_serially(plan, tmp_path / "journal")
     assert len(outcome.thresholds) == 1
-    said = sorted(failure.why for failure in outcome.failures)
-    assert said == ["its detector has learned nothing", "these clouds teach nothing"]
+    printed = sorted(failure.why for failure in outcome.failures)
+    assert printed == ["its detector has learned nothing", "these clouds teach nothing"]
     assert all("runs" in record for record in records_of(tmp_path / "journal", outcome))
 
 
@@ -171,7 +171,7 @@ def test_every_unit_inspects_every_damaged_board_and_others_have_units_of_their_
     study_out, tmp_path
 ):
     group = group_in(study_out, tmp_path, UNITS, LEARNING)
-    more = group_in(study_out, tmp_path, "study.units=4", LEARNING)
+    additional = group_in(study_out, tmp_path, "study.units=4", LEARNING)
     seeds: Counter[int] = Counter()
     for batch in (*group.first, *group.then):
         tasks = [
@@ -186,12 +186,13 @@ def test_every_unit_inspects_every_damaged_board_and_others_have_units_of_their_
     )
     taught = {ref.camera.unit_seed for ref in group.learning[0].views}
     assert len(taught) == LEARNING_BOARDS and not taught & set(seeds)
-    assert {batch.paths for batch in more.batches} == {batch.paths for batch in group.batches}, (
-        "units share renders"
-    )
+    assert {batch.paths for batch in additional.batches} == {
+        batch.paths for batch in group.batches
+    }, "units share renders"
     at_5 = {point.digest: 5.0 for point in group.points}
     keys = [
-        {key for batch in one.then for key, _ in one.trials(batch, at_5)} for one in (group, more)
+        {key for batch in one.then for key, _ in one.trials(batch, at_5)}
+        for one in (group, additional)
     ]
     assert keys[0] < keys[1], "a further unit leaves the trials of the others as they were"
 
@@ -226,10 +227,10 @@ def test_units_in_shards_give_the_same_record(over_units, study_out, tmp_path):
 
 
 def test_one_unit_is_said_first(study_out, tmp_path):
-    one = limit_of(study_of(study_out, tmp_path, *ONE_FRAME).set_ups[0], draws=50)
-    assert study_answer([one]).startswith("One unit of the camera: 1 frame: ")
-    assert limits_grid([one], terminal=True).title.startswith("One unit of the camera: ")
-    assert "new unit (mm)" not in limits_grid([one]).heads
+    limit = limit_of(study_of(study_out, tmp_path, *ONE_FRAME).set_ups[0], draws=50)
+    assert study_answer([limit]).startswith("One unit of the camera: 1 frame: ")
+    assert limits_grid([limit], terminal=True).title.startswith("One unit of the camera: ")
+    assert "new unit (mm)" not in limits_grid([limit]).heads
 
 
 @pytest.mark.slow  # three studies

@@ -80,24 +80,31 @@ def test_a_registration_error_is_split_into_the_plane_and_across_it():
 
 def test_the_truth_lies_on_a_map_where_its_cells_are():
     cloud, T_reference_cloud = map_of(0.0, missing=True)
-    known = first_view().labelled_map(cloud, T_reference_cloud)
-    places = board_places_m(cloud, known.T_board_cloud)
-    inside = places.reshape(-1, 2)[known.outlines[7]]
+    reference = first_view().labelled_map(cloud, T_reference_cloud)
+    positions = board_places_m(cloud, reference.T_board_cloud)
+    inside = positions.reshape(-1, 2)[reference.outlines[7]]
     # cells without a value count as seeing into the hole as well
-    assert not cloud.valid.ravel()[known.outlines[7]].all()
+    assert not cloud.valid.ravel()[reference.outlines[7]].all()
     steps = range(-6, 7)
     assert len(inside) == sum((2 * i) ** 2 + (2 * j) ** 2 < 10.5**2 for i in steps for j in steps)
     assert np.linalg.norm(inside - [0.05, 0.0], axis=-1).max() < 0.0105
     margin_m = 8 * 1.4e-3
-    assert np.linalg.norm(places[known.undamaged] - [0.05, 0.0], axis=-1).min() > 0.0105 + margin_m
-    assert np.abs(places[known.undamaged]).max(axis=0) == pytest.approx([0.14, 0.0888], abs=2.1e-3)
-    assert known.centre_in_cloud_m(known.truth[0]) == pytest.approx([0.05, 0.0, 0.7], abs=1e-12)
+    assert (
+        np.linalg.norm(positions[reference.undamaged] - [0.05, 0.0], axis=-1).min()
+        > 0.0105 + margin_m
+    )
+    assert np.abs(positions[reference.undamaged]).max(axis=0) == pytest.approx(
+        [0.14, 0.0888], abs=2.1e-3
+    )
+    assert reference.centre_in_cloud_m(reference.truth[0]) == pytest.approx(
+        [0.05, 0.0, 0.7], abs=1e-12
+    )
 
 
 def test_a_finding_at_depth_is_placed_along_the_maps_axis():
     cloud, T_reference_cloud = map_of(0.0)
-    known = first_view().labelled_map(cloud, T_reference_cloud)
-    assert known.on_board(np.array([[0.05, 0.01, 0.73]]))[0] == pytest.approx(
+    reference = first_view().labelled_map(cloud, T_reference_cloud)
+    assert reference.on_board(np.array([[0.05, 0.01, 0.73]]))[0] == pytest.approx(
         [0.05, -0.01], abs=1e-12
     )
 
@@ -105,16 +112,16 @@ def test_a_finding_at_depth_is_placed_along_the_maps_axis():
 @pytest.mark.parametrize("height_m", [0.0, 1e-3, -2e-3])
 def test_errors_of_a_map_are_told_behind_the_face(height_m):
     cloud, T_reference_cloud = map_of(height_m)
-    known = first_view(damaged=False).labelled_map(cloud, T_reference_cloud)
-    errors = face_errors_m(known, np.array([[0.0, 0.0], [0.1, 0.05], [-0.1, 0.0301]]))
+    reference = first_view(damaged=False).labelled_map(cloud, T_reference_cloud)
+    errors = face_errors_m(reference, np.array([[0.0, 0.0], [0.1, 0.05], [-0.1, 0.0301]]))
     assert errors == pytest.approx(np.full(3, -height_m), abs=1e-9)
 
 
 def test_a_place_that_a_map_does_not_reach_has_no_error():
     cloud, T_reference_cloud = map_of(0.0)
-    known = first_view(damaged=False).labelled_map(cloud, T_reference_cloud)
-    near = np.random.default_rng(1).uniform(-0.08, 0.08, (20, 2))
-    errors = face_errors_m(known, np.vstack([near, [[0.3, 0.2]]]))
+    reference = first_view(damaged=False).labelled_map(cloud, T_reference_cloud)
+    nearby = np.random.default_rng(1).uniform(-0.08, 0.08, (20, 2))
+    errors = face_errors_m(reference, np.vstack([nearby, [[0.3, 0.2]]]))
     assert np.isfinite(errors[:-1]).all()
     assert np.isnan(errors[-1])
 

@@ -23,13 +23,13 @@ from tests.support.tiny_sweep import ROOT
 def run(engine: JobEngine, jobs: list[Job]) -> dict[str, Ended]:
     """All jobs, by name."""
     waiting = list(jobs)
-    found = {}
+    result = {}
     with engine:
-        while len(found) < len(jobs):
+        while len(result) < len(jobs):
             while waiting and engine.room(waiting[0].stage) > 0:
                 engine.submit(waiting.pop(0))
-            found.update({job.name: ended for job, ended in engine.ended()})
-    return found
+            result.update({job.name: ended for job, ended in engine.ended()})
+    return result
 
 
 def doubles(count: int) -> list[Job]:
@@ -53,8 +53,8 @@ def test_every_fault_costs_its_own_job_only():
     jobs = [
         one for pair in zip(faults, innocent[: len(faults)], strict=True) for one in pair
     ] + innocent[len(faults) :]
-    found = run(LocalEngine(2, Limits(seconds=10.0, memory_mb=1000)), jobs)
-    assert {name: ended.state for name, ended in found.items() if ended.state != "done"} == {
+    result = run(LocalEngine(2, Limits(seconds=10.0, memory_mb=1000)), jobs)
+    assert {name: ended.state for name, ended in result.items() if ended.state != "done"} == {
         "raises": "failed",
         "refuses": "failed",
         "kills_its_process": "crashed",
@@ -62,36 +62,36 @@ def test_every_fault_costs_its_own_job_only():
         "hangs": "timed out",
         "eats_memory": "failed",
     }
-    assert [found[one.name].value for one in innocent] == [2 * n for n in range(30)]
-    assert found["raises"].is_bug and found["raises"].why.rstrip().endswith("ValueError: a bug")
-    assert "Traceback" in found["raises"].why
-    assert not found["refuses"].is_bug and "to do: mend it" in found["refuses"].why
-    assert "SIGKILL" in found["kills_its_process"].why
-    assert "SIGABRT" in found["aborts"].why and "faulty_jobs.py" in found["aborts"].why
-    assert "not done after 10" in found["hangs"].why and "in hangs" in found["hangs"].why
-    assert "out of memory" in found["eats_memory"].why
-    assert found["hangs"].seconds >= 10.0
-    assert all(ended.state in STATES and ended.worker for ended in found.values())
+    assert [result[one.name].value for one in innocent] == [2 * n for n in range(30)]
+    assert result["raises"].is_bug and result["raises"].why.rstrip().endswith("ValueError: a bug")
+    assert "Traceback" in result["raises"].why
+    assert not result["refuses"].is_bug and "to do: mend it" in result["refuses"].why
+    assert "SIGKILL" in result["kills_its_process"].why
+    assert "SIGABRT" in result["aborts"].why and "faulty_jobs.py" in result["aborts"].why
+    assert "not done after 10" in result["hangs"].why and "in hangs" in result["hangs"].why
+    assert "out of memory" in result["eats_memory"].why
+    assert result["hangs"].seconds >= 10.0
+    assert all(ended.state in STATES and ended.worker for ended in result.values())
 
 
 def test_quick_jobs_are_ready_before_the_last_has_ended():
     """And those that wait for a process that dies, or hangs, are run by another."""
-    rest = doubles(40)
+    remainder = doubles(40)
     jobs = [
-        *rest[:20],
+        *remainder[:20],
         job(faulty_jobs.kills_its_process),
-        *rest[20:30],
+        *remainder[20:30],
         job(faulty_jobs.hangs),
-        *rest[30:],
+        *remainder[30:],
     ]
     with LocalEngine(1, Limits()) as engine:
         assert engine.room("trials") == 2
         engine.submit(jobs[0])
         assert engine.room("trials") == 1
-    found = run(LocalEngine(1, Limits(seconds=8.0)), jobs)
-    states = {name: ended.state for name, ended in found.items() if ended.state != "done"}
+    result = run(LocalEngine(1, Limits(seconds=8.0)), jobs)
+    states = {name: ended.state for name, ended in result.items() if ended.state != "done"}
     assert states == {"kills_its_process": "crashed", "hangs": "timed out"}
-    assert [found[one.name].value for one in rest] == [2 * n for n in range(40)]
+    assert [result[one.name].value for one in remainder] == [2 * n for n in range(40)]
 
 
 def test_time_and_memory_are_told():
@@ -134,17 +134,17 @@ def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_i
     other.mkdir(parents=True)
     for path in (other.parent / "__init__.py", other / "__init__.py", other / "trial.py"):
         path.touch()
-    given = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900}
-    done = subprocess.run([sys.executable, "-c", OTHER_FOLDER, str(tmp_path)], **given)
+    arguments = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900}
+    done = subprocess.run([sys.executable, "-c", OTHER_FOLDER, str(tmp_path)], **arguments)
     assert str(ROOT / "harness" / "trials" / "trial.py") in done.stdout, done.stdout + done.stderr
 
 
 def test_serial_runs_here_and_in_order():
     jobs = [Job("pid", "trials", os.getpid, ()), *doubles(3), job(faulty_jobs.raises)]
-    found = run(SerialEngine(), jobs)
-    assert found["pid"].value == os.getpid()
-    assert list(found) == [job.name for job in jobs]
-    assert found["raises"].state == "failed"
+    result = run(SerialEngine(), jobs)
+    assert result["pid"].value == os.getpid()
+    assert list(result) == [job.name for job in jobs]
+    assert result["raises"].state == "failed"
 
 
 def test_leaving_early_ends_processes_at_once():
@@ -186,8 +186,8 @@ def test_a_process_that_has_loaded_edited_code_is_refused(tmp_path, monkeypatch)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     code = {"trials": (("edited_plug_in",), ("numpy",))}
-    found = run(LocalEngine(1, Limits(), code), doubles(2))
-    assert [ended.value for ended in found.values()] == [0, 2]
+    result = run(LocalEngine(1, Limits(), code), doubles(2))
+    assert [ended.value for ended in result.values()] == [0, 2]
     engine = LocalEngine(1, Limits(), code)
     source.write_text("ANSWER = 2\n")
     with pytest.raises(UserError, match="the code of trials was edited while this sweep ran"):
@@ -211,8 +211,8 @@ def test_time_in_which_everything_stood_still_is_not_counted(monkeypatch):
 
     monkeypatch.setattr(Connection, "poll", stopped)
     engine = LocalEngine(1, Limits(seconds=60.0))
-    found = run(engine, [Job("sleeps", "trials", time.sleep, (3.0,))])
-    assert clock["ahead_s"] == 3600.0 and found["sleeps"].state == "done"
+    result = run(engine, [Job("sleeps", "trials", time.sleep, (3.0,))])
+    assert clock["ahead_s"] == 3600.0 and result["sleeps"].state == "done"
 
 
 def test_a_full_disk_ends_everything(tmp_path, monkeypatch):

@@ -144,21 +144,21 @@ def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
             if group.damaged.board is None
         ]
         assert outcome.examples == pictures
-        found = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
-        assert expected is None or found == expected
-        expected = found
+        result = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
+        assert expected is None or result == expected
+        expected = result
 
 
 def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
     """Any trials are missing from the journal, others are left as failed or skipped."""
-    whole = go(plan, tmp_path / "whole", Pretended())
+    complete = go(plan, tmp_path / "whole", Pretended())
     rng = random.Random(1)
     for number in range(3):
         folder = tmp_path / str(number)
         kept = 0
         journal = Journal(folder)
         source = Journal(tmp_path / "whole")
-        for key in whole.finished:
+        for key in complete.finished:
             entry = source.read(key)
             assert entry is not None
             chance = rng.random()
@@ -170,8 +170,8 @@ def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
         engine = Pretended(number)
         outcome = go(plan, folder, engine, retry_failed=True)
         assert (outcome.trials.found, outcome.trials.over) == (kept, trial_count(plan))
-        assert outcome.failures == [] and outcome.finished == whole.finished
-        assert outcome.examples == whole.examples, (
+        assert outcome.failures == [] and outcome.finished == complete.finished
+        assert outcome.examples == complete.examples, (
             "pictures are made again, though every trial may be there"
         )
         assert records(folder) == records(tmp_path / "whole")
@@ -228,22 +228,22 @@ def test_a_calibration_whose_process_dies_is_tried_once_more(tmp_path):
 def test_shards_that_finish_each_others_calibration(plan, tmp_path):
     """While one shard works, another in the same folder does; in any order of events no judged
     trial is lost."""
-    whole = go(plan, tmp_path / "whole", Pretended())
+    complete = go(plan, tmp_path / "whole", Pretended())
     for seed in range(3):
         folder = tmp_path / str(seed)
 
         def other_is_faster(job: Job, folder: Path = folder) -> None:
             source = Journal(tmp_path / "whole")
             journal = Journal(folder)
-            for key in whole.finished:
+            for key in complete.finished:
                 entry = source.read(key)
                 if entry is not None and key.startswith(("calibration", "hole_free")):
                     journal.write(key, entry)
 
         rng = random.Random(seed)
-        at = rng.randrange(1, 6)
+        index = rng.randrange(1, 6)
 
-        def ends(job: Job, at: int = at, seen: list[str] = [], faster=other_is_faster) -> None:  # noqa: B006
+        def ends(job: Job, at: int = index, seen: list[str] = [], faster=other_is_faster) -> None:  # noqa: B006
             seen.append(job.name)
             if len(seen) == at:
                 faster(job)
@@ -271,11 +271,11 @@ def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Pat
 def test_shards_of_unlike_machines_lose_no_work(plan, tmp_path):
     """Their thresholds differ in the last digits: nothing is judged again, and all rows state the
     threshold in use."""
-    whole = go(plan, tmp_path / "whole", Pretended())
+    complete = go(plan, tmp_path / "whole", Pretended())
     into = shards_of_unlike_machines(plan, tmp_path, 1 + 1e-9)
     joined = go(plan, into, Pretended())
     assert (joined.trials.done, joined.trials.found, joined.failures) == (0, trial_count(plan), [])
-    assert joined.thresholds == pytest.approx(whole.thresholds, rel=1e-8)
+    assert joined.thresholds == pytest.approx(complete.thresholds, rel=1e-8)
     journal = Journal(into)
     for key in joined.finished:
         entry = journal.read(key)
@@ -305,11 +305,11 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
         [id(leader) for leader, parts in zip(leaders, each, strict=True) if parts]
         for each in judged
     ]
-    both = [
+    pair = [
         group for group in leaders if all(id(group) in shard for shard in shards) and group.first
     ]
     calibrates = any(
-        point.config.threshold.calibrate is not None for group in both for point in group.points
+        point.config.threshold.calibrate is not None for group in pair for point in group.points
     )
     assert (joined.trials.done > 0) == calibrates
     assert joined.failures == [] and joined.trials.over == trial_count(plan)
@@ -321,14 +321,14 @@ def test_work_ahead_is_bounded(tmp_path, monkeypatch):
     (tmp_path / "tiny.yaml").write_text(TINY)
     changes = ["repeats=100000", "threshold={k: 5.0}"]
     plan = plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path)
-    made = []
+    created = []
     real = Group._key
 
     class Stopped(Pretended):
         def ended(self) -> list[tuple[Job, Ended]]:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Group, "_key", lambda *one: made.append(1) or real(*one))
+    monkeypatch.setattr(Group, "_key", lambda *one: created.append(1) or real(*one))
     with pytest.raises(KeyboardInterrupt):
         go(plan, tmp_path / "journal", Stopped())
-    assert 0 < len(made) <= engine_run.AHEAD + 256
+    assert 0 < len(created) <= engine_run.AHEAD + 256

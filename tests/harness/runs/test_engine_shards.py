@@ -53,8 +53,8 @@ def test_shards_with_a_common_folder_share_the_calibration(home, tmp_path):
     counts = [run_serially(study, tmp_path, shard=Shard(number, 3)).trials for number in (3, 1, 2)]
     assert [count.failed for count in counts] == [0, 0, 0]
     assert sum(count.done for count in counts) == trial_count(study)
-    whole = run_serially(study, tmp_path)
-    assert (whole.trials.done, whole.trials.found) == (0, trial_count(study))
+    complete = run_serially(study, tmp_path)
+    assert (complete.trials.done, complete.trials.found) == (0, trial_count(study))
 
 
 def test_a_shard_takes_the_calibration_that_is_merged_into_its_folder(home, tmp_path):
@@ -71,27 +71,27 @@ def test_a_shard_takes_the_calibration_that_is_merged_into_its_folder(home, tmp_
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
 def test_every_judged_trial_belongs_to_one_shard(home, count):
     study = plan(home)
-    seen: list[tuple[int, int, int]] = []
+    observed: list[tuple[int, int, int]] = []
     for number in range(1, count + 1):
         first, then = parts_of(study, Shard(number, count))
         for parts in then:
-            seen += [
+            observed += [
                 (id(part.batch), part.group, repeat) for part in parts for repeat in part.repeats
             ]
         for group, parts in enumerate(first):
             assert bool(parts) == bool(then[group]), (
                 "a shard calibrates what it judges, and nothing else"
             )
-    assert len(seen) == len(set(seen))
-    assert len(seen) == sum(g.most_repeats(b) for g in study.groups for b in g.then)
+    assert len(observed) == len(set(observed))
+    assert len(observed) == sum(g.most_repeats(b) for g in study.groups for b in g.then)
 
 
 def test_a_shard_renders_only_what_it_needs(home):
     study = plan(home)
     (first, then), (_, all_then) = parts_of(study, Shard(1, 4)), parts_of(study, Shard(1, 1))
-    mine = {path for parts in (*first, *then) for part in parts for path in part.batch.paths}
+    own_rows = {path for parts in (*first, *then) for part in parts for path in part.batch.paths}
     judged = {path for parts in all_then for part in parts for path in part.batch.paths}
-    assert judged - mine
+    assert judged - own_rows
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "3", "a/b", "-1/3", "1/0", "1/3/5", "1/100001"])
@@ -121,9 +121,9 @@ def test_the_same_shard_twice_or_beside_a_whole_sweep_is_refused(tmp_path):
 @pytest.fixture
 def two(home, tmp_path) -> tuple[Path, Path]:
     """A finished folder, and where to merge into."""
-    whole = results(home / "out")
-    shutil.copytree(whole, tmp_path / "a" / "tiny" / whole.name)
-    return tmp_path / "a" / "tiny" / whole.name, tmp_path / "b" / "tiny" / whole.name
+    complete = results(home / "out")
+    shutil.copytree(complete, tmp_path / "a" / "tiny" / complete.name)
+    return tmp_path / "a" / "tiny" / complete.name, tmp_path / "b" / "tiny" / complete.name
 
 
 def test_merging_twice_copies_once(two, capsys):
@@ -175,14 +175,14 @@ def test_mistakes_in_merging(two, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     stranger = tmp_path / "c" / "tiny" / "0123456789abcdef"
     shutil.copytree(other, stranger)
-    for arguments, said in (
+    for arguments, printed in (
         ([str(tmp_path / "empty"), "--into", str(into)], "has no journal"),
         ([str(other), "--into", str(other)], "is the folder to merge into"),
         ([str(other), str(stranger), "--into", str(into)], "different experiments"),
         ([str(other), "--into", str(tmp_path / "elsewhere")], "must be in a folder of that name"),
     ):
         assert merge.main(arguments) == 2
-        assert said in capsys.readouterr().err
+        assert printed in capsys.readouterr().err
     assert not into.exists()
 
 

@@ -62,9 +62,9 @@ def written(folder: Path, text: str = STUDY) -> Path:
     ],
 )
 def test_what_does_not_fit_together_is_told(tmp_path, changed, expected):
-    with pytest.raises(DeclarationError) as told:
+    with pytest.raises(DeclarationError) as message:
         load_experiment(written(tmp_path), [changed])
-    assert expected in str(told.value)
+    assert expected in str(message.value)
 
 
 def test_the_rate_of_false_calls_has_a_default_and_is_written_out(tmp_path):
@@ -75,12 +75,14 @@ def test_the_rate_of_false_calls_has_a_default_and_is_written_out(tmp_path):
 
 
 def test_more_boards_are_another_study_of_the_same_boards(tmp_path):
-    few = load_experiment(written(tmp_path), ["study.boards=" + "4"])
-    more = load_experiment(written(tmp_path), ["study.boards=" + "6"])
-    assert few.digest != more.digest
-    assert [point.digest for point in few.points] == [point.digest for point in more.points]
-    a = plan_of(few, tmp_path).groups[0].then
-    b = plan_of(more, tmp_path).groups[0].then
+    experiment = load_experiment(written(tmp_path), ["study.boards=" + "4"])
+    experiment = load_experiment(written(tmp_path), ["study.boards=" + "6"])
+    assert experiment.digest != experiment.digest
+    assert [point.digest for point in experiment.points] == [
+        point.digest for point in experiment.points
+    ]
+    a = plan_of(experiment, tmp_path).groups[0].then
+    b = plan_of(experiment, tmp_path).groups[0].then
     assert {job.path for batch in a for job in batch.renders} < {
         job.path for batch in b for job in batch.renders
     }
@@ -121,9 +123,9 @@ def test_groups_that_differ_in_damage_share_their_trials_before_thresholds(tmp_p
         assert {point.digest for task in tasks for point in task.points} == {
             point.digest for point in group.points
         }
-    for apart in ("source.camera.unit_seed: [1, 2]", "source.target.distance_m: [0.6, 0.7]"):
+    for separation in ("source.camera.unit_seed: [1, 2]", "source.target.distance_m: [0.6, 0.7]"):
         groups = plan_of(
-            load_experiment(written(tmp_path), [f"sweep={{{apart}}}"]), tmp_path
+            load_experiment(written(tmp_path), [f"sweep={{{separation}}}"]), tmp_path
         ).groups
         assert [group.leader for group in groups] == [None, None]
 
@@ -210,11 +212,11 @@ def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_pat
         and one.failed == 0
         and len(one.inspected.hit) == 20
     )
-    (said,) = without_limit(experiment.points, outcome, failed, record.set_ups)
-    assert said.startswith(
+    (printed,) = without_limit(experiment.points, outcome, failed, record.set_ups)
+    assert printed.startswith(
         "no limit for unit seed 2: the camera sees no part of the board that can be judged"
     )
-    assert "leaves none of the cloud's points" in said
+    assert "leaves none of the cloud's points" in printed
 
 
 # ---- the whole study

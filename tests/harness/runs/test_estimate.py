@@ -36,10 +36,10 @@ def lines(
 
 def test_the_dry_run_counts_and_writes_nothing(tmp_path, capsys):
     experiment = load_experiment(EXPERIMENTS / "smoke.yaml", [])
-    said = lines(experiment, tmp_path / "out", capsys)
+    printed = lines(experiment, tmp_path / "out", capsys)
     assert not (tmp_path / "out").exists()
-    assert said[0] == "smoke: valid" and str(experiment.folder(tmp_path / "out")) in said[-1]
-    assert said[2:4] == ["  renders: 3, 0 of them cached", "  trials: 12"]
+    assert printed[0] == "smoke: valid" and str(experiment.folder(tmp_path / "out")) in printed[-1]
+    assert printed[2:4] == ["  renders: 3, 0 of them cached", "  trials: 12"]
 
 
 def test_cached_renders_and_recorded_trials_are_told(tmp_path, capsys):
@@ -50,9 +50,9 @@ def test_cached_renders_and_recorded_trials_are_told(tmp_path, capsys):
     Journal(experiment.folder(tmp_path) / "journal").write(
         "damaged-1", Ended("done", '{"runs": []}')
     )
-    said = lines(experiment, tmp_path, capsys)
-    assert said[2] == "  renders: 3, 1 of them cached"
-    assert "the journal holds 1 trial;" in said[4]
+    printed = lines(experiment, tmp_path, capsys)
+    assert printed[2] == "  renders: 3, 1 of them cached"
+    assert "the journal holds 1 trial;" in printed[4]
 
 
 def test_shards_share_the_trials(tmp_path, capsys):

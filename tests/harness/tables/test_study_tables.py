@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 
 from harness.evaluation.intervals import Interval
-from harness.evaluation.study.curves import PixelCurves
+from harness.evaluation.study.curves import ChanceHits, PixelCurves
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import Calibrated
-from harness.evaluation.study.result import FRAMES, Difference, SetUpResult, axis_lines
+from harness.evaluation.study.result import (
+    FRAMES,
+    Difference,
+    SetUpResult,
+    StudyResult,
+    axis_lines,
+)
 from harness.evaluation.study.surface import PodSurface
 from harness.evaluation.study.units import OverUnits
 from harness.tables.limits import (
@@ -27,6 +33,10 @@ from harness.tables.limits import (
 )
 from harness.tables.study import (
     AXES,
+    CHANCE,
+    DEPTH_LIMITS,
+    OPERATING,
+    THRESHOLDS,
     AxisRow,
     axis_groups,
     axis_note,
@@ -35,6 +45,7 @@ from harness.tables.study import (
     depths_at,
     operating_notes,
     set_by,
+    study_tables,
     threshold_note,
     threshold_warnings,
 )
@@ -332,3 +343,62 @@ def test_hits_by_missing_returns_alone_are_noted(two: list[SetUpLimit]) -> None:
             )
         )
     )
+
+
+# files
+
+
+def test_every_column_of_a_limit_is_its_own_number(two: list[SetUpLimit]) -> None:
+    limit = replace(two[0], size_error_mm=0.25, sized=7, seconds_detect=0.0423)
+    row = LIMITS.frame([limit]).iloc[0]
+    inspected = limit.record.inspected
+    assert row["smallest_mm"] == inspected.diameter_mm.min()
+    assert row["largest_mm"] == inspected.diameter_mm.max()
+    assert row["over_boards_mm"] == limit.over_boards.value
+    assert row["a50_low_mm"] == limit.a50_interval_mm.low
+    assert row["a50_high_mm"] == limit.a50_interval_mm.high
+    assert row["false_calls"] == limit.false_calls.calls
+    assert row["false_calls_per_m2"] == limit.false_calls.rate_per_m2
+    assert row["hole_free_m2"] == pytest.approx(12 * 0.25)
+    assert row["inspections"] == limit.inspections
+    assert row["design_effect"] == limit.design_effect
+    assert row["threshold"] == limit.record.threshold
+    assert row["calibration_runs"] == limit.record.calibration_runs
+    assert (row["size_error_mm"], row["sized"], row["seconds_detect"]) == (0.25, 7, 0.0423)
+    assert row["frames"] == 1
+    assert row["is_at_most"] == limit.is_at_most
+    assert row["detector"] == "plane"
+    cells = LIMITS.grid([limit])
+    texts = dict(zip(cells.heads, (cell.text for cell in cells.rows[0]), strict=True))
+    assert texts["ms a cloud"] == "42"
+    beyond = replace(limit, over_boards=replace(limit.over_boards, value=14.1))
+    verdicts = LIMITS.frame([beyond]).iloc[0]
+    assert verdicts["over_boards_verdict"] == "beyond the sizes inspected"
+    assert verdicts["a90_95_verdict"] == "demonstrated"
+
+
+def test_tables_hold_the_set_ups_they_are_of(two: list[SetUpLimit]) -> None:
+    chance = ChanceHits(0.1, 9, 0.2, 30, 0.3, Interval(0.2, 0.4))
+    set_ups = (
+        SetUpResult(two[0], chance, None, None, None, None, ""),
+        SetUpResult(two[1], None, None, None, None, None, ""),
+    )
+    result = StudyResult(study_record(), set_ups, tuple(two), axis_lines(two), (), {})
+    tables = study_tables(result)
+    assert tables[LIMITS] == two
+    assert tables[THRESHOLDS] == two
+    assert tables[CHANCE] == [set_ups[0]]
+    assert tables[OPERATING] == list(set_ups)
+    assert [row.value for row in tables[AXES]] == [1, 50]
+    assert tables[DEPTH_LIMITS] == []
+    row = CHANCE.frame(tables[CHANCE]).iloc[0]
+    assert (row["shuffled_share"], row["expected_share"], row["places"]) == (0.1, 0.2, 30)
+    assert row["unflawed_share"] == 0.3
+
+
+def test_an_axis_is_numeric_if_all_its_lines_are(two: list[SetUpLimit]) -> None:
+    (group,) = axis_groups(axis_lines(two))
+    line = group.lines[""]
+    mixed = replace(group, lines={"a": line, "b": replace(line, numeric=False)})
+    assert group.numeric
+    assert not mixed.numeric

@@ -111,14 +111,14 @@ class StoresWrongly(Sound):
 
 class ScoresInvalid(Sound):
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        return replace(found, score=np.nan_to_num(found.score))
+        result = super().analyse(cloud)
+        return replace(result, score=np.nan_to_num(result.score))
 
 
 class OtherShape(Sound):
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        return replace(found, residual_m=found.residual_m.T)
+        result = super().analyse(cloud)
+        return replace(result, residual_m=result.residual_m.T)
 
 
 class NoScale(Sound):
@@ -128,8 +128,8 @@ class NoScale(Sound):
 
 class Infinite(Sound):
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        return replace(found, score=np.where(found.score > 30, np.inf, found.score))
+        result = super().analyse(cloud)
+        return replace(result, score=np.where(result.score > 30, np.inf, result.score))
 
 
 class Restless(Sound):
@@ -137,26 +137,26 @@ class Restless(Sound):
 
     def analyse(self, cloud: Cloud) -> Evidence:
         Restless.calls += 1
-        found = super().analyse(cloud)
-        return replace(found, score=found.score * (1 + 1e-12 * Restless.calls))
+        result = super().analyse(cloud)
+        return replace(result, score=result.score * (1 + 1e-12 * Restless.calls))
 
 
 class Remembers(Sound):
     last = 0.0
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
+        result = super().analyse(cloud)
         size = float(cloud.valid.sum())
         drift = 1e-9 if self.last not in (0.0, size) else 0.0
         self.last = size
-        return replace(found, scale_m=found.scale_m + drift)
+        return replace(result, scale_m=result.scale_m + drift)
 
 
 class Writes(Sound):
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
+        result = super().analyse(cloud)
         cloud.count[0, 0] += 1
-        return found
+        return result
 
 
 class WritesAndRestores(Sound):
@@ -183,11 +183,11 @@ class MeanScores(Sound):
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         score = evidence.score.reshape(-1)
-        found = [
+        result = [
             replace(one, score=float(score[one.pixels].mean()))
             for one in super().find(cloud, evidence, threshold)
         ]
-        return tuple(sorted(found, key=lambda one: -one.score))
+        return tuple(sorted(result, key=lambda one: -one.score))
 
 
 class NeverQuiet(Sound):
@@ -229,8 +229,8 @@ class TakesInvalid(Sound):
 
 class Beyond(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        found = super().find(cloud, evidence, threshold)
-        return tuple(replace(one, pixels=np.append(one.pixels, cloud.valid.size)) for one in found)
+        result = super().find(cloud, evidence, threshold)
+        return tuple(replace(one, pixels=np.append(one.pixels, cloud.valid.size)) for one in result)
 
 
 class InMillimetres(Sound):
@@ -297,29 +297,29 @@ class LosesItself(Sound):
         return {"settings": self.settings}
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        return replace(found, score=self.gain * found.score)
+        result = super().analyse(cloud)
+        return replace(result, score=self.gain * result.score)
 
 
 class AlongRows(Sound):
     """Looks at neighbours in its row alone."""
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        beside = np.fmax(found.score, np.roll(found.score, 1, axis=1))
-        return replace(found, score=np.where(cloud.valid, beside, np.nan))
+        result = super().analyse(cloud)
+        beside = np.fmax(result.score, np.roll(result.score, 1, axis=1))
+        return replace(result, score=np.where(cloud.valid, beside, np.nan))
 
 
 class LooksAtX(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        found = super().find(cloud, evidence, threshold)
-        return tuple(replace(one, centre_m=np.abs(one.centre_m)) for one in found)
+        result = super().find(cloud, evidence, threshold)
+        return tuple(replace(one, centre_m=np.abs(one.centre_m)) for one in result)
 
 
 class LooksAtDistance(Sound):
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        return replace(found, score=found.score * (cloud.points_m[..., 2] / 0.7) ** 2)
+        result = super().analyse(cloud)
+        return replace(result, score=result.score * (cloud.points_m[..., 2] / 0.7) ** 2)
 
 
 class LearnsAnew(Sound):
@@ -399,15 +399,15 @@ def test_every_check_has_a_detector_that_breaks_it_and_is_run() -> None:
     assert {check for check, _, _ in BROKEN} == set(CHECKS)
     with pytest.raises(
         AssertionError, match="moved by 37 mm, a score changed"
-    ) as told:  # the last check
+    ) as message:  # the last check
         check_detector(lambda: LooksAtDistance(ScoreMapConfig()), clouds=[CLOUD])
-    assert "in moves_with_the_cloud" in told.value.__notes__[0]
+    assert "in moves_with_the_cloud" in message.value.__notes__[0]
 
 
 class FindsNothing(Sound):
     def analyse(self, cloud: Cloud) -> Evidence:
-        found = super().analyse(cloud)
-        return replace(found, score=0.0 * found.score)
+        result = super().analyse(cloud)
+        return replace(result, score=0.0 * result.score)
 
 
 def test_a_detector_that_finds_nothing_anywhere_was_not_checked() -> None:
@@ -430,14 +430,14 @@ def test_settings_that_are_no_config_are_told() -> None:
 
 def test_the_clouds_are_what_an_imager_sees() -> None:
     for cloud in synthetic_clouds():
-        seen = cloud.valid
+        valid = cloud.valid
         np.testing.assert_allclose(
-            cloud.lens.project(cloud.points_m[seen])[:, 0], np.nonzero(seen)[1], atol=1e-6
+            cloud.lens.project(cloud.points_m[valid])[:, 0], np.nonzero(valid)[1], atol=1e-6
         )
         np.testing.assert_allclose(
-            cloud.lens.project(cloud.points_m[seen])[:, 1], np.nonzero(seen)[0], atol=1e-6
+            cloud.lens.project(cloud.points_m[valid])[:, 1], np.nonzero(valid)[0], atol=1e-6
         )
-        assert np.array_equal(seen, cloud.count > 0) and np.array_equal(seen, cloud.reason == 0)
+        assert np.array_equal(valid, cloud.count > 0) and np.array_equal(valid, cloud.reason == 0)
 
 
 def test_a_turned_cloud_is_what_the_turned_lens_sees() -> None:
@@ -452,8 +452,8 @@ def test_a_turned_cloud_is_what_the_turned_lens_sees() -> None:
     turned = turned_once(replace(CLOUD, lens=skewed, points_m=points))
     assert turned.valid.shape == CLOUD.valid.shape[::-1] == turned.region.shape
     expected = turned.lens.region_slopes(turned.region)
-    found = turned.points_m[..., :2] / turned.points_m[..., 2:]
-    np.testing.assert_allclose(found[turned.valid], expected[turned.valid], atol=1e-9)
+    result = turned.points_m[..., :2] / turned.points_m[..., 2:]
+    np.testing.assert_allclose(result[turned.valid], expected[turned.valid], atol=1e-9)
 
 
 def test_four_turns_are_none() -> None:

@@ -60,9 +60,9 @@ def test_the_oracle_finds_each_damage_once_where_it_is(threshold: float) -> None
     cloud = plane(seed=1)
     detector = oracle(*TRUTH)
     evidence = detector.analyse(cloud)
-    found = detector.find(cloud, evidence, threshold)
-    assert [one.score for one in found] == [1.0, 1.0, 1.0]
-    for one, true in zip(found, TRUTH, strict=True):
+    result = detector.find(cloud, evidence, threshold)
+    assert [one.score for one in result] == [1.0, 1.0, 1.0]
+    for one, true in zip(result, TRUTH, strict=True):
         np.testing.assert_array_equal(one.centre_m, true.centre_m)
         np.testing.assert_array_equal(one.pixels, true.pixels)
         measured = detector.measure(cloud, evidence, one)
@@ -84,9 +84,9 @@ def test_the_oracle_finds_damage_none_of_whose_pixels_has_a_range() -> None:
     blinded = without(cloud, gone)
     detector = oracle(*TRUTH)
     evidence = detector.analyse(blinded)
-    found = detector.find(blinded, evidence, 0.5)
-    assert len(found) == 3 and (evidence.score.reshape(-1)[TRUTH[0].pixels] == 1.0).all()
-    assert detector.measure(blinded, evidence, found[0]).extent_diameter_m == TRUTH[0].diameter_m
+    result = detector.find(blinded, evidence, 0.5)
+    assert len(result) == 3 and (evidence.score.reshape(-1)[TRUTH[0].pixels] == 1.0).all()
+    assert detector.measure(blinded, evidence, result[0]).extent_diameter_m == TRUTH[0].diameter_m
 
 
 def test_the_oracle_calls_nothing_on_a_hole_free_board() -> None:
@@ -156,11 +156,11 @@ def test_guesses_are_as_many_as_stated_everywhere_alike_and_exponential() -> Non
     area_m2 = 0.0
     for seed in range(400):
         evidence = blind(seed=seed).analyse(cloud)
-        found = detector.find(cloud, evidence, 0.0)
-        rows += [one.pixels[0] // SHAPE[1] for one in found]
-        scores += [one.score for one in found]
+        result = detector.find(cloud, evidence, 0.0)
+        rows += [one.pixels[0] // SHAPE[1] for one in result]
+        scores += [one.score for one in result]
         area_m2 += evidence.notes["area_m2"]
-        assert len(found) == evidence.notes["guesses"]
+        assert len(result) == evidence.notes["guesses"]
     low, high = stats.poisson.interval(1 - ALPHA, 400 * area_m2)
     assert low <= len(scores) <= high
     assert stats.kstest(scores, "expon").pvalue > ALPHA
@@ -177,9 +177,9 @@ def test_guesses_do_not_look_at_depth() -> None:
     inside = 0
     total = 0
     for seed in range(300):
-        places = np.flatnonzero(blind(seed=seed).analyse(cloud).score > 0)
-        inside += int(damaged.reshape(-1)[places].sum())
-        total += len(places)
+        positions = np.flatnonzero(blind(seed=seed).analyse(cloud).score > 0)
+        inside += int(damaged.reshape(-1)[positions].sum())
+        total += len(positions)
     assert stats.binomtest(inside, total, float(damaged.mean())).pvalue > ALPHA
 
 
@@ -232,6 +232,6 @@ def test_a_cloud_without_a_grid_has_an_area_and_guesses() -> None:
 
 def test_three_points_on_a_line_have_no_area() -> None:
     cloud = plane(seed=1)
-    some = np.ones(SHAPE, dtype=bool)
-    some[5, [3, 40]] = False
-    assert judged_area_m2(cloud, without(cloud, some).valid) == 0.0
+    sample = np.ones(SHAPE, dtype=bool)
+    sample[5, [3, 40]] = False
+    assert judged_area_m2(cloud, without(cloud, sample).valid) == 0.0

@@ -52,8 +52,8 @@ def test_a_reader_that_leaves_ends_the_program_silently(lines: int, option: str)
     assert program.stdout is not None and program.stderr is not None
     program.stdout.close()
     with program.stderr as stream:
-        said = stream.read()
-    assert (program.wait(), said) == (141, b"")
+        printed = stream.read()
+    assert (program.wait(), printed) == (141, b"")
 
 
 def test_another_pipe_that_breaks_is_a_bug() -> None:

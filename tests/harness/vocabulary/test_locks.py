@@ -13,8 +13,10 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import lock, one_at_a_time, opened_lock
 
 HOLDS = (
-    "import sys, time; from pathlib import Path; from harness.vocabulary.files import one_at_a_time\n"
-    "with one_at_a_time(Path(sys.argv[1]), int(sys.argv[2])): print('held', flush=True); sys.stdin.read()"
+    "import sys, time; from pathlib import Path; from harness.vocabulary.files import "
+    "one_at_a_time\n"
+    "with one_at_a_time(Path(sys.argv[1]), int(sys.argv[2])): print('held', flush=True); "
+    "sys.stdin.read()"
 )
 ASKS = (
     "import sys; from pathlib import Path; from harness.vocabulary.files import one_at_a_time\n"

@@ -109,13 +109,13 @@ def test_a_name_taken_twice_is_an_error_that_names_both_and_leaves_others_alone(
         {"thesis": "acme.found:Detector", "x": "p:A"},
     )
     offer(monkeypatch, tmp_path / "b", "bolt", detectors.GROUP, {"x": "q:B", "mine": MINE})
-    told = str(mistake(load_detector, "thesis", {}))
-    assert "2 detectors are called 'thesis'" in told
+    message = str(mistake(load_detector, "thesis", {}))
+    assert "2 detectors are called 'thesis'" in message
     offers = (
         f"detectors.methods.thesis:ThesisDetector (tofpod {__version__}) "
         "and acme.found:Detector (acme 1.2)"
     )
-    assert offers in told
+    assert offers in message
     assert "p:A (acme 1.2) and q:B (bolt 1.2)" in str(mistake(detector_type, "x"))
     assert detector_type("mine") is Mine
 
@@ -139,9 +139,9 @@ def test_one_offer_seen_twice_is_no_clash(monkeypatch, tmp_path):
 )
 def test_a_broken_plug_in_is_told_with_its_package(monkeypatch, tmp_path, target, why):
     offer(monkeypatch, tmp_path, "acme-tools", detectors.GROUP, {"bad": target})
-    told = str(mistake(load_detector, "bad", {}))
-    assert f"detector 'bad' ({target}, of the package acme-tools 1.2) cannot be loaded" in told
-    assert why in told and "repair or uninstall the package acme-tools" in told
+    message = str(mistake(load_detector, "bad", {}))
+    assert f"detector 'bad' ({target}, of the package acme-tools 1.2) cannot be loaded" in message
+    assert why in message and "repair or uninstall the package acme-tools" in message
 
 
 @pytest.fixture
@@ -159,8 +159,8 @@ def quitting(monkeypatch, tmp_path) -> None:
 
 
 def test_a_plug_in_that_ends_the_program_on_import_is_broken(quitting, capsys):
-    told = str(mistake(detector_type, "quits"))
-    assert "of the package acme-quits 1.2) cannot be loaded: SystemExit: no licence" in told
+    message = str(mistake(detector_type, "quits"))
+    assert "of the package acme-quits 1.2) cannot be loaded: SystemExit: no licence" in message
     rows = listed(capsys, "detectors")
     assert "SystemExit: no licence" in rows["quits"][0]["broken"]
     assert (
@@ -204,7 +204,10 @@ def acme_camera(monkeypatch, tmp_path) -> Path:
     )
     (tmp_path / "acme_tof.yaml").write_text(text)
     (tmp_path / "acme_cameras.py").write_text(
-        "from pathlib import Path\nFILE = Path(__file__).parent / 'acme_tof.yaml'\nTEXT = str(FILE)\nNUMBER = 7\n"
+        (
+            "from pathlib import Path\nFILE = Path(__file__).parent / 'acme_tof.yaml'\nTEXT = "
+            "str(FILE)\nNUMBER = 7\n"
+        )
     )
     offer(monkeypatch, tmp_path, "acme-cameras", cameras.GROUP, {"acme_tof": "acme_cameras:FILE"})
     monkeypatch.delitem(sys.modules, "acme_cameras", raising=False)
@@ -214,9 +217,12 @@ def acme_camera(monkeypatch, tmp_path) -> Path:
 def test_a_packages_camera_is_read_like_any_other(acme_camera):
     assert {"acme_tof", "azure_kinect_nfov", "kinect_v2", "realsense_l515"} < set(camera_names())
     assert camera_file("acme_tof") == acme_camera
-    own = load_camera("kinect_v2")
+    camera = load_camera("kinect_v2")
     copied = load_camera("acme_tof")
-    assert copied.name == "acme_tof" and copied.to_data() == {**own.to_data(), "name": "acme_tof"}
+    assert copied.name == "acme_tof" and copied.to_data() == {
+        **camera.to_data(),
+        "name": "acme_tof",
+    }
 
 
 def test_a_number_that_a_packages_camera_has_not_is_told_with_its_file(acme_camera):
@@ -238,10 +244,10 @@ def test_a_packages_camera_that_is_no_file_is_told_with_its_package(
     acme_camera, monkeypatch, name, target, why
 ):
     offer(monkeypatch, acme_camera.parent / "more", "more-cameras", cameras.GROUP, {name: target})
-    told = str(mistake(load_camera, name))
+    message = str(mistake(load_camera, name))
     assert (
-        f"camera {name!r} ({target}, of the package more-cameras 1.2) cannot be loaded" in told
-        and why in told
+        f"camera {name!r} ({target}, of the package more-cameras 1.2) cannot be loaded" in message
+        and why in message
     )
 
 
@@ -303,11 +309,11 @@ def test_a_named_detector_shows_its_settings_and_what_is_legal(capsys):
     # the listed defaults are all of the settings: they make the same declaration
     rebuilt: dict = {}
     for path, setting in settings.items():
-        at = rebuilt
+        index = rebuilt
         *groups, leaf = path.split(".")
         for group in groups:
-            at = at.setdefault(group, {})
-        at[leaf] = setting["value"]
+            index = index.setdefault(group, {})
+        index[leaf] = setting["value"]
     assert ThesisConfig.from_data(rebuilt) == ThesisConfig()
     assert main(["detectors", "thesis"]) == 0
     text = capsys.readouterr().out
@@ -351,21 +357,21 @@ def test_a_name_alone_is_looked_for_in_both_lists(acme_camera, monkeypatch, caps
         sys.modules["acme_cameras"], "MINE", acme_camera.parent / "mine.yaml", raising=False
     )
     assert main(["mine", "--json"]) == 0
-    both = json.loads(capsys.readouterr().out)
-    assert (both["detectors"]["package"], both["cameras"]["columns"]) == ("more", 512)
+    pair = json.loads(capsys.readouterr().out)
+    assert (pair["detectors"]["package"], pair["cameras"]["columns"]) == ("more", 512)
 
 
 def test_what_is_neither_a_kind_nor_a_name(capsys):
-    for words, near in (
+    for words, nearby in (
         (["thesys"], "thesis"),
         (["l515"], "realsense_l515"),
         (["detector", "thesis"], "detectors"),
     ):
         assert main(words) == 2
-        told = capsys.readouterr().err
+        error_text = capsys.readouterr().err
         assert (
-            f"there is nothing called {words[0]!r} to list; did you mean {near!r}?" in told
-            and "legal: " in told
+            f"there is nothing called {words[0]!r} to list; did you mean {nearby!r}?" in error_text
+            and "legal: " in error_text
         )
 
 

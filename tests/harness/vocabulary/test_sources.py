@@ -14,7 +14,9 @@ FILES = {
     "harness/trial.py": "import numpy\nfrom harness.trials import (\n    judge,  # why\n)\n",
     "harness/page.py": "from harness.trial import run\n",
     "harness/trials/__init__.py": "",
-    "harness/trials/judge.py": "def run():\n    from scenes.board import Board\n    import detectors.methods.thesis as t\n",
+    "harness/trials/judge.py": (
+        "def run():\n    from scenes.board import Board\n    import detectors.methods.thesis as t\n"
+    ),
     "harness/trials/other.py": "",
     "scenes/__init__.py": "",
     "scenes/board.py": "class Board: ...\n",

@@ -54,9 +54,9 @@ process."""
 def forbidden_calls(text: str) -> set[str]:
     """Calls in a source text that could run what a file holds; ``np.load`` with
     ``allow_pickle=False`` cannot."""
-    found: set[str] = set()
+    result: set[str] = set()
     if not SUSPECT.search(text):  # to parse all sources takes seconds
-        return found
+        return result
     for node in ast.walk(ast.parse(text)):
         if not isinstance(node, ast.Call):
             continue
@@ -66,27 +66,27 @@ def forbidden_calls(text: str) -> set[str]:
             for keyword in node.keywords
         )
         if name in FORBIDDEN and not (name in LOADS and safe):
-            found.add(name)
+            result.add(name)
         if any(
             keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"
             for keyword in node.keywords
         ):
-            found.add(f"{name}(allow_pickle)")
+            result.add(f"{name}(allow_pickle)")
         if name.endswith("YAML") and any(
             ast.unparse(keyword.value) == "'unsafe'" for keyword in node.keywords
         ):
-            found.add(f"{name}(unsafe)")
-    return found
+            result.add(f"{name}(unsafe)")
+    return result
 
 
 def test_no_code_of_ours_runs_what_a_file_holds():
-    found = {
+    result = {
         (path.relative_to(ROOT).as_posix(), name)
         for folder in ("harness", "scenes", "detectors")
         for path in (ROOT / folder).rglob("*.py")
         for name in forbidden_calls(path.read_text(encoding="utf-8"))
     }
-    assert found <= ALLOWED
+    assert result <= ALLOWED
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,10 @@ def test_what_is_known_is_read(found, oldest):
     [
         (
             4,
-            "x.json: was written by a newer tofpod: it is a record of version 4\n  legal: versions 2 to 3\n  to do: up",
+            (
+                "x.json: was written by a newer tofpod: it is a record of version 4\n  legal: "
+                "versions 2 to 3\n  to do: up"
+            ),
         ),
         (1, "x.json: is a record of version 1\n  legal: versions 2 to 3\n  to do: run it again"),
         (None, "x.json: is a record that states no version"),
@@ -115,7 +118,7 @@ def test_an_experiment_of_a_result_folder(tmp_path):
     assert stamp_of(text, "experiment") == EXPERIMENT_VERSION
     assert load_experiment(path).digest == load_experiment(EXPERIMENT).digest
     body = text.partition("\n")[2]
-    for line, told in (
+    for line, message in (
         (
             stamped("experiment", EXPERIMENT_VERSION + 1),
             "newer tofpod: it is an experiment of version",
@@ -124,7 +127,7 @@ def test_an_experiment_of_a_result_folder(tmp_path):
         ("# tofpod experiment x1\n", "states the invalid version 'x1'"),
     ):
         path.write_text(line + body)
-        with pytest.raises(UserError, match=told):
+        with pytest.raises(UserError, match=message):
             load_experiment(path)
     path.write_text(body)
     assert load_experiment(path).digest == load_experiment(EXPERIMENT).digest, (

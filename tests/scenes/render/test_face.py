@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from harness.vocabulary.geometry import invert, transform_points
+from scenes.optics import RenderConfig
+from scenes.render import face
+from scenes.render.direct import DirectLight
 from scenes.render.face import (
+    ABOVE_FACE_M,
     _above_face,
     _bounds_of_face,
     _node_line_m,
     between_nodes,
+    face_light,
     face_triangles,
 )
+from scenes.render.indirect import PathWork
 from scenes.render.range_noise import range_noise_m, range_weights
+from scenes.sensor.camera import load_camera
 from scenes.target.custom import (
     BoardConfig,
     HoleConfig,
@@ -23,6 +32,7 @@ from scenes.target.custom import (
     TargetConfig,
 )
 from scenes.target.mesh import Target, build_target
+from scenes.target.truth import face_of
 
 COLUMNS = 5
 ROWS = 4
@@ -160,3 +170,61 @@ def test_triangles_of_the_face_lie_on_it_and_those_of_tape_count(target: Target)
     assert np.abs(off_sphere_m[~on_board & ~at_rim]).min() > 1e-3
     assert mesh.area_faces[on_board].sum() == pytest.approx(0.12 * 0.08, rel=0.06)
     assert on_tape.all()
+
+
+def test_each_pixel_gets_the_light_of_its_place_on_the_face(
+    target: Target, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Light that grows evenly over the board, by two batches of equal noise: pixels of the face get
+    that of the point which they see."""
+    optics = load_camera("azure_kinect_nfov_binned").optics
+    T_board_camera = invert(target.T_camera_board)
+    requests: list[Any] = []
+
+    def gather(
+        lit: Any,
+        points_m: np.ndarray,
+        normals: np.ndarray,
+        work: PathWork,
+        samples: int,
+        bright: np.ndarray,
+    ) -> np.ndarray:
+        requests.append((work, samples, bright))
+        x_m, y_m, _ = transform_points(T_board_camera, points_m - ABOVE_FACE_M * normals).T
+        light = evenly(x_m, y_m)
+        return np.stack([light - 0.01j, light + 0.01j])[:, None].repeat(4, axis=1)
+
+    def evenly(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        return 2 + 10 * x_m - 20 * y_m + 0j
+
+    monkeypatch.setattr(face, "gather_at_points", gather)
+    x_m, y_m = np.meshgrid(np.linspace(-0.05, 0.05, 7), np.linspace(-0.03, 0.03, 5))
+    points = transform_points(target.T_camera_board, face_of(target.config.board).point(x_m, y_m))
+    sees_face = np.ones(x_m.shape)
+    sees_face[2, 3] = 0.0
+    none: Any = None
+    direct = DirectLight(
+        phasor=np.full((3, *x_m.shape), 8.0 + 0j),
+        intensity=none,
+        range_m=none,
+        surface=none,
+        uv=none,
+        coverage=none,
+        fine=none,
+        face=np.broadcast_to(0.5 * sees_face, (4, *x_m.shape)).astype(complex),
+        face_range_m=np.linalg.norm(points, axis=-1),
+        off_face=none,
+    )
+    slopes = points[..., :2] / points[..., 2:]
+    work = PathWork(optics.frequencies_hz, bounces=3, seed=2)
+    config = RenderConfig(face_spacing_mm=30.0, face_samples=77)
+    light, noise_m = face_light(none, target, direct, slopes, work, config)
+    seen = sees_face > 0
+    expected = 0.5 * evenly(x_m[seen], y_m[seen])
+    assert light == pytest.approx(np.broadcast_to(expected, (4, seen.sum())), rel=1e-6)
+    turned = np.full((2, 3, 1), 0.005j) * np.array([[[-1]], [[1]]])
+    total = 8.0 + np.broadcast_to(expected, (3, seen.sum()))
+    expected_noise_m = range_noise_m(turned, total, optics.frequencies_hz)
+    assert noise_m == pytest.approx(expected_noise_m, rel=1e-3)
+    assert requests[0][:2] == (work, 77)
+    assert requests[0][2] == pytest.approx(_bounds_of_face(target))

@@ -243,6 +243,37 @@ def test_one_bounce_in_a_corner_equals_quadrature_and_lengthens_the_range():
     assert (np.angle((direct + pixel.mean(axis=0)[:3, 0]) / direct) > 0).all()
 
 
+def test_paths_are_those_of_before():
+    """Few paths, whose sum is far from the truth: it moves with any change of their directions."""
+    wall = quad([[-1, -1, 1.0], [1, -1, 1.0], [1, 0.3, 1.0], [-1, 0.3, 1.0]], "board", 0.8)
+    floor = quad([[-1, 0.3, 0.2], [1, 0.3, 0.2], [1, 0.3, 1.0], [-1, 0.3, 1.0]], "floor", 0.6)
+    lit = scene_of(wall, floor)
+    work = PathWork(CAMERA.frequencies_hz, 2, seed=3)
+    points_m = np.array([[0.05, 0.2, 1.0], [-0.3, 0.1, 1.0]])
+    normals = np.array([[0.0, 0.0, -1.0]] * 2)
+    at_points = gather_at_points(lit, points_m, normals, work, 64)
+    bright = np.eye(4)
+    bright[:3, 3] = [0.0, -0.35, 1.0]
+    bright[:3, :3] = np.diag([1.0, -0.65, -1.0])
+    towards_wall = gather_at_points(lit, points_m[:1], normals[:1], work, 64, bright)
+    slopes = np.array([[0.05, 0.2], [0.0, 0.45], [0.1, 0.5]], np.float32)
+    rays = OffFace(np.array([3, 8]), np.array([1, 2]), np.ones(2), slopes)
+    in_pixels = gather_in_pixels(lit, rays, work, np.array([32, 64]))
+    later = gather_in_pixels(lit, rays, work, 32, after=32)
+    lights = (at_points, towards_wall, in_pixels, later)
+    phasors = np.concatenate([light.mean(axis=0)[0] for light in lights])
+    assert phasors == pytest.approx(np.array(PATHS), rel=1e-4)
+
+
+PATHS = [
+    0.0322413 - 0.108666j,
+    0.0394013 - 0.047496j,
+    0.0407574 - 0.0914795j,
+    -0.0775502 - 0.00463892j,
+    -0.0697903 - 0.0358554j,
+    -0.0762188 - 0.0015777j,
+    -0.0680803 - 0.0382905j,
+]
 SMALL = ThesisTargetConfig.from_data({"name": "thesis"}).declare()
 QUICK = RenderConfig(
     face_samples=1024,

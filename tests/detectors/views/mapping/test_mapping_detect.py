@@ -119,8 +119,8 @@ def hole_map(
         for i, T in enumerate(poses)
     ]
     registrations = [reference(), *(registered(f"v{i}", T) for i, T in enumerate(poses) if i)]
-    found = merge(views, registrations, config)
-    return found.cloud, invert(plane.T_reference_plane) @ found.T_reference_cloud, plane
+    result = merge(views, registrations, config)
+    return result.cloud, invert(plane.T_reference_plane) @ result.T_reference_cloud, plane
 
 
 def strongest(cloud: Cloud, detector: ThesisDetector) -> tuple[Detection, object]:
@@ -159,10 +159,12 @@ def test_places_of_the_cameras_matter_to_the_size() -> None:
             {"crop": {"kind": "none"}, "min_points": 3, "hole_model": LIT_FROM_THE_LENS}
         )
     )
-    _, known = strongest(cloud, detector)
+    _, reference = strongest(cloud, detector)
     _, unknown = strongest(replace(cloud, map_views=None), detector)
-    assert abs(known.model_depth_m - HOLE.depth_m) < 0.5 * abs(unknown.model_depth_m - HOLE.depth_m)
-    assert abs(known.model_diameter_m - HOLE.diameter_m) < 0.5 * abs(
+    assert abs(reference.model_depth_m - HOLE.depth_m) < 0.5 * abs(
+        unknown.model_depth_m - HOLE.depth_m
+    )
+    assert abs(reference.model_diameter_m - HOLE.diameter_m) < 0.5 * abs(
         unknown.model_diameter_m - HOLE.diameter_m
     )
 

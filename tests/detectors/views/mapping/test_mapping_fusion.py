@@ -60,23 +60,25 @@ def interior(found: Merged) -> np.ndarray:
 
 
 def test_facing_plane_is_mapped_in_the_first_cameras_own_frame() -> None:
-    found = fused([seen(Plane(), np.eye(4))], [np.eye(4)])
-    np.testing.assert_allclose(found.T_reference_cloud, np.eye(4), atol=1e-12)
-    assert found.surface_map.cell_m == pytest.approx(PITCH_M, rel=1e-12)
+    result = fused([seen(Plane(), np.eye(4))], [np.eye(4)])
+    np.testing.assert_allclose(result.T_reference_cloud, np.eye(4), atol=1e-12)
+    assert result.surface_map.cell_m == pytest.approx(PITCH_M, rel=1e-12)
     assert (
-        found.cloud.projection == "parallel" and found.cloud.organised and found.cloud.lens is None
+        result.cloud.projection == "parallel"
+        and result.cloud.organised
+        and result.cloud.lens is None
     )
-    known = found.cloud.valid
-    np.testing.assert_allclose(found.cloud.points_m[known][:, 2], DISTANCE_M, atol=1e-12)
+    valid = result.cloud.valid
+    np.testing.assert_allclose(result.cloud.points_m[valid][:, 2], DISTANCE_M, atol=1e-12)
     # cells stand at whole multiples of the pitch, half a pixel off the pixels here: 119 x 159
     # between them
-    assert known.all() and known.shape == (119, 159)
+    assert valid.all() and valid.shape == (119, 159)
 
 
 def test_frame_stands_before_the_place_where_the_axis_meets_a_tilted_plane() -> None:
     plane = Plane(20.0, -30.0)
-    found = fused([seen(plane, np.eye(4))], [np.eye(4)])
-    T = found.T_reference_cloud
+    result = fused([seen(plane, np.eye(4))], [np.eye(4)])
+    T = result.T_reference_cloud
     normal = plane.T_reference_plane[:3, 2]
     np.testing.assert_allclose(T[:3, 2], normal, atol=1e-9)
     np.testing.assert_allclose(
@@ -92,10 +94,10 @@ def test_axis_that_misses_the_target_puts_the_origin_before_its_middle() -> None
     view = seen(Plane(), np.eye(4))
     inside = np.zeros(view.inside.shape, dtype=bool)
     inside[20:60, 100:150] = True
-    found = fused([prepared(view.view.cloud, inside, None, "v")], [np.eye(4)])
+    result = fused([prepared(view.view.cloud, inside, None, "v")], [np.eye(4)])
     middle = np.median(view.view.cloud.points_m[inside], axis=0)
     expected = middle - np.array([0.0, 0.0, np.linalg.norm(middle)])
-    np.testing.assert_allclose(found.T_reference_cloud[:3, 3], expected, atol=1e-9)
+    np.testing.assert_allclose(result.T_reference_cloud[:3, 3], expected, atol=1e-9)
 
 
 @settings(max_examples=5, deadline=None)
@@ -111,11 +113,13 @@ def test_noise_free_views_of_a_plane_reproduce_it(
 ) -> None:
     plane = Plane(tilt_x, tilt_y)
     poses = [np.eye(4), turned(about_x, about_y, (0.01, -0.02, 0.03))]
-    found = fused(
+    result = fused(
         [seen(plane, T, name=str(i)) for i, T in enumerate(poses)], poses, cell_mm=cell_mm
     )
-    height = plane_height(found.cloud.points_m[found.cloud.valid], found.T_reference_cloud, plane)
-    assert found.cloud.valid.any()
+    height = plane_height(
+        result.cloud.points_m[result.cloud.valid], result.T_reference_cloud, plane
+    )
+    assert result.cloud.valid.any()
     np.testing.assert_allclose(height, 0.0, atol=2e-7)
 
 
@@ -124,11 +128,11 @@ def test_equal_pitches_leave_no_gaps_and_lens_distortion_no_bend() -> None:
 
     bent = Lens(160, 120, 500.0, 500.0, 79.5, 59.5, (0.3, -0.2, 1e-3, -1e-3, 0.1, 0.0, 0.0, 0.0))
     poses = [np.eye(4), turned(2.0, -3.0, (0.0007, 0.0003, 0.0))]
-    found = fused([seen(Plane(), T, lens=bent, name=str(i)) for i, T in enumerate(poses)], poses)
-    inner = found.surface_map.seen_by.sum(axis=0)[15:-15, 15:-15]
+    result = fused([seen(Plane(), T, lens=bent, name=str(i)) for i, T in enumerate(poses)], poses)
+    inner = result.surface_map.seen_by.sum(axis=0)[15:-15, 15:-15]
     assert (inner == 2).all()
     np.testing.assert_allclose(
-        plane_height(found.cloud.points_m[found.cloud.valid], found.T_reference_cloud, Plane()),
+        plane_height(result.cloud.points_m[result.cloud.valid], result.T_reference_cloud, Plane()),
         0,
         atol=2e-7,
     )
@@ -137,19 +141,19 @@ def test_equal_pitches_leave_no_gaps_and_lens_distortion_no_bend() -> None:
 def test_order_of_the_other_views_changes_nothing_but_rounding() -> None:
     poses = arc(4, 20.0)
     views = noisy(poses, 5, Plane(5.0, 3.0))
-    one = fused(views, poses)
-    other = fused([views[0], *views[:0:-1]], [poses[0], *poses[:0:-1]])
-    np.testing.assert_allclose(one.cloud.points_m, other.cloud.points_m, atol=1e-9)
+    first = fused(views, poses)
+    second = fused([views[0], *views[:0:-1]], [poses[0], *poses[:0:-1]])
+    np.testing.assert_allclose(first.cloud.points_m, second.cloud.points_m, atol=1e-9)
     np.testing.assert_allclose(
-        one.surface_map.variance_m2, other.surface_map.variance_m2, rtol=0.02
+        first.surface_map.variance_m2, second.surface_map.variance_m2, rtol=0.02
     )
 
 
 def test_the_same_views_give_the_same_bits() -> None:
     poses = arc(3, 15.0)
-    one, other = (fused(noisy(poses, 9, Plane()), poses) for _ in range(2))
-    np.testing.assert_array_equal(one.cloud.points_m, other.cloud.points_m)
-    np.testing.assert_array_equal(one.cloud.mean_variance_m2, other.cloud.mean_variance_m2)
+    first, second = (fused(noisy(poses, 9, Plane()), poses) for _ in range(2))
+    np.testing.assert_array_equal(first.cloud.points_m, second.cloud.points_m)
+    np.testing.assert_array_equal(first.cloud.mean_variance_m2, second.cloud.mean_variance_m2)
 
 
 # ---------------------------------------------------------------- noise and its variance
@@ -161,8 +165,8 @@ def test_white_noise_falls_with_the_square_root_of_views() -> None:
     views = noisy(poses, 11, plane, frames=10)
     spread = {}
     for count in (1, 4, 16):
-        found = fused(views[:count], poses[:count])
-        spread[count] = float(np.std(deviations(found, plane, count)))
+        result = fused(views[:count], poses[:count])
+        spread[count] = float(np.std(deviations(result, plane, count)))
     # 10,000 cells, neighbours share pixels: 2 % each; views at an angle and interpolation differ
     # by some percent
     assert spread[1] / spread[4] == pytest.approx(2.0, rel=0.08)
@@ -179,9 +183,9 @@ def test_stated_variance_is_that_of_the_heights(
     monkeypatch.setattr(fusion, "LATERAL_PX", 0.0)
     plane = Plane(5.0, -5.0)
     poses = arc(count, 20.0)
-    found = fused(noisy(poses, 3, plane, frames=frames), poses, cell_mm=cell_mm)
-    cells = interior(found)
-    standard = deviations(found, plane, count) / np.sqrt(found.cloud.mean_variance_m2[cells])
+    result = fused(noisy(poses, 3, plane, frames=frames), poses, cell_mm=cell_mm)
+    cells = interior(result)
+    standard = deviations(result, plane, count) / np.sqrt(result.cloud.mean_variance_m2[cells])
     assert float(np.std(standard)) == pytest.approx(1.0, rel=0.08)
 
 
@@ -193,14 +197,17 @@ def test_registration_error_is_in_the_variance() -> None:
     # middle
     covariance = np.diag([0.0, 2e-3, 0.0, 0.0, 0.0, 0.4 * MM]) ** 2
     merged = merge(views, [reference(), registered("v1", poses[1], covariance)], FusedMerge())
-    known = merged.surface_map
+    surface_map = merged.surface_map
     exact = fused(views, poses).surface_map
     added = (0.4 * MM) ** 2 + (2e-3 * merged.cloud.points_m[..., 0]) ** 2
-    for cells in (known.seen_by[1] & ~known.seen_by[0], known.seen_by.all(axis=0)):
+    for cells in (
+        surface_map.seen_by[1] & ~surface_map.seen_by[0],
+        surface_map.seen_by.all(axis=0),
+    ):
         assert cells.sum() > 100
-    alone = known.seen_by[1] & ~known.seen_by[0]
+    alone = surface_map.seen_by[1] & ~surface_map.seen_by[0]
     np.testing.assert_allclose(
-        (known.variance_m2 - exact.variance_m2)[alone], added[alone], rtol=0.15
+        (surface_map.variance_m2 - exact.variance_m2)[alone], added[alone], rtol=0.15
     )
 
 
@@ -221,12 +228,12 @@ def test_a_pattern_of_its_own_in_each_view_is_found() -> None:
         )
         for i, T in enumerate(poses)
     ]
-    found = fused(views, poses)
-    cells = interior(found)
-    standard = deviations(found, plane, 5) / np.sqrt(found.cloud.mean_variance_m2[cells])
+    result = fused(views, poses)
+    cells = interior(result)
+    standard = deviations(result, plane, 5) / np.sqrt(result.cloud.mean_variance_m2[cells])
     assert float(np.std(standard)) == pytest.approx(1.0, rel=0.1)
     # interpolation takes about half of the variance of a pattern that changes from pixel to pixel
-    between = found.surface_map.between
+    between = result.surface_map.between
     assert np.sqrt(between.own_m2 + between.pattern_m2) == pytest.approx(
         own_m * np.sqrt(0.5), rel=0.15
     )
@@ -250,20 +257,20 @@ def test_a_pattern_that_belongs_to_the_pixels_does_not_pass_for_independent() ->
         seen(Plane(), T, rng, noise_m=NOISE_M, frames=25, name=f"v{i}", pattern_m=pattern)
         for i, T in enumerate(poses)
     ]
-    found = fused(views, poses)
-    cells = interior(found)
-    actual = float(np.std(deviations(found, Plane(), 9)))
-    stated = float(np.sqrt(found.cloud.mean_variance_m2[cells].mean()))
+    result = fused(views, poses)
+    cells = interior(result)
+    actual = float(np.std(deviations(result, Plane(), 9)))
+    stated = float(np.sqrt(result.cloud.mean_variance_m2[cells].mean()))
     independent = 0.6 * MM / 3.0
     assert actual > 1.5 * independent
     assert 0.75 < actual / stated < 1.25
-    assert found.surface_map.between.pattern_m2 == pytest.approx((0.6 * MM) ** 2, rel=0.4)
+    assert result.surface_map.between.pattern_m2 == pytest.approx((0.6 * MM) ** 2, rel=0.4)
 
 
 def test_one_view_says_that_it_does_not_know_its_pattern() -> None:
-    found = fused(noisy([np.eye(4)], 1, Plane(), frames=10), [np.eye(4)])
-    assert found.cloud.mean_variance_m2 is None
-    assert any("one view" in note for note in found.notes)
+    result = fused(noisy([np.eye(4)], 1, Plane(), frames=10), [np.eye(4)])
+    assert result.cloud.mean_variance_m2 is None
+    assert any("one view" in note for note in result.notes)
 
 
 def test_what_a_cell_knows_of_its_views() -> None:
@@ -282,17 +289,17 @@ def test_what_a_cell_knows_of_its_views() -> None:
         )
         for i, T in enumerate(poses)
     ]
-    found = fused(views, poses)
-    away = np.hypot(found.cloud.points_m[..., 0], found.cloud.points_m[..., 1])
+    result = fused(views, poses)
+    away = np.hypot(result.cloud.points_m[..., 0], result.cloud.points_m[..., 1])
     middle = np.unravel_index(np.nanargmin(away), away.shape)
-    assert found.surface_map.seen_by.sum(axis=0)[middle] == 3 and found.cloud.count[middle] == 21
-    cameras = found.cloud.map_views.T_cloud_cameras[:, :3, 3]
+    assert result.surface_map.seen_by.sum(axis=0)[middle] == 3 and result.cloud.count[middle] == 21
+    cameras = result.cloud.map_views.T_cloud_cameras[:, :3, 3]
     np.testing.assert_allclose(
         np.rad2deg(np.arctan2(cameras[:, 0], DISTANCE_M - cameras[:, 2])), [0, -20, 20], atol=1
     )
-    assert found.cloud.rgb[middle][0] == pytest.approx(90, abs=15)
-    assert found.cloud.amplitude[middle] == pytest.approx(100.0, abs=1e-9)
-    assert found.cloud.n_frames == 21
+    assert result.cloud.rgb[middle][0] == pytest.approx(90, abs=15)
+    assert result.cloud.amplitude[middle] == pytest.approx(100.0, abs=1e-9)
+    assert result.cloud.n_frames == 21
 
 
 # ---------------------------------------------------------------- outliers
@@ -317,23 +324,23 @@ def worst(found: Merged) -> float:
 
 
 def test_a_flying_pixel_is_rejected() -> None:
-    found = spoiled((slice(60, 61), slice(80, 81)), 30 * MM, (2,))
-    assert 1 <= found.surface_map.rejected <= 9
-    assert worst(found) < 5 * NOISE_M
-    assert any("outliers" in note for note in found.notes)
+    result = spoiled((slice(60, 61), slice(80, 81)), 30 * MM, (2,))
+    assert 1 <= result.surface_map.rejected <= 9
+    assert worst(result) < 5 * NOISE_M
+    assert any("outliers" in note for note in result.notes)
 
 
 def test_what_stands_before_the_surface_in_one_view_is_rejected() -> None:
-    found = spoiled((slice(50, 70), slice(70, 90)), -30 * MM, (2,))
-    assert found.surface_map.rejected >= 300
-    assert worst(found) < 5 * NOISE_M
+    result = spoiled((slice(50, 70), slice(70, 90)), -30 * MM, (2,))
+    assert result.surface_map.rejected >= 300
+    assert worst(result) < 5 * NOISE_M
 
 
 def test_a_hole_that_few_views_see_into_stays() -> None:
-    found = spoiled((slice(50, 70), slice(70, 90)), 30 * MM, (2, 4))
+    result = spoiled((slice(50, 70), slice(70, 90)), 30 * MM, (2, 4))
     # two of five views: 12 mm in the mean
-    assert worst(found) == pytest.approx(12 * MM, rel=0.2)
-    assert (found.surface_map.height_m > 10 * MM).sum() > 100
+    assert worst(result) == pytest.approx(12 * MM, rel=0.2)
+    assert (result.surface_map.height_m > 10 * MM).sum() > 100
 
 
 def test_two_views_have_no_majority() -> None:
@@ -354,12 +361,14 @@ def test_a_view_without_a_grid_gives_the_same_map() -> None:
     poses = arc(2, 10.0)
     views = noisy(poses, 7, plane, frames=10)
     flat = [without_grid(view) for view in views]
-    one = fused(views, poses, cell_mm=1.4)
-    other = fused(flat, poses, cell_mm=1.4)
-    h, w = (min(a, b) for a, b in zip(one.cloud.valid.shape, other.cloud.valid.shape, strict=True))
+    first = fused(views, poses, cell_mm=1.4)
+    second = fused(flat, poses, cell_mm=1.4)
+    h, w = (
+        min(a, b) for a, b in zip(first.cloud.valid.shape, second.cloud.valid.shape, strict=True)
+    )
     gap = (
-        one.surface_map.height_m[5 : h - 5, 5 : w - 5]
-        - other.surface_map.height_m[5 : h - 5, 5 : w - 5]
+        first.surface_map.height_m[5 : h - 5, 5 : w - 5]
+        - second.surface_map.height_m[5 : h - 5, 5 : w - 5]
     )
     # other diagonals in the same squares, other weights: a part of the noise, no bias
     assert np.isfinite(gap).mean() > 0.6
@@ -391,11 +400,11 @@ def test_invalid_pixels_and_pixels_outside_the_target_leave_cells_empty() -> Non
     view = seen(Plane(), np.eye(4))
     inside = view.inside.copy()
     inside[40:60, 50:90] = False
-    found = fused([prepared(view.view.cloud, inside, None, "v")], [np.eye(4)])
-    hollow = (LENS.whole.shape[0] * LENS.whole.shape[1]) - found.cloud.valid.sum()
+    result = fused([prepared(view.view.cloud, inside, None, "v")], [np.eye(4)])
+    hollow = (LENS.whole.shape[0] * LENS.whole.shape[1]) - result.cloud.valid.sum()
     # triangles end at the last valid pixel: one more row and column of cells is lost at most
     assert 20 * 40 <= hollow <= 22 * 42 + 120 + 160
-    assert found.cloud.reason[~found.cloud.valid].min() > 0
+    assert result.cloud.reason[~result.cloud.valid].min() > 0
 
 
 def test_too_many_cells_are_refused() -> None:

@@ -65,10 +65,10 @@ def test_boxes_of_two_clouds_by_hand() -> None:
         count=np.full((1, 3), 30, dtype=np.int32),
         variance_m2=np.full((1, 3), 5e-6),
     )
-    found = merge([fixed, moving], [reference(), registered("b", np.eye(4))], GridMerge())
+    result = merge([fixed, moving], [reference(), registered("b", np.eye(4))], GridMerge())
     # the overlap is x 0.04..20, y 0.02..20, z 700.01..702: the pair near (10, 10, 700) has one
     # point below it in z
-    points = found.cloud.points_m[0] / MM
+    points = result.cloud.points_m[0] / MM
     expected = [
         [10.05, 10.02, 700.06],
         [20, 20, 702],
@@ -78,9 +78,9 @@ def test_boxes_of_two_clouds_by_hand() -> None:
         [60, 30, 703],
     ]
     assert sorted(map(tuple, np.round(points, 6))) == sorted(map(tuple, expected))
-    np.testing.assert_array_equal(found.T_reference_cloud, np.eye(4))
-    assert not found.cloud.organised and found.cloud.lens is None
-    assert (found.cloud.z_step_m, found.cloud.n_frames) == (1e-3, 10)
+    np.testing.assert_array_equal(result.T_reference_cloud, np.eye(4))
+    assert not result.cloud.organised and result.cloud.lens is None
+    assert (result.cloud.z_step_m, result.cloud.n_frames) == (1e-3, 10)
 
 
 def test_points_of_one_box_become_their_mean() -> None:
@@ -93,38 +93,40 @@ def test_points_of_one_box_become_their_mean() -> None:
         count=np.full((1, 3), 30, dtype=np.int32),
         variance_m2=np.full((1, 3), 5e-6),
     )
-    found = merge([fixed, moving], [reference(), registered("b", np.eye(4))], GridMerge())
+    result = merge([fixed, moving], [reference(), registered("b", np.eye(4))], GridMerge())
     np.testing.assert_allclose(
-        found.cloud.points_m[0] / MM,
+        result.cloud.points_m[0] / MM,
         [[0, 0, 700], [10.03, 10.02, 701.05], [20, 20, 702]],
         atol=1e-9,
     )
     # 10.5 and 0.5 round up, as MATLAB does
-    np.testing.assert_array_equal(found.cloud.rgb[0], [[1, 0, 0], [11, 1, 0], [1, 0, 0]])
-    np.testing.assert_array_equal(found.cloud.count[0], [40, 40, 40])
+    np.testing.assert_array_equal(result.cloud.rgb[0], [[1, 0, 0], [11, 1, 0], [1, 0, 0]])
+    np.testing.assert_array_equal(result.cloud.count[0], [40, 40, 40])
     # (10 x 1 + 30 x 5) / 40
-    np.testing.assert_allclose(found.cloud.variance_m2[0], 4e-6, rtol=1e-12)
+    np.testing.assert_allclose(result.cloud.variance_m2[0], 4e-6, rtol=1e-12)
 
 
 def test_a_single_cloud_and_clouds_apart_stay_as_they_are() -> None:
     points = [[0, 0, 700], [0.01, 0.01, 700.01]]
     alone = merge([points_view(points, "a")], [reference()], GridMerge())
     np.testing.assert_allclose(alone.cloud.points_m[0] / MM, points, atol=1e-9)
-    apart = np.eye(4)
-    apart[0, 3] = 1.0
-    both = merge([points_view(points, "a")] * 2, [reference(), registered("b", apart)], GridMerge())
-    assert both.cloud.points_m.shape == (1, 4, 3)
-    assert both.cloud.rgb is None
+    separation = np.eye(4)
+    separation[0, 3] = 1.0
+    pair = merge(
+        [points_view(points, "a")] * 2, [reference(), registered("b", separation)], GridMerge()
+    )
+    assert pair.cloud.points_m.shape == (1, 4, 3)
+    assert pair.cloud.rgb is None
 
 
 def test_colour_is_dropped_where_one_cloud_has_none() -> None:
     coloured = points_view([[0, 0, 700]], "a", rgb=np.zeros((1, 1, 3), np.uint8))
-    found = merge(
+    result = merge(
         [coloured, points_view([[0, 0, 700]], "b")],
         [reference(), registered("b", np.eye(4))],
         GridMerge(),
     )
-    assert found.cloud.rgb is None
+    assert result.cloud.rgb is None
 
 
 @settings(max_examples=15, deadline=None)
@@ -162,21 +164,21 @@ def test_volume_of_a_plane_lies_on_it(distortion: tuple[float, ...]) -> None:
     poses = arc(3, 15.0)
     colour = np.full((120, 160, 3), (200, 100, 50), np.uint8)
     views = [seen(plane, T, lens=lens, name=str(i), rgb=colour) for i, T in enumerate(poses)]
-    found = merge(
+    result = merge(
         views,
         [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)],
         VolumeMerge(),
     )
-    assert not found.cloud.organised and found.cloud.valid.all()
-    height = plane_height(found.cloud.points_m[0], found.T_reference_cloud, plane)
+    assert not result.cloud.organised and result.cloud.valid.all()
+    height = plane_height(result.cloud.points_m[0], result.T_reference_cloud, plane)
     # depth is looked up up to a quarter of a pixel beside its place along each axis, at incidences
     # up to 35 degrees
     assert float(np.abs(height).max()) < np.sqrt(2.0) / 4.0 * np.tan(np.deg2rad(35.0)) * PITCH_M
     assert abs(float(height.mean())) < 0.02 * PITCH_M
-    np.testing.assert_allclose(found.cloud.rgb[0].mean(axis=0), [200, 100, 50], atol=1.0)
-    one = found.cloud.points_m[0][:-1]
-    other = found.cloud.points_m[0][1:]
-    assert (one[:, 0] <= other[:, 0]).all()
+    np.testing.assert_allclose(result.cloud.rgb[0].mean(axis=0), [200, 100, 50], atol=1.0)
+    first = result.cloud.points_m[0][:-1]
+    second = result.cloud.points_m[0][1:]
+    assert (first[:, 0] <= second[:, 0]).all()
 
 
 def test_volume_is_the_same_twice_and_noise_falls_with_views() -> None:
@@ -186,8 +188,8 @@ def test_volume_is_the_same_twice_and_noise_falls_with_views() -> None:
     rng = np.random.default_rng(3)
     views = [seen(plane, T, rng, noise_m=0.5 * MM, name=str(i)) for i, T in enumerate(poses)]
     registrations = [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)]
-    one, other = (merge(views, registrations, VolumeMerge()).cloud.points_m for _ in range(2))
-    np.testing.assert_array_equal(one, other)
+    first, second = (merge(views, registrations, VolumeMerge()).cloud.points_m for _ in range(2))
+    np.testing.assert_array_equal(first, second)
     spread = {}
     for count in (1, 4):
         points = merge(views[:count], registrations[:count], VolumeMerge()).cloud.points_m[0]
@@ -202,19 +204,19 @@ def test_volume_keeps_face_and_floor_apart_from_the_walls_of_a_hole() -> None:
     plane = Plane(5.0, 5.0, hole)
     poses = arc(5, 25.0)
     views = [seen(plane, T, name=str(i), blur=3) for i, T in enumerate(poses)]
-    found = merge(
+    result = merge(
         views,
         [reference(), *(registered(str(i), T) for i, T in enumerate(poses) if i)],
         VolumeMerge(),
     )
-    assert re.search(r"[1-9]\d\d points on walls steeper than 60 degrees", " ".join(found.notes))
+    assert re.search(r"[1-9]\d\d points on walls steeper than 60 degrees", " ".join(result.notes))
     points = transform_points(
-        invert(plane.T_reference_plane) @ found.T_reference_cloud, found.cloud.points_m[0]
+        invert(plane.T_reference_plane) @ result.T_reference_cloud, result.cloud.points_m[0]
     )
     from_axis = np.hypot(points[:, 0] - hole.at[0], points[:, 1] - hole.at[1])
-    near = from_axis < 0.6 * hole.diameter_m
-    floor = near & (points[:, 2] > 0.8 * hole.depth_m)
-    on_wall = near & (points[:, 2] > 0.25 * hole.depth_m) & (points[:, 2] < 0.75 * hole.depth_m)
+    nearby = from_axis < 0.6 * hole.diameter_m
+    floor = nearby & (points[:, 2] > 0.8 * hole.depth_m)
+    on_wall = nearby & (points[:, 2] > 0.25 * hole.depth_m) & (points[:, 2] < 0.75 * hole.depth_m)
     # without the rule there are more points on the walls (391) than on the floor (375)
     assert floor.sum() > 250 and on_wall.sum() < 0.1 * floor.sum()
 
@@ -224,11 +226,11 @@ def test_volume_leaves_out_what_lies_outside_the_target() -> None:
     view = seen(Plane(5.0, 5.0), np.eye(4))
     inside = np.zeros(view.inside.shape, dtype=bool)
     inside[40:80, 50:110] = True
-    found = merge([prepared(view.view.cloud, inside, None, "view")], [reference()], VolumeMerge())
+    result = merge([prepared(view.view.cloud, inside, None, "view")], [reference()], VolumeMerge())
     limits = view.view.cloud.points_m[inside]
     for axis in (0, 1):
-        assert found.cloud.points_m[0][:, axis].min() > limits[:, axis].min() - 1.5 * PITCH_M
-        assert found.cloud.points_m[0][:, axis].max() < limits[:, axis].max() + 1.5 * PITCH_M
+        assert result.cloud.points_m[0][:, axis].min() > limits[:, axis].min() - 1.5 * PITCH_M
+        assert result.cloud.points_m[0][:, axis].max() < limits[:, axis].max() + 1.5 * PITCH_M
 
 
 def test_volume_without_a_surface_is_a_users_error() -> None:
@@ -253,12 +255,14 @@ def test_failed_views_are_left_out_and_named(config: GridMerge | FusedMerge | Vo
     poses = arc(3, 10.0)
     views = [seen(Plane(), T, name=f"v{i}") for i, T in enumerate(poses)]
     wrong = registered("v1", turned(0, 0, (0.0, 0.0, 0.3)), failure="too few marks")
-    found = merge(views, [reference(), wrong, registered("v2", poses[2])], config)
-    assert found.views_used == ("v0", "v2")
-    assert any("v1" in note and "too few marks" in note for note in found.notes)
-    height = plane_height(found.cloud.points_m[found.cloud.valid], found.T_reference_cloud, Plane())
+    result = merge(views, [reference(), wrong, registered("v2", poses[2])], config)
+    assert result.views_used == ("v0", "v2")
+    assert any("v1" in note and "too few marks" in note for note in result.notes)
+    height = plane_height(
+        result.cloud.points_m[result.cloud.valid], result.T_reference_cloud, Plane()
+    )
     assert float(np.abs(height).max()) < 0.3 * MM
-    assert found.seconds > 0
+    assert result.seconds > 0
 
 
 def test_nothing_left_is_a_users_error_that_names_each_view() -> None:
@@ -289,24 +293,24 @@ def test_triangles_reproduce_what_is_linear(seed: int, step: float, parts: int) 
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:12, :15].astype(float)
     turn = rng.uniform(-0.15, 0.15)  # so that the cells below lie well within the samples
-    places = np.stack(
+    positions = np.stack(
         [u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn)], axis=-1
     )
-    places += 0.2 * rng.uniform(-1, 1, places.shape)
+    positions += 0.2 * rng.uniform(-1, 1, positions.shape)
     slope = rng.uniform(-2, 2, 2)
-    values = places @ slope + 3.0
+    values = positions @ slope + 3.0
     grid = CellGrid(1.0, 1.0, step, (int(8 / step), int(8 / step)))
-    flat = places.reshape(1, -1, 2)
+    flat = positions.reshape(1, -1, 2)
     valid = np.ones(v.shape, dtype=bool)
-    for where, inside, organised in ((places, valid, True), (flat, valid.reshape(1, -1), False)):
-        found = raster_between(where, inside, organised, step / parts, grid).at_cells(
+    for where, inside, organised in ((positions, valid, True), (flat, valid.reshape(1, -1), False)):
+        result = raster_between(where, inside, organised, step / parts, grid).at_cells(
             values.reshape(-1)
         )
         x, y = grid.places()
         # cells well within; a cell that is covered in part takes the mean of that part
-        whole = (x > 3) & (x < 9) & (y > 3) & (y < 7)
+        complete = (x > 3) & (x < 9) & (y > 3) & (y < 7)
         np.testing.assert_allclose(
-            found[whole], (slope[0] * x + slope[1] * y + 3.0)[whole], atol=1e-9
+            result[complete], (slope[0] * x + slope[1] * y + 3.0)[complete], atol=1e-9
         )
 
 
@@ -315,20 +319,20 @@ def test_cells_beyond_the_samples_are_unknown_and_one_invalid_corner_costs_a_tri
     valid = np.ones((4, 4), dtype=bool)
     valid[0, 0] = False
     grid = CellGrid(-0.25, -0.25, 0.5, (6, 6))
-    found = raster_between(np.stack([u, v], axis=-1), valid, True, 0.5, grid).at_cells(
+    result = raster_between(np.stack([u, v], axis=-1), valid, True, 0.5, grid).at_cells(
         np.arange(16.0)
     )
-    assert np.isnan(found[0]).all() and np.isnan(found[:, 0]).all()
-    assert np.isnan(found[1, 1]) and found[2, 2] == pytest.approx(0.75 * 5)
+    assert np.isnan(result[0]).all() and np.isnan(result[:, 0]).all()
+    assert np.isnan(result[1, 1]) and result[2, 2] == pytest.approx(0.75 * 5)
 
 
 def test_concentration_is_the_variance_of_white_noise() -> None:
     v, u = np.mgrid[:40, :40].astype(float)
-    places = np.stack([u, v], axis=-1)
+    positions = np.stack([u, v], axis=-1)
     rng = np.random.default_rng(0)
     for step in (0.93, 2.1, 2.9):
         grid = CellGrid(3.2, 3.1, step, (int(30 / step), int(30 / step)))
-        raster = raster_between(places, np.ones((40, 40), bool), True, 1.0, grid)
+        raster = raster_between(positions, np.ones((40, 40), bool), True, 1.0, grid)
         drawn = raster.at_cells(rng.standard_normal((1600, 400)))
         np.testing.assert_allclose(
             (drawn.var(axis=-1) / raster.concentration).mean(), 1.0, rtol=0.02

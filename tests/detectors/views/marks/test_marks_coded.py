@@ -57,8 +57,8 @@ def test_tags_are_read_and_placed_as_well_as_stated():
         cloud = replace(cloud, rgb=cv2.GaussianBlur(cloud.rgb, (0, 0), rng.uniform(0.3, 1.0)))  # type: ignore[arg-type]
         for mark in find_marks(cloud, cloud.valid, CodedMarks()).trusted:
             assert mark.code is not None
-            place = transform_points(invert(T), mark.centre_m)
-            error = place - [*PLACES[mark.code], 0.0]
+            position = transform_points(invert(T), mark.centre_m)
+            error = position - [*PLACES[mark.code], 0.0]
             errors.append(np.abs(error[:2]).max())
             in_camera = T[:3, :3] @ error
             squares.append(in_camera @ np.linalg.solve(mark.covariance_m2, in_camera) / 3)
@@ -90,13 +90,13 @@ def test_a_code_seen_twice_is_in_doubt_and_a_tag_off_the_target_is_none():
 
 def test_tags_that_are_cut_or_lack_range_are_in_doubt():
     cloud = marked_cloud(board_pose(0.0, 0.0), tags(PLACES), samples=3, lens=WIDE)
-    whole = {mark.code: mark for mark in find_marks(cloud, cloud.valid, CodedMarks()).marks}
-    assert set(whole) == set(PLACES)
+    complete = {mark.code: mark for mark in find_marks(cloud, cloud.valid, CodedMarks()).marks}
+    assert set(complete) == set(PLACES)
     inside = cloud.valid.copy()
     points = cloud.points_m.copy()
-    columns = whole[3].pixels % 400
+    columns = complete[3].pixels % 400
     inside[:, : int(np.quantile(columns, 0.25))] = False
-    v, u = np.divmod(whole[7].pixels, 400)
+    v, u = np.divmod(complete[7].pixels, 400)
     points[v.min() : int(np.quantile(v, 0.2)), u.min() : u.max() + 1] = np.nan
     marks = find_marks(
         replace(cloud, points_m=points), inside & np.isfinite(points[..., 2]), CodedMarks()
@@ -136,8 +136,8 @@ def test_the_real_plate_shows_its_tags(shared_data: Path):
     blue = find_marks(cloud, inside, ColourMarks())
     # the ink of most, each about the middle of its tag; one has no range along one side, another
     # shines
-    near = [
+    nearby = [
         min(np.linalg.norm(b.centre_m - c.centre_m) for c in coded.trusted) for b in blue.trusted
     ]
-    assert len(near) >= 3
-    assert max(near) < 5e-3
+    assert len(nearby) >= 3
+    assert max(nearby) < 5e-3

@@ -22,10 +22,10 @@ def everywhere(cloud: Cloud) -> np.ndarray:
 
 def on_board_m(marks: MarkSet, T_camera_board: np.ndarray) -> np.ndarray:
     """(n, 3) centres of the trusted marks in the board's frame, by x, then y."""
-    places = transform_points(
+    positions = transform_points(
         invert(T_camera_board), np.stack([mark.centre_m for mark in marks.trusted])
     )
-    return places[np.lexsort((places[:, 1], places[:, 0] > 0))]
+    return positions[np.lexsort((positions[:, 1], positions[:, 0] > 0))]
 
 
 EXPECTED = np.column_stack([TAPES, np.zeros(4)])[np.lexsort((TAPES[:, 1], TAPES[:, 0] > 0))]
@@ -147,9 +147,9 @@ def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg,
             T, strips(half_size=half_size), rng=rng, samples=samples, sigma_m=sigma_m
         )
         for mark in find_marks(cloud, everywhere(cloud), ColourMarks()).trusted:
-            place = transform_points(invert(T), mark.centre_m)
+            position = transform_points(invert(T), mark.centre_m)
             error = T[:3, :3] @ (
-                place - EXPECTED[np.linalg.norm(EXPECTED - place, axis=1).argmin()]
+                position - EXPECTED[np.linalg.norm(EXPECTED - position, axis=1).argmin()]
             )
             squares.append(error @ np.linalg.solve(mark.covariance_m2, error) / 3)
             across.append(error @ T[:3, 2])
@@ -247,9 +247,9 @@ def test_no_colour_and_no_target_are_said():
         "no colour"
         in find_marks(replace(cloud, rgb=None), everywhere(cloud), ColourMarks()).problem
     )
-    few = np.zeros_like(cloud.valid)
-    few[:5, :5] = True
-    assert "25 pixels of the target" in find_marks(cloud, few, RedMarks()).problem
+    subset = np.zeros_like(cloud.valid)
+    subset[:5, :5] = True
+    assert "25 pixels of the target" in find_marks(cloud, subset, RedMarks()).problem
 
 
 def test_the_same_cloud_gives_the_same_bits():

@@ -117,14 +117,14 @@ def test_points_on_a_line_or_too_few_give_no_plane():
 
 
 def wood(rng: np.random.Generator, noise: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    places = rng.uniform(-1, 1, (pixels, 2))
-    light = np.exp(0.5 * np.log(3.0) * places[:, :1]) * np.array([1.0, 0.9, 0.7])
+    positions = rng.uniform(-1, 1, (pixels, 2))
+    light = np.exp(0.5 * np.log(3.0) * positions[:, :1]) * np.array([1.0, 0.9, 0.7])
     # no channel is clipped: 98 * 1.73 * 1.5 = 254
     colours = (
         np.array([98.0, 75.0, 50.0]) * light * (1.0 + 0.15 * rng.standard_normal((pixels, 1)))
         + noise
     )
-    return np.clip(np.rint(colours), 0, 255).astype(np.uint8), places
+    return np.clip(np.rint(colours), 0, 255).astype(np.uint8), positions
 
 
 @pytest.mark.parametrize(("tail", "factor"), [("gaussian", 30), ("laplace", 150)])
@@ -136,17 +136,17 @@ def test_as_many_of_the_targets_own_pixels_pass_as_stated(tail, factor):
         if tail == "gaussian"
         else rng.laplace(size=(pixels, 3)) / np.sqrt(2)
     )
-    rgb, places = wood(rng, noise, pixels)
-    passed = (stand_out(*chromaticity(rgb), places)[1] > 1.0).mean()
+    rgb, positions = wood(rng, noise, pixels)
+    passed = (stand_out(*chromaticity(rgb), positions)[1] > 1.0).mean()
     assert passed < factor * FALSE_RATE
 
 
 def test_a_quarter_of_the_target_may_be_marked():
     rng = random_stream(5, "many marks")
-    rgb, places = wood(rng, 3.0 * rng.standard_normal((20_000, 3)), 20_000)
-    marked = places[:, 1] > 0.5
+    rgb, positions = wood(rng, 3.0 * rng.standard_normal((20_000, 3)), 20_000)
+    marked = positions[:, 1] > 0.5
     rgb[marked] = (200, 30, 30)
-    chosen = stand_out(*chromaticity(rgb), places)[1] > 1.0
+    chosen = stand_out(*chromaticity(rgb), positions)[1] > 1.0
     assert chosen[marked].all()
     assert chosen[~marked].mean() < 30 * FALSE_RATE
 

@@ -128,19 +128,21 @@ def test_covariance_and_residuals_are_those_of_repeats():
     normal = FIRST[:3, 2]
     for _ in range(150):
         reference = view_of("a", marks_at(RECTANGLE, FIRST, rng), np.eye(4))
-        found = register_by_marks(reference, view_of("b", marks_at(RECTANGLE, SECOND, rng), GUESS))
-        assert found.failure == ""
-        error = found.T_reference_view @ invert(TRUE)
+        by_marks = register_by_marks(
+            reference, view_of("b", marks_at(RECTANGLE, SECOND, rng), GUESS)
+        )
+        assert by_marks.failure == ""
+        error = by_marks.T_reference_view @ invert(TRUE)
         small = np.r_[
             Rotation.from_matrix(error[:3, :3]).as_rotvec(),
-            transform_points(error, found.centre_m) - found.centre_m,
+            transform_points(error, by_marks.centre_m) - by_marks.centre_m,
         ]
-        if not found.notes:
-            squares.append(small @ np.linalg.solve(found.covariance, small))
-        residuals.append(found.residual_m**2)
-        moved = displacement_jacobian(points, found.centre_m) @ small
+        if not by_marks.notes:
+            squares.append(small @ np.linalg.solve(by_marks.covariance, small))
+        residuals.append(by_marks.residual_m**2)
+        moved = displacement_jacobian(points, by_marks.centre_m) @ small
         across.append(
-            np.mean((moved @ normal) ** 2) / predicted_error_m(found, points, normal)[1] ** 2
+            np.mean((moved @ normal) ** 2) / predicted_error_m(by_marks, points, normal)[1] ** 2
         )
     # widened for disagreeing marks: one in a hundred
     assert len(squares) > 150 - stats.binom(150, 0.01).ppf(0.9999)
@@ -153,13 +155,18 @@ def test_covariance_and_residuals_are_those_of_repeats():
 
 
 def test_marks_are_matched_without_any_guess_where_they_lie_unevenly():
-    found = register_by_marks(
+    by_marks = register_by_marks(
         view_of("a", marks_at(UNEVEN, FIRST), np.eye(4)),
         view_of("b", marks_at(UNEVEN, SECOND)[::-1]),
     )
-    assert (found.failure, found.pairs, found.method, found.view) == ("", 4, "marks", "b")
-    assert error_m(found.T_reference_view) < 1e-9
-    assert np.isnan(found.overlap)
+    assert (by_marks.failure, by_marks.pairs, by_marks.method, by_marks.view) == (
+        "",
+        4,
+        "marks",
+        "b",
+    )
+    assert error_m(by_marks.T_reference_view) < 1e-9
+    assert np.isnan(by_marks.overlap)
 
 
 @settings(max_examples=12, deadline=None)
@@ -230,8 +237,8 @@ def test_a_rectangle_needs_a_guess_to_tell_its_twin(hidden):
 
 def test_a_guess_of_the_reference_itself_is_taken_into_account():
     reference = view_of("b", marks_at(RECTANGLE, SECOND), TRUE)
-    found = register_by_marks(reference, view_of("a", marks_at(RECTANGLE, FIRST), np.eye(4)))
-    np.testing.assert_allclose(found.T_reference_view, invert(TRUE), atol=1e-9)
+    by_marks = register_by_marks(reference, view_of("a", marks_at(RECTANGLE, FIRST), np.eye(4)))
+    np.testing.assert_allclose(by_marks.T_reference_view, invert(TRUE), atol=1e-9)
 
 
 def test_other_targets_moved_marks_and_lines_fail():
@@ -253,18 +260,18 @@ def test_other_targets_moved_marks_and_lines_fail():
 def test_a_line_of_common_marks_among_others_fails():
     ours = np.array([[x, 0.0, 0.0] for x in (-0.2, -0.05, 0.1, 0.2)] + [[0.0, 0.05, 0.0]])
     theirs = np.vstack([ours[:4], [[0.03, -0.045, 0.0]]])
-    found = register_by_marks(
+    by_marks = register_by_marks(
         view_of("a", marks_at(ours, FIRST), np.eye(4)),
         view_of("b", marks_at(theirs, SECOND), GUESS),
     )
-    assert "lie on a line" in found.failure
+    assert "lie on a line" in by_marks.failure
 
 
 def test_too_few_marks_say_whose():
-    few = view_of("left", marks_at(RECTANGLE[:2], SECOND), GUESS)
-    found = register_by_marks(view_of("a", marks_at(RECTANGLE, FIRST), np.eye(4)), few)
-    assert found.failure == "left: 2 marks found, 3 needed"
-    assert held_out_error_m(few, few) is None
+    view = view_of("left", marks_at(RECTANGLE[:2], SECOND), GUESS)
+    by_marks = register_by_marks(view_of("a", marks_at(RECTANGLE, FIRST), np.eye(4)), view)
+    assert by_marks.failure == "left: 2 marks found, 3 needed"
+    assert held_out_error_m(view, view) is None
 
 
 def test_codes_decide_alone():
@@ -273,9 +280,9 @@ def test_codes_decide_alone():
     reference = view_of("a", marks_at(RECTANGLE, FIRST, rng, codes))
     order = [2, 0, 3, 1]
     view = view_of("b", marks_at(RECTANGLE[order], SECOND, rng, [codes[i] for i in order]))
-    found = register_by_marks(reference, view)
-    assert found.failure == ""
-    assert error_m(found.T_reference_view) < 2e-3
+    by_marks = register_by_marks(reference, view)
+    assert by_marks.failure == ""
+    assert error_m(by_marks.T_reference_view) < 2e-3
     others = view_of("b", marks_at(RECTANGLE[order], SECOND, rng, [15, 4, 23, 42]))
     assert register_by_marks(reference, others).failure == (
         "2 codes in common, 3 needed: the reference shows 4, 8, 15, 16, the view 4, 15, 23, 42"

@@ -98,10 +98,10 @@ def test_every_iteration_is_that_of_a_dense_implementation(w):
     moving = transform_points(transform((8, -5, 12), (0.02, 0.01, -0.03)), cloud(80) + noise)
     for iterations in (1, 5, 20):
         config = CpdRegistration(outlier_ratio=w, max_iterations=iterations, tolerance=1e-300)
-        found = coherent_point_drift(fixed, moving, config)
-        assert found.iterations == iterations
+        result = coherent_point_drift(fixed, moving, config)
+        assert result.iterations == iterations
         np.testing.assert_allclose(
-            found.T_fixed_moving, dense_cpd(fixed, moving, w, iterations), rtol=0, atol=1e-9
+            result.T_fixed_moving, dense_cpd(fixed, moving, w, iterations), rtol=0, atol=1e-9
         )
 
 
@@ -119,9 +119,9 @@ def test_known_transforms_come_back_through_outliers(turn, shift, seed):
     low = fixed.min(axis=0)
     high = fixed.max(axis=0)
     strays = random.uniform(low, high, (20, 3))
-    found = coherent_point_drift(np.concatenate([fixed, strays]), moving, EXACT)
-    np.testing.assert_allclose(transform_points(found.T_fixed_moving, moving), fixed, atol=2e-5)
-    rotation = found.T_fixed_moving[:3, :3]
+    result = coherent_point_drift(np.concatenate([fixed, strays]), moving, EXACT)
+    np.testing.assert_allclose(transform_points(result.T_fixed_moving, moving), fixed, atol=2e-5)
+    rotation = result.T_fixed_moving[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
 
@@ -143,14 +143,14 @@ def test_the_background_is_that_of_the_last_iteration():
 def test_a_grown_cloud_gives_no_scale():
     fixed = cloud(200)
     middle = fixed.mean(axis=0)
-    found = coherent_point_drift(fixed, middle + 1.02 * (fixed - middle), EXACT)
-    assert np.linalg.svd(found.T_fixed_moving[:3, :3])[1] == pytest.approx([1, 1, 1], abs=1e-12)
+    result = coherent_point_drift(fixed, middle + 1.02 * (fixed - middle), EXACT)
+    assert np.linalg.svd(result.T_fixed_moving[:3, :3])[1] == pytest.approx([1, 1, 1], abs=1e-12)
 
 
 def test_a_mirrored_cloud_is_not_mirrored_back():
     fixed = cloud(200)
-    found = coherent_point_drift(fixed, fixed * [-1, 1, 1], EXACT)
-    assert np.linalg.det(found.T_fixed_moving[:3, :3]) == pytest.approx(1.0)
+    result = coherent_point_drift(fixed, fixed * [-1, 1, 1], EXACT)
+    assert np.linalg.det(result.T_fixed_moving[:3, :3]) == pytest.approx(1.0)
 
 
 def test_only_the_turn_of_the_guess_matters():
@@ -166,11 +166,11 @@ def test_only_the_turn_of_the_guess_matters():
 
 
 def test_equal_clouds_end_at_once_and_stay():
-    found = coherent_point_drift(
+    result = coherent_point_drift(
         cloud(50), cloud(50), CpdRegistration(outlier_ratio=0.0, max_iterations=1000)
     )
-    assert found.converged
-    np.testing.assert_allclose(found.T_fixed_moving, np.eye(4), atol=1e-9)
+    assert result.converged
+    np.testing.assert_allclose(result.T_fixed_moving, np.eye(4), atol=1e-9)
 
 
 def test_a_loose_tolerance_stops_early_and_a_tight_one_runs_on():

@@ -49,22 +49,22 @@ def test_a_shaped_target_is_found_from_a_usual_guess():
     T = usual_error()
     reference = wavy_view(pose(), np.eye(4), 0, 2e-4)
     view = wavy_view(pose(5, -8), pose() @ np.linalg.inv(pose(5, -8)) @ T, 1, 2e-4)
-    found = register_by_icp(reference, view, IcpRegistration(points="target"))
-    wrong = found.T_reference_view @ np.linalg.inv(pose() @ np.linalg.inv(pose(5, -8)))
-    moved = transform_points(wrong, found.centre_m) - found.centre_m
+    by_icp = register_by_icp(reference, view, IcpRegistration(points="target"))
+    wrong = by_icp.T_reference_view @ np.linalg.inv(pose() @ np.linalg.inv(pose(5, -8)))
+    moved = transform_points(wrong, by_icp.centre_m) - by_icp.centre_m
     turn = Rotation.from_matrix(wrong[:3, :3]).magnitude()
     assert np.linalg.norm(moved) < 1.5e-3 and turn * 0.1 < 1.5e-3
-    assert not found.failure and found.converged and found.pairs > 2400
+    assert not by_icp.failure and by_icp.converged and by_icp.pairs > 2400
 
 
 def test_flat_marks_come_as_near_as_point_to_point_can():
     """It stops at one of many near minima, 0.7 to 2.6 mm off in the plane; the guess is 15 mm off."""
     reference, view = views(POSES, guess_error=usual_error(), noise_m=3e-4)
-    found = register_by_icp(reference.prepared, view.prepared, IcpRegistration())
-    within, across = target_error_m(found, reference, view)
+    by_icp = register_by_icp(reference.prepared, view.prepared, IcpRegistration())
+    within, across = target_error_m(by_icp, reference, view)
     assert within < 3e-3 and across < 0.2 * PITCH_M
     predicted = predicted_error_m(
-        found, reference.prepared.points_m[::50], reference.T_camera_board[:3, 2]
+        by_icp, reference.prepared.points_m[::50], reference.T_camera_board[:3, 2]
     )
     assert 0.05e-3 < predicted[0] < 2 * PITCH_M and 1e-6 < predicted[1] < 0.2 * PITCH_M
 
@@ -81,21 +81,22 @@ def test_the_same_views_give_the_same_bits():
 def test_without_a_guess_it_starts_at_the_reference_and_says_so():
     reference = wavy_view(pose(), np.eye(4), 0, 0.0)
     blind = wavy_view(pose(2, 3, 0, (0.004, 0.0, 0.0)), None, 0, 0.0)
-    found = register_by_icp(reference, blind, IcpRegistration(points="target"))
-    assert "no guess" in found.notes[0]
+    by_icp = register_by_icp(reference, blind, IcpRegistration(points="target"))
+    assert "no guess" in by_icp.notes[0]
     np.testing.assert_allclose(
-        found.T_reference_view @ pose(2, 3, 0, (0.004, 0.0, 0.0)), pose(), atol=1e-6
+        by_icp.T_reference_view @ pose(2, 3, 0, (0.004, 0.0, 0.0)), pose(), atol=1e-6
     )
 
 
 def test_too_few_fiducial_points_are_a_failure_in_words():
     reference = board_view(POSES[0], np.eye(4)).prepared
     bare = board_view(POSES[1], np.eye(4), tapes_m=()).prepared
-    found = register_by_icp(reference, bare, IcpRegistration())
-    assert found.failure == (
-        "too few points of the fiducial colour: 730 in the reference and 0 in the view, 3 needed in each"
+    by_icp = register_by_icp(reference, bare, IcpRegistration())
+    assert by_icp.failure == (
+        "too few points of the fiducial colour: 730 in the reference and 0 in the view, 3 "
+        "needed in each"
     )
-    assert np.isnan(found.covariance).all()
+    assert np.isnan(by_icp.covariance).all()
 
 
 def test_nothing_in_reach_is_a_failure():

@@ -25,12 +25,12 @@ def across_error(found: Registration, reference, view) -> float:
 
 
 def test_without_noise_the_surfaces_meet_to_a_micrometre():
-    made = views(POSES, guess_error=usual_error())
-    for found, view in zip(
-        register_jointly([each.prepared for each in made]), made[1:], strict=True
+    created = views(POSES, guess_error=usual_error())
+    for result, view in zip(
+        register_jointly([each.prepared for each in created]), created[1:], strict=True
     ):
-        assert not found.failure and found.converged and found.method == "joint"
-        assert across_error(found, made[0], view) < 2e-6
+        assert not result.failure and result.converged and result.method == "joint"
+        assert across_error(result, created[0], view) < 2e-6
 
 
 def test_across_it_is_better_than_the_marks_where_noise_is_white():
@@ -38,11 +38,11 @@ def test_across_it_is_better_than_the_marks_where_noise_is_white():
 
     errors = []
     for seed in range(3):
-        made = views(POSES[:3], guess_error=usual_error(), noise_m=1e-3, seed=seed)
-        joint = register_jointly([each.prepared for each in made])
-        for found, view in zip(joint, made[1:], strict=True):
-            marks = register_by_marks(made[0].prepared, view.prepared)
-            errors.append([across_error(each, made[0], view) for each in (found, marks)])
+        created = views(POSES[:3], guess_error=usual_error(), noise_m=1e-3, seed=seed)
+        joint = register_jointly([each.prepared for each in created])
+        for result, view in zip(joint, created[1:], strict=True):
+            marks = register_by_marks(created[0].prepared, view.prepared)
+            errors.append([across_error(each, created[0], view) for each in (result, marks)])
     # four marks of 180 pixels against 2000 points: sqrt(720 / 2000) = 0.6 for a level, more for
     # tilts, which the marks in the corners hold well
     by_joint, by_marks = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -60,17 +60,17 @@ def smooth_error_repeats(repeats: int) -> np.ndarray:
             np.add.outer(np.arange(4), np.arange(4)) <= 3
         )
         guesses = [poses[0] @ np.linalg.inv(T) for T in poses]
-        made = [
+        created = [
             board_view(T, guesses[i], noise_m=2e-4, seed=50 * seed + i, smooth_m=errors[i])
             for i, T in enumerate(poses)
         ]
-        for found, view in zip(
-            register_jointly([each.prepared for each in made]), made[1:], strict=True
+        for result, view in zip(
+            register_jointly([each.prepared for each in created]), created[1:], strict=True
         ):
             _, predicted = predicted_error_m(
-                found, made[0].prepared.points_m[::40], made[0].T_camera_board[:3, 2]
+                result, created[0].prepared.points_m[::40], created[0].T_camera_board[:3, 2]
             )
-            squares.append((across_error(found, made[0], view) / predicted) ** 2)
+            squares.append((across_error(result, created[0], view) / predicted) ** 2)
     return np.array(squares)
 
 
@@ -85,27 +85,27 @@ def test_the_predicted_error_across_holds_smooth_errors_of_views():
 
 
 def test_a_view_whose_marks_fail_takes_no_part():
-    made = views(POSES[:3], guess_error=usual_error(), noise_m=2e-4)
-    good = register_jointly([made[0].prepared, made[2].prepared])[0]
-    spoilt = made[1].prepared
+    created = views(POSES[:3], guess_error=usual_error(), noise_m=2e-4)
+    good = register_jointly([created[0].prepared, created[2].prepared])[0]
+    spoilt = created[1].prepared
     hidden = PreparedView(
         spoilt.view, spoilt.inside, MarkSet((), np.empty(0, int), "no mark found, 3 needed")
     )
-    failed, found = register_jointly([made[0].prepared, hidden, made[2].prepared])
+    failed, result = register_jointly([created[0].prepared, hidden, created[2].prepared])
     assert "no mark found" in failed.failure and failed.method == "joint"
-    np.testing.assert_array_equal(found.T_reference_view, good.T_reference_view)
+    np.testing.assert_array_equal(result.T_reference_view, good.T_reference_view)
 
 
 def test_points_count_as_fewer_than_they_are():
     """The covariance across is that of one independent value in 25 pixels: between that of 1/5 and
     1/50 of them."""
-    made = views(POSES[:2], noise_m=1e-3)
-    found = register_jointly([each.prepared for each in made])[0]
+    created = views(POSES[:2], noise_m=1e-3)
+    result = register_jointly([each.prepared for each in created])[0]
     _, across = predicted_error_m(
-        found, made[0].prepared.points_m[::40], made[0].T_camera_board[:3, 2]
+        result, created[0].prepared.points_m[::40], created[0].T_camera_board[:3, 2]
     )
-    pixels = made[0].prepared.inside.sum()
+    pixels = created[0].prepared.inside.sum()
     # two views' noise, three unknowns of which each is known to sigma / sqrt(n)
     least = np.sqrt(2 * 3) * 0.001 / np.sqrt(pixels / 5)
-    most = np.sqrt(2 * 3) * 0.001 / np.sqrt(pixels / 50)
-    assert least < across < 3 * most
+    largest = np.sqrt(2 * 3) * 0.001 / np.sqrt(pixels / 50)
+    assert least < across < 3 * largest

@@ -56,13 +56,13 @@ def changed(view: PreparedView, **cloud) -> PreparedView:
     "config", [*BY_MARKS[::2], IcpRegistration(), SLOW_CPD], ids=lambda config: config.method
 )
 def test_good_views_are_registered_and_nothing_is_said(config):
-    made = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
-    reference, *found = register(prepared(made), config)
+    created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
+    reference, *result = register(prepared(created), config)
     np.testing.assert_array_equal(reference.T_reference_view, np.eye(4))
     assert reference.overlap == 1.0 and not reference.covariance.any()
-    for each, view, expected in zip(found, made[1:], ("view 1", "view 2"), strict=True):
+    for each, view, expected in zip(result, created[1:], ("view 1", "view 2"), strict=True):
         assert (each.view, each.method, each.failure) == (expected, config.method, "")
-        within, across = target_error_m(each, made[0], view)
+        within, across = target_error_m(each, created[0], view)
         assert (
             within < (2.0 if config.method == "icp" else 0.5) * PITCH_M and across < 0.3 * PITCH_M
         )
@@ -89,20 +89,22 @@ def only_failure(made, config: AnyRegistration) -> str:
 def test_views_that_do_not_overlap():
     away = np.eye(4)
     away[0, 3] = 0.29
-    made = views(POSES[:2])
+    created = views(POSES[:2])
     moved = View(
-        "view 1", made[1].prepared.view.cloud, away @ made[1].prepared.view.T_reference_view_guess
+        "view 1",
+        created[1].prepared.view.cloud,
+        away @ created[1].prepared.view.T_reference_view_guess,
     )
-    side = PreparedView(moved, made[1].prepared.inside, made[1].prepared.marks)
-    failure = register([made[0].prepared, side], PlainRegistration(method="nominal"))[1].failure
+    side = PreparedView(moved, created[1].prepared.inside, created[1].prepared.marks)
+    failure = register([created[0].prepared, side], PlainRegistration(method="nominal"))[1].failure
     assert "the views do not overlap" in failure and "%" in failure
 
 
 def test_other_marks_on_the_other_target():
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M)
-    others = tuple((x * 0.5, y * 0.6) for x, y in TAPES_M)
+    remaining = tuple((x * 0.5, y * 0.6) for x, y in TAPES_M)
     guess = POSES[0] @ np.linalg.inv(POSES[1])
-    other = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=others)
+    other = board_view(POSES[1], guess, noise_m=NOISE_M, tapes_m=remaining)
     assert "do not coincide" in only_failure(
         [reference, other], IcpRegistration()
     ) or "no pairs" in only_failure([reference, other], IcpRegistration())
@@ -115,8 +117,8 @@ def test_a_target_of_another_shape_lies_apart():
     bent[2, 0] = 0.012
     reference = board_view(POSES[0], np.eye(4), noise_m=NOISE_M)
     other = board_view(POSES[1], POSES[0] @ np.linalg.inv(POSES[1]), noise_m=NOISE_M, smooth_m=bent)
-    found = register(prepared([reference, other]), CpdRegistration())[1]
-    assert "apart" in found.failure and "different targets" in found.failure
+    result = register(prepared([reference, other]), CpdRegistration())[1]
+    assert "apart" in result.failure and "different targets" in result.failure
 
 
 FINE = Lens(440, 320, 600.0, 600.0, 219.5, 159.5)
@@ -139,25 +141,25 @@ def fine_pair(bend_mm: float, seed: int = 0):
 def test_views_that_differ_by_their_own_smooth_errors_are_merged_with_a_note(config):
     exact = fine_pair(0.0)
     bent = fine_pair(1.2)
-    found = register(prepared(bent), config)[1]
+    result = register(prepared(bent), config)[1]
     plain = register(prepared(exact), config)[1]
-    assert found.failure == plain.failure == ""
+    assert result.failure == plain.failure == ""
     assert not any("beyond what noise explains" in note for note in plain.notes)
     normal = bent[0].T_camera_board[:3, 2]
     points = bent[0].prepared.points_m
-    wider = predicted_error_m(found, points, normal)[1]
+    wider = predicted_error_m(result, points, normal)[1]
     narrow = predicted_error_m(plain, points, normal)[1]
     assert wider > 3 * narrow
     if config.method != "joint":  # whose covariance holds such errors already
-        assert any("the covariance is widened" in note for note in found.notes)
+        assert any("the covariance is widened" in note for note in result.notes)
         # root mean square of the bend over the board is 0.7 mm, of which a turn cannot take
         # anything
         assert 0.3e-3 < wider < 1.2e-3
 
 
 def test_views_whose_errors_would_blur_the_map_are_refused():
-    found = register(prepared(fine_pair(9.0)), PlainRegistration(method="marks"))[1]
-    assert "which would blur the map (up to" in found.failure
+    result = register(prepared(fine_pair(9.0)), PlainRegistration(method="marks"))[1]
+    assert "which would blur the map (up to" in result.failure
 
 
 @pytest.mark.slow
@@ -168,12 +170,12 @@ def test_the_widened_covariance_holds_the_true_errors():
     ratios = []
     for seed in range(12):
         pair = fine_pair(1.2 * random.standard_normal(), seed)
-        found = register(prepared(pair), PlainRegistration(method="marks"))[1]
-        assert found.failure == ""
+        result = register(prepared(pair), PlainRegistration(method="marks"))[1]
+        assert result.failure == ""
         _, predicted = predicted_error_m(
-            found, pair[0].prepared.points_m, pair[0].T_camera_board[:3, 2]
+            result, pair[0].prepared.points_m, pair[0].T_camera_board[:3, 2]
         )
-        ratios.append(target_error_m(found, *pair)[1] / predicted)
+        ratios.append(target_error_m(result, *pair)[1] / predicted)
     # chi square of 12 degrees lies below 32.9 with a probability of 0.999: the covariance may be
     # cautious, not too sure
     assert np.sum(np.square(ratios)) < 32.9
@@ -200,21 +202,23 @@ def replace_guess(view: PreparedView, guess: np.ndarray | None) -> PreparedView:
 
 
 def test_points_on_a_line_leave_a_turn_open():
-    made = views(POSES[:2], noise_m=NOISE_M)
-    found = register(prepared(made), PlainRegistration(method="marks"))[1]
+    created = views(POSES[:2], noise_m=NOISE_M)
+    result = register(prepared(created), PlainRegistration(method="marks"))[1]
     open_turn = np.diag([0.2**2, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
-    judged = judge(replace(found, covariance=open_turn), made[0].prepared, made[1].prepared)
+    judged = judge(replace(result, covariance=open_turn), created[0].prepared, created[1].prepared)
     assert "lie on a line" in judged.failure and "which would blur" in judged.failure
     slides = np.diag([1e-8, 1e-8, 1e-8, 0.01**2, 1e-8, 1e-8])
-    judged = judge(replace(found, covariance=slides), made[0].prepared, made[1].prepared)
+    judged = judge(replace(result, covariance=slides), created[0].prepared, created[1].prepared)
     assert "not determined: the points let the target slide" in judged.failure
 
 
 @pytest.mark.parametrize("broken", [np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)])
 def test_a_mirror_image_or_nothing_is_no_registration(broken):
-    made = views(POSES[:2])
-    found = register(prepared(made), PlainRegistration(method="marks"))[1]
-    judged = judge(replace(found, T_reference_view=broken), made[0].prepared, made[1].prepared)
+    created = views(POSES[:2])
+    result = register(prepared(created), PlainRegistration(method="marks"))[1]
+    judged = judge(
+        replace(result, T_reference_view=broken), created[0].prepared, created[1].prepared
+    )
     assert judged.failure in (
         "mirrored: the transform is a reflection, not a rotation",
         "no transform was found",
@@ -227,19 +231,19 @@ def test_an_iteration_that_still_moves_has_failed():
 
 
 def test_one_bad_view_does_not_spoil_the_others():
-    made = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
+    created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
     hidden = board_view(POSES[1], None, tapes_m=TAPES_M[:1]).prepared
     for config in BY_MARKS[:1] + BY_MARKS[2:]:
-        _, bad, good = register([made[0].prepared, hidden, made[2].prepared], config)
+        _, bad, good = register([created[0].prepared, hidden, created[2].prepared], config)
         assert "3 needed" in bad.failure and good.failure == ""
 
 
 def test_what_nominal_leaves_is_noted_and_not_refused():
-    made = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
-    found = register(prepared(made), PlainRegistration(method="nominal"))[1]
-    assert found.failure == "" and "apart" in found.notes[-1]
+    created = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
+    result = register(prepared(created), PlainRegistration(method="nominal"))[1]
+    assert result.failure == "" and "apart" in result.notes[-1]
     np.testing.assert_array_equal(
-        found.T_reference_view, made[1].prepared.view.T_reference_view_guess
+        result.T_reference_view, created[1].prepared.view.T_reference_view_guess
     )
 
 
@@ -250,17 +254,17 @@ def test_what_nominal_leaves_is_noted_and_not_refused():
     "config", [*BY_MARKS, IcpRegistration(), PlainRegistration(method="odometry")]
 )
 def test_a_capture_without_colour_is_refused_where_colour_is_needed(config):
-    made = prepared(views(POSES[:2]))
+    created = prepared(views(POSES[:2]))
     with pytest.raises(UserError, match=r"view 1: registration by \w+ needs colour"):
-        register([made[0], changed(made[1], rgb=None)], config)
+        register([created[0], changed(created[1], rgb=None)], config)
 
 
 def test_odometry_needs_a_lens_and_nominal_a_guess():
-    made = prepared(views(POSES[:2]))
+    created = prepared(views(POSES[:2]))
     with pytest.raises(UserError, match="needs a pixel grid and the lens"):
-        register([made[0], changed(made[1], lens=None)], PlainRegistration(method="odometry"))
+        register([created[0], changed(created[1], lens=None)], PlainRegistration(method="odometry"))
     with pytest.raises(UserError, match="needs the nominal pose of every view"):
-        register([made[0], replace_guess(made[1], None)], PlainRegistration(method="nominal"))
+        register([created[0], replace_guess(created[1], None)], PlainRegistration(method="nominal"))
 
 
 # ------------------------------------------------------------ the yardstick
@@ -295,7 +299,7 @@ def test_the_predicted_error_is_the_jacobians():
     points = random.standard_normal((20, 3))
     centre = np.array([0.1, 0.2, 0.3])
     normal = np.array([0.6, 0.0, 0.8])
-    found = Registration("", "", np.eye(4), root @ root.T, centre, 0.0, 1.0, 0, 0, True, 0.0)
+    registration = Registration("", "", np.eye(4), root @ root.T, centre, 0.0, 1.0, 0, 0, True, 0.0)
     motions = random.standard_normal((20000, 6)) @ root.T
     errors = np.cross(motions[:, None, :3], points - centre) + motions[:, None, 3:]
     np.testing.assert_allclose(
@@ -303,4 +307,6 @@ def test_the_predicted_error_is_the_jacobians():
     )
     across = np.sqrt(np.mean((errors @ normal) ** 2))
     within = np.sqrt(np.mean(np.sum(errors**2, axis=2)) - across**2)
-    assert predicted_error_m(found, points, normal) == pytest.approx((within, across), rel=0.03)
+    assert predicted_error_m(registration, points, normal) == pytest.approx(
+        (within, across), rel=0.03
+    )

@@ -21,38 +21,38 @@ WALK = [
 
 
 def test_it_follows_a_walk_and_drifts():
-    made = views(WALK, noise_m=2e-4, textured=True)
-    found = register([each.prepared for each in made], PlainRegistration(method="odometry"))
+    created = views(WALK, noise_m=2e-4, textured=True)
+    result = register([each.prepared for each in created], PlainRegistration(method="odometry"))
     errors = [
-        np.hypot(*target_error_m(each, made[0], view))
-        for each, view in zip(found, made, strict=True)
+        np.hypot(*target_error_m(each, created[0], view))
+        for each, view in zip(result, created, strict=True)
     ]
-    assert not any(each.failure for each in found) and errors[0] == 0.0
+    assert not any(each.failure for each in result) and errors[0] == 0.0
     # steps of 3 degrees and 5 mm; without following them the last view would be 24 mm off
     assert max(errors[1:]) < 1.5 * PITCH_M and errors[-1] > errors[1] > 1e-5
     assert all(
-        np.isnan(each.covariance).all() and "no covariance" in each.notes[0] for each in found[1:]
+        np.isnan(each.covariance).all() and "no covariance" in each.notes[0] for each in result[1:]
     )
 
 
 def test_the_same_walk_gives_the_same_bits():
-    made = [view.prepared for view in views(WALK[:3], noise_m=2e-4, textured=True)]
-    first = register_by_odometry(made)
-    second = register_by_odometry(made)
+    created = [view.prepared for view in views(WALK[:3], noise_m=2e-4, textured=True)]
+    first = register_by_odometry(created)
+    second = register_by_odometry(created)
     assert [a.T_reference_view.tobytes() for a in first] == [
         b.T_reference_view.tobytes() for b in second
     ]
 
 
 def test_after_a_view_that_shows_nothing_it_is_lost_for_good():
-    made = [view.prepared for view in views(WALK[:4], noise_m=2e-4, textured=True)]
-    nothing = np.zeros_like(made[2].inside)
+    created = [view.prepared for view in views(WALK[:4], noise_m=2e-4, textured=True)]
+    nothing = np.zeros_like(created[2].inside)
     # only a corner of three pixels is left of the target
-    nothing[tuple(np.argwhere(made[2].inside)[:3].T)] = True
-    made[2] = replace(made[2], inside=nothing)
-    found = register_by_odometry(made)
-    assert [bool(each.failure) for each in found] == [False, True, True]
-    assert all("failed at view 2" in each.failure for each in found[1:])
+    nothing[tuple(np.argwhere(created[2].inside)[:3].T)] = True
+    created[2] = replace(created[2], inside=nothing)
+    by_odometry = register_by_odometry(created)
+    assert [bool(each.failure) for each in by_odometry] == [False, True, True]
+    assert all("failed at view 2" in each.failure for each in by_odometry[1:])
 
 
 def test_distortion_is_taken_out():
@@ -67,8 +67,8 @@ def test_distortion_is_taken_out():
     )
     errors = []
     for lens in (LENS, bent):
-        made = views(WALK[:2], noise_m=2e-4, textured=True, lens=lens)
-        (found,) = register_by_odometry([each.prepared for each in made])
-        errors.append(np.hypot(*target_error_m(found, made[0], made[1])))
+        created = views(WALK[:2], noise_m=2e-4, textured=True, lens=lens)
+        (result,) = register_by_odometry([each.prepared for each in created])
+        errors.append(np.hypot(*target_error_m(result, created[0], created[1])))
     # left in, the distortion shifts the board's corners by 3 pixels
     assert errors[1] < 2 * errors[0] + 0.2 * PITCH_M

@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 from scipy import special, stats
 
-from harness.evaluation.intervals import false_call_rate
+from harness.evaluation.intervals import false_call_rate, percentiles
+from harness.evaluation.study.boards import weights_in_blocks
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curve
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord
@@ -402,3 +403,50 @@ class TestAxes:
         assert unpaired.interval.high - unpaired.interval.low > 1.5 * (
             paired.interval.high - paired.interval.low
         )
+
+
+class TestEdges:
+    """What curves hold where one of their tables is empty or ends early."""
+
+    def test_free_response_needs_every_table(self, loud):
+        runs = loud.runs
+        assert free_response(loud.operating.iloc[:0], runs, loud.holes) is None
+        assert free_response(loud.operating, runs, loud.holes.iloc[:0]) is None
+        assert free_response(loud.operating, pd.DataFrame(), loud.holes) is None
+
+    def test_intervals_of_a_free_response_are_over_boards(self, loud):
+        curve = free_response(loud.operating, loud.runs, loud.holes, draws=30)
+        index = np.flatnonzero(curve.threshold == THRESHOLD)[0]
+        boards = np.unique(loud.holes["board"])
+        hits = loud.holes.groupby("board")["detected"].sum().to_numpy(float)
+        count = loud.holes.groupby("board").size().to_numpy(float)
+        (weights,) = next(iter(weights_in_blocks(30, (boards, "damaged"))))
+        expected = percentiles((weights @ hits) / (weights @ count))
+        assert curve.found_low[index] == pytest.approx(expected.low)
+        assert curve.found_high[index] == pytest.approx(expected.high)
+
+    def test_pixels_that_end_early_keep_their_curves(self):
+        rows = [("", 100, np.array([20, 10])), ("a", 4, np.array([3, 1]))]
+        pixels = pd.DataFrame(rows, columns=["hole", "pixels", "above"])
+        curves = pixel_curves(pixels)
+        assert curves.false.tolist() == [0.0, 0.1, 0.2, 1.0]
+        assert curves.overlap.tolist() == [0.0, 0.25, 0.75, 1.0]
+        assert np.isnan(curves.pro)
+        assert curves.why == "the thresholds counted end at a false-positive rate of 0.2"
+
+    def test_pixels_that_are_all_found_early_have_an_area(self):
+        rows = [("", 100, np.array([20, 10])), ("a", 4, np.array([4, 2]))]
+        pixels = pd.DataFrame(rows, columns=["hole", "pixels", "above"])
+        curves = pixel_curves(pixels)
+        # 0 -> 0.5 over 0.1, then 0.5 -> 1 over 0.1, then 1 over 0.1
+        assert curves.pro == pytest.approx((0.1 * 0.25 + 0.1 * 0.75 + 0.1) / 0.3)
+        assert curves.why == ""
+
+    def test_chance_without_sites_and_without_a_rate(self, loud):
+        chance = chance_hits(loud.holes, pd.DataFrame(), loud.runs, loud.findings, RADIUS_MM)
+        assert chance.sites == 0
+        assert np.isnan(chance.of_sites)
+        assert np.isnan(chance.expected)
+        assert not chance.sites_interval.known
+        only = loud.runs.iloc[:0]
+        assert np.isnan(chance_hits(loud.holes, pd.DataFrame(), only, only, RADIUS_MM).probability)

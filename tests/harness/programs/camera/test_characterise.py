@@ -138,24 +138,26 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
         )
     ]
     out = tmp_path / "out"
-    given = [*map(str, paths), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(out)]
-    given += ["--certificate", "--about", "firmware=1.6"]
-    assert characterise.main(given) == 0
+    arguments = [*map(str, paths), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(out)]
+    arguments += ["--certificate", "--about", "firmware=1.6"]
+    assert characterise.main(arguments) == 0
     printed = capsys.readouterr().out
     assert "displaced as a whole" in printed
-    own = read_camera(out / "my_camera.yaml")
-    assert isinstance(own, EmpiricalCamera)
-    assert own.noise.range_exponent.value == pytest.approx(1.6, rel=0.1)
-    assert own.noise.brightness_exponent.value == pytest.approx(0.7, rel=0.1)
+    camera = read_camera(out / "my_camera.yaml")
+    assert isinstance(camera, EmpiricalCamera)
+    assert camera.noise.range_exponent.value == pytest.approx(1.6, rel=0.1)
+    assert camera.noise.brightness_exponent.value == pytest.approx(0.7, rel=0.1)
     # the recorded wall's mean albedo is what counts as 1
-    brightness = own.light.amplitude_at_1m.value / truth.light.amplitude_at_1m.value
-    at_1m = np.interp(1000.0, own.noise.range_mm.value, own.noise.sigma_mm.value)
+    brightness = camera.light.amplitude_at_1m.value / truth.light.amplitude_at_1m.value
+    at_1m = np.interp(1000.0, camera.noise.range_mm.value, camera.noise.sigma_mm.value)
     assert at_1m == pytest.approx(2.0 * brightness**-0.7, rel=0.1)
-    assert own.unit.jitter_mm.value == pytest.approx(0.5, rel=0.2)  # 120 frames tell it to 7 %
-    assert own.unit.jump_rate.value == pytest.approx(0.1, abs=0.06)
-    assert own.unit.jump_mm.value == pytest.approx(12.0, rel=0.1)
-    assert own.fixed_pattern.deviation_mm.value == pytest.approx(1.5, rel=0.1)
-    share = np.interp(np.log(100.0), np.log(own.dropouts.amplitude.value), own.dropouts.share.value)
+    assert camera.unit.jitter_mm.value == pytest.approx(0.5, rel=0.2)  # 120 frames tell it to 7 %
+    assert camera.unit.jump_rate.value == pytest.approx(0.1, abs=0.06)
+    assert camera.unit.jump_mm.value == pytest.approx(12.0, rel=0.1)
+    assert camera.fixed_pattern.deviation_mm.value == pytest.approx(1.5, rel=0.1)
+    share = np.interp(
+        np.log(100.0), np.log(camera.dropouts.amplitude.value), camera.dropouts.share.value
+    )
     assert share == pytest.approx(0.2, abs=0.02)
     table = figures_of(out)
     close = table[
@@ -202,7 +204,7 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
     path = recorded(
         tmp_path / "step.npz", truth, z_m, 0.6 / z_m**2, 12, keep=False, frame_jumps=False
     )
-    given = [
+    arguments = [
         str(path),
         "--intrinsics",
         str(tmp_path / "lens.json"),
@@ -211,18 +213,20 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
         "--rate",
         "15",
     ]
-    given.append("--certificate")
-    assert characterise.main(given) == 0
+    arguments.append("--certificate")
+    assert characterise.main(arguments) == 0
     assert (
         "the mean of 12 recorded frames reveals"
         in (tmp_path / "out" / "certificate.html").read_text()
     )
     printed = capsys.readouterr().out
     assert printed.index("no amplitude is recorded") < printed.index("temporal noise")
-    own = read_camera(tmp_path / "out" / "my_camera.yaml")
+    camera = read_camera(tmp_path / "out" / "my_camera.yaml")
     # dropouts near the edge count as gap
-    assert own.edge.gap_px.value == pytest.approx(4.0, rel=0.25)
-    assert own.noise.brightness_exponent.tag == "M" and own.unit.frames_per_second.value == 15.0
+    assert camera.edge.gap_px.value == pytest.approx(4.0, rel=0.25)
+    assert (
+        camera.noise.brightness_exponent.tag == "M" and camera.unit.frames_per_second.value == 15.0
+    )
     rows = figures_of(tmp_path / "out").set_index("figure")
     assert rows.loc["gap at an edge", "ratio"] == pytest.approx(1.0, abs=0.15)
 
@@ -243,27 +247,34 @@ def test_a_known_camera_s_gain_and_pattern_are_found_again(tmp_path, capsys):
     }
     lines = ["name: known", "title: known", "like: realsense_l515", "lens:"]
     lines += [f"  {key}: {{value: {value}, tag: M, source: test}}" for key, value in small.items()]
-    known = tmp_path / "known.yaml"
-    known.write_text("\n".join(lines) + "\n")
+    known_file = tmp_path / "known.yaml"
+    known_file.write_text("\n".join(lines) + "\n")
     gain = 0.5 * data["photons"]["signal_electrons"]["value"]
     ripples = 2.0 * data["fixed_pattern"]["smooth_mm"]["value"]
-    other = tmp_path / "other.yaml"
-    other.write_text(
-        f"name: other\ntitle: other\nlike: {known}\n"
-        f"photons: {{signal_electrons: {{value: {gain}, tag: M, source: test}}}}\n"
-        f"fixed_pattern: {{smooth_mm: {{value: {ripples}, tag: M, source: test}}}}\n"
+    other_file = tmp_path / "other.yaml"
+    other_file.write_text(
+        f"name: other\ntitle: other\nlike: {known_file}\nphotons: {{signal_electrons: {{value: "
+        f"{gain}, tag: M, source: test}}}}\nfixed_pattern: {{smooth_mm: {{value: {ripples}, tag: "
+        f"M, source: test}}}}\n"
     )
-    camera = read_camera(other)
+    camera = read_camera(other_file)
     path = recorded(
         tmp_path / "wall.npz", camera, *wall(camera, 1.0, 0.2, (0.6, 0.6)), 16, keep=False
     )
-    given = [str(path), "--intrinsics", str(tmp_path / "lens.json"), "--like", str(known), "--out"]
-    assert characterise.main([*given, str(tmp_path / "out")]) == 0
-    own = read_camera(tmp_path / "out" / "my_camera.yaml")
-    assert own.photons.signal_electrons.value == pytest.approx(gain, rel=0.1)
+    arguments = [
+        str(path),
+        "--intrinsics",
+        str(tmp_path / "lens.json"),
+        "--like",
+        str(known_file),
+        "--out",
+    ]
+    assert characterise.main([*arguments, str(tmp_path / "out")]) == 0
+    refitted = read_camera(tmp_path / "out" / "my_camera.yaml")
+    assert refitted.photons.signal_electrons.value == pytest.approx(gain, rel=0.1)
     assert (
-        own.photons.signal_electrons.tag == "O"
-        and "wall.npz" in own.photons.signal_electrons.source
+        refitted.photons.signal_electrons.tag == "O"
+        and "wall.npz" in refitted.photons.signal_electrons.source
     )
     noise = figures_of(tmp_path / "out").set_index("figure").loc["temporal noise"]
     assert noise["ratio"] == pytest.approx(1.0, abs=0.05) and noise["known_ratio"] < 0.9
@@ -271,15 +282,15 @@ def test_a_known_camera_s_gain_and_pattern_are_found_again(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_real_walls(shared_data, tmp_path, capsys):
-    given = [
+    arguments = [
         str(shared_data / "azure_nfov_walls"),
         "--intrinsics",
         "azure_kinect_nfov",
         "--out",
         str(tmp_path),
     ]
-    for more in ([], ["--like", "azure_kinect_nfov"]):
-        assert characterise.main([*given, *more]) == 0
+    for like_options in ([], ["--like", "azure_kinect_nfov"]):
+        assert characterise.main([*arguments, *like_options]) == 0
         rows = figures_of(tmp_path)
         noise = rows[rows["figure"] == "temporal noise"]
         assert len(noise) == 2 and noise["ratio"].between(0.85, 1.15).all()
@@ -300,7 +311,7 @@ def test_bad_input_is_one_message(tmp_path, capsys):
     np.savez(tmp_path / "short.npz", depth=equal[:2])
     (tmp_path / "lens.json").write_text('{"fx": 90, "fy": 90, "cx": 40, "cy": 30}')
     lens = ["--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out")]
-    for name, more, message in (
+    for name, options, message in (
         ("equal.npz", [], "all frames are equal"),
         ("short.npz", [], "2 frames: too few to measure temporal noise"),
         ("equal.npz", ["--albedo", "0"], "--albedo 0"),
@@ -309,7 +320,7 @@ def test_bad_input_is_one_message(tmp_path, capsys):
         ("equal.npz", ["--certificate", "--about", "firmware"], "is not KEY=TEXT"),
         ("none.npz", [], "no such file"),
     ):
-        assert characterise.main([str(tmp_path / name), *lens, *more]) == 2
+        assert characterise.main([str(tmp_path / name), *lens, *options]) == 2
         assert message in capsys.readouterr().err
     assert characterise.main([str(tmp_path / "equal.npz")] * 2 + lens) == 2
     assert "is named twice" in capsys.readouterr().err

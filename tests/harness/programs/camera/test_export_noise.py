@@ -24,8 +24,8 @@ def statistics(frames: list[np.ndarray]) -> tuple[dict[str, float], float]:
     """Deviation in mm and correlations of the frames' noise, and the share of returns."""
     everywhere = np.ones(frames[0].shape, bool)
     pairs = [pair_noise(*frames[2 * k : 2 * k + 2], everywhere) for k in range(PAIRS)]
-    told = {key: float(np.mean([pair[key] for pair in pairs])) for key in pairs[0]}
-    return told, float(np.isfinite(frames).mean())
+    means = {key: float(np.mean([pair[key] for pair in pairs])) for key in pairs[0]}
+    return means, float(np.isfinite(frames).mean())
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,8 @@ def test_the_table_has_the_statistics_of_the_full_model(name):
         unit = unit_before_plane(camera, distance_m, albedo)
         full = [frame.z_m.astype(float) for frame in unit.capture(2 * PAIRS, 7).frames()]
         cut = unit.region.within(camera.nominal_lens.whole)
-        own = {**table, "slopes": table["slopes"][cut], "falloff": table["falloff"][cut]}
-        noise = DepthNoise(own)
+        cut_table = {**table, "slopes": table["slopes"][cut], "falloff": table["falloff"][cut]}
+        noise = DepthNoise(cut_table)
         rng = np.random.default_rng(1)
         ideal = np.nanmean(full, axis=0)
         ideal = (
@@ -72,13 +72,15 @@ def test_too_little_light_and_ranges_out_of_reach_return_nothing():
     assert np.isnan(noise(np.full(noise.shape, 0.01), np.ones(noise.shape), rng)).all()
     for dark in (0.0, -1.0, np.nan):
         assert np.isnan(noise(np.full(noise.shape, 1.0), np.full(noise.shape, dark), rng)).all()
-    near = noise(np.full(noise.shape, 1.0), np.full(noise.shape, 0.6), rng)
+    close_z_m = noise(np.full(noise.shape, 1.0), np.full(noise.shape, 0.6), rng)
     # inside the lit hexagon, not in the corners
-    assert np.isfinite(near[250:350, 270:370]).all() and np.isnan(near[0, 0])
-    assert np.round(1e3 * near[300]) == pytest.approx(1e3 * near[300], abs=1e-3, nan_ok=True)
-    other = DepthNoise(table, seed=2)
+    assert np.isfinite(close_z_m[250:350, 270:370]).all() and np.isnan(close_z_m[0, 0])
+    assert np.round(1e3 * close_z_m[300]) == pytest.approx(
+        1e3 * close_z_m[300], abs=1e-3, nan_ok=True
+    )
+    other_unit = DepthNoise(table, seed=2)
     assert np.std(noise.pattern_m) == pytest.approx(float(table["pattern_m"]), rel=0.1)
-    assert abs(np.corrcoef(noise.pattern_m.ravel(), other.pattern_m.ravel())[0, 1]) < 0.05
+    assert abs(np.corrcoef(noise.pattern_m.ravel(), other_unit.pattern_m.ravel())[0, 1]) < 0.05
 
 
 def test_the_program_writes_files_that_stand_alone(tmp_path, capsys, monkeypatch):
@@ -88,9 +90,9 @@ def test_the_program_writes_files_that_stand_alone(tmp_path, capsys, monkeypatch
     assert main(["kinect_v2", "--out", str(tmp_path)]) == 0
     assert "fixed pattern of a unit" in capsys.readouterr().out
     code = (
-        "import numpy as np; from depth_noise import DepthNoise; n = DepthNoise('kinect_v2.npz');"
-        "z = n(np.ones(n.shape), np.full(n.shape, 0.6), np.random.default_rng(0));"
-        "print(z.shape, np.isfinite(z).mean())"
+        "import numpy as np; from depth_noise import DepthNoise; n = "
+        "DepthNoise('kinect_v2.npz');z = n(np.ones(n.shape), np.full(n.shape, 0.6), "
+        "np.random.default_rng(0));print(z.shape, np.isfinite(z).mean())"
     )
     ran = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True

@@ -75,9 +75,9 @@ def run(engine: JobEngine, jobs: Iterable[Job]) -> dict[str, Ended]:
         while waiting and engine.room(waiting[-1].stage) > 0:
             engine.submit(waiting.pop())
             under_way += 1
-        for job, how in engine.ended():
+        for job, options in engine.ended():
             assert job.name not in ended, "a job ended twice"
-            ended[job.name] = how
+            ended[job.name] = options
             under_way -= 1
     return ended
 
@@ -100,12 +100,12 @@ def test_results_are_those_of_this_process(cluster):
         here = run(serial, jobs)
     with engine_at(cluster) as engine:
         there = run(engine, jobs)
-    assert {name: (how.state, how.value, how.is_bug) for name, how in there.items()} == {
-        name: (how.state, how.value, how.is_bug) for name, how in here.items()
-    }
+    assert {
+        name: (options.state, options.value, options.is_bug) for name, options in there.items()
+    } == {name: (options.state, options.value, options.is_bug) for name, options in here.items()}
     assert "ValueError: no such number: 7" in there["bad"].why
-    assert {how.worker.partition(":")[0] for how in there.values()} == {"127.0.0.1"}
-    assert len({how.worker for how in there.values()}) == 2
+    assert {options.worker.partition(":")[0] for options in there.values()} == {"127.0.0.1"}
+    assert len({options.worker for options in there.values()}) == 2
 
 
 def test_the_queue_stays_short_whatever_the_plan(cluster):
@@ -134,16 +134,21 @@ def test_every_fault_costs_its_own_job_only(cluster):
         ended = run(engine, jobs)
         again = run(engine, squares(30))
     bad = {name: ended.pop(name) for name in (*faults, "hungry")}
-    assert [how.state for how in bad.values()] == ["crashed", "timed out", "timed out", "failed"]
+    assert [options.state for options in bad.values()] == [
+        "crashed",
+        "timed out",
+        "timed out",
+        "failed",
+    ]
     assert "SIGKILL" in bad["killer"].why
     assert "in hang" in bad["endless"].why and "--time-limit" in bad["endless"].why
     assert "in hold_the_interpreter" in bad["stuck"].why
     assert "out of memory" in bad["hungry"].why and "--memory-limit" in bad["hungry"].why
     assert all(
-        how.state == "done" and how.value == int(name.split()[1]) ** 2
-        for name, how in ended.items()
+        options.state == "done" and options.value == int(name.split()[1]) ** 2
+        for name, options in ended.items()
     )
-    assert {how.state for how in again.values()} == {"done"} and len(ended) == 120
+    assert {options.state for options in again.values()} == {"done"} and len(ended) == 120
 
 
 @pytest.mark.slow  # test_engine_processes has deaths without a cluster
@@ -166,7 +171,7 @@ def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
         killing.start()
         ended = run(engine, jobs)
         killing.join()
-    assert {how.state for how in ended.values()} == {"done"} and len(ended) == 12 and killed
+    assert {options.state for options in ended.values()} == {"done"} and len(ended) == 12 and killed
 
 
 @pytest.mark.slow  # a node of its own
@@ -178,8 +183,8 @@ def test_a_node_of_several_processes_uses_them_all_each_in_one_thread_whatever_i
         with engine_at(bare) as engine:
             ended = run(engine, [Job(f"pid {n}", "trials", pid_after, (0.3,)) for n in range(12)])
             used = run(engine, [Job("threads", "trials", threads, ())])["threads"].value
-    assert len({how.value for how in ended.values()}) == 2
-    assert len({how.worker for how in ended.values()}) == 1
+    assert len({options.value for options in ended.values()}) == 2
+    assert len({options.worker for options in ended.values()}) == 1
     assert len(used) > 1 and set(used.values()) == {1}, used
 
 
@@ -187,13 +192,13 @@ def test_a_node_of_several_processes_uses_them_all_each_in_one_thread_whatever_i
 def test_the_scheduler_gone_is_a_clear_message(tmp_path):
     with processes(tmp_path / "mortal") as mortal:
         mortal.worker("--no-nanny")
-        with pytest.raises(UserError, match="is gone") as told, engine_at(mortal) as engine:
+        with pytest.raises(UserError, match="is gone") as message, engine_at(mortal) as engine:
             engine.submit(Job("slow", "trials", slow_square, (1, 1.0)))
             engine.submit(Job("slower", "trials", slow_square, (1, HOLD)))
             assert [job.name for job, _ in engine.ended()] == ["slow"]
             mortal.scheduler.kill()
             engine.ended()
-        assert "finished trials are kept" in str(told.value.fix)
+        assert "finished trials are kept" in str(message.value.fix)
 
 
 @pytest.mark.parametrize(
@@ -296,10 +301,10 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tin
         looks = run(engine, [Job(f"look {n}", "trials", loaded, ()) for n in range(40)])
     # a node that does not answer in time is asked again, and may find the view that it has
     # rendered
-    assert [how.state for how in rendered.values()] == ["done"], rendered
+    assert [options.state for options in rendered.values()] == ["done"], rendered
     assert again[renders[0].name].value[0] is True
     assert all(read_view(cache / job.name) is not None for job in renders)
-    assert {how.state for how in ended.values()} == {"done"}, ended
+    assert {options.state for options in ended.values()} == {"done"}, ended
     assert len({look.worker for look in looks.values()}) == 2
     assert all(look.value == [] for look in looks.values()), "a worker loaded Mitsuba"
     assert {path.name for path in cache.glob(".*")} <= {
@@ -321,8 +326,8 @@ def test_a_render_that_fails_or_kills_its_process_costs_itself(cluster, tmp_path
         again = run(engine, squares(20))
     assert ended["dies.npz"].state == "crashed" and "SIGKILL" in ended["dies.npz"].why
     assert ended["fails.npz"].state == "failed" and "no such number" in ended["fails.npz"].why
-    assert {how.state for name, how in ended.items() if "npz" not in name} == {"done"}
-    assert {how.state for how in again.values()} == {"done"}
+    assert {options.state for name, options in ended.items() if "npz" not in name} == {"done"}
+    assert {options.state for options in again.values()} == {"done"}
 
 
 def die_in(folder: str) -> None:
@@ -369,8 +374,8 @@ def without_seconds(value: object) -> object:
 def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tiny_out, tmp_path):
     shutil.copytree(tiny_out / ".cache", tmp_path / "out" / ".cache")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    more = ("--set", "repeats=400", "--scheduler", cluster.address)
-    command = sweep_command(experiment, "out", *more)
+    additional = ("--set", "repeats=400", "--scheduler", cluster.address)
+    command = sweep_command(experiment, "out", *additional)
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
     )
@@ -384,8 +389,8 @@ def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tiny_out, tmp_
     until(lambda: len(ended()) > 2 or process.poll() is not None, 2 * HOLD)
     process.send_signal(signal.SIGINT)
     began = time.monotonic()
-    _, said = process.communicate(timeout=HOLD)
+    _, printed = process.communicate(timeout=HOLD)
     print(f"left after {time.monotonic() - began:.2f} s")
-    assert process.returncode == 130, said
-    assert "Traceback" not in said and "--scheduler" in said
+    assert process.returncode == 130, printed
+    assert "Traceback" not in printed and "--scheduler" in printed
     assert len(ended()) > 2

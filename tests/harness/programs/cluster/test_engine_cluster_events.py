@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs 
 FIRST = "tcp://first:1"
 SECOND = "tcp://second:1"
 CODE = code_of(["thesis"])
-DIGESTS = {stage: source_digest(*which) for stage, which in CODE.items()}
+DIGESTS = {stage: source_digest(*indices) for stage, indices in CODE.items()}
 SEEN = "the driver's mark"
 
 

@@ -59,32 +59,35 @@ def inspections(count: int, looks: int = 4, growth: float = 1.0) -> ScoredDamage
 
 
 def test_a_patch_has_the_size_whose_signal_is_needed() -> None:
-    some = inspections(1500)
+    sample = inspections(1500)
     # what was found by missing returns alone is found, however strong the signal
-    found = findable(replace(some, score=np.where(some.score > 100, np.inf, some.score)), THRESHOLD)
-    assert found.damages == 1500 and found.doubt == ""
-    assert found.scatter == pytest.approx(SCATTER, rel=0.1) and found.growth == pytest.approx(
+    result = findable(
+        replace(sample, score=np.where(sample.score > 100, np.inf, sample.score)), THRESHOLD
+    )
+    assert result.damages == 1500 and result.doubt == ""
+    assert result.scatter == pytest.approx(SCATTER, rel=0.1) and result.growth == pytest.approx(
         1, abs=0.25
     )
     unit_m = np.array([1e-3, 2e-3, 1e-3, 12e-3, np.inf, 1e-3])
     places = Seen(unit_m, np.array([1, 1, 0.5, 0.5, 1, 0.3]), np.full(6, 0.7))
     needed_m = THRESHOLD * unit_m * np.exp(1.2816 * SCATTER / places.cosine)
     wanted = (needed_m / signal_m(np.ones(6), places)) ** (1 / 1.5)
-    limits_mm = found.limits_mm(places)
+    limits_mm = result.limits_mm(places)
     assert limits_mm[:3] == pytest.approx(wanted[:3], rel=0.03)
     assert (
         np.isinf(limits_mm[3]) and np.isnan(limits_mm[4:]).all()
     )  # too large; not judged, steeper than all inspected
-    assert wanted[3] > found.sizes_mm[1]
+    assert wanted[3] > result.sizes_mm[1]
 
 
 def test_misses_that_size_angle_and_distance_do_not_explain_are_told() -> None:
-    some = inspections(400)
+    sample = inspections(400)
 
     def learnt(every: int) -> Findable:
         """Some damage is missed whatever its signal, as may be where its surroundings are cropped."""
         return findable(
-            replace(some, score=np.where(some.damage % every == 0, np.nan, some.score)), THRESHOLD
+            replace(sample, score=np.where(sample.damage % every == 0, np.nan, sample.score)),
+            THRESHOLD,
         )
 
     assert learnt(10).doubt.startswith(
@@ -99,21 +102,21 @@ def test_misses_that_size_angle_and_distance_do_not_explain_are_told() -> None:
 
 
 def test_too_few_damages_teach_nothing() -> None:
-    some = inspections(30)
-    blind = Seen(np.full(120, np.inf), some.seen.cosine, some.seen.range_m)
+    sample = inspections(30)
+    blind = Seen(np.full(120, np.inf), sample.seen.cosine, sample.seen.range_m)
     with pytest.raises(UserError, match="only 0 of 30 damages"):
-        findable(replace(some, seen=blind), THRESHOLD)
+        findable(replace(sample, seen=blind), THRESHOLD)
 
 
 def test_poses_are_taken_by_what_they_add() -> None:
     patches = Patches(np.zeros((5, 3)), np.zeros((5, 3)), np.array([1.0, 1.0, 2.0, 4.0, 2.0]))
-    found = [
+    result = [
         np.array(one, bool)
         for one in ([1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 1, 0], [1, 1, 0, 0, 0])
     ]
     # the others add nothing
-    assert in_turn(patches, found, 1, 3) == [(0, 0.2, 0.2), (1, 0.6, 0.8)]
-    assert in_turn(patches, found, 0, 1) == [(1, 0.6, 0.6)]
+    assert in_turn(patches, result, 1, 3) == [(0, 0.2, 0.2), (1, 0.6, 0.8)]
+    assert in_turn(patches, result, 0, 1) == [(1, 0.6, 0.6)]
 
 
 # ---------------------------------------------------------------- the program
@@ -134,10 +137,10 @@ def test_the_program_says_where_the_camera_is_blind(
     tiny = str(study_out.parent / "tiny.yaml")
     one = ["--set", "sweep={}", "--serial", "--results", str(tmp_path)]
     assert main([tiny, *one, "--size", "8mm", "--suggest", "1"]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     folder = tmp_path / "coverage" / "tiny"
-    assert told.startswith("warning: 0 of 1 pose suggested")  # warnings stand first
-    assert "\nDamage with a diameter of 8 mm is found nine times in ten on " in told
+    assert printed.startswith("warning: 0 of 1 pose suggested")  # warnings stand first
+    assert "\nDamage with a diameter of 8 mm is found nine times in ten on " in printed
     patches, poses = (pd.read_parquet(folder / table.files[1]) for table in COVERAGE_TABLES[:2])
     assert patches["area_m2"].sum() == pytest.approx(0.3048 * 0.2032)
     # the rim is cropped away, and what is in the middle is not
@@ -178,8 +181,8 @@ def test_mistakes_are_one_message(
     arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*arguments, "--results", str(tmp_path), "--serial"]) == 2
-    told = capsys.readouterr().err
-    assert said in told and "Traceback" not in told and not list(tmp_path.iterdir())
+    error_text = capsys.readouterr().err
+    assert said in error_text and "Traceback" not in error_text and not list(tmp_path.iterdir())
 
 
 # ---------------------------------------------------------------- against full studies
@@ -200,10 +203,10 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
     hits: dict[tuple[int, int], list[tuple[float, bool, int]]] = {}
     for number in range(boards):
         drawn = source.target.drawn("damaged", 1000 + number)
-        places = PLACES_MM[number % 2]
+        positions = PLACES_MM[number % 2]
         # sizes rise with the damage's id: each place has all of them in turn
-        at = {flaw.id: places[(n + number // 2) % 5] for n, flaw in enumerate(drawn.flaws)}
-        flaws = tuple(flaw.model_copy(update={"centre_mm": at[flaw.id]}) for flaw in drawn.flaws)
+        index = {flaw.id: positions[(n + number // 2) % 5] for n, flaw in enumerate(drawn.flaws)}
+        flaws = tuple(flaw.model_copy(update={"centre_mm": index[flaw.id]}) for flaw in drawn.flaws)
         batch = batch_of(
             drawn.model_copy(update={"flaws": flaws}), "damaged", source, cache, 1000 + number
         )
@@ -220,12 +223,14 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
             )
             for row in run_trial(trial).holes:
                 is_hit = bool(row.detected or row.no_return)
-                hits.setdefault(at[int(row.hole)], []).append((row.true_depth_mm, is_hit, number))
+                hits.setdefault(index[int(row.hole)], []).append(
+                    (row.true_depth_mm, is_hit, number)
+                )
     limits = {}
-    for place, rows in hits.items():
+    for position, rows in hits.items():
         depth_mm, hit, inspected = zip(*rows, strict=True)
         fit = fit_hit_miss(depth_mm, hit, link="probit", log_size=True, inspections=inspected)
-        limits[place] = fit.curve.size_at(0.9)
+        limits[position] = fit.curve.size_at(0.9)
     return limits
 
 
@@ -238,11 +243,11 @@ def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
     limits_mm = survey.found.limits_mm(survey.seen[0.7, 0.0, 0.0])
     studied = studied_mm(survey, 48, cache)
     predicted = []
-    for place in studied:
-        near = np.argsort(
-            np.linalg.norm(survey.patches.points_m[:, :2] - np.array(place) * 1e-3, axis=1)
+    for position in studied:
+        nearby = np.argsort(
+            np.linalg.norm(survey.patches.points_m[:, :2] - np.array(position) * 1e-3, axis=1)
         )[:9]
-        predicted.append(float(np.median(limits_mm[near])))
+        predicted.append(float(np.median(limits_mm[nearby])))
     ratio = np.array(predicted) / np.array(list(studied.values()))
     # the program says that a single patch's limit may be wrong by 40 %
     assert np.abs(np.log(ratio)).max() < np.log(1.45), dict(zip(studied, ratio, strict=True))

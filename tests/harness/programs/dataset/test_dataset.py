@@ -45,8 +45,8 @@ def tiff_floats(path: Path) -> np.ndarray:
         tags[259] == (1,) and tags[258] == (32,) * 3 and tags[339] == (3,) * 3 and tags[277] == (3,)
     )
     strips = zip(tags[273], tags[279], strict=True)
-    whole = b"".join(content[start : start + length] for start, length in strips)
-    return np.frombuffer(whole, f"{order}f4").reshape(tags[257][0], tags[256][0], 3)
+    pixel_bytes = b"".join(content[start : start + length] for start, length in strips)
+    return np.frombuffer(pixel_bytes, f"{order}f4").reshape(tags[257][0], tags[256][0], 3)
 
 
 def test_the_layout_is_that_of_mvtec_3d_ad(home):
@@ -61,18 +61,18 @@ def test_the_layout_is_that_of_mvtec_3d_ad(home):
     colours = [part for part in parts if part[2] == "rgb"]
     assert len(colours) == 10 == len(names_in(folder)) and len(pictures) == 2 * 10 + 5
     for split, label, _, file in colours:
-        place = folder / "tiny" / split / label
+        label_folder = folder / "tiny" / split / label
         stem = Path(file).stem
-        points = tiff_floats(place / "xyz" / f"{stem}.tiff")
+        points = tiff_floats(label_folder / "xyz" / f"{stem}.tiff")
         name = f"tiny/{split}/{label}/{stem}"
         arrays = arrays_of(folder, name)
         np.testing.assert_array_equal(points, np.nan_to_num(arrays["points_m"]))
         assert 0.6 < np.median(points[arrays["inspected"], 2]) < 0.8 and np.isfinite(points).all()
-        colour = cv2.imread(str(place / "rgb" / file), cv2.IMREAD_UNCHANGED)
+        colour = cv2.imread(str(label_folder / "rgb" / file), cv2.IMREAD_UNCHANGED)
         assert colour.shape == points.shape and colour.dtype == np.uint8 and np.ptp(colour) > 100
-        assert (place / "gt" / file).exists() == (split == "test")
+        assert (label_folder / "gt" / file).exists() == (split == "test")
         if split == "test":
-            mask = cv2.imread(str(place / "gt" / file), cv2.IMREAD_UNCHANGED)
+            mask = cv2.imread(str(label_folder / "gt" / file), cv2.IMREAD_UNCHANGED)
             np.testing.assert_array_equal(mask, np.where(arrays["damage"] > 0, 255, 0))
             assert mask.any() == (label != "good")
 
@@ -105,13 +105,13 @@ def test_coco_masks_are_the_damages(home):
     assert data["categories"] == [{"id": 1, "name": "through"}] and len(data["images"]) == 5
     assert not json.loads((folder / "coco" / "tiny_train.json").read_text())["annotations"]
     names = {image["id"]: image["file_name"] for image in data["images"]}
-    for one in data["annotations"]:
-        height, width = one["segmentation"]["size"]
-        counts = one["segmentation"]["counts"]
+    for annotation in data["annotations"]:
+        height, width = annotation["segmentation"]["size"]
+        counts = annotation["segmentation"]["counts"]
         inside = (
             np.repeat(np.arange(len(counts)) % 2, counts).reshape(width, height).T
         )  # by columns
-        split, label, _, file = names[one["image_id"]].split("/")[1:]
+        split, label, _, file = names[annotation["image_id"]].split("/")[1:]
         damage = arrays_of(folder, f"tiny/{split}/{label}/{Path(file).stem}")["damage"]
         (number,) = np.unique(damage[inside > 0])
         np.testing.assert_array_equal(inside > 0, damage == number)
@@ -123,9 +123,9 @@ def test_coco_masks_are_the_damages(home):
             rows.max() + 1 - rows.min(),
         ]
         assert (
-            one["bbox"] == box
-            and one["area"] == len(rows)
-            and (folder / names[one["image_id"]]).exists()
+            annotation["bbox"] == box
+            and annotation["area"] == len(rows)
+            and (folder / names[annotation["image_id"]]).exists()
         )
     assert len(data["annotations"]) == 4 * 2
 
@@ -140,11 +140,11 @@ def test_truth_depth_and_validity_agree_with_the_cloud(home):
     name = "tiny/test/through/0002"
     truth = truth_of(folder, name)
     arrays = arrays_of(folder, name)
-    place = folder / "boards" / name
-    depth = cv2.imread(str(place / f"{'depth'}.png"), cv2.IMREAD_UNCHANGED)
-    valid = cv2.imread(str(place / f"{'valid'}.png"), cv2.IMREAD_UNCHANGED)
-    intensity = cv2.imread(str(place / f"{'intensity'}.png"), cv2.IMREAD_UNCHANGED)
-    mask = cv2.imread(str(place / f"{'mask'}.png"), cv2.IMREAD_UNCHANGED)
+    board_folder = folder / "boards" / name
+    depth = cv2.imread(str(board_folder / f"{'depth'}.png"), cv2.IMREAD_UNCHANGED)
+    valid = cv2.imread(str(board_folder / f"{'valid'}.png"), cv2.IMREAD_UNCHANGED)
+    intensity = cv2.imread(str(board_folder / f"{'intensity'}.png"), cv2.IMREAD_UNCHANGED)
+    mask = cv2.imread(str(board_folder / f"{'mask'}.png"), cv2.IMREAD_UNCHANGED)
     z_m = arrays["points_m"][..., 2]
     np.testing.assert_array_equal(valid > 0, np.isfinite(z_m))
     assert (
@@ -158,12 +158,14 @@ def test_truth_depth_and_validity_agree_with_the_cloud(home):
     )
     np.testing.assert_array_equal(mask, arrays["damage"])
     assert depth.shape == (truth["height"], truth["width"])
-    for one in truth["damages"]:
-        own = arrays["damage"] == one["id"]
-        middle_mm = 1000 * arrays["board_xy_m"][own].mean(axis=0)
-        assert np.hypot(*(middle_mm - [one["x_board_mm"], one["y_board_mm"]])) < 1.0
-        area_mm2 = own.sum() / arrays["inspected"].sum() * 130 * 90 * 0.9  # pixels are some 2 mm2
-        assert area_mm2 == pytest.approx(np.pi / 4 * one["diameter_mm"] ** 2, rel=0.35)
+    for flaw in truth["damages"]:
+        flaw_mask = arrays["damage"] == flaw["id"]
+        middle_mm = 1000 * arrays["board_xy_m"][flaw_mask].mean(axis=0)
+        assert np.hypot(*(middle_mm - [flaw["x_board_mm"], flaw["y_board_mm"]])) < 1.0
+        area_mm2 = (
+            flaw_mask.sum() / arrays["inspected"].sum() * 130 * 90 * 0.9
+        )  # pixels are some 2 mm2
+        assert area_mm2 == pytest.approx(np.pi / 4 * flaw["diameter_mm"] ** 2, rel=0.35)
 
 
 def test_no_unit_and_no_board_is_in_two_splits(home):
@@ -197,29 +199,31 @@ def test_a_killed_run_goes_on_and_writes_equal_bytes(home, tmp_path, capsys):
     assert "trials 10/10 (8 found)" in capsys.readouterr().err
     after = {path: path.read_bytes() for path in (tmp_path / "set").rglob("*") if path.is_file()}
     assert before.keys() == after.keys()
-    told = {"README.md", "dataset.json"}  # these name the command
-    assert all(after[path] == content for path, content in before.items() if path.name not in told)
+    with_command = {"README.md", "dataset.json"}  # these name the command
+    assert all(
+        after[path] == content for path, content in before.items() if path.name not in with_command
+    )
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--set", "seed=4"], "holds a data set of another experiment"),
         (["--boards", "9"], "10 to 10000 boards"),
         (["--set", "source.target={name: thesis}", "--set", "study=null"], "no random boards"),
     ],
 )
-def test_mistakes_are_told(home, capsys, arguments, said):
+def test_mistakes_are_told(home, capsys, arguments, message):
     index = (home / "set" / "dataset.json").read_bytes()
     changed = arguments + (["--set", "threshold={k: 5.0}"] if "study=null" in arguments else [])
     assert write(home, "set", *changed) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert (home / "set" / "dataset.json").read_bytes() == index
 
 
 def test_a_folder_with_other_files_is_left_alone(home, tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("mine")
-    given = [
+    arguments = [
         "--boards",
         "10",
         "--out",
@@ -228,7 +232,7 @@ def test_a_folder_with_other_files_is_left_alone(home, tmp_path, capsys):
         str(home / "results"),
         "--serial",
     ]
-    assert dataset.main([str(home / "tiny.yaml"), *given]) == 2
+    assert dataset.main([str(home / "tiny.yaml"), *arguments]) == 2
     assert "is not empty" in capsys.readouterr().err and [*tmp_path.iterdir()] == [
         tmp_path / "mine.txt"
     ]

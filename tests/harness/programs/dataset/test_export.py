@@ -100,17 +100,17 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return bags | {"tum": exported(path, folder / "tum", "tum")}
 
 
-def exported(experiment: Path, out: Path, form: str, *more: str) -> Path:
-    assert export.main([str(experiment), "--format", form, "--out", str(out), *more]) == 0
+def exported(experiment: Path, out: Path, form: str, *options: str) -> Path:
+    assert export.main([str(experiment), "--format", form, "--out", str(out), *options]) == 0
     return out
 
 
 def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The message of a run that must end with exit code 2."""
     assert export.main([str(argument) for argument in arguments]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: ") and "Traceback" not in said
-    return said
+    message = capsys.readouterr().err
+    assert message.startswith("error: ") and "Traceback" not in message
+    return message
 
 
 def detected(cloud: Cloud) -> tuple[tuple[Detection, ...], tuple[Measurement, ...]]:
@@ -123,8 +123,10 @@ def detected(cloud: Cloud) -> tuple[tuple[Detection, ...], tuple[Measurement, ..
     }
     detector = load_detector("thesis", {"crop": box})
     evidence = detector.analyse(cloud)
-    found = detector.find(cloud, evidence, 5.0)
-    return found, tuple(detector.measure(cloud, evidence, each) for each in found)
+    detections = detector.find(cloud, evidence, 5.0)
+    return detections, tuple(
+        detector.measure(cloud, evidence, detection) for detection in detections
+    )
 
 
 def simulated(view: NoiseFreeView, number: int) -> FrameSource:
@@ -133,7 +135,7 @@ def simulated(view: NoiseFreeView, number: int) -> FrameSource:
 
 
 # ---- bags
-# ------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", ("ros2", "mcap"))
@@ -159,9 +161,9 @@ def test_written_read_back_and_detected_is_equal_bit_for_bit(
             expected.lens,
             expected.n_frames,
         )
-        (found, measured), (found_there, measured_there) = detected(expected), detected(got)
-        assert len(found) == 1 and [each.score for each in found] == [
-            each.score for each in found_there
+        (detections, measured), (found_there, measured_there) = detected(expected), detected(got)
+        assert len(detections) == 1 and [detection.score for detection in detections] == [
+            detection.score for detection in found_there
         ]
         assert repr(measured) == repr(measured_there)
         assert measured[0].model_diameter_m == pytest.approx(0.012, rel=0.1)
@@ -174,7 +176,7 @@ def test_the_program_finds_the_same_in_either_storage(
 ) -> None:
     for form in ("ros2", "mcap"):
         bag = exports[form] / "view_00"
-        more = [
+        reading = [
             "--topic",
             "points2",
             "--crop",
@@ -182,8 +184,8 @@ def test_the_program_finds_the_same_in_either_storage(
             "--out",
             str(tmp_path / f"found_{form}"),
         ]
-        more += ["--threshold", "8"]
-        assert detect.main([str(bag), *more]) == 0
+        reading += ["--threshold", "8"]
+        assert detect.main([str(bag), *reading]) == 0
     first = (tmp_path / f"found_{'ros2'}" / "findings.csv").read_text()
     second = (tmp_path / f"found_{'mcap'}" / "findings.csv").read_text()
     assert first == second and len(first.splitlines()) == 2
@@ -209,9 +211,9 @@ def test_a_bag_holds_lens_and_pose_at_the_clouds_times(exports: dict[str, Path])
     T_camera_board = poses_of(ArcViews(kind="arc", count=3, spread_deg=40.0), target.pose)[
         1
     ].T_camera_board
-    place = pose.transform.translation
+    translation = pose.transform.translation
     np.testing.assert_allclose(
-        [place.x, place.y, place.z], invert(T_camera_board)[:3, 3], rtol=1e-14
+        [translation.x, translation.y, translation.z], invert(T_camera_board)[:3, 3], rtol=1e-14
     )
     info = got[1][2]
     cloud = got[2][2]
@@ -235,8 +237,10 @@ def test_the_truth_and_the_nominal_poses_stand_beside(
     assert len(truth["damages"]) == 11
     views = ArcViews(kind="arc", count=3, spread_deg=40.0)
     poses = poses_of(views, target.pose)
-    for number, told in enumerate(truth["views"]):
-        np.testing.assert_array_equal(told["T_board_camera"], invert(poses[number].T_camera_board))
+    for number, view_truth in enumerate(truth["views"]):
+        np.testing.assert_array_equal(
+            view_truth["T_board_camera"], invert(poses[number].T_camera_board)
+        )
     nominal = json.loads((out / "nominal_poses.json").read_text())["T_reference_view"]
     np.testing.assert_allclose(nominal[0], np.eye(4), atol=1e-15)
     np.testing.assert_array_equal(
@@ -271,7 +275,7 @@ def test_without_damage_nothing_is_listed_and_the_noise_is_another(
 
 
 # ---- TUM
-# -------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_a_sequence_has_what_the_benchmark_and_rtabmap_read(exports: dict[str, Path]) -> None:
@@ -349,9 +353,9 @@ def test_a_sequence_read_back_lies_on_the_planes(
     expected = whole.points_m[rows, columns]
     off = cloud.points_m[cloud.valid][inside] - expected
     pitch_m = 0.72 / camera_of(CAMERA).nominal_lens.fx
-    near = np.abs(off[:, 2]) < 2e-7
-    assert near.mean() > 0.97  # the rest: rounding to the other pixel at just half a pixel
-    assert np.abs(off[near, :2]).max() < 0.51 * pitch_m
+    close_to_back = np.abs(off[:, 2]) < 2e-7
+    assert close_to_back.mean() > 0.97  # the rest: rounding to the other pixel at just half a pixel
+    assert np.abs(off[close_to_back, :2]).max() < 0.51 * pitch_m
 
 
 @pytest.mark.parametrize(
@@ -407,7 +411,7 @@ def test_views_follow_each_other_in_time(view: NoiseFreeView) -> None:
 
 
 # ---- what it refuses
-# -------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_mistakes_are_one_message_and_leave_nothing(
@@ -415,7 +419,10 @@ def test_mistakes_are_one_message_and_leave_nothing(
 ) -> None:
     start = (experiment, "--format", "mcap", "--out", tmp_path / "out")
     assert "the experiment has 3" in failed(capsys, *start, "--views", "4")
-    away = "source.views={kind: list, poses: [{distance_m: 0.7}, {distance_m: 0.7, offset_x_mm: 900.0}]}"
+    away = (
+        "source.views={kind: list, poses: [{distance_m: 0.7}, {distance_m: 0.7, offset_x_mm: "
+        "900.0}]}"
+    )
     assert "view 1 of 2" in failed(capsys, *start, "--set", away)
     assert "spread" in failed(capsys, *start, "--set", "source.views.spred_deg=20.0")
     assert "no such file" in failed(capsys, tmp_path / "none.yaml", *start[1:]).lower()

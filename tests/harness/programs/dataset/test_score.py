@@ -70,14 +70,14 @@ def test_areas_are_those_of_scikit_learn(folder, maps, tmp_path):
     boards = []
     for name in (name for name in names_in(folder) if "/test/" in name):
         arrays = arrays_of(folder, name)
-        own = map_of(maps, name)
-        here = arrays["inspected"]
-        damage = arrays["damage"][here]
-        scores.append(own[here])
+        board_map = map_of(maps, name)
+        inspected = arrays["inspected"]
+        damage = arrays["damage"][inspected]
+        scores.append(board_map[inspected])
         damaged.append(damage > 0)
         counts = np.bincount(damage)
         weights.append(np.where(damage > 0, 1.0 / counts[damage], 1.0))
-        boards.append((own[here].max(), "/good/" not in name))
+        boards.append((board_map[inspected].max(), "/good/" not in name))
     flat = np.concatenate(scores)
     truth = np.concatenate(damaged)
     found = pd.read_csv(tmp_path / "out" / "scores.csv").iloc[0]
@@ -105,7 +105,7 @@ def test_a_hit_is_a_finding_above_the_threshold_of_the_good_boards(folder, maps,
         len(record.inspected.hit) == 8 and record.inspected.hit.all()
     )  # six deviations over a threshold of some four
     truth = truth_of(folder, "tiny/test/through/0000")["damages"]
-    assert record.inspected.diameter_mm[:2].tolist() == [one["diameter_mm"] for one in truth]
+    assert record.inspected.diameter_mm[:2].tolist() == [flaw["diameter_mm"] for flaw in truth]
     assert record.unflawed.area_m2[0] == pytest.approx(0.13 * 0.09 * 0.83, rel=0.05)
     assert compare.main([str(tmp_path / "out"), str(tmp_path / "out")]) == 0
 
@@ -132,12 +132,13 @@ def test_wrong_sets_of_maps_are_refused_at_once(folder, maps, tmp_path, capsys):
     )
     (maps / "tiny/test/through/0002.npy").write_bytes(b"no array")
     assert run(maps, folder, tmp_path / "out", *RATE) == 2
-    said = capsys.readouterr().err
-    assert "1 maps are missing: tiny/test/good/0000" in said
-    assert "1 maps are not for a board of validation or test: tiny/test/good/0009" in said
-    assert "0000 (3 x 4 instead of" in said and "0001 (no finite number at" in said
+    message = capsys.readouterr().err
+    assert "1 maps are missing: tiny/test/good/0000" in message
+    assert "1 maps are not for a board of validation or test: tiny/test/good/0009" in message
+    assert "0000 (3 x 4 instead of" in message and "0001 (no finite number at" in message
     assert (
-        "0002 (cannot be read as an array of numbers)" in said and not (tmp_path / "out").exists()
+        "0002 (cannot be read as an array of numbers)" in message
+        and not (tmp_path / "out").exists()
     )
 
 

@@ -35,9 +35,12 @@ def test_detectors_stand_beside_the_ideal_observer(
 ) -> None:
     monkeypatch.setattr(ideal, "UNITS_A_BOARD", 2)
     assert main([str(results), "--serial"]) == 0
-    told = capsys.readouterr().out
-    assert told.startswith(
-        "The ideal observer judges a new unit of azure_kinect_nfov by the noise of 8 units, at 4 false"
+    printed = capsys.readouterr().out
+    assert printed.startswith(
+        (
+            "The ideal observer judges a new unit of azure_kinect_nfov by the noise of 8 units, "
+            "at 4 false"
+        )
     )
     tables = [pd.read_parquet(results / table.files[1]) for table in EFFICIENCY_TABLES]
     efficiency, damages = tables
@@ -49,11 +52,11 @@ def test_detectors_stand_beside_the_ideal_observer(
     assert np.corrcoef(np.log(one["diameter_mm"]), np.log(one["index"]))[0, 1] > 0.8
     assert one["threshold"].between(3.5, 5.0).all() and one["pod"].between(0, 1).all()
     # the ideal observer needs smaller damage than the detector, and none is better than it
-    known = efficiency.dropna(subset="efficiency_50_share")
-    assert (known["ideal_a50_mm"] < known["a50_mm"]).all() and (
-        known["efficiency_50_share_low"] < 1
+    reference = efficiency.dropna(subset="efficiency_50_share")
+    assert (reference["ideal_a50_mm"] < reference["a50_mm"]).all() and (
+        reference["efficiency_50_share_low"] < 1
     ).all()
-    assert EFFICIENCY_PAGE.name in told and "d' of the ideal observer" not in told
+    assert EFFICIENCY_PAGE.name in printed and "d' of the ideal observer" not in printed
     assert "Efficiency: tiny" in (results / EFFICIENCY_PAGE.name).read_text()
     assert all(
         is_output(name, "results")
@@ -94,8 +97,8 @@ def test_mistakes_are_one_message(results, change, said, monkeypatch, capsys) ->
     monkeypatch.setattr("harness.programs.efficiency.ideal_trials.ideal_of_set_ups", lambda *_: {})
     change(results)
     assert main([str(results), "--serial"]) == 2
-    told = capsys.readouterr()
-    assert said in told.err and "Traceback" not in told.err
+    captured = capsys.readouterr()
+    assert said in captured.err and "Traceback" not in captured.err
     assert not (results / EFFICIENCY_PAGE.name).exists()
 
 

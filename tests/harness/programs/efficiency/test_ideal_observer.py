@@ -29,15 +29,17 @@ def rng(*labels: str | int) -> np.random.Generator:
 def noise_of(kind: str) -> NoiseSums:
     """Return sums whose autocovariance is the given one under Parzen's window."""
     length, white = KINDS[kind]
-    apart = np.hypot(LAGS[:, None], LAGS)
-    smooth = np.exp(-(apart**2) / (2 * length**2)) if length else np.zeros(apart.shape)
-    return NoiseSums((1 - white) * smooth + white * (apart == 0), np.ones(apart.shape), 3.0, 1.0)
+    separation = np.hypot(LAGS[:, None], LAGS)
+    smooth = np.exp(-(separation**2) / (2 * length**2)) if length else np.zeros(separation.shape)
+    return NoiseSums(
+        (1 - white) * smooth + white * (separation == 0), np.ones(separation.shape), 3.0, 1.0
+    )
 
 
 def dense(sums: NoiseSums, known: np.ndarray) -> np.ndarray:
     """Return the covariance (n, n) of the known pixels."""
-    at = np.argwhere(known)
-    lags = at[:, None] - at[None] + LONGEST_LAG_PX
+    index = np.argwhere(known)
+    lags = index[:, None] - index[None] + LONGEST_LAG_PX
     return np.asarray(sums.autocovariance[lags[..., 0], lags[..., 1]])
 
 
@@ -52,40 +54,40 @@ def fields(sums: NoiseSums, count: int, side: int) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_templates_have_the_index_and_the_likelihood_of_brute_force(kind: str) -> None:
     sums = noise_of(kind)
-    known = rng(kind, "holes").random((SIDE, SIDE)) > 0.2
-    covariance = dense(sums, known)
+    reference = rng(kind, "holes").random((SIDE, SIDE)) > 0.2
+    covariance = dense(sums, reference)
     v = np.linspace(-1, 1, SIDE)
     surface = np.stack([np.ones((SIDE, SIDE)), *np.meshgrid(v, v)])
     signals = rng(kind, "signals").standard_normal((3, SIDE, SIDE))
-    found = ideal.detectability(signals * known, surface * known, known, sums)
-    s = signals[:, known].T
-    b = surface[:, known].T
+    result = ideal.detectability(signals * reference, surface * reference, reference, sums)
+    s = signals[:, reference].T
+    b = surface[:, reference].T
     inverse = np.linalg.inv(covariance)
     k = inverse - inverse @ b @ np.linalg.solve(b.T @ inverse @ b, b.T @ inverse)
-    assert found == pytest.approx(np.sqrt(np.diag(s.T @ k @ s)), rel=1e-4)
+    assert result == pytest.approx(np.sqrt(np.diag(s.T @ k @ s)), rel=1e-4)
     # without a surface the statistic is the ratio of the two densities
-    seen = rng(kind, "seen").standard_normal((SIDE, SIDE)) * known
-    whitened = ideal.inverse_times(np.stack([seen, signals[0] * known]), known, sums)
+    observed = rng(kind, "seen").standard_normal((SIDE, SIDE)) * reference
+    whitened = ideal.inverse_times(np.stack([observed, signals[0] * reference]), reference, sums)
     normal = stats.multivariate_normal(cov=covariance)
-    ratio = normal.logpdf(seen[known] - s[:, 0]) - normal.logpdf(seen[known])
+    ratio = normal.logpdf(observed[reference] - s[:, 0]) - normal.logpdf(observed[reference])
     square = float((whitened[1] * signals[0]).sum())
     assert float((whitened[0] * signals[0]).sum()) - square / 2 == pytest.approx(ratio, rel=1e-3)
-    assert not whitened[:, ~known].any()
+    assert not whitened[:, ~reference].any()
 
 
 def test_the_covariance_is_found_in_drawn_noise_with_missing_pixels() -> None:
     sums = noise_of("correlated")
     drawn = fields(sums, 40, 160)
-    known = rng("missing").random(drawn.shape) > 0.3
-    found = ideal.noise_sums(drawn, known)
-    near = slice(LONGEST_LAG_PX - 6, LONGEST_LAG_PX + 7)
+    reference = rng("missing").random(drawn.shape) > 0.3
+    result = ideal.noise_sums(drawn, reference)
+    nearby = slice(LONGEST_LAG_PX - 6, LONGEST_LAG_PX + 7)
     # a million pixels in patches of 4 pi 2^2: 0.5 % of the variance
-    assert found.autocovariance[near, near] == pytest.approx(
-        sums.autocovariance[near, near], abs=0.025
+    assert result.autocovariance[nearby, nearby] == pytest.approx(
+        sums.autocovariance[nearby, nearby], abs=0.025
     )
-    assert found.kurtosis == pytest.approx(0.0, abs=0.1)
-    part = ideal.noise_sums(drawn[:10], known[:10])
-    assert (found - part).pixels == known[10:].sum()
+    assert result.kurtosis == pytest.approx(0.0, abs=0.1)
+    part = ideal.noise_sums(drawn[:10], reference[:10])
+    assert (result - part).pixels == reference[10:].sum()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -115,16 +117,16 @@ def test_detection_is_as_likely_as_in_drawn_fields() -> None:
         .swapaxes(2, 3)
         .reshape(-1, 20, 20)[:, :19, :19]
     )
-    near = slice(LONGEST_LAG_PX - 9, LONGEST_LAG_PX + 10)
+    nearby = slice(LONGEST_LAG_PX - 9, LONGEST_LAG_PX + 10)
     needed = ideal.needed_indices(sums.autocovariance, 4.0)
     for index in (3.0, 4.5):
         share = float(
-            ((drawn + index * sums.autocovariance[near, near]).max(axis=(1, 2)) > 4.0).mean()
+            ((drawn + index * sums.autocovariance[nearby, nearby]).max(axis=(1, 2)) > 4.0).mean()
         )
-        found = ideal.detection_probability(needed, index)
-        assert found == pytest.approx(share, abs=5 * np.sqrt(0.25 / len(drawn)))
-        assert found > special.ndtr(index - 4.0)  # more than at the damage's own place alone
-        assert ideal.index_for(needed, found) == pytest.approx(index)
+        result = ideal.detection_probability(needed, index)
+        assert result == pytest.approx(share, abs=5 * np.sqrt(0.25 / len(drawn)))
+        assert result > special.ndtr(index - 4.0)  # more than at the damage's own place alone
+        assert ideal.index_for(needed, result) == pytest.approx(index)
 
 
 # ---------------------------------------------------------------- efficiency
@@ -134,40 +136,41 @@ def judged(share: float) -> tuple[SetUpLimit, IdealDamages]:
     """Return the limit of a linear detector with this efficiency, and the ideal observer on its
     damages."""
     record = study_record().set_ups[0]
-    seen = record.inspected
-    index = (seen.diameter_mm / 3.0) ** 3
+    inspected = record.inspected
+    index = (inspected.diameter_mm / 3.0) ** 3
     pod = special.ndtr(index - 4.5)
     hit = rng("hits").random(len(index)) < special.ndtr(np.sqrt(share) * index - 4.5)
-    seen = replace(seen, hit=hit, by_depth=None, by_no_return=None)
+    inspected = replace(inspected, hit=hit, by_depth=None, by_no_return=None)
     needed = np.full((2, len(index)), [[4.5], [4.5 + special.ndtri(0.9)]])
-    known = IdealDamages(
-        seen.board, seen.hole, index, np.full(len(index), 4.5), pod, needed, 200, 0.0, 0.0
+    ideal_damages = IdealDamages(
+        inspected.board, inspected.hole, index, np.full(len(index), 4.5), pod, needed, 200, 0.0, 0.0
     )
-    return limit_of(replace(record, inspected=seen)), known
+    return limit_of(replace(record, inspected=inspected)), ideal_damages
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_the_efficiency_of_a_linear_detector_is_found(share: float) -> None:
-    found = efficiency_of(*judged(share))
-    for level in (found.half, found.most):
+    efficiency = efficiency_of(*judged(share))
+    for level in (efficiency.half, efficiency.most):
         assert level.interval.low < share < level.interval.high
         assert level.efficiency == pytest.approx(share, rel=0.15)
     # d' = 4.5; the probit curve of ln a is not quite the true one, of a cubed
-    assert found.half.ideal_mm == pytest.approx(3.0 * 4.5 ** (1 / 3), rel=0.02)
-    assert not warnings_of([found])
+    assert efficiency.half.ideal_mm == pytest.approx(3.0 * 4.5 ** (1 / 3), rel=0.02)
+    assert not warnings_of([efficiency])
 
 
 def test_everything_missed_has_no_efficiency_and_says_so() -> None:
-    limit, known = judged(1.0)
-    seen = replace(limit.record.inspected, hit=np.zeros(len(known.index), bool))
-    found = efficiency_of(
-        limit_of(replace(limit.record, inspected=seen)), replace(known, kurtosis=4.0, lost=0.2)
+    limit, reference = judged(1.0)
+    observed = replace(limit.record.inspected, hit=np.zeros(len(reference.index), bool))
+    efficiency = efficiency_of(
+        limit_of(replace(limit.record, inspected=observed)),
+        replace(reference, kurtosis=4.0, lost=0.2),
     )
-    assert np.isnan(found.half.efficiency) and not found.half.interval.known
-    said = warnings_of([found])
+    assert np.isnan(efficiency.half.efficiency) and not efficiency.half.interval.known
+    warnings = warnings_of([efficiency])
     assert [
         word in text
-        for word, text in zip(("tails", "return nothing", "not known"), said, strict=True)
+        for word, text in zip(("tails", "return nothing", "not known"), warnings, strict=True)
     ] == [True] * 3
 
 
@@ -179,16 +182,16 @@ def test_expected_sizes_of_hardly_any_hits_or_misses() -> None:
 
 
 def test_a_detector_that_finds_half_at_no_damage_inspected_has_no_efficiency() -> None:
-    limit, known = judged(1.0)
-    strong = known.index > 12.0
-    seen = limit.record.inspected
-    few = replace(
-        seen,
+    limit, reference = judged(1.0)
+    strong = reference.index > 12.0
+    inspected = limit.record.inspected
+    subset = replace(
+        inspected,
         **{
             name: column[strong]
-            for name, column in vars(seen).items()
+            for name, column in vars(inspected).items()
             if isinstance(column, np.ndarray)
         },
     )
-    found = efficiency_of(limit_of(replace(limit.record, inspected=few)), known)
-    assert np.isnan(found.half.efficiency) and found.half.at_most and found.why
+    efficiency = efficiency_of(limit_of(replace(limit.record, inspected=subset)), reference)
+    assert np.isnan(efficiency.half.efficiency) and efficiency.half.at_most and efficiency.why

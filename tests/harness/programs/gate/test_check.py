@@ -71,8 +71,12 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: Experim
 
 def test_without_a_baseline_nothing_runs_and_update_is_named(program, capsys):
     assert program(record()) == 2
-    said = capsys.readouterr()
-    assert "there is no such baseline" in said.err and "--update" in said.err and not said.out
+    captured = capsys.readouterr()
+    assert (
+        "there is no such baseline" in captured.err
+        and "--update" in captured.err
+        and not captured.out
+    )
     assert not list(program.home.rglob("study.json"))
 
 
@@ -80,8 +84,8 @@ def test_update_writes_the_baseline_and_says_what_changes(program, capsys):
     assert program(record(), "--update") == 0
     assert read_record(program.baseline).set_ups[0].frames_digest == "frames-a-1"
     assert program(record(SetUp(a50_mm=9, frames_digest="b")), "--update") == 0
-    said = capsys.readouterr().out
-    assert "worse" in said and " → " in said and f"wrote {program.baseline}" in said
+    printed = capsys.readouterr().out
+    assert "worse" in printed and " → " in printed and f"wrote {program.baseline}" in printed
     assert read_record(program.baseline).set_ups[0].frames_digest == "b-1"
 
 
@@ -98,15 +102,22 @@ def test_a_baseline_that_cannot_be_read_is_written_anew_by_update_alone(
 ):
     program.baseline.write_text(content)
     assert program(record()) == 2
-    said = capsys.readouterr().err
-    assert f"{program.baseline}: {why}" in said and "to do: write a new one with --update" in said
+    error_text = capsys.readouterr().err
+    assert (
+        f"{program.baseline}: {why}" in error_text
+        and "to do: write a new one with --update" in error_text
+    )
     assert program.baseline.read_text() == content
     assert program(record(), "--update") == 0
-    said = capsys.readouterr().out
+    error_text = capsys.readouterr().out
     assert (
-        "no comparison with the old baseline, which will be overwritten. " in said and why in said
+        "no comparison with the old baseline, which will be overwritten. " in error_text
+        and why in error_text
     )
-    assert f"wrote {program.baseline}" in said and len(read_record(program.baseline).set_ups) == 1
+    assert (
+        f"wrote {program.baseline}" in error_text
+        and len(read_record(program.baseline).set_ups) == 1
+    )
     assert program(record()) == 0
 
 
@@ -131,8 +142,8 @@ def test_exit_codes(program, capsys):
     assert program(record()) == 0
     assert program(record(SetUp(a50_mm=4, frames_digest="b"))) == 0, "better"
     assert program(record(SetUp(a50_mm=9, frames_digest="b"))) == 1
-    said = capsys.readouterr()
-    assert "1 of 1 set-ups is worse. 1 frame: a90 " in said.out and "--update" in said.err
+    captured = capsys.readouterr()
+    assert "1 of 1 set-ups is worse. 1 frame: a90 " in captured.out and "--update" in captured.err
     assert len(list(program.home.rglob("compare.html"))) == 1
 
 

@@ -60,13 +60,13 @@ SMALL = {"boards": 24, "hole_free_boards": 24, "holes": 6}
 def each_limit_once() -> Iterator[None]:
     """The limit of a set-up that several tests compare is computed once; half of these tests' time
     went there."""
-    known: dict[bytes, SetUpLimit] = {}
+    reference: dict[bytes, SetUpLimit] = {}
 
     def limit(record: SetUpRecord) -> SetUpLimit:
         key = pickle.dumps(replace(record, variant=""))
-        if key not in known:
-            known[key] = limit_of(record, draws=200)
-        return replace(known[key], record=record)
+        if key not in reference:
+            reference[key] = limit_of(record, draws=200)
+        return replace(reference[key], record=record)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(verdict, "limit_of", limit)
@@ -98,9 +98,9 @@ def test_sign_flip_is_the_enumeration_of_all_signs(gained):
         for signs in product((-1, 1), repeat=len(gained))
     ]
     observed = sum(gained)
-    fewer, more = sign_flip(np.array(gained))
+    fewer, additional = sign_flip(np.array(gained))
     assert fewer == pytest.approx(np.mean([one <= observed for one in sums]), abs=1e-12)
-    assert more == pytest.approx(np.mean([one >= observed for one in sums]), abs=1e-12)
+    assert additional == pytest.approx(np.mean([one >= observed for one in sums]), abs=1e-12)
 
 
 def test_sign_flip_by_hand():
@@ -142,18 +142,18 @@ def test_boards_are_the_unit_where_damages_are_lost_together():
 
 
 def test_only_shared_inspections_are_compared_in_any_order():
-    whole = inspected([0, 0, 1, 1], [True, False, True, True])
+    complete = inspected([0, 0, 1, 1], [True, False, True, True])
     order = np.array([2, 0, 3])
     part = Inspected(
-        *(column[order] for column in vars(whole).values() if isinstance(column, np.ndarray))
+        *(column[order] for column in vars(complete).values() if isinstance(column, np.ndarray))
     )
-    one, two = shared_rows(whole, part)
-    assert [(whole.hole[a], part.hole[b]) for a, b in zip(one, two, strict=True)] == [
+    one, two = shared_rows(complete, part)
+    assert [(complete.hole[a], part.hole[b]) for a, b in zip(one, two, strict=True)] == [
         ("0",) * 2,
         ("2",) * 2,
         ("3",) * 2,
     ]
-    change = hits_change(whole, part)
+    change = hits_change(complete, part)
     assert change is not None and (change.only_first, change.only_second, change.inspections) == (
         0,
         0,
@@ -170,14 +170,14 @@ def test_no_shared_inspection_is_no_test():
 
 
 def test_paired_draws_make_the_interval_narrower_than_independent_ones():
-    one = small(SetUp(boards_mm=1.5, own_noise=0.2)).set_ups[0]
-    other = small(SetUp(boards_mm=1.5, own_noise=0.2, variant="other", a50_mm=6.3)).set_ups[0]
-    limits = limit_of(one), limit_of(other)
+    first = small(SetUp(boards_mm=1.5, own_noise=0.2)).set_ups[0]
+    second = small(SetUp(boards_mm=1.5, own_noise=0.2, variant="other", a50_mm=6.3)).set_ups[0]
+    limits = limit_of(first), limit_of(second)
     paired = limit_change(*limits, True)
-    apart = limit_change(*limits, False)
-    assert paired.paired and not apart.paired
-    assert paired.difference_mm == apart.difference_mm == limits[1].a90_mm - limits[0].a90_mm
-    widths = [change.interval_mm.high - change.interval_mm.low for change in (paired, apart)]
+    separation = limit_change(*limits, False)
+    assert paired.paired and not separation.paired
+    assert paired.difference_mm == separation.difference_mm == limits[1].a90_mm - limits[0].a90_mm
+    widths = [change.interval_mm.high - change.interval_mm.low for change in (paired, separation)]
     assert widths[0] < 0.7 * widths[1]
 
 
@@ -205,9 +205,9 @@ def unflawed(calls: np.ndarray, area_m2: float = 0.07) -> SetUpRecord:
 
 
 def test_given_thresholds_leave_fishers_exact_test():
-    one = replace(unflawed(np.arange(20) < 2), calibration_runs=0)
-    other = replace(unflawed(np.arange(20) < 8), calibration_runs=0)
-    change = calls_change(one, other, None)
+    first = replace(unflawed(np.arange(20) < 2), calibration_runs=0)
+    second = replace(unflawed(np.arange(20) < 8), calibration_runs=0)
+    change = calls_change(first, second, None)
     assert change is not None and change.calling == (2, 8)
     table = [[8, 12], [2, 18]]
     assert change.more_p == pytest.approx(stats.fisher_exact(table, alternative="greater").pvalue)
@@ -223,32 +223,35 @@ def test_no_call_anywhere_says_nothing():
 def test_on_identical_frames_the_signs_of_boards_are_tossed():
     """All 16 boards call where 5 did: with a threshold that is the second highest of 20 scores
     such luck has 0.2 %, on identical frames it has 2^-11."""
-    one = replace(unflawed(np.arange(16) < 5), calibration_runs=20)
-    other = replace(unflawed(np.arange(16) < 16), calibration_runs=20)
-    apart = calls_change(one, other, 2.0)
-    alike = calls_change(
-        replace(one, frames_digest="same"), replace(other, frames_digest="same"), 2.0
+    first = replace(unflawed(np.arange(16) < 5), calibration_runs=20)
+    second = replace(unflawed(np.arange(16) < 16), calibration_runs=20)
+    separation = calls_change(first, second, 2.0)
+    is_equal = calls_change(
+        replace(first, frames_digest="same"), replace(second, frames_digest="same"), 2.0
     )
-    assert apart is not None and alike is not None
-    assert (apart.way, alike.way) == ("calibrations", "signs")
-    assert alike.more_p == pytest.approx(2.0**-11) and alike.fewer_p == 1.0
-    assert 0.0005 < apart.more_p < 0.005
+    assert separation is not None and is_equal is not None
+    assert (separation.way, is_equal.way) == ("calibrations", "signs")
+    assert is_equal.more_p == pytest.approx(2.0**-11) and is_equal.fewer_p == 1.0
+    assert 0.0005 < separation.more_p < 0.005
 
 
 def test_luck_with_the_calibration_is_the_same_only_where_the_threshold_is():
-    one, other = (
+    first, second = (
         replace(unflawed(np.arange(16) < k), calibration_runs=20, frames_digest="same")
         for k in (5, 16)
     )
-    signs = calls_change(one, replace(other, threshold=one.threshold * 1.0), 2.0)
-    both = calls_change(one, replace(other, threshold=one.threshold * 1.01), 2.0)
-    given = calls_change(
-        *(replace(u, calibration_runs=0) for u in (one, replace(other, threshold=9.0))), None
+    signs = calls_change(first, replace(second, threshold=first.threshold * 1.0), 2.0)
+    pair = calls_change(first, replace(second, threshold=first.threshold * 1.01), 2.0)
+    arguments = calls_change(
+        *(replace(u, calibration_runs=0) for u in (first, replace(second, threshold=9.0))), None
     )
-    assert signs is not None and both is not None and given is not None
-    assert (signs.way, both.way, given.way) == ("signs", "both", "signs")
-    apart = calls_change(one, replace(other, frames_digest="others"), 2.0)
-    assert apart is not None and both.more_p == apart.more_p > signs.more_p == given.more_p
+    assert signs is not None and pair is not None and arguments is not None
+    assert (signs.way, pair.way, arguments.way) == ("signs", "both", "signs")
+    separation = calls_change(first, replace(second, frames_digest="others"), 2.0)
+    assert (
+        separation is not None
+        and pair.more_p == separation.more_p > signs.more_p == arguments.more_p
+    )
 
 
 @pytest.mark.slow
@@ -311,16 +314,19 @@ def test_calibration_draws_are_in_the_false_calls_test_and_not_in_that_of_counts
 
 def labels(pairs) -> list[tuple[str | None, str | None]]:
     return [
-        (one and f"{one.variant} {one.frames}", other and f"{other.variant} {other.frames}")
-        for one, other in pairs
+        (
+            first and f"{first.variant} {first.frames}",
+            second and f"{second.variant} {second.frames}",
+        )
+        for first, second in pairs
     ]
 
 
 def test_pairs_by_name_then_by_axes_then_alone():
     axes = {"source.target.distance_m": 0.7}
-    one = small(SetUp("a", 1), SetUp("b", 1, axes), SetUp("c", 5))
-    other = small(SetUp("renamed", 1, axes), SetUp("a", 1), SetUp("d", 5, {"x": 2}))
-    assert labels(paired_set_ups(one, other)) == [
+    first = small(SetUp("a", 1), SetUp("b", 1, axes), SetUp("c", 5))
+    second = small(SetUp("renamed", 1, axes), SetUp("a", 1), SetUp("d", 5, {"x": 2}))
+    assert labels(paired_set_ups(first, second)) == [
         ("a 1", "a 1"), ("b 1", "renamed 1"), ("c 5", None), (None, "d 5"),
     ]  # fmt: skip
     single = small(SetUp("thesis", 1)), small(SetUp("other", 50))
@@ -336,9 +342,9 @@ def test_pairs_by_name_then_by_axes_then_alone():
     ],
 )
 def test_another_measuring_stick_is_not_compared(study, set_up, word):
-    one = small()
-    other = replace(first_set_up(one, **set_up), **study)
-    row = only_row(one, other)
+    first = small()
+    second = replace(first_set_up(first, **set_up), **study)
+    row = only_row(first, second)
     assert row.mark == "not comparable" and word in row.why
     assert not row.is_worse and row.limit is None
 
@@ -368,10 +374,10 @@ def test_a_study_is_as_good_as_itself():
 
 
 def test_worse_one_way_is_better_the_other():
-    one = small(SetUp(a50_mm=5))
-    other = small(SetUp(a50_mm=7, detector_version=2, frames_digest="b"))
-    there = only_row(one, other)
-    back = only_row(other, one)
+    first = small(SetUp(a50_mm=5))
+    second = small(SetUp(a50_mm=7, detector_version=2, frames_digest="b"))
+    there = only_row(first, second)
+    back = only_row(second, first)
     assert (there.mark, back.mark) == ("worse", "better")
     assert there.limit.ratio == pytest.approx(1 / back.limit.ratio)
     assert (there.hits.only_first, there.hits.only_second) == (
@@ -386,9 +392,10 @@ def test_worse_one_way_is_better_the_other():
 def test_a_larger_limit_that_may_be_chance_is_not_worse():
     """Of one board alone all hits are lost: the limit grows, and one board is no evidence."""
     one = small(boards=3, holes=16)
-    seen = one.set_ups[0].inspected
+    inspected = one.set_ups[0].inspected
     row = only_row(
-        one, first_set_up(one, inspected=replace(seen, hit=seen.hit & (seen.board != 0)))
+        one,
+        first_set_up(one, inspected=replace(inspected, hit=inspected.hit & (inspected.board != 0))),
     )
     assert row.limit.ratio > 1.1 and row.hits.only_first > row.hits.only_second
     assert row.hits.fewer_p == pytest.approx(0.5) and row.mark == "not significant"
@@ -415,36 +422,38 @@ def weaker(study: StudyRecord, by: float, above: float = 1.0, **changed: Any) ->
     """The study with all signals times ``by``, found from ``above`` times as much on."""
     record = study.set_ups[0]
     signal = by * record.inspected.signal
-    at = above * record.threshold
+    index = above * record.threshold
     return first_set_up(
-        study, inspected=replace(record.inspected, signal=signal, hit=signal > at), **changed
+        study, inspected=replace(record.inspected, signal=signal, hit=signal > index), **changed
     )
 
 
 @pytest.mark.slow  # a Monte Carlo campaign
 def test_weaker_signals_and_a_higher_threshold_are_worse_though_a90_is_not():
     """Signals grow so fast with size that the limit moves by less than the margin."""
-    one = small(SetUp(a50_mm=7.0, width_mm=0.2), boards=20)
-    seen = one.set_ups[0].inspected
-    one = first_set_up(
-        one,
+    first = small(SetUp(a50_mm=7.0, width_mm=0.2), boards=20)
+    inspected = first.set_ups[0].inspected
+    first = first_set_up(
+        first,
         inspected=replace(
-            seen, signal=5.0 * (seen.diameter_mm / 7.0) ** 5, hit=seen.diameter_mm > 7
+            inspected,
+            signal=5.0 * (inspected.diameter_mm / 7.0) ** 5,
+            hit=inspected.diameter_mm > 7,
         ),
     )
-    for by, threshold in ((1 / 1.4, 1.0), (1.0, 1.2)):
-        row = only_row(one, weaker(one, by, threshold))
+    for key, threshold in ((1 / 1.4, 1.0), (1.0, 1.2)):
+        row = only_row(first, weaker(first, key, threshold))
         assert (
             row.limit.ratio < 1.1
             and row.mark == "worse"
             and row.why.startswith("signals over what is needed")
         )
         assert (
-            row.signal.ratio == pytest.approx(by / threshold, rel=0.06) and row.signal_p[0] < ALPHA
+            row.signal.ratio == pytest.approx(key / threshold, rel=0.06) and row.signal_p[0] < ALPHA
         )
-    assert only_row(one, weaker(one, 0.95)).mark == "as good", "within the margin"
-    other = weaker(one, 1 / 1.4, detector="another")
-    assert only_row(one, other).signal is None, "other scores are in other units"
+    assert only_row(first, weaker(first, 0.95)).mark == "as good", "within the margin"
+    second = weaker(first, 1 / 1.4, detector="another")
+    assert only_row(first, second).signal is None, "other scores are in other units"
 
 
 def test_the_luck_of_both_calibrations_is_in_the_test_of_signals():
@@ -475,10 +484,10 @@ def test_signals_under_another_draw_of_the_noise_are_as_rarely_weaker_as_the_tes
     def drawn(size: gate_power.Size, boards: int, noise: int) -> list[SetUpRecord]:
         records = []
         for record in gate_power.study(size, boards, noise).set_ups:
-            seen = record.inspected
+            inspected = record.inspected
             factor = np.exp(slip * random.standard_normal(len(record.inspected.signal)))
-            hit = seen.signal * factor > record.threshold
-            records.append(replace(record, inspected=replace(seen, hit=hit)))
+            hit = inspected.signal * factor > record.threshold
+            records.append(replace(record, inspected=replace(inspected, hit=hit)))
         return records
 
     size = gate_power.Size()
@@ -500,10 +509,10 @@ def test_the_effective_threshold_is_where_half_of_the_signals_are_found(seed):
     record = replace(small().set_ups[0], threshold=1.1)
 
     def effective(hit: np.ndarray) -> tuple[float, float]:
-        seen = Inspected(
+        inspected = Inspected(
             np.arange(n), np.full(n, "1"), np.zeros(n, int), *np.ones((4, n)), hit, signal
         )
-        return found_from(replace(record, inspected=seen))
+        return found_from(replace(record, inspected=inspected))
 
     assert effective(signal > 1.1) == (1.1, 0.0), "hits follow the threshold"
     lower = signal > np.sort(signal)[10]
@@ -518,19 +527,19 @@ def test_the_effective_threshold_is_where_half_of_the_signals_are_found(seed):
 
 
 def test_more_false_calls_are_worse_whatever_the_limit():
-    one = small(SetUp(a50_mm=6))
-    other = small(SetUp(a50_mm=4.5, frames_digest="b"))
-    table = other.set_ups[0].unflawed
+    first = small(SetUp(a50_mm=6))
+    second = small(SetUp(a50_mm=4.5, frames_digest="b"))
+    table = second.set_ups[0].unflawed
     row = only_row(
-        one, first_set_up(other, unflawed=replace(table, calls=np.full(len(table.calls), 3)))
+        first, first_set_up(second, unflawed=replace(table, calls=np.full(len(table.calls), 3)))
     )
     assert row.limit.ratio < 0.9 and row.mark == "worse" and "false calls" in row.why
 
 
 def test_lost_limits_and_failed_trials_fail_and_the_way_back_is_newly_working():
     one = small()
-    seen = one.set_ups[0].inspected
-    blind = first_set_up(one, inspected=replace(seen, hit=np.zeros(len(seen.hit), bool)))
+    inspected = one.set_ups[0].inspected
+    blind = first_set_up(one, inspected=replace(inspected, hit=np.zeros(len(inspected.hit), bool)))
     assert (only_row(one, blind).mark, only_row(blind, one).mark) == (
         "newly failing",
         "newly working",
@@ -543,8 +552,8 @@ def test_lost_limits_and_failed_trials_fail_and_the_way_back_is_newly_working():
 
 def test_everything_found_is_no_failure():
     one = small()
-    seen = one.set_ups[0].inspected
-    perfect = first_set_up(one, inspected=replace(seen, hit=np.ones(len(seen.hit), bool)))
+    inspected = one.set_ups[0].inspected
+    perfect = first_set_up(one, inspected=replace(inspected, hit=np.ones(len(inspected.hit), bool)))
     assert only_row(one, perfect).mark == "better"
     assert only_row(perfect, one).mark == "worse"
 
@@ -565,16 +574,18 @@ def test_holm_by_hand():
 def test_many_set_ups_ask_for_more():
     """A loss that convicts a single set-up does not convict one of forty."""
     one = small(boards=14, hole_free_boards=4)
-    seen = replace(
+    observed = replace(
         one.set_ups[0].inspected, signal=np.full(len(one.set_ups[0].inspected.hit), np.nan)
     )
-    one = first_set_up(one, inspected=seen)  # of hits alone
-    worse = first_set_up(one, inspected=replace(seen, hit=seen.hit & (seen.diameter_mm > 10)))
+    one = first_set_up(one, inspected=observed)  # of hits alone
+    worse = first_set_up(
+        one, inspected=replace(observed, hit=observed.hit & (observed.diameter_mm > 10))
+    )
     alone = only_row(one, worse)
     assert alone.mark == "worse" and min(alone.hits.fewer_p, alone.limit.grown_p) > ALPHA / 160
-    others = tuple(replace(one.set_ups[0], variant=str(k)) for k in range(39))
+    remaining = tuple(replace(one.set_ups[0], variant=str(k)) for k in range(39))
     among = compare_studies(
-        *(replace(study, set_ups=study.set_ups + others) for study in (one, worse))
+        *(replace(study, set_ups=study.set_ups + remaining) for study in (one, worse))
     )
     assert (
         among.rows[0].mark == "not significant" and among.rows[0].limit.ratio == alone.limit.ratio
@@ -587,13 +598,13 @@ def test_many_set_ups_ask_for_more():
 
 @pytest.fixture(scope="module")
 def comparison() -> Comparison:
-    one = small(SetUp(frames=1), SetUp(frames=5, a50_mm=4), SetUp("gone", 5))
-    other = small(
+    first = small(SetUp(frames=1), SetUp(frames=5, a50_mm=4), SetUp("gone", 5))
+    second = small(
         SetUp(frames=1, a50_mm=8, frames_digest="b"),
         SetUp(frames=5, a50_mm=4),
         SetUp("new", 9, {"x": 1}),
     )
-    return compare_studies(one, other)
+    return compare_studies(first, second)
 
 
 def test_every_row_is_said_in_text_and_on_the_page(comparison):
@@ -630,9 +641,9 @@ def test_the_program_prints_writes_and_returns_0(tmp_path, capsys):
 
 
 def test_nothing_paired_is_said_with_what_there_is(tmp_path, capsys):
-    one = small(SetUp("a", 1), SetUp("b", 1, {"x": 1}))
-    other = small(SetUp("c", 5), SetUp("d", 9))
-    for name, study in (("one.json", one), ("other.json", other)):
+    first = small(SetUp("a", 1), SetUp("b", 1, {"x": 1}))
+    second = small(SetUp("c", 5), SetUp("d", 9))
+    for name, study in (("one.json", first), ("other.json", second)):
         (tmp_path / name).write_text(record_text(study))
     assert (
         compare.main(
@@ -645,12 +656,12 @@ def test_nothing_paired_is_said_with_what_there_is(tmp_path, capsys):
         )
         == 2
     )
-    said = capsys.readouterr()
+    captured = capsys.readouterr()
     assert (
-        "no set-ups can be paired" in said.err
-        and "a, 1 frame; b, 1 frame / c, 5 frames; d, 9 frames" in said.err
+        "no set-ups can be paired" in captured.err
+        and "a, 1 frame; b, 1 frame / c, 5 frames; d, 9 frames" in captured.err
     )
-    assert not said.out and not (tmp_path / "out").exists()
+    assert not captured.out and not (tmp_path / "out").exists()
 
 
 def test_the_program_names_a_users_mistakes(tmp_path, capsys):

@@ -72,7 +72,10 @@ def test_a_package_guards_its_limit(tmp_path):
     info = tmp_path / "site" / "acme-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
-    entries = "[tofpod.detectors]\nacme = acme:AcmeDetector\n[pytest11]\ntofpod = harness.programs.gate.pytest_plugin\n"
+    entries = (
+        "[tofpod.detectors]\nacme = acme:AcmeDetector\n[pytest11]\ntofpod = "
+        "harness.programs.gate.pytest_plugin\n"
+    )
     (info / "entry_points.txt").write_text(entries)
     path = os.pathsep.join((str(ROOT), str(tmp_path / "site")))
 

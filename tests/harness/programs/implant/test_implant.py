@@ -79,44 +79,50 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
     for each in (target, target.hole_free()):
         view, _ = cached_view(each, camera.optics, RenderConfig(), tmp_path)
         units.append(SimulatedUnit(camera, NOISE, view))
-    seen, bare = (
+    observed, bare = (
         np.stack([frame.z_m for frame in unit.capture(48, 1, name).frames()]).astype(float)
         for unit, name in zip(units, "ab", strict=True)
     )
     T = target.pose.T_camera_board
-    place = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
+    position = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
     config, same = unit_config(CAMERA, camera.nominal_lens)
     (one,) = target.damages
-    alone = local_board(target, one, place, T[:3, 2], side_mm(one, 0.7, config))
-    found = implant_of(config, same, camera.nominal_lens, alone, 48, 3, tmp_path)
+    alone = local_board(target, one, position, T[:3, 2], side_mm(one, 0.7, config))
+    implant = implant_of(config, same, camera.nominal_lens, alone, 48, 3, tmp_path)
     assert same
     np.testing.assert_allclose(alone.pose.T_camera_board[:3, 2], T[:3, 2], atol=1e-9)
 
-    cut = found.region.within(units[0].region)
-    z_m = np.zeros(found.shift_m.shape)
-    valid = np.zeros(found.shift_m.shape)
+    cut = implant.region.within(units[0].region)
+    z_m = np.zeros(implant.shift_m.shape)
+    valid = np.zeros(implant.shift_m.shape)
     for number, plain in enumerate(bare):
-        frame = Frame("", plain[cut], np.zeros(found.shift_m.shape, np.uint8))
-        whole = plain[cut].copy()
+        frame = Frame("", plain[cut], np.zeros(implant.shift_m.shape, np.uint8))
+        complete = plain[cut].copy()
         reason = frame.reason.copy()
         part = Implant(
-            Region(0, whole.shape[0], 0, whole.shape[1]), found.shift_m, found.noise_m, found.lost
+            Region(0, complete.shape[0], 0, complete.shape[1]),
+            implant.shift_m,
+            implant.noise_m,
+            implant.lost,
         )
-        part.put_into(frame, number, whole, reason)
-        assert np.array_equal(np.isnan(whole), (reason != Reason.VALID) | np.isnan(frame.z_m))
-        z_m = z_m + np.nan_to_num(whole)
-        valid = valid + np.isfinite(whole)
+        part.put_into(frame, number, complete, reason)
+        assert np.array_equal(np.isnan(complete), (reason != Reason.VALID) | np.isnan(frame.z_m))
+        z_m = z_m + np.nan_to_num(complete)
+        valid = valid + np.isfinite(complete)
     with np.errstate(invalid="ignore"):
-        depth_m = z_m / valid - np.nanmean(seen[:, *cut], axis=0)
-        changed = np.abs(found.shift_m) > 1 * MM
+        depth_m = z_m / valid - np.nanmean(observed[:, *cut], axis=0)
+        changed = np.abs(implant.shift_m) > 1 * MM
         assert changed.sum() > 20
         # of the hole the backing, 33 mm behind the face, mixed with the rim
-        assert found.depth_mm > abs(most_mm) and found.shift_m.sum() * most_mm > 0
-        both = changed & (valid > FRAMES)
-        assert np.sqrt(np.nanmean(depth_m[both] ** 2)) < 0.05 * found.depth_mm * MM + 0.1 * MM
-        assert abs(np.nanmean(depth_m[both])) < 0.02 * found.depth_mm * MM + 0.05 * MM
+        assert implant.depth_mm > abs(most_mm) and implant.shift_m.sum() * most_mm > 0
+        pair = changed & (valid > FRAMES)
+        assert np.sqrt(np.nanmean(depth_m[pair] ** 2)) < 0.05 * implant.depth_mm * MM + 0.1 * MM
+        assert abs(np.nanmean(depth_m[pair])) < 0.02 * implant.depth_mm * MM + 0.05 * MM
         lost = 1 - valid / len(bare)
-        assert np.abs(lost - np.isnan(seen[:, *cut]).mean(axis=0))[found.shift_m != 0].mean() < 0.1
+        assert (
+            np.abs(lost - np.isnan(observed[:, *cut]).mean(axis=0))[implant.shift_m != 0].mean()
+            < 0.1
+        )
 
 
 @pytest.mark.parametrize(("radius_m", "said"), [(0.3, "the inner"), (None, "")])
@@ -155,11 +161,11 @@ def test_a_rim_that_is_seen_more_steeply_is_told(radius_m: float | None, said: s
         for one in [damages_placed(scan, family, CAMERA, "damaged", n)]
         if one.damages
     ]
-    known = scan.known(scan.whole, site, damaged=True)
-    for damage in known.truth:
-        wide_m2 = scan.pitch_m**2 * len(known.outlines[damage.id])
+    reference = scan.known(scan.whole, site, damaged=True)
+    for damage in reference.truth:
+        wide_m2 = scan.pitch_m**2 * len(reference.outlines[damage.id])
         assert wide_m2 == pytest.approx(damage.length_m * damage.width_m, rel=0.4)
-        assert not known.undamaged.ravel()[known.outlines[damage.id]].any()
+        assert not reference.undamaged.ravel()[reference.outlines[damage.id]].any()
 
 
 def recorded(folder: Path, frames: int = FRAMES) -> Path:
@@ -195,7 +201,7 @@ def test_the_program_states_a_limit_of_a_recording(
 ):
     folder = recorded(tmp_path / "wall")
     out = tmp_path / "out"
-    given = [
+    arguments = [
         str(folder / "wall.npy"),
         "--intrinsics",
         str(folder / "lens.json"),
@@ -204,7 +210,7 @@ def test_the_program_states_a_limit_of_a_recording(
         "--crop",
         "none",
     ]
-    given += [
+    arguments += [
         "--damage",
         "through",
         "--diameters",
@@ -217,33 +223,38 @@ def test_the_program_states_a_limit_of_a_recording(
         "m",
     ]
     assert (
-        implant.main([*given, "--frames", str(FRAMES), "1", "--threshold", "7", "--out", str(out)])
+        implant.main(
+            [*arguments, "--frames", str(FRAMES), "1", "--threshold", "7", "--out", str(out)]
+        )
         == 0
     )
     record = read_record(out)
     assert [one.frames for one in record.set_ups] == [1, FRAMES]
     for one in record.set_ups:
-        seen = one.inspected
-        assert len(seen.hit) >= 4
-        assert seen.hit[seen.diameter_mm > 9].all() and not seen.hit[seen.diameter_mm < 2.5].any()
+        inspected = one.inspected
+        assert len(inspected.hit) >= 4
+        assert (
+            inspected.hit[inspected.diameter_mm > 9].all()
+            and not inspected.hit[inspected.diameter_mm < 2.5].any()
+        )
         assert one.unflawed.area_m2[0] == pytest.approx(80 * 110 * (0.6 / 504) ** 2, rel=0.05)
     assert len(record.set_ups[0].unflawed.board) == FRAMES // 2
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     page = (out / "report.html").read_text()
     assert (
-        said.startswith("warning: virtual damage may be harder to find than real damage")
+        printed.startswith("warning: virtual damage may be harder to find than real damage")
         and "7 of 23" in page
     )
-    assert "one average sets the threshold" in said and "one average sets the threshold" in page
+    assert "one average sets the threshold" in printed and "one average sets the threshold" in page
     assert "What is measured and what is simulated" in page
 
-    assert implant.main([*given, "--depths", "2:4", "--out", str(tmp_path / "no")]) == 2
+    assert implant.main([*arguments, "--depths", "2:4", "--out", str(tmp_path / "no")]) == 2
     assert "depth_mm" in capsys.readouterr().err
     for name in ("--targets", "--hit-radius", "--frames"):
-        assert implant.main([*given, name, "0", "--out", str(tmp_path / "no")]) == 2
+        assert implant.main([*arguments, name, "0", "--out", str(tmp_path / "no")]) == 2
         assert f"{name} 0" in capsys.readouterr().err
-    given[given.index("2:14")] = "60:80"
-    assert implant.main([*given, "--out", str(tmp_path / "no")]) == 2
+    arguments[arguments.index("2:14")] = "60:80"
+    assert implant.main([*arguments, "--out", str(tmp_path / "no")]) == 2
     assert not (tmp_path / "no").exists()
 
 
@@ -277,9 +288,9 @@ def test_the_implanted_limit_is_the_simulated_one(tmp_path: Path):
     ]
     study += ["study.boards=7", "study.hole_free_boards=1"]
     study += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 8]}"]
-    given = [text for each in study for text in ("--set", each)]
-    assert sweep.main([str(experiment), *changes, *given, "--out", str(tmp_path / "sim")]) == 0
-    given = [
+    arguments = [text for each in study for text in ("--set", each)]
+    assert sweep.main([str(experiment), *changes, *arguments, "--out", str(tmp_path / "sim")]) == 0
+    arguments = [
         "--camera",
         CAMERA,
         "--damage",
@@ -294,7 +305,7 @@ def test_the_implanted_limit_is_the_simulated_one(tmp_path: Path):
     out = tmp_path / "implanted"
     assert (
         implant.main(
-            [str(tmp_path / "bags" / "view_00"), *given, "--threshold", "7", "--out", str(out)]
+            [str(tmp_path / "bags" / "view_00"), *arguments, "--threshold", "7", "--out", str(out)]
         )
         == 0
     )

@@ -49,7 +49,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # ---- the guess
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=30, deadline=None)
@@ -60,11 +60,11 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log_size=st.booleans(),
 )
 def test_the_guess_goes_through_both_sizes(
-    a50: float, more: float, link: str, log_size: bool
+    a50: float, ratio: float, link: str, log_size: bool
 ) -> None:
-    curve = curve_through(a50, more * a50, link, log_size=log_size)
-    assert curve.pod(np.array([a50, more * a50])) == pytest.approx([0.5, 0.9], abs=1e-9)
-    assert (curve.size_at(0.5), curve.size_at(0.9)) == pytest.approx((a50, more * a50), rel=1e-9)
+    curve = curve_through(a50, ratio * a50, link, log_size=log_size)
+    assert curve.pod(np.array([a50, ratio * a50])) == pytest.approx([0.5, 0.9], abs=1e-9)
+    assert (curve.size_at(0.5), curve.size_at(0.9)) == pytest.approx((a50, ratio * a50), rel=1e-9)
 
 
 def test_logit_by_hand() -> None:
@@ -76,20 +76,20 @@ def test_logit_by_hand() -> None:
 # ---------------------------------------------------------------------------------------------
 
 
-def plans(*told: tuple[int, float]) -> list[StudyPlan]:
+def plans(*targets_and_bounds: tuple[int, float]) -> list[StudyPlan]:
     """(targets, 90 % quantile)."""
     first = StudyPlan(60, 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0))
-    return [replace(first, targets=n, high=high) for n, high in told]
+    return [replace(first, targets=n, high=high) for n, high in targets_and_bounds]
 
 
 def test_recommends_the_fewest_that_are_sure_of_the_goal() -> None:
-    known = plans((30, 7.9), (60, 9.0), (120, 8.4), (240, 8.0))
-    assert recommend(known) == (known[1], None), "without a wish the handbook's minimum"
-    assert recommend(known, 8.5) == (known[2], True)
-    assert recommend(known, 7.5) == (known[3], False), (
+    candidates = plans((30, 7.9), (60, 9.0), (120, 8.4), (240, 8.0))
+    assert recommend(candidates) == (candidates[1], None), "without a wish the handbook's minimum"
+    assert recommend(candidates, 8.5) == (candidates[2], True)
+    assert recommend(candidates, 7.5) == (candidates[3], False), (
         "30 targets are no study, whatever they seem to show"
     )
-    assert recommend(known[:1]) == (known[0], None)
+    assert recommend(candidates[:1]) == (candidates[0], None)
 
 
 # ---- hole-free boards
@@ -99,54 +99,58 @@ def test_recommends_the_fewest_that_are_sure_of_the_goal() -> None:
 @settings(max_examples=40, deadline=None)
 @given(rate=st.floats(0.05, 20), area=st.floats(0.01, 2))
 def test_the_fewest_boards_are_what_the_rule_of_thresholds_takes(rate: float, area: float) -> None:
-    found = hole_free(rate, area)
-    assert found.expected_per_m2 <= rate * (1 + 1e-9)
-    if found.calibration_boards > 1:
-        with pytest.raises(UserError, match=f"at least {found.calibration_boards} runs"):
-            threshold_for_rate(np.arange(found.calibration_boards - 1.0), area, rate)
+    boards = hole_free(rate, area)
+    assert boards.expected_per_m2 <= rate * (1 + 1e-9)
+    if boards.calibration_boards > 1:
+        with pytest.raises(UserError, match=f"at least {boards.calibration_boards} runs"):
+            threshold_for_rate(np.arange(boards.calibration_boards - 1.0), area, rate)
 
 
 def test_areas_bound_the_rate_exactly() -> None:
-    found = hole_free(1.0, 0.25, 0.9)
-    assert found.silent_m2 == pytest.approx(-np.log(0.1)), "exp(-area) = 0.1"
-    assert found.silent_boards == 10
+    boards = hole_free(1.0, 0.25, 0.9)
+    assert boards.silent_m2 == pytest.approx(-np.log(0.1)), "exp(-area) = 0.1"
+    assert boards.silent_boards == 10
 
 
 # ---- the program
-# -----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    said = answered(capsys, *TOLD, *FEW, "--goal", "11")
+    answer = answered(capsys, *TOLD, *FEW, "--goal", "11")
     expected = design(GUESS, (30, 60), (2.0, 12.0), studies=20, seed=1)
-    assert [one["targets"] for one in said["plans"]] == [30, 60]
-    assert [one["bound"] for one in said["plans"]] == [plan.bound for plan in expected]
-    assert [one["sizes"] for one in said["plans"]] == [plan.sizes.tolist() for plan in expected]
+    assert [plan["targets"] for plan in answer["plans"]] == [30, 60]
+    assert [plan["bound"] for plan in answer["plans"]] == [plan.bound for plan in expected]
+    assert [plan["sizes"] for plan in answer["plans"]] == [plan.sizes.tolist() for plan in expected]
     chosen, _ = recommend(expected, 11.0)
-    assert [one["recommended"] for one in said["plans"]] == [plan is chosen for plan in expected]
-    assert said["recommendation"].startswith("Make 60 targets")
-    assert said["unflawed_sites"] == 180
-    assert (said["guess"]["a50"], said["guess"]["a90"]) == pytest.approx((5.0, 7.0))
+    assert [plan["recommended"] for plan in answer["plans"]] == [
+        plan is chosen for plan in expected
+    ]
+    assert answer["recommendation"].startswith("Make 60 targets")
+    assert answer["unflawed_sites"] == 180
+    assert (answer["guess"]["a50"], answer["guess"]["a90"]) == pytest.approx((5.0, 7.0))
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixture[str]) -> None:
     """The 90 % quantile comes nearer to a90 = 7 as one over the root of the targets: by hand from
     the plan's."""
-    said = answered(capsys, *TOLD, *FEW, "--goal", "7.2")
-    assert "no plan listed is sure to show the 7.2 mm" in said["recommendation"]
-    (high,) = (one["high"] for one in said["plans"] if one["recommended"])
+    answer = answered(capsys, *TOLD, *FEW, "--goal", "7.2")
+    assert "no plan listed is sure to show the 7.2 mm" in answer["recommendation"]
+    (high,) = (plan["high"] for plan in answer["plans"] if plan["recommended"])
     wanted = 60 * ((high - 7) / 0.2) ** 2
     (number,) = (
-        note.split("needs about ")[1].split()[0] for note in said["notes"] if "needs about" in note
+        note.split("needs about ")[1].split()[0]
+        for note in answer["notes"]
+        if "needs about" in note
     )
     assert int(number) == pytest.approx(wanted, rel=0.051)
 
 
 def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    others = ["--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
-    assert main([*TOLD, *FEW, "--studies", "10", *others]) == 0
+    options = ["--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
+    assert main([*TOLD, *FEW, "--studies", "10", *options]) == 0
     printed = capsys.readouterr().out
     assert "count as 8 targets" in printed
     assert "a90/95 (furlong)" in printed
@@ -166,8 +170,8 @@ def test_files_are_repeatable_and_whole(tmp_path: Path, capsys: pytest.CaptureFi
     assert first[1] == second[1]
     assert first[1].startswith(b"\x89PNG")
     page = first[2].decode()
-    other = second[2].decode()
-    assert page.replace(str(tmp_path / "a"), str(tmp_path / "b")) == other
+    second_page = second[2].decode()
+    assert page.replace(str(tmp_path / "a"), str(tmp_path / "b")) == second_page
     assert page.count("<details") == 2
     assert "Make 60 targets" in page and "http" not in page.replace("http://www.w3.org", "")
     data = json.loads(first[0])
@@ -201,20 +205,20 @@ def test_no_limit_at_all_is_said_and_drawn(
 @pytest.mark.usefixtures("unsaved")
 def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--study", str(study), "--set-up", "50 frames", "--studies", "10", "--targets", "60"]
-    more = ["--false-calls-per-m2", "1"]
-    said = answered(capsys, *asked, *more)
+    options = ["--false-calls-per-m2", "1"]
+    answer = answered(capsys, *asked, *options)
     record = study_record(
         Study(set_ups=(SetUp(frames=1), SetUp(frames=50, a50_mm=4.0)), boards=30)
     ).set_ups[1]
     limit = limit_of(record)
-    assert said["guess"]["a50"] == pytest.approx(limit.a50_mm, rel=1e-12)
-    assert said["guess"]["a90"] == pytest.approx(limit.a90_mm, rel=1e-12)
-    assert said["range_of_sizes"] == [
+    assert answer["guess"]["a50"] == pytest.approx(limit.a50_mm, rel=1e-12)
+    assert answer["guess"]["a90"] == pytest.approx(limit.a90_mm, rel=1e-12)
+    assert answer["range_of_sizes"] == [
         record.inspected.diameter_mm.min(),
         record.inspected.diameter_mm.max(),
     ]
-    assert said["hole_free"]["board_m2"] == AREA_M2
-    assert said["guess"]["origin"] == "fitted to synthetic, 50 frames"
+    assert answer["hole_free"]["board_m2"] == AREA_M2
+    assert answer["guess"]["origin"] == "fitted to synthetic, 50 frames"
 
 
 @pytest.mark.parametrize(
@@ -243,17 +247,17 @@ def test_mistakes(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr()
-    assert message in said.err
-    assert said.err.startswith("error: ") and said.err.count("error") == 1
-    assert said.out == ""
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert printed.err.startswith("error: ") and printed.err.count("error") == 1
+    assert printed.out == ""
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_set_up(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--study", str(study), "--set-up", "50 frame"]) == 2
-    said = capsys.readouterr().err
-    assert "did you mean '50 frames'?" in said and "legal: 1 frame; 50 frames" in said
+    message = capsys.readouterr().err
+    assert "did you mean '50 frames'?" in message and "legal: 1 frame; 50 frames" in message
     assert main(["--study", str(study)]) == 2
     assert "has 2 set-ups" in capsys.readouterr().err
 

@@ -43,39 +43,43 @@ THRESHOLD = 8
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def gauge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("gauge") / "out"
     assert gauge.main([*GIVEN, "--out", str(out)]) == 0
     return out
 
 
-def test_the_truth_holds_what_was_designed(made: Path):
-    (board,) = read_gauge(made / "gauge.json").boards
+def test_the_truth_holds_what_was_designed(gauge_folder: Path):
+    (board,) = read_gauge(gauge_folder / "gauge.json").boards
     sizes = np.array([hole.diameter_mm for hole in board.holes])
     assert len(sizes) == 24
     assert set((sizes * 2 % 1).tolist()) == {0.0} and sizes.min() >= 2 and sizes.max() <= 12
     assert ((sizes > 4) & (sizes < 8)).sum() >= 8  # where the guessed curve rises
-    places = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes])
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + 1e3 * np.eye(24)
-    assert apart.min() > 2 * read_gauge(made / "gauge.json").hit_radius_mm
+    centres_mm = np.array([(hole.x_mm, hole.y_mm) for hole in board.holes])
+    distances_mm = np.linalg.norm(centres_mm[:, None] - centres_mm[None], axis=-1) + 1e3 * np.eye(
+        24
+    )
+    assert distances_mm.min() > 2 * read_gauge(gauge_folder / "gauge.json").hit_radius_mm
     for mark in board.marks:
-        beside = np.abs(places - [mark.x_mm, mark.y_mm]).max(axis=1) - sizes / 2
+        beside = np.abs(centres_mm - [mark.x_mm, mark.y_mm]).max(axis=1) - sizes / 2
         assert beside.min() > mark.side_mm / 2 + 3
 
 
-def test_the_template_is_true_to_scale(made: Path):
+def test_the_template_is_true_to_scale(gauge_folder: Path):
     """The SVG states its size; the drawing, in pixels of 0.2 mm, shows the codes where the truth
     has them."""
     from matplotlib.figure import Figure
 
-    found = read_gauge(made / "gauge.json")
-    (board,) = found.boards
-    size = re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', (made / "board-1.svg").read_text())
+    board_read = read_gauge(gauge_folder / "gauge.json")
+    (board,) = board_read.boards
+    size = re.search(
+        r'width="([\d.]+)pt" height="([\d.]+)pt"', (gauge_folder / "board-1.svg").read_text()
+    )
     assert size is not None
     np.testing.assert_allclose(
         [float(size[k]) / 72 * 25.4 for k in (1, 2)], [board.width_mm + 2, board.height_mm + 2]
     )
-    pdf = template_pdf(found.boards, found.dictionary, "letter")
+    pdf = template_pdf(board_read.boards, board_read.dictionary, "letter")
     box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
     assert box is not None
     assert sorted(float(box[k]) / 72 * 25.4 for k in (1, 2)) == pytest.approx(
@@ -89,28 +93,29 @@ def test_the_template_is_true_to_scale(made: Path):
         ylim=(-board.height_mm / 2, board.height_mm / 2),
     )
     axes.set_axis_off()
-    draw_board(axes, board, found.dictionary)
+    draw_board(axes, board, board_read.dictionary)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=127)
     picture = cv2.imdecode(np.frombuffer(buffer.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
     codes = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50))
-    corners, seen, _ = codes.detectMarkers(picture)
-    assert sorted(seen.ravel().tolist()) == [mark.code for mark in board.marks]
-    for code, corner in zip(seen.ravel(), corners, strict=True):
+    corners, marker_ids, _ = codes.detectMarkers(picture)
+    assert sorted(marker_ids.ravel().tolist()) == [mark.code for mark in board.marks]
+    for code, corner in zip(marker_ids.ravel(), corners, strict=True):
         mark = board.marks[int(code)]
         centre = corner.reshape(4, 2).mean(axis=0) + 0.5
-        at = (centre / 5 - [board.width_mm / 2, board.height_mm / 2]) * [1, -1]
-        np.testing.assert_allclose(at, [mark.x_mm, mark.y_mm], atol=0.3)
+        centre_mm = (centre / 5 - [board.width_mm / 2, board.height_mm / 2]) * [1, -1]
+        np.testing.assert_allclose(centre_mm, [mark.x_mm, mark.y_mm], atol=0.3)
 
 
 @pytest.mark.parametrize("paper", list(PAPER_MM))
 def test_tiles_cover_the_board_and_overlap(paper: str):
     for size in ((100.0, 80.0), (400.0, 300.0), (900.0, 200.0)):
-        sheet, places = tiles_of(*size, paper)
+        sheet, tile_corners = tiles_of(*size, paper)
         room = np.array(sheet) - [2 * MARGIN_MM, 2 * MARGIN_MM + 12]
         for x, y in np.random.default_rng(1).uniform(0, 1, (200, 2)) * size:
             assert any(
-                left <= x <= left + room[0] and low <= y <= low + room[1] for left, low in places
+                x_mm <= x <= x_mm + room[0] and low <= y <= low + room[1]
+                for x_mm, low in tile_corners
             )
 
 
@@ -119,15 +124,15 @@ def picture(truth: Gauge, place_mm: np.ndarray, hidden: tuple[int, ...] = ()) ->
     (board,) = truth.boards
     rgb = np.full((*place_mm.shape[:2], 3), 90, np.uint8)
     rgb[(np.abs(place_mm) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)] = 215
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, truth.dictionary))
+    marker_codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, truth.dictionary))
     for mark in board.marks:
         if mark.code not in hidden:
-            tag = cv2.aruco.generateImageMarker(known, mark.code, 8)
-            at = np.floor(
+            tag = cv2.aruco.generateImageMarker(marker_codes, mark.code, 8)
+            cell = np.floor(
                 ((place_mm - [mark.x_mm, mark.y_mm]) * [1, -1] / mark.side_mm + 0.5) * 8
             ).astype(int)
-            inside = ((at >= 0) & (at < 8)).all(axis=-1)
-            rgb[inside] = tag[at[inside][:, 1], at[inside][:, 0]][:, None] // 2 + 60
+            inside = ((cell >= 0) & (cell < 8)).all(axis=-1)
+            rgb[inside] = tag[cell[inside][:, 1], cell[inside][:, 0]][:, None] // 2 + 60
     return rgb
 
 
@@ -143,15 +148,15 @@ def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     normal = T[:3, 2]
     centre = T[:3, 3]
     z_m = (centre @ normal) / (rays @ normal)
-    place = transform_points(invert(T), rays * z_m[..., None])[..., :2] / MM
-    on_board = (np.abs(place) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)
+    board_xy_mm = transform_points(invert(T), rays * z_m[..., None])[..., :2] / MM
+    on_board = (np.abs(board_xy_mm) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)
     z_m = np.where(on_board, z_m, z_m + 0.3)
     for hole in board.holes:
         if hole.diameter_mm > NEVER_FOUND_MM:
             z_m += DEPTH_M * (
-                np.linalg.norm(place - [hole.x_mm, hole.y_mm], axis=-1) < hole.diameter_mm / 2
+                np.linalg.norm(board_xy_mm - [hole.x_mm, hole.y_mm], axis=-1) < hole.diameter_mm / 2
             )
-    rgb = picture(truth, place, hidden)
+    rgb = picture(truth, board_xy_mm, hidden)
     for name in ("depth", "color"):
         (folder / name).mkdir(parents=True)
     for number in range(3):
@@ -172,13 +177,17 @@ def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
 @pytest.mark.usefixtures("unsaved")
 @pytest.mark.usefixtures("unpictured")
 def test_a_capture_of_the_board_gives_hits_and_misses(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    gauge_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    truth = read_gauge(made / "gauge.json")
-    given = [str(captured(tmp_path / "seen", truth)), "--gauge", str(made / "gauge.json")]
-    assert gauge.main(["read", *given, "--out", str(tmp_path / "found")]) == 0
-    said = capsys.readouterr().out
-    assert "4 marks" in said and "0 false calls" in said
+    truth = read_gauge(gauge_folder / "gauge.json")
+    arguments = [
+        str(captured(tmp_path / "seen", truth)),
+        "--gauge",
+        str(gauge_folder / "gauge.json"),
+    ]
+    assert gauge.main(["read", *arguments, "--out", str(tmp_path / "found")]) == 0
+    printed = capsys.readouterr().out
+    assert "4 marks" in printed and "0 false calls" in printed
     lines = (tmp_path / "found" / "gauge.csv").read_text().splitlines()
     rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
     assert [row["target"] for row in rows] == [f"board-1:{n}" for n in range(1, 25)]
@@ -196,7 +205,7 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
     assert pod.main([table, *asked, "--out", str(tmp_path / "pod")]) == 0
 
     hidden = captured(tmp_path / "hidden", truth, hidden=(0, 2))
-    assert gauge.main(["read", str(hidden), "--gauge", str(made / "gauge.json")]) == 2
+    assert gauge.main(["read", str(hidden), "--gauge", str(gauge_folder / "gauge.json")]) == 2
     assert "no board is recognised" in capsys.readouterr().err
     (tmp_path / "no.json").write_text('{"gauge_version": 1, "boards": []}')
     assert gauge.main(["read", str(hidden), "--gauge", str(tmp_path / "no.json")]) == 2
@@ -241,10 +250,10 @@ def seen_by(
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     on_board = rays * ((T[:3, 3] @ T[:3, 2]) / (rays @ T[:3, 2]))[..., None]
     place_mm = transform_points(invert(T), on_board)[..., :2] / MM
-    whole = camera.nominal_lens.whole
+    window = camera.nominal_lens.whole
     cut = unit.region.within(camera.nominal_lens.whole)
-    depth = np.zeros(whole.shape, np.uint16)
-    colour = np.full((*whole.shape, 3), 90, np.uint8)
+    depth = np.zeros(window.shape, np.uint16)
+    colour = np.full((*window.shape, 3), 90, np.uint8)
     depth[cut], colour[cut] = np.rint(np.nan_to_num(frame.z_m) / MM), picture(truth, place_mm)
     for name, image in (("depth", depth), ("color", colour)):
         (folder / "seen" / name).mkdir(parents=True)
@@ -281,10 +290,10 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
     changes.append(f"source.target.edge_mm={2 * gauge.EDGE_MM}")
     changes += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 12]}"]
     changes.append(f"sweep={json.dumps({'source.camera.numbers': [{}, numbers]})}")
-    given = [text for change in changes for text in ("--set", change)]
-    assert sweep.main([str(experiment), *given, "--out", str(tmp_path / "study")]) == 0
+    arguments = [text for change in changes for text in ("--set", change)]
+    assert sweep.main([str(experiment), *arguments, "--out", str(tmp_path / "study")]) == 0
     study = tmp_path / "study" / "detection_limit" / "latest"
-    simulated, real = (limit_of(one) for one in read_record(study).set_ups)
+    simulated, real = (limit_of(set_up) for set_up in read_record(study).set_ups)
     truth_mm = real.statement.a90
     assert simulated.statement.bound.value < truth_mm
 
@@ -302,13 +311,18 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
     truth = read_gauge(tmp_path / "gauge" / "gauge.json")
     for seed, tilt_deg in enumerate([(5.0, -4.0), (-3.0, 6.0), (2.0, 1.0)]):
         out = tmp_path / str(seed)
-        given = [
+        arguments = [
             str(seen_by(CameraConfig(name=CAMERA, numbers=numbers), truth, tilt_deg, seed, out))
         ]
-        given += ["--intrinsics", CAMERA, "--detector", "local", "--threshold", str(THRESHOLD)]
-        given += ["--gauge", str(tmp_path / "gauge" / "gauge.json"), "--out", str(out / "found")]
-        assert gauge.main(["read", *given]) == 0
-        given = [
+        arguments += ["--intrinsics", CAMERA, "--detector", "local", "--threshold", str(THRESHOLD)]
+        arguments += [
+            "--gauge",
+            str(tmp_path / "gauge" / "gauge.json"),
+            "--out",
+            str(out / "found"),
+        ]
+        assert gauge.main(["read", *arguments]) == 0
+        arguments = [
             str(out / "found" / "gauge.csv"),
             "--size",
             "diameter_mm",
@@ -317,7 +331,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
             "--board",
             "board",
         ]
-        given += [
+        arguments += [
             "--prior",
             str(study),
             "--set-up",
@@ -325,18 +339,19 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
             "--out",
             str(out / "pod"),
         ]
-        assert pod.main(given) == 0
-        said = json.loads((out / "pod" / "mapod.json").read_text())
-        last = said["after_each_board"][-1]
+        assert pod.main(arguments) == 0
+        mapod = json.loads((out / "pod" / "mapod.json").read_text())
+        last = mapod["after_each_board"][-1]
         print(
-            f"simulated {simulated.statement.a90:.2f}, truth {truth_mm:.2f}, {last}, quoted {said['a90_95']}"
+            f"simulated {simulated.statement.a90:.2f}, truth {truth_mm:.2f}, {last}, quoted "
+            f"{mapod['a90_95']}"
         )
-        assert said["counted_otherwise"] == ""
+        assert mapod["counted_otherwise"] == ""
         assert truth_mm <= last["a90_95"] < 2 * truth_mm
-        assert truth_mm <= said["a90_95"] < 2 * truth_mm
+        assert truth_mm <= mapod["a90_95"] < 2 * truth_mm
         assert (
             simulated.statement.a90 < last["a90"]
-            and simulated.statement.bound.value < said["a90_95"]
+            and simulated.statement.bound.value < mapod["a90_95"]
         )
 
 
@@ -361,7 +376,7 @@ def test_mistakes_are_explained(
 ):
     planned = plan.design  # whose simulated studies are most of the time
     monkeypatch.setattr(
-        plan, "design", lambda *given, **how: planned(*given, **how | {"studies": 10})
+        plan, "design", lambda *arguments, **how: planned(*arguments, **how | {"studies": 10})
     )
     base = [] if "--diameters" in wrong else ["--diameters", "2:12"]
     assert gauge.main([*base, *wrong, "--targets", "24", "--out", str(tmp_path / "none")]) == 2

@@ -36,11 +36,11 @@ def test_many_real_targets_overrule_the_simulation(log_size: bool):
     curve = simulated(log_size)
     truth = wrong_by(curve, 1.6, 1.5)
     size = np.linspace(1.0, 25.0, 300)
-    found = campaign(size, np.random.default_rng(1).random(300) < truth.pod(size), curve)
-    last = found.steps()[-1]
+    step = campaign(size, np.random.default_rng(1).random(300) < truth.pod(size), curve)
+    last = step.steps()[-1]
     assert last.a50 == pytest.approx(truth.size_at(0.5), rel=0.1)
     assert last.a90 == pytest.approx(truth.size_at(0.9), rel=0.1)
-    assert found.agreement() < 0.01
+    assert step.agreement() < 0.01
 
 
 def test_without_real_targets_the_prior_remains():
@@ -66,13 +66,13 @@ def test_agreement_is_as_rare_as_it_says():
 
 def test_a_rise_steeper_than_the_simulated_one_is_credited_only_within_the_study_s_uncertainty():
     size = np.linspace(1.0, 12.0, 60)
-    known, hardly_known = (
+    certain, hardly_known = (
         campaign(
             size, size > 5.0, replace(simulated(), covariance=np.diag([1e-6, sigma**2]))
         ).steps()[-1]
         for sigma in (1e-3, 0.6 * simulated().sigma)
     )
-    assert hardly_known.a90 - hardly_known.a50 < 1.4 < 1.8 < known.a90 - known.a50
+    assert hardly_known.a90 - hardly_known.a50 < 1.4 < 1.8 < certain.a90 - certain.a50
 
 
 @pytest.mark.slow
@@ -80,7 +80,8 @@ def test_a_rise_steeper_than_the_simulated_one_is_credited_only_within_the_study
     "curve", [curve_through(4.0, 5.0, log_size=True), curve_through(4.0, 5.0, "cloglog")]
 )
 def test_the_limit_covers_the_truth_whatever_the_camera(curve: PodCurve):
-    """100 campaigns of 24 holes know a share of 0.98 to 0.014; the docs' table has 300 of a case."""
+    """100 campaigns of 24 holes know a share of 0.98 to 0.014; the docs' table has 300 of a
+    case."""
     cases = list(product((1.0, 1.25, 1.5, 2.0), (0.6, 1.0, 1.6)))
     rows = coverage(curve, cases, 24, campaigns=100)
     print("\n".join(map(str, rows)))
@@ -104,16 +105,16 @@ def test_the_program_corrects_a_study(
     ]
     table = tmp_path / "real.csv"
     table.write_text("\n".join(["size,found,board", *rows]) + "\n")
-    given = [str(table), "--size", "size", "--hit", "found", "--unit", "mm"]
+    arguments = [str(table), "--size", "size", "--hit", "found", "--unit", "mm"]
     prior = ["--prior", str(tmp_path), "--board", "board", "--out", str(tmp_path / "out")]
-    assert pod.main([*given, *prior]) == 0
-    said = json.loads((tmp_path / "out" / "mapod.json").read_text())
+    assert pod.main([*arguments, *prior]) == 0
+    mapod = json.loads((tmp_path / "out" / "mapod.json").read_text())
     printed = capsys.readouterr().out
     assert printed.startswith("warning:") and "real.csv does not state" in printed.splitlines()[0]
     assert "simulated" in printed and "measured" in printed and "combined" in printed
-    assert [step["board"] for step in said["after_each_board"]] == ["none", "A", "B"]
-    assert [step["targets"] for step in said["after_each_board"]] == [0, 12, 24]
-    assert said["a90_95"] > truth.size_at(0.9) > said["simulated"]["a90"]
+    assert [step["board"] for step in mapod["after_each_board"]] == ["none", "A", "B"]
+    assert [step["targets"] for step in mapod["after_each_board"]] == [0, 12, 24]
+    assert mapod["a90_95"] > truth.size_at(0.9) > mapod["simulated"]["a90"]
     assert (tmp_path / "out" / "mapod.html").read_text().count("<svg") == 1
 
     request.getfixturevalue("unsaved")
@@ -130,7 +131,7 @@ def test_the_program_corrects_a_study(
     ):
         head = "size,found,board,detector,threshold,hit_radius_mm"
         table.write_text("\n".join([head, *(f"{row},{counted}" for row in rows)]) + "\n")
-        assert pod.main([*given, *prior]) == 0
+        assert pod.main([*arguments, *prior]) == 0
         first = capsys.readouterr().out.splitlines()[0]
         assert first.startswith("warning:") == bool(word) and word in first
         assert (
@@ -145,6 +146,6 @@ def test_the_program_corrects_a_study(
         (["--prior", str(tmp_path), "--target", "board"], "one size"),
         (["--prior", str(tmp_path / "no")], "no"),
     ):
-        assert pod.main([*given, *wrong, "--out", str(tmp_path / "none")]) == 2
+        assert pod.main([*arguments, *wrong, "--out", str(tmp_path / "none")]) == 2
         assert word in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

@@ -27,12 +27,12 @@ def test_rate_per_area_by_poisson() -> None:
 def test_threshold_of_a_hundred_runs_by_hand() -> None:
     """99 runs, wanted P(call) = 1 - exp(-0.07) = 0.0676: six of a hundred may lie above, so five
     of the 99 do."""
-    found = threshold_for_rate(
+    threshold = threshold_for_rate(
         np.random.default_rng(3).permutation(99.0 * np.arange(99)), 0.07, 1.0
     )
-    assert (found.value, found.calling_runs, found.runs) == (99.0 * 93, 5, 99)
-    assert found.rate_per_m2 == pytest.approx(-np.log(0.94) / 0.07)
-    assert found.upper_per_m2 == pytest.approx(-np.log1p(-stats.beta.ppf(0.95, 6, 94)) / 0.07)
+    assert (threshold.value, threshold.calling_runs, threshold.runs) == (99.0 * 93, 5, 99)
+    assert threshold.rate_per_m2 == pytest.approx(-np.log(0.94) / 0.07)
+    assert threshold.upper_per_m2 == pytest.approx(-np.log1p(-stats.beta.ppf(0.95, 6, 94)) / 0.07)
 
 
 def test_threshold_keeps_the_rate_on_new_runs() -> None:
@@ -49,9 +49,9 @@ def test_threshold_keeps_the_rate_on_new_runs() -> None:
             rng.exponential(size=count).max(initial=-np.inf)
             for count in rng.poisson(6 * area, runs)
         ]
-        found = threshold_for_rate(highest, area, 1.0)
-        probability.append(-np.expm1(-6 * np.exp(-max(found.value, 0.0)) * area))
-        wanted.append(-np.expm1(-found.rate_per_m2 * area))
+        threshold = threshold_for_rate(highest, area, 1.0)
+        probability.append(-np.expm1(-6 * np.exp(-max(threshold.value, 0.0)) * area))
+        wanted.append(-np.expm1(-threshold.rate_per_m2 * area))
     assert np.allclose(wanted, 2 / 41)
     error = np.std(probability) / np.sqrt(300)
     assert abs(np.mean(probability) - 2 / 41) < 3.3 * error
@@ -75,9 +75,12 @@ def test_places_of_sizes() -> None:
 
 
 def test_more_targets_demonstrate_smaller_sizes() -> None:
-    few, many = design(GUESS, (30, 120), (1, 80), studies=40)
-    assert few.true_size == many.true_size == pytest.approx(10 + 2 * np.log(9))
-    assert many.low <= many.bound <= many.high and many.bound < few.bound
+    few_targets, many_targets = design(GUESS, (30, 120), (1, 80), studies=40)
+    assert few_targets.true_size == many_targets.true_size == pytest.approx(10 + 2 * np.log(9))
+    assert (
+        many_targets.low <= many_targets.bound <= many_targets.high
+        and many_targets.bound < few_targets.bound
+    )
 
 
 def test_a_plan_is_repeatable_and_independent_of_its_company() -> None:

@@ -30,7 +30,8 @@ def hits(sizes: np.ndarray = SIZES, seed: int = 4) -> np.ndarray:
 def table(path: Path, **columns: Any) -> Path:
     rows = zip(*columns.values(), strict=True)
     path.write_text(
-        "\n".join([",".join(columns), *(",".join(str(one) for one in row) for row in rows)]) + "\n"
+        "\n".join([",".join(columns), *(",".join(str(value) for value in row) for row in rows)])
+        + "\n"
     )
     return path
 
@@ -40,7 +41,7 @@ def stated(folder: Path) -> dict[str, Any]:
 
 
 # ---- what it says
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -62,36 +63,37 @@ def test_the_handbooks_hits_and_misses(
         "--no-log",
     ]
     assert main([file, *asked, "--out", str(tmp_path)]) == 0
-    said = stated(tmp_path)
+    statement = stated(tmp_path)
     printed = capsys.readouterr().out
-    assert said["results_version"] == RESULTS_VERSION
-    assert (said["a50"], said["a90"]) == pytest.approx((0.1156, 0.1709), abs=5e-5)
-    assert said["a90_95"]["size"] == pytest.approx(0.1974, abs=5e-5)
-    assert said["a90_95"]["method"] == "likelihood ratio"
-    assert (said["inspections"], said["targets"], said["hits"]) == (134, 134, 92)
-    by_log = next(row for row in said["models"] if row["model"] == "logit, ln size")
+    assert statement["results_version"] == RESULTS_VERSION
+    assert (statement["a50"], statement["a90"]) == pytest.approx((0.1156, 0.1709), abs=5e-5)
+    assert statement["a90_95"]["size"] == pytest.approx(0.1974, abs=5e-5)
+    assert statement["a90_95"]["method"] == "likelihood ratio"
+    assert (statement["inspections"], statement["targets"], statement["hits"]) == (134, 134, 92)
+    by_log = next(row for row in statement["models"] if row["model"] == "logit, ln size")
     assert by_log["a90_95"]["size"] == pytest.approx(0.2106, abs=5e-5)
-    deviances = [row["deviance"] for row in said["models"]]
+    deviances = [row["deviance"] for row in statement["models"]]
     assert deviances == sorted(deviances)
     assert len(deviances) == 8
     assert "A flaw of 0.20 inch is found" in printed
-    assert [row["model"] for row in said["models"] if row["chosen"]] == ["logit, size"]
+    assert [row["model"] for row in statement["models"] if row["chosen"]] == ["logit, size"]
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_handbooks_signals(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """MIL-HDBK-1823A example 1: a50 8.8, a90 12.69, a90/95 13.68 with the signal against ln size."""
+    """MIL-HDBK-1823A example 1: a50 8.8, a90 12.69, a90/95 13.68 with the signal against ln
+    size."""
     file = str(shared_data / "pod" / "example1_ahat.csv")
     limits = ["--left", "50", "--right", "1375", "--decision", "200"]
     asked = ["--ahat", "Test B", "--size", "size", *limits, "--log", "--no-log-signal"]
     assert main([file, *asked, "--out", str(tmp_path)]) == 0
-    said = stated(tmp_path)
-    assert said["a50"] == pytest.approx(8.80, abs=0.005)
-    assert said["a90"] == pytest.approx(12.69, abs=0.005)
-    assert said["a90_95"]["size"] == pytest.approx(13.68, abs=0.005)
-    assert said["numbers"]["mu"] == pytest.approx(2.175, abs=5e-4)
+    statement = stated(tmp_path)
+    assert statement["a50"] == pytest.approx(8.80, abs=0.005)
+    assert statement["a90"] == pytest.approx(12.69, abs=0.005)
+    assert statement["a90_95"]["size"] == pytest.approx(13.68, abs=0.005)
+    assert statement["numbers"]["mu"] == pytest.approx(2.175, abs=5e-4)
     assert "A flaw of 14 is found" in capsys.readouterr().out
 
 
@@ -99,10 +101,10 @@ def test_the_handbooks_signals(
 def test_without_a_choice_the_least_deviance_decides(tmp_path: Path) -> None:
     file = table(tmp_path / "a.csv", size=SIZES, hit=hits())
     assert main([str(file), "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
-    said = stated(tmp_path)
-    assert said["models"][0]["chosen"]
-    assert said["model"] == min(said["models"], key=lambda row: row["deviance"])["model"]
-    assert said["a50"] < said["a90"] < said["a90_95"]["size"]
+    statement = stated(tmp_path)
+    assert statement["models"][0]["chosen"]
+    assert statement["model"] == min(statement["models"], key=lambda row: row["deviance"])["model"]
+    assert statement["a50"] < statement["a90"] < statement["a90_95"]["size"]
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -112,25 +114,29 @@ def test_the_limit_is_the_largest_of_the_models_that_fit_about_as_well(tmp_path:
     sizes = np.linspace(0.5, 10.0, 400)
     file = str(table(tmp_path / "a.csv", size=sizes, hit=hits(sizes)))
     assert main([file, "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
-    said = stated(tmp_path)
+    statement = stated(tmp_path)
     page = (tmp_path / "pod.html").read_text()
-    near = [row for row in said["models"] if row["deviance"] <= said["models"][0]["deviance"] + 2]
+    close_models = [
+        row
+        for row in statement["models"]
+        if row["deviance"] <= statement["models"][0]["deviance"] + 2
+    ]
     assert (
-        1 < len(near) < len(said["models"])
-        and [row for row in said["models"] if row["in_a90_95"]] == near
+        1 < len(close_models) < len(statement["models"])
+        and [row for row in statement["models"] if row["in_a90_95"]] == close_models
     )
-    assert said["a90_95"]["size"] == max(row["a90_95"]["size"] for row in near)
+    assert statement["a90_95"]["size"] == max(row["a90_95"]["size"] for row in close_models)
     assert (
-        f"{len(near)} models are within 2 of the least" in page
-        and page.count("(compared)") == len(near) - 1
+        f"{len(close_models)} models are within 2 of the least" in page
+        and page.count("(compared)") == len(close_models) - 1
     )
     alone = [
         "--link",
-        near[0]["model"].partition(",")[0],
-        "--log" if "ln" in near[0]["model"] else "--no-log",
+        close_models[0]["model"].partition(",")[0],
+        "--log" if "ln" in close_models[0]["model"] else "--no-log",
     ]
     assert main([file, "--hit", "hit", "--size", "size", *alone, "--out", str(tmp_path)]) == 0
-    assert stated(tmp_path)["a90_95"]["size"] == near[0]["a90_95"]["size"]
+    assert stated(tmp_path)["a90_95"]["size"] == close_models[0]["a90_95"]["size"]
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -138,14 +144,14 @@ def test_limits_that_hang_on_the_model_are_warned_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Twenty targets do not tell links apart."""
-    few = table(tmp_path / "few.csv", size=SIZES[::3], hit=hits(SIZES[::3]))
-    assert main([str(few), "--size", "size", "--hit", "hit", "--out", str(tmp_path)]) == 0
+    sparse = table(tmp_path / "few.csv", size=SIZES[::3], hit=hits(SIZES[::3]))
+    assert main([str(sparse), "--size", "size", "--hit", "hit", "--out", str(tmp_path)]) == 0
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith("warning: ") and "a90/95 differ" in first
-    near = [
+    limits = [
         row["a90_95"]["size"] or np.inf for row in stated(tmp_path)["models"] if row["in_a90_95"]
     ]
-    assert max(near) > 1.05 * min(near) and len(stated(tmp_path)["warnings"]) == 1
+    assert max(limits) > 1.05 * min(limits) and len(stated(tmp_path)["warnings"]) == 1
     assert "a90/95 differ" in (tmp_path / "pod.html").read_text()
 
 
@@ -162,9 +168,9 @@ def test_repeats_are_not_targets(tmp_path: Path, capsys: pytest.CaptureFixture[s
     file = str(table(tmp_path / "many.csv", **repeated))
     asked = ["--hit", "hit", "--size", "size", "--link", "logit", "--no-log", "--target", "hole"]
     assert main([file, *asked, "--out", str(tmp_path)]) == 0
-    said = stated(tmp_path)
-    assert said["a90_95"]["size"] == pytest.approx(once.bound.value, rel=1e-6)
-    assert (said["inspections"], said["targets"]) == (300, 60)
+    statement = stated(tmp_path)
+    assert statement["a90_95"]["size"] == pytest.approx(once.bound.value, rel=1e-6)
+    assert (statement["inspections"], statement["targets"]) == (300, 60)
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -194,12 +200,14 @@ def test_what_is_not_demonstrated_is_said(
 )
 def test_the_band_reaches_90_percent_at_the_limit(tmp_path: Path, model: dict) -> None:
     read = read_inspections(table(tmp_path / "a.csv", size=SIZES, hit=hits()), "size", ["hit"])
-    said = state_hits(read, **model)
-    lower, upper = said.band
+    statement = state_hits(read, **model)
+    lower, upper = statement.band
     rising = np.maximum.accumulate(lower)
-    assert float(np.interp(0.9, rising, said.sizes)) == pytest.approx(said.bound.value, rel=2e-3)
-    assert np.all(lower <= said.curve.pod(said.sizes) + 1e-9)
-    assert np.all(said.curve.pod(said.sizes) <= upper + 1e-9)
+    assert float(np.interp(0.9, rising, statement.sizes)) == pytest.approx(
+        statement.bound.value, rel=2e-3
+    )
+    assert np.all(lower <= statement.curve.pod(statement.sizes) + 1e-9)
+    assert np.all(statement.curve.pod(statement.sizes) <= upper + 1e-9)
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -208,8 +216,8 @@ def test_a_ceiling_that_the_data_ask_for(
 ) -> None:
     """A fifth of the targets is hidden and never found: the first line says so."""
     sizes = np.linspace(0.5, 12.0, 200)
-    seen = hits(sizes) & (np.arange(200) % 5 != 0)
-    file = table(tmp_path / "a.csv", size=sizes, hit=seen)
+    is_found = hits(sizes) & (np.arange(200) % 5 != 0)
+    file = table(tmp_path / "a.csv", size=sizes, hit=is_found)
     asked = [
         str(file),
         "--hit",
@@ -223,12 +231,14 @@ def test_a_ceiling_that_the_data_ask_for(
         str(tmp_path),
     ]
     assert main(asked) == 0
-    ceiling = next(one for one in stated(tmp_path)["tests"] if one["test"].startswith("a ceiling"))
+    ceiling = next(
+        test for test in stated(tmp_path)["tests"] if test["test"].startswith("a ceiling")
+    )
     assert ceiling["p"] < 0.01
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert (
         "warning: the curve has no floor or ceiling, and the data suggest "
-        in said.partition(str(file))[0]
+        in printed.partition(str(file))[0]
     )
     assert "warning: the curve has no floor or ceiling" in (tmp_path / "pod.html").read_text()
 
@@ -272,10 +282,10 @@ def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixtu
     ]
     file = str(table(tmp_path / "a.csv", **repeated))
     assert main([file, *asked, "--no-log-signal", "--out", str(tmp_path)]) == 0
-    said = stated(tmp_path)
-    assert said["a90_95"]["size"] == pytest.approx(once.bound.value, rel=1e-5)
-    assert said["a50"] < said["a90"] < said["a90_95"]["size"]
-    assert said["a90"] == pytest.approx(4 + 0.8 * 1.2816, rel=0.05)
+    statement = stated(tmp_path)
+    assert statement["a90_95"]["size"] == pytest.approx(once.bound.value, rel=1e-5)
+    assert statement["a50"] < statement["a90"] < statement["a90_95"]["size"]
+    assert statement["a90"] == pytest.approx(4 + 0.8 * 1.2816, rel=0.05)
     assert float(np.interp(0.9, once.band[0], once.sizes)) == pytest.approx(
         once.bound.value, rel=2e-3
     )
@@ -287,8 +297,10 @@ def test_unflawed_sites_give_the_probability_of_a_false_positive(tmp_path: Path)
     = 0.62 %."""
     noise = np.random.default_rng(3).normal(150, 100, 2000)
     sizes = np.concatenate([np.linspace(1, 10, 50), np.zeros(2000)])
-    both = np.concatenate([signals(np.linspace(1, 10, 50)), noise])
-    file = table(tmp_path / "a.csv", size=sizes, signal=both, hit=(both > 400).astype(int))
+    responses = np.concatenate([signals(np.linspace(1, 10, 50)), noise])
+    file = table(
+        tmp_path / "a.csv", size=sizes, signal=responses, hit=(responses > 400).astype(int)
+    )
     asked = ["--ahat", "signal", "--decision", "400", "--left", "50", "--no-log", "--no-log-signal"]
     assert main([str(file), "--size", "size", *asked, "--out", str(tmp_path)]) == 0
     numbers = stated(tmp_path)["numbers"]
@@ -339,7 +351,7 @@ def test_small_studies_and_separation_are_noted(
 
 
 # ---- what it writes
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_same_input_same_bytes(tmp_path: Path) -> None:
@@ -386,7 +398,7 @@ def test_drawn_sizes_hold_data_and_near_marks() -> None:
 
 
 # ---- what it reads
-# ---------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
@@ -499,11 +511,11 @@ def test_a_sheet_of_excel_reads_as_its_csv(
         book.active.append([None, *row])
     book.create_sheet("empty")
     book.save(tmp_path / "a.xlsx")
-    found = read_inspections(tmp_path / "a.xlsx", "size", ["hit"])
+    read = read_inspections(tmp_path / "a.xlsx", "size", ["hit"])
     same = read_inspections(table(tmp_path / "a.csv", size=SIZES, hit=hits()), "size", ["hit"])
-    assert found.size == pytest.approx(same.size, rel=1e-14)
-    assert found.response.tolist() == same.response.tolist()
-    assert found.unflawed.tolist() == [1.0]
+    assert read.size == pytest.approx(same.size, rel=1e-14)
+    assert read.response.tolist() == same.response.tolist()
+    assert read.unflawed.tolist() == [1.0]
     book["empty"].append(["size"])
     book.save(tmp_path / "a.xlsx")
     assert main([str(tmp_path / "a.xlsx"), *HIT, "--out", str(tmp_path / "out")]) == 2
@@ -515,7 +527,7 @@ HIT = ["--size", "a", "--hit", "hit"]
 
 
 @pytest.mark.parametrize(
-    ("text", "asked", "said"),
+    ("text", "asked", "message_parts"),
     [
         (GOOD, ["--size", "b", "--hit", "hit"], ["no column 'b'", "'a', 'hit', 't'"]),
         (GOOD, ["--size", "a", "--hit", "Hits"], ["no column 'Hits'", "did you mean 'hit'?"]),
@@ -568,14 +580,18 @@ HIT = ["--size", "a", "--hit", "hit"]
     ],
 )
 def test_mistakes_are_explained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, asked: list[str], said: list[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
+    asked: list[str],
+    message_parts: list[str],
 ) -> None:
     file = tmp_path / "a.csv"
     file.write_text(text)
     assert main([str(file), *asked, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
-    for part in said:
+    for part in message_parts:
         assert part in error
     assert not (tmp_path / "out").exists()
 
@@ -586,14 +602,14 @@ def test_a_folder_a_missing_file_and_no_table(
     (tmp_path / "zeros.csv").write_bytes(bytes(100))
     (tmp_path / "broken.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
     excel = "Excel file"
-    for name, said in (
+    for name, message in (
         ("none.csv", "no such file"),
         (".", "is a directory"),
         ("zeros.csv", "not a text file"),
         ("broken.xlsx", excel),
     ):
         assert main([str(tmp_path / name), *HIT, "--out", str(tmp_path / "out")]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
 def test_detection_that_falls_with_size_is_refused(

@@ -41,12 +41,12 @@ def results(out: Path, digest: str, name: str = "study", records: int = 0, **sai
     for number in range(records):
         journal.write(f"damaged-{number:05d}-{number:016x}", Ended("done", value='{"runs":[]}'))
     if said:
-        whole = {
+        complete = {
             "results_version": RESULTS_VERSION,
             "started": "2026-11-21T10:00:00+00:00",
             "commit": "abcdef0123",
         }
-        (folder / "provenance.json").write_text(json.dumps({**whole, "dirty": True, **said}))
+        (folder / "provenance.json").write_text(json.dumps({**complete, "dirty": True, **said}))
         (folder / "report.html").write_text("<html>")
     return folder
 
@@ -163,9 +163,9 @@ def cache(tmp_path: Path) -> Path:
         if letter == "c":
             path.write_bytes(path.read_bytes()[:-50])
         os.utime(path, (time.time() - days * DAY_S,) * 2)
-    left = folder / f".{'d' * 16}.abcd1234.part.npz"
-    left.write_bytes(b"x")
-    os.utime(left, (time.time() - 2 * DAY_S,) * 2)
+    left_over = folder / f".{'d' * 16}.abcd1234.part.npz"
+    left_over.write_bytes(b"x")
+    os.utime(left_over, (time.time() - 2 * DAY_S,) * 2)
     (folder / "mine.txt").write_text("mine")
     return folder
 
@@ -185,7 +185,10 @@ def test_the_cache_is_counted(cache, tmp_path, capsys):
 def test_what_tells_runs_apart_and_the_limits_found_are_listed(tmp_path, capsys):
     for digest, frames, size in (("0" * 16, 1, "5.314"), ("1" * 16, 50, "")):
         folder = results(tmp_path, digest, trials={"done": 5})
-        settings = f"name: study\ncapture: {{frames: {frames}}}\nseed: 3\nsource: {{target: {{distance_m: 0.{frames}}}}}\n"
+        settings = (
+            f"name: study\ncapture: {{frames: {frames}}}\nseed: 3\nsource: {{target: "
+            f"{{distance_m: 0.{frames}}}}}\n"
+        )
         (folder / "experiment.yaml").write_text(f"# tofpod experiment 1\n{settings}")
         rows = f'"far, {frames} frames",{size},{"demonstrated" if size else "not demonstrated"}\n'
         rows += "near,3.2,demonstrated\n" if size else ""
@@ -303,8 +306,8 @@ def test_renders_go_by_size(cache, tmp_path, capsys, arguments, kept):
     assert clean.main(["cache", *arguments, "--yes", "--out", str(tmp_path)]) == 0
     leftover = {f".{'d' * 16}.abcd1234.part.npz"} if "--dry-run" in arguments else set()
     assert left_in(cache) == {"mine.txt", *(f"{letter * 16}.npz" for letter in kept), *leftover}
-    said = capsys.readouterr().out
-    assert ("would remove 4 stored renders" in said) == ("--dry-run" in arguments)
+    printed = capsys.readouterr().out
+    assert ("would remove 4 stored renders" in printed) == ("--dry-run" in arguments)
 
 
 def test_a_cache_in_use_is_refused(cache, tmp_path, capsys):
@@ -456,7 +459,8 @@ def test_what_is_no_size(text):
 
 def test_help_of_clean_loads_nothing_heavy():
     code = (
-        "import sys; sys.argv = ['x', '--help']\nimport harness.programs.keeping.clean as program\n"
+        "import sys; sys.argv = ['x', '--help']\nimport harness.programs.keeping.clean as "
+        "program\n"
         "try: program.main()\nexcept SystemExit as end: assert end.code == 0\n"
         "heavy = {'mitsuba', 'numpy', 'scipy', 'numba', 'pandas', 'pydantic'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
@@ -467,8 +471,8 @@ def test_help_of_clean_loads_nothing_heavy():
 
 def test_the_reference_has_every_key_of_experiments_and_the_site_every_page(capsys):
     assert ls.main(["keys"]) == 0
-    told = capsys.readouterr().out
-    for place, keys in (
+    printed = capsys.readouterr().out
+    for position, keys in (
         ("## Experiments\n", ("name", "source", "study", "sweep")),
         (
             "### `source[kind=simulated].target[name=drawn].damage[kind=blind]`\n",
@@ -480,10 +484,10 @@ def test_the_reference_has_every_key_of_experiments_and_the_site_every_page(caps
             tuple(detector_type("matched").settings_type.model_fields),
         ),
     ):
-        section = told.partition(place)[2].partition("\n#")[0]
-        assert section and all(f"\n| `{key}` |" in section for key in keys), place
-    assert "| `per_board` | a whole number from 1 to" in told and "required" in told
-    made = {"index.md", "reference.md", "contributing.md"}
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | made
+        section = printed.partition(position)[2].partition("\n#")[0]
+        assert section and all(f"\n| `{key}` |" in section for key in keys), position
+    assert "| `per_board` | a whole number from 1 to" in printed and "required" in printed
+    created = {"index.md", "reference.md", "contributing.md"}
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | created
     listed = set(re.findall(r"[a-z_]+\.md", (ROOT / "mkdocs.yml").read_text()))
     assert listed == pages

@@ -150,8 +150,8 @@ def test_all_mistakes_are_told_at_once(tmp_path):
 )
 @settings(max_examples=60, deadline=None)
 def test_limits_are_the_bound_and_its_tolerance(kind, bound, tolerance, simulated):
-    told = {"above": bound, "below": bound + 1} if kind == "between" else {kind: bound}
-    low, high = Published.from_data({**told, "tolerance": tolerance}).limits(0.0, tolerance)
+    bounds = {"above": bound, "below": bound + 1} if kind == "between" else {kind: bound}
+    low, high = Published.from_data({**bounds, "tolerance": tolerance}).limits(0.0, tolerance)
     expected = {
         "value": abs(simulated - bound) <= tolerance,
         "below": simulated <= bound + tolerance,
@@ -168,17 +168,17 @@ def test_a_negative_tolerance_is_refused():
 
 
 # ---- the judgement
-# ---------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_verdicts(tmp_path):
     wall, neighbours = read_figures(written(tmp_path))
-    known = wall.model_copy(update={"fails": "the wall is not known"})
+    failing = wall.model_copy(update={"fails": "the wall is not known"})
     for figure, simulated, verdict in (
         (wall, Reading(1.11), "pass"),
         (wall, Reading(1.12), "FAIL (new)"),
-        (known, Reading(1.12), "fail"),
-        (known, NOTHING, "fail"),
+        (failing, Reading(1.12), "fail"),
+        (failing, NOTHING, "fail"),
         (neighbours, Reading(0.7), "pass"),
     ):
         score = Score(figure, simulated)
@@ -240,7 +240,7 @@ def test_numbers_have_three_digits(value, text):
 
 
 # ---- measuring
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
@@ -255,15 +255,15 @@ def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
     quantity = QUANTITIES["temporal_sigma_mm"]
     requests = [(AZURE, quantity.name, quantity.conditions(albedo=albedo)) for albedo in (0.1, 0.3)]
     requests += [figure.request for figure in read_figures(written(tmp_path))]
-    one = measured(requests, QUICK, jobs=1)
+    in_one_process = measured(requests, QUICK, jobs=1)
     two = measured(tuple(reversed(requests)), QUICK, jobs=2)
-    assert set(one) == set(two) == set(requests)
+    assert set(in_one_process) == set(two) == set(requests)
     for request in requests:
-        assert repr(one[request]) == repr(two[request]), request
+        assert repr(in_one_process[request]) == repr(two[request]), request
 
 
 # ---- the program
-# -----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
@@ -275,10 +275,10 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
     options = ["--jobs", "1", "--camera", AZURE]
     options += ["--figures", str(figures), "--out", str(out)]
     assert main(options) == 0
-    told = capsys.readouterr()
-    assert "temporal deviation, 1.5 m, albedo 0.8" in told.out
+    printed = capsys.readouterr()
+    assert "temporal deviation, 1.5 m, albedo 0.8" in printed.out
     # on a slow machine progress is told meanwhile
-    assert all(line.startswith("measured ") for line in told.err.splitlines())
+    assert all(line.startswith("measured ") for line in printed.err.splitlines())
     page = (out / "scorecard.html").read_text()
     assert f'<meta name="generator" content="{GENERATOR}">' in page
     assert page.count("<svg") == 1 and "http" not in page.replace("http://www.w3.org", "")
@@ -294,8 +294,8 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
         GOOD.replace("{value: 0.89, tolerance: 0.06}", "{value: 2.0, tolerance: 0.06}")
     )
     assert main(options) == 1
-    told = capsys.readouterr()
-    assert "wall (temporal deviation" in told.err and "neighbours (" not in told.err
+    printed = capsys.readouterr()
+    assert "wall (temporal deviation" in printed.err and "neighbours (" not in printed.err
 
     figures.write_text(GOOD.replace("source: a filter", "source: a filter\n    fails: it did once"))
     assert main(options) == 0
@@ -327,12 +327,10 @@ def test_a_mistake_of_the_user_is_one_message_and_exit_code_2(
 
 def test_help_is_instant():
     code = (
-        "import sys; sys.argv = ['x', '--help']\n"
-        "import harness.programs.scorecard.validate as program\n"
-        "try: program.main()\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "heavy = {'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2', 'numpy'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "import sys; sys.argv = ['x', '--help']\nimport harness.programs.scorecard.validate as "
+        "program\ntry: program.main()\nexcept SystemExit as end: assert end.code == 0\nheavy = "
+        "{'mitsuba', 'drjit', 'open3d', 'matplotlib', 'pandas', 'scipy', 'numba', 'av', 'cv2', "
+        "'numpy'}\nassert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

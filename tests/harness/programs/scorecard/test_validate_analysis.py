@@ -35,7 +35,7 @@ PINHOLE = camera_of(
 
 
 # ---- temporal noise
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def white(frames: int, shape: tuple[int, int], sigma: float, seed: int = 3) -> np.ndarray:
@@ -77,8 +77,8 @@ def test_jackknife_interval_covers_as_stated():
         # all pixels share half of the variance, so an interval from independent pixels would be
         # far too narrow
         z = rng.standard_normal((30, 4, 4)) + rng.standard_normal((30, 1, 1))
-        found = jackknifed(z, lambda s: temporal_sigma_m(s, np.ones((4, 4), bool)))
-        hits += found.interval.low <= np.sqrt(2) <= found.interval.high
+        reading = jackknifed(z, lambda s: temporal_sigma_m(s, np.ones((4, 4), bool)))
+        hits += reading.interval.low <= np.sqrt(2) <= reading.interval.high
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 200, 0.95)
     assert low <= hits <= high
 
@@ -95,7 +95,7 @@ def test_estimates_without_repeats_have_no_interval():
 
 
 # ---- edges
-# -----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def ideal_step(step: float = 0.1, columns: int = 40) -> tuple[np.ndarray, ...]:
@@ -148,7 +148,7 @@ def test_surfaces_that_noise_makes_one_are_not_told_apart(sigma_m, step_m):
 
 
 # ---- planes
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def two_walls(noise_m: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -166,14 +166,14 @@ def test_two_planes_are_found_with_their_pixels():
     """1 mm of noise over thousands of pixels: the distance is known to 0.1 mm."""
     z, slopes, board = two_walls()
     z[:5] = np.nan
-    found = find_planes(z, slopes, 8e-3, least_px=1000)
-    assert len(found) == 2
-    (wall, _), (near, on_board) = found
+    planes = find_planes(z, slopes, 8e-3, least_px=1000)
+    assert len(planes) == 2
+    (wall, _), (near, on_board) = planes
     assert (wall.distance_m, wall.slope_x) == pytest.approx((1.6, -0.4), abs=1e-3)
     assert (near.distance_m, near.slope_x) == pytest.approx((0.9, 0.1), abs=1e-3)
     assert (on_board == board)[5:].mean() > 0.999
     again = find_planes(z, slopes, 8e-3, least_px=1000)
-    assert all((one[1] == other[1]).all() for one, other in zip(found, again, strict=True))
+    assert all((first[1] == second[1]).all() for first, second in zip(planes, again, strict=True))
 
 
 def test_no_plane_in_a_ball_nor_in_nothing():
@@ -196,7 +196,7 @@ def test_a_plane_is_fitted_exactly(distance_m, slope_x, slope_y):
 
 
 # ---- views of steps
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 REGION = Region(300, 330, 280, 360)
 
@@ -206,7 +206,8 @@ def half(edge_slope: float, sign: float = 1.0):  # type: ignore[no-untyped-def]
 
 
 def test_a_front_that_is_everywhere_or_nowhere_is_a_plane():
-    """Averaging over the footprint turns the light by what z bends within a pixel: far below 1e-4."""
+    """Averaging over the footprint turns the light by what z bends within a pixel: far below
+    1e-4."""
     front = Plane(0.8, 0.1)
     back = Plane(1.1)
     for covers, plane in (
@@ -258,7 +259,7 @@ def test_the_shadow_is_as_wide_as_the_emitter_says():
 
 
 # ---- the bench
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

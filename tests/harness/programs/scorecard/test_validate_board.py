@@ -93,9 +93,9 @@ def test_the_drill_of_a_simulated_capture_is_found_again(recorded, capsys):
     ]
     out = recorded / "out"
     assert main(["--board", str(recorded / "known.yaml"), *options, "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "diameter=6 mm is closest" in told
-    assert "1.png is left out: the whole range jumps by +17.0 mm" in told
+    printed = capsys.readouterr().out
+    assert "diameter=6 mm is closest" in printed
+    assert "1.png is left out: the whole range jumps by +17.0 mm" in printed
     rows = list(csv.DictReader((out / "capture.csv").open()))
     right = [row for row in rows if row["where"].endswith("6 mm")]
     for row in right:

@@ -32,10 +32,10 @@ def recorded(folder: Path, view, frames: int = FRAMES) -> Path:
     nothing."""
     folder.mkdir()
     unit = SimulatedUnit(AZURE, CameraConfig(unit_seed=9, effects=NOISE), view)
-    place = unit.region.within(AZURE.nominal_lens.whole)
+    region = unit.region.within(AZURE.nominal_lens.whole)
     for number, frame in enumerate(unit.capture(frames, 77, "a recording").frames()):
         image = np.zeros((AZURE.nominal_lens.height, AZURE.nominal_lens.width), np.uint16)
-        image[place] = np.round(1e3 * np.nan_to_num(frame.z_m)).astype(np.uint16)
+        image[region] = np.round(1e3 * np.nan_to_num(frame.z_m)).astype(np.uint16)
         assert cv2.imwrite(str(folder / f"{number:03d}.png"), image)
     return folder
 
@@ -98,9 +98,9 @@ def test_the_edge_is_found_and_its_widths_agree(step):
     """The edge is placed by the middle of its gap, half of each pixel along it on either side;
     what the recording has beside that is the emitter's shadow behind the front, 2.4 pixels wide
     here, which narrows the gap."""
-    for figure, most in (("gap at an edge", 1.0), ("flying pixels", 0.5)):
+    for figure, limit in (("gap at an edge", 1.0), ("flying pixels", 0.5)):
         measured, simulated = pick(step, figure)
-        assert simulated == pytest.approx(measured, abs=most)
+        assert simulated == pytest.approx(measured, abs=limit)
     assert pick(step, "gap at an edge")[0] > 0.5
 
 
@@ -135,9 +135,9 @@ def test_a_mask_leaves_pixels_out(tmp_path):
 
 def refused(options: list[str], capsys) -> str:
     assert main(options) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("error: ") and "Traceback" not in told
-    return told
+    message = capsys.readouterr().err
+    assert message.startswith("error: ") and "Traceback" not in message
+    return message
 
 
 def test_one_frame_is_refused(tmp_path, capsys):
@@ -157,20 +157,21 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
     small.mkdir()
     for number in range(4):
         cv2.imwrite(str(small / f"{number}.png"), np.full((160, 200), 900 + number % 2, np.uint16))
-    told = refused(["--capture", str(small), "--intrinsics", str(lens)], capsys)
+    message = refused(["--capture", str(small), "--intrinsics", str(lens)], capsys)
     assert (
-        "no simulated camera has 200 x 160 pixels" in told and "azure_kinect_nfov 640 x 576" in told
+        "no simulated camera has 200 x 160 pixels" in message
+        and "azure_kinect_nfov 640 x 576" in message
     )
-    told = refused(
+    message = refused(
         ["--capture", str(small), "--intrinsics", str(lens), "--camera", "azure_kinect_nfov"],
         capsys,
     )
-    assert "the capture has 200 x 160 pixels, but azure_kinect_nfov has 640 x 576" in told
-    told = refused(
+    assert "the capture has 200 x 160 pixels, but azure_kinect_nfov has 640 x 576" in message
+    message = refused(
         ["--capture", str(capture), "--intrinsics", "azure_kinect_nfov", "--mask", str(lens)],
         capsys,
     )
-    assert "is not a readable image" in told and "neither PNG nor JPEG" in told
+    assert "is not a readable image" in message and "neither PNG nor JPEG" in message
 
 
 def test_nothing_flat_is_refused(tmp_path, capsys):
@@ -188,7 +189,7 @@ def test_nothing_flat_is_refused(tmp_path, capsys):
 
 
 # ---- real captures
-# ---------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

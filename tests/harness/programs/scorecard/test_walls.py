@@ -69,11 +69,11 @@ def patterned_stack(
 def test_a_planted_fixed_pattern_is_found_again(smooth_mm, pixel_mm):
     """Within 0.04 mm: three deviations of a field of some 400 patches of (2 l)^2 pixels. The
     surface takes the longest waves with it, which shortens the correlation by half a pixel."""
-    found = fixed_pattern(*patterned_stack(smooth_mm * 1e-3, 6.0, pixel_mm * 1e-3))
-    assert found.std_m * 1e3 == pytest.approx(np.hypot(smooth_mm, pixel_mm), abs=0.04)
-    assert max(white_before_m(found), 0) * 1e3 == pytest.approx(pixel_mm, abs=0.04)
+    pattern = fixed_pattern(*patterned_stack(smooth_mm * 1e-3, 6.0, pixel_mm * 1e-3))
+    assert pattern.std_m * 1e3 == pytest.approx(np.hypot(smooth_mm, pixel_mm), abs=0.04)
+    assert max(white_before_m(pattern), 0) * 1e3 == pytest.approx(pixel_mm, abs=0.04)
     if pixel_mm == 0:
-        assert length_px(found) == pytest.approx(5.6, abs=0.4)
+        assert length_px(pattern) == pytest.approx(5.6, abs=0.4)
 
 
 def test_covariance_and_correlation_by_hand():
@@ -86,8 +86,8 @@ def test_covariance_and_correlation_by_hand():
     assert covariance(d, where, 0, 1) == pytest.approx(
         ((3 - 2) / 2, ((1 + 4) / 2 + (9 + 1) / 2) / 2)
     )
-    found = [correlation(d, where, *lags) for lags in ((1, 0), (0, 1))]
-    assert found == pytest.approx([-2 / (41 / 6), 0.5 / 3.75])
+    correlations = [correlation(d, where, *lags) for lags in ((1, 0), (0, 1))]
+    assert correlations == pytest.approx([-2 / (41 / 6), 0.5 / 3.75])
 
 
 def test_common_jitter_is_taken_off_only_on_request():
@@ -152,8 +152,8 @@ def test_temporal_noise_is_as_smooth_as_on_the_walls(checks):
     With it the left wall's lag 5 differs by 0.103, all others by less than 0.1.
     """
     for check in checks:
-        own = check.correlation["measured", False] - check.correlation["simulated", False]
-        assert np.abs(own).max() < 0.1
+        difference = check.correlation["measured", False] - check.correlation["simulated", False]
+        assert np.abs(difference).max() < 0.1
         raw = check.correlation["measured", True] - check.correlation["simulated", True]
         assert np.abs(raw[:, :4]).max() < 0.1
         assert np.abs(raw).max() < 0.11
@@ -172,10 +172,10 @@ def test_real_frames_jitter_as_a_whole(checks):
 @pytest.mark.slow
 def test_the_files_fixed_pattern_is_that_of_the_walls(checks):
     """0.47 and 0.42 mm of the file's source, and 6.3 px within 1 px as the mean of both walls."""
-    left, right = (check.pattern for check in checks)
-    assert left.std_m * 1e3 == pytest.approx(0.47, abs=0.01)
+    measured, right = (check.pattern for check in checks)
+    assert measured.std_m * 1e3 == pytest.approx(0.47, abs=0.01)
     assert right.std_m * 1e3 == pytest.approx(0.42, abs=0.01)
-    assert np.mean([length_px(left), length_px(right)]) == pytest.approx(
+    assert np.mean([length_px(measured), length_px(right)]) == pytest.approx(
         FILE.smooth_length_px.value, abs=1.0
     )
 
