@@ -277,3 +277,17 @@ def test_lines_of_sight_meet_a_flat_face_where_they_should():
     np.testing.assert_allclose(
         met, points - (points[:, 2] / direction[:, 2])[:, None] * direction, atol=1e-15
     )
+
+
+def test_a_detection_without_return_that_hits_a_damage_is_no_false_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two places without a return, one is the second damage, the other is far from both."""
+    hit = Detection(1.0, np.array([2979, 2980]), np.array([30e-3, 0.0, 0.0]), kind="no return")
+    call = Detection(1.0, np.array([250, 251]), np.array([0.0, -25e-3, 0.0]), kind="no return")
+    missing = SimpleNamespace(detections=(hit, call))
+    monkeypatch.setattr("harness.trials.judge.missing_returns", lambda *_: missing)
+    judgement = judgement_of()
+    assert judgement.without_return == (frozenset({1}), 1)
+    hole_free = judgement_of(damaged=False)
+    assert hole_free.without_return == (frozenset(), 2)
