@@ -101,7 +101,7 @@ def _setting_in_words(part: str) -> str:
 
 
 def differing(value: Any, siblings: Iterable[Any]) -> Any:
-    """Return a mapping without the entries that all ``others`` share; return any other value
+    """Return a mapping without the entries that all ``siblings`` share; return any other value
     unchanged."""
     sibling_values = list(siblings)
     if not all(isinstance(item, dict) for item in (value, *sibling_values)):

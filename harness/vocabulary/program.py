@@ -86,7 +86,7 @@ def program(
 
 
 def whole_number(largest: int) -> Callable[[str], int]:
-    """Return a parser of whole numbers from 1 to ``most``."""
+    """Return a parser of whole numbers from 1 to ``largest``."""
 
     def parsed(text: str) -> int:
         if not (text.isascii() and text.isdigit()) or not 1 <= int(text) <= largest:

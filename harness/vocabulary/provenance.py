@@ -98,8 +98,8 @@ def check_version(
     oldest: int | None = None,
     again: str | None = None,
 ) -> int:
-    """Return a file's version if it lies between ``oldest`` (default: ``known``) and ``known``;
-    else raise UserError. ``what`` names the kind of file, such as "a record"; ``again`` says how
+    """Return a file's version if it lies between ``oldest`` (default: ``newest``) and ``newest``;
+    else raise UserError. ``noun`` names the kind of file, such as "a record"; ``again`` says how
     to make an outdated file again."""
     first = newest if oldest is None else oldest
     legal = f"version {newest}" if first == newest else f"versions {first} to {newest}"

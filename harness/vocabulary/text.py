@@ -44,7 +44,7 @@ def plus_minus(mean: float, std: float, sign: str = "") -> str:
 
 
 def size(value: float, largest: float = np.inf) -> str:
-    """Return a limit in mm with two digits; ``> 15.9`` beyond the largest inspected, ``most``;
+    """Return a limit in mm with two digits; ``> 15.9`` beyond the largest inspected, ``largest``;
     ``none`` for NaN."""
     if np.isnan(value) or value > largest:
         return "none" if np.isnan(value) else f">\u00a0{largest:.3g}"
@@ -72,8 +72,8 @@ def p_value(p: float) -> str:
 
 
 def interval(low: float, high: float, digits: int = 2, largest: float = np.inf) -> str:
-    """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` if an end lies beyond ``most``; ``unknown``
-    without interval."""
+    """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` if an end lies beyond ``largest``;
+    ``unknown`` without interval."""
     if np.isnan(low) or np.isnan(high):
         return "unknown"
     return " to ".join(_number(end, digits, largest) for end in (low, high))
@@ -83,7 +83,7 @@ def with_interval(
     value: float, low: float, high: float, digits: int = 2, largest: float = np.inf
 ) -> str:
     """Return ``5.1 (4.8 to 5.6)``, or only the estimate if its interval is unknown or beyond
-    ``most``. Numbers have at most ``digits`` decimals. They have two significant digits if the
+    ``largest``. Numbers have at most ``digits`` decimals. They have two significant digits if the
     interval is wider than `ROUGH` times the value (or times its upper end if the value is 0)."""
     if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > largest:
         return _number(value, digits, largest)

@@ -72,9 +72,9 @@ def between_views(
     repeated: bool,
 ) -> BetweenViews:
     """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances
-    that the ``sensor`` and ``other`` (lens, registration) explain; and the direction ``looks_px``
-    (k, h, w, 2), in pixels, in which each view sees each cell. ``repeated``: the sensor's
-    variances come from repeated frames. All zero with too little overlap."""
+    that the ``sensor`` and ``explained`` (lens, registration) explain; and the direction
+    ``looks_px`` (k, h, w, 2), in pixels, in which each view sees each cell. ``repeated``: the
+    sensor's variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
     chosen = several[:: max(1, len(several) // CELLS)]
     flat = heights.reshape(len(heights), -1)[:, chosen]

@@ -77,8 +77,8 @@ def raster_between(
     spacing: float,
     grid: CellGrid,
 ) -> Raster:
-    """Return the `Raster` of a grid over the ``valid`` samples at ``places`` (v, u, 2), on a pixel
-    grid or not (v = 1). Cells larger than ``spacing``, that of the samples, are divided into
+    """Return the `Raster` of a grid over the ``valid`` samples at ``sample_xy`` (v, u, 2), on a
+    pixel grid or not (v = 1). Cells larger than ``spacing``, that of the samples, are divided into
     parts, whose mean they take."""
     parts = max(1, round(grid.step / spacing))
     step = grid.step / parts
@@ -146,7 +146,7 @@ def _fill(
     corners: np.ndarray,
     shares: np.ndarray,
 ) -> None:
-    """Give each triangle (t, 3) the cells that no earlier triangle has; ``places`` (n, 2) in
+    """Give each triangle (t, 3) the cells that no earlier triangle has; ``sample_xy`` (n, 2) in
     cells."""
     h, w = corners.shape[:2]
     for t in range(len(triangles)):

@@ -362,8 +362,8 @@ def _models(
     bounds: Sequence[Bound],
     close_fits: Sequence[Fit],
 ) -> tuple[ModelRow, ...]:
-    """Return rows of fits with their ``bounds``; the first of the ``near`` fits is that of the
-    curve."""
+    """Return rows of fits with their ``bounds``; the first of the ``close_fits`` fits is that of
+    the curve."""
     rows = []
     for fit, limit in zip(tried, bounds, strict=True):
         row = ModelRow(

@@ -43,7 +43,8 @@ AROUND_PX = 31
 NEAR_PX = 15
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # sizes that differ by less are equal; if all are, the size of damage is its depth
-# A patch is visible if its z and the view's differ by less, or by less than two pixels on the slope
+# A patch is visible if its z and the view's differ by less, or by less than two pixels on the
+# slope
 ON_FACE_M = 5 * MM
 
 # Distance in metres, tilts of the part about its x and y in degrees

@@ -220,9 +220,10 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
 def in_turn(
     patches: Patches, found_patches: Sequence[np.ndarray], given_count: int, further_count: int
 ) -> list[tuple[int, float, float]]:
-    """Return the first ``given`` poses, then up to ``further`` others, always the one that adds
-    most. ``found``: by pose, the patches (n,) bool on which damage is found. A row has the pose's
-    index, the share of the area that it adds, and the share that all poses so far cover."""
+    """Return the first ``given_count`` poses, then up to ``further_count`` others, always the one
+    that adds most. ``found_patches``: by pose, the patches (n,) bool on which damage is found. A
+    row has the pose's index, the share of the area that it adds, and the share that all poses so
+    far cover."""
     covered = np.zeros(len(patches.areas_m2), bool)
     rows = list[tuple[int, float, float]]()
     for turn in range(given_count + further_count):

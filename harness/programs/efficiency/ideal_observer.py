@@ -114,8 +114,8 @@ class NoiseSums:
 
 
 def noise_sums(noise: np.ndarray, is_known: np.ndarray) -> NoiseSums:
-    """Return the sums over fields ``noise`` (k, h, w), in deviations, at the ``known`` (k, h, w)
-    pixels."""
+    """Return the sums over fields ``noise`` (k, h, w), in deviations, at the ``is_known`` (k, h,
+    w) pixels."""
     shape = _padded(*noise.shape[1:])
 
     def by_lag(images: np.ndarray) -> np.ndarray:
@@ -132,8 +132,9 @@ def noise_sums(noise: np.ndarray, is_known: np.ndarray) -> NoiseSums:
 
 
 def inverse_times(images: np.ndarray, is_known: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``known`` (h, w) pixels, 0 elsewhere,
-    by conjugate gradients that start from the inverse on a periodic grid; exact for any outline.
+    """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``is_known`` (h, w) pixels, 0
+    elsewhere, by conjugate gradients that start from the inverse on a periodic grid; exact for any
+    outline.
     """
     h, w = is_known.shape
     shape = _padded(h, w)

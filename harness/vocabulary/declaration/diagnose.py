@@ -95,7 +95,7 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
 
 def settings_of(model: type[C], data: Mapping[str, Any], noun: str, within: str | None = None) -> C:
     """Validate plain data from command line options and return it as a declaration. Raises a
-    single UserError with all problems under the heading ``what``; ``within`` is the key that
+    single UserError with all problems under the heading ``noun``; ``within`` is the key that
     precedes each path there."""
     try:
         return model.from_data(data)
