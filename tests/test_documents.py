@@ -117,6 +117,11 @@ def test_the_documented_detector_keeps_the_contract(monkeypatch):
     exec(block_of("docs/extending.md", "from harness.testing import check_detector"), tests)
     tests["test_contract"]()
 
+    # the same test fails where the detector finds nothing
+    monkeypatch.setattr(detector.MeanDetector, "find", lambda *_: ())
+    with pytest.raises(AssertionError):
+        tests["test_contract"]()
+
 
 def test_the_documented_gate_is_a_valid_study(tmp_path):
     (tmp_path / "limit.yaml").write_text(block_of("docs/ci_gate.md", "# tests/limit.yaml"))
