@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from harness.evaluation import maps
+from harness.evaluation.summary import HoleState
 from harness.records.examples import MappedExample
 from harness.records.outputs import MAPS
 from harness.records.schema import Table
@@ -142,11 +143,11 @@ def _case_sentence(case: maps.MapCase) -> str:
     return f"With {maps.frames_text(single.frames)} {text}."
 
 
-def _found(status: dict[str, maps.HoleState]) -> int:
+def _found(status: dict[str, HoleState]) -> int:
     return list(status.values()).count("found")
 
 
-def _undecided(status: dict[str, maps.HoleState]) -> str:
+def _undecided(status: dict[str, HoleState]) -> str:
     undecided = list(status.values()).count("undecided")
     return f" ({undecided} undecided)" if undecided else ""
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.evaluation.study.curves import PRO_LIMIT, FreeResponse, PixelCurves, Roc
 from harness.evaluation.study.limit import SetUpLimit
-from harness.evaluation.study.result import SetUpResult
+from harness.evaluation.study.result import AxisLine, SetUpResult
 from harness.report.blocks import COLOURS, GREY, MARKERS, PALE, svg
 from harness.report.pod import MOST_MARKS, plain, plain_numbers
 from harness.tables import study
@@ -423,7 +423,7 @@ def _draw_line(
 
 
 def _name_missing(
-    axes: Axes, axis: study.AxisGroup, scale: AxisScale, shown: dict[str, study.AxisLine]
+    axes: Axes, axis: study.AxisGroup, scale: AxisScale, shown: dict[str, AxisLine]
 ) -> None:
     """Write above each value how many lines have no limit there."""
     for value, position in zip(axis.values, scale.positions, strict=True):
