@@ -17,7 +17,7 @@ def rows_of(truths):
     """What a perfect detector would write."""
     rows = []
     for truth in truths:
-        x, y, z = (1e3 * v for v in truth.centre_m)
+        x, y, z = 1e3 * np.asarray(truth.centre_m)
         depth = 1e3 * truth.depth_m[0] if math.isfinite(truth.depth_m[0]) else 0.0
         rows.append({"kind": truth.kind, "x_mm": f"{x}", "y_mm": f"{y}", "z_mm": f"{z}"})
         rows[-1] |= {

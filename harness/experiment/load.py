@@ -159,13 +159,12 @@ def _with_calibration(source: Source, recording: Path) -> Source:
         )
     swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
     single = shape.get(source.data, checks.CAMERA_NAME)
-    names = (
-        swept
-        if isinstance(swept, list)
-        else [single]
-        if isinstance(single, str)
-        else [CameraConfig().name]
-    )
+    if isinstance(swept, list):
+        names = swept
+    elif isinstance(single, str):
+        names = [single]
+    else:
+        names = [CameraConfig().name]
     numbers = shape.get(source.data, checks.CAMERA_NUMBERS)
     merged = {
         **(numbers if isinstance(numbers, dict) else {}),

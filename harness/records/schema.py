@@ -170,8 +170,11 @@ class Column:
         """Return the row's value; None if a mapping lacks it or an attribute on its path is
         None."""
         if self.value is None:
-            values = [row.get(name) for name in self.names]
-            return values[0] if len(values) == 1 or values[0] is None else Estimate(*values)
+            value = row.get(self.name)
+            if value is None or len(self.names) == 1:
+                return value
+            _, low_name, high_name = self.names
+            return Estimate(value, row.get(low_name), row.get(high_name))
         if isinstance(self.value, str):
             return _attribute(row, self.value)
         if isinstance(self.value, tuple):

@@ -167,10 +167,8 @@ def attempt(job: Job, worker: str) -> Ended:
     seconds = time.monotonic() - began
     peak_mb = 0.0
     with contextlib.suppress(OSError, ValueError):
-        (high,) = (
-            line
-            for line in Path("/proc/self/status").read_text().splitlines()
-            if line.startswith("VmHWM")
-        )
-        peak_mb = round(int(high.split()[1]) * 1024 / 1e6, 1)
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM"):
+                peak_kib = int(line.split()[1])
+                peak_mb = round(peak_kib * 1024 / 1e6, 1)
     return Ended(state, value, why, is_bug, seconds, peak_mb, worker, ends_all)

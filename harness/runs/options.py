@@ -17,16 +17,22 @@ LEAST_MEMORY_GB = 0.5  # a process that has loaded the code of trials needs 0.2 
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """``jobs``: processes, or a cluster's workers. ``scheduler`` None: this machine. ``serial``:
-    in this process."""
+    """The engine of a run: where its jobs are done, and within which limits."""
 
     jobs: int = 2
+    """Number of processes, or of a cluster's workers."""
     limits: Limits = DEFAULT_LIMITS
+    """Time and memory that a process may take."""
     scheduler: str | None = None
+    """Address of a cluster's scheduler; None for this machine."""
     serial: bool = False
+    """Whether jobs are done in this process."""
     shard: Shard = WHOLE
+    """The share of the jobs that this run does."""
     retry_failed: bool = False
+    """Whether jobs that failed before are tried again."""
     cache_limit_gb: float | None = None
+    """Size of all stored renders; None for no limit."""
 
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
@@ -85,8 +91,15 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         raise UserError(message, legal=legal)
     limits = Limits(options.time_limit, round(1000 * options.memory_limit))
     shard = WHOLE if options.shard is None else Shard.of(options.shard)
-    where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)
-    return EngineOptions(options.jobs, limits, *where)
+    return EngineOptions(
+        jobs=options.jobs,
+        limits=limits,
+        scheduler=options.scheduler,
+        serial=options.serial,
+        shard=shard,
+        retry_failed=options.retry_failed,
+        cache_limit_gb=options.cache_limit,
+    )
 
 
 def _positive(text: str) -> float:

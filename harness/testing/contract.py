@@ -349,10 +349,8 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
         return
     before = Look.at(make(), cloud).everything()
     clouds = [plane(seed=seed, damage=()) for seed in range(8)]
-    learned, again = (
-        dict(detector.calibrate([_with_arrays(clean, _read_only) for clean in clouds]))
-        for _ in range(2)
-    )
+    learned = dict(detector.calibrate([_with_arrays(clean, _read_only) for clean in clouds]))
+    again = dict(detector.calibrate([_with_arrays(clean, _read_only) for clean in clouds]))
     require(_same(learned, again), "the same clouds gave another learned state the second time")
     file = io.BytesIO()
     np.savez(file, **learned)  # type: ignore[arg-type]

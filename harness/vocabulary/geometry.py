@@ -72,8 +72,12 @@ class Region:
     def grown(self, margin: int, height: int, width: int) -> Region:
         """Return the region with ``margin`` more pixels on each side, clipped to a sensor of
         ``height`` x ``width``."""
-        rows = max(self.row0 - margin, 0), min(self.row1 + margin, height)
-        return Region(*rows, max(self.col0 - margin, 0), min(self.col1 + margin, width))
+        return Region(
+            row0=max(self.row0 - margin, 0),
+            row1=min(self.row1 + margin, height),
+            col0=max(self.col0 - margin, 0),
+            col1=min(self.col1 + margin, width),
+        )
 
     @property
     def area(self) -> int:
@@ -82,8 +86,12 @@ class Region:
 
     def joined(self, second: Region) -> Region:
         """Return the smallest region that holds both."""
-        rows = min(self.row0, second.row0), max(self.row1, second.row1)
-        return Region(*rows, min(self.col0, second.col0), max(self.col1, second.col1))
+        return Region(
+            row0=min(self.row0, second.row0),
+            row1=max(self.row1, second.row1),
+            col0=min(self.col0, second.col0),
+            col1=max(self.col1, second.col1),
+        )
 
     def within(self, outer: Region) -> tuple[slice, slice]:
         """Return the slices that cut this region out of an array that covers ``outer``."""

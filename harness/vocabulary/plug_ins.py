@@ -113,14 +113,10 @@ def _offers(
     from harness import __version__
 
     offers = [Offer(name, target, OWN, __version__) for name, target in built_in]
-    offers += [
-        Offer(
-            entry.name,
-            entry.value,
-            *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")),
-        )
-        for entry in entry_points(group=group)
-    ]
+    for entry in entry_points(group=group):
+        origin = entry.dist.name if entry.dist else entry.module
+        version = entry.dist.version if entry.dist else ""
+        offers.append(Offer(entry.name, entry.value, origin, version))
     return tuple(
         sorted(
             dict.fromkeys(offers), key=lambda offer: (offer.name, not offer.built_in, offer.package)

@@ -48,13 +48,11 @@ def size(value: float, largest: float = np.inf) -> str:
     ``none`` for NaN."""
     if np.isnan(value) or value > largest:
         return "none" if np.isnan(value) else f">\u00a0{largest:.3g}"
-    return (
-        "∞"
-        if np.isinf(value)
-        else f"{value:#.2g}".removesuffix(".")
-        if abs(value) < 99.5
-        else f"{value:.3g}"
-    )
+    if np.isinf(value):
+        return "∞"
+    if abs(value) < 99.5:
+        return f"{value:#.2g}".removesuffix(".")
+    return f"{value:.3g}"
 
 
 def percent(share: float) -> str:
@@ -63,12 +61,18 @@ def percent(share: float) -> str:
     value = 100 * share
     if np.isnan(value) or 1 <= value <= 99:
         return UNKNOWN_TEXT if np.isnan(value) else f"{value:.0f}"
-    return "< 0.1" if value < 0.05 else "> 99.9" if value > 99.95 else f"{value:.1f}"
+    if value < 0.05:
+        return "< 0.1"
+    if value > 99.95:
+        return "> 99.9"
+    return f"{value:.1f}"
 
 
 def p_value(p: float) -> str:
     """Return a p-value with two digits."""
-    return "< 0.0001" if p < 0.0001 else UNKNOWN_TEXT if np.isnan(p) else f"{p:.2g}"
+    if np.isnan(p):
+        return UNKNOWN_TEXT
+    return "< 0.0001" if p < 0.0001 else f"{p:.2g}"
 
 
 def interval(low: float, high: float, digits: int = 2, largest: float = np.inf) -> str:

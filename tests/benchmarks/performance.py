@@ -104,7 +104,8 @@ def peers_of_frames(runs: int) -> None:
     source: Any = SimpleNamespace(
         name="bench", organised=True, z_step_m=0.0, region=lens.whole, lens=lens
     )
-    source.slopes, source.frames = lens.region_slopes(lens.whole), lambda: iter(frames)
+    source.slopes = lens.region_slopes(lens.whole)
+    source.frames = lambda: iter(frames)
 
     def theirs() -> np.ndarray:
         np.nanvar(stack, axis=0, dtype=float), np.isfinite(stack).sum(axis=0)

@@ -342,7 +342,8 @@ def test_a_finding_that_the_crop_cuts_is_told_first(
 def test_a_filter_that_hides_the_rim_of_a_hole_to_the_room_behind_is_told_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], blur_px: int, is_doubted: bool
 ) -> None:
-    rng, (v, u) = np.random.default_rng(1), np.mgrid[:120, :160]
+    rng = np.random.default_rng(1)
+    v, u = np.mgrid[:120, :160]
     clean = np.where(np.hypot(u - 90, v - 50) < 8, 2500.0, 700.0)
     white = rng.standard_normal((8, 120, 160))
     noise = np.stack([blur_px * cv2.blur(each, (blur_px, blur_px)) for each in white])

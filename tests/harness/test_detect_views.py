@@ -460,7 +460,8 @@ def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, told: str) -
 def _halves(source: Path, folder: Path) -> list[str]:
     """The first and last frames of a capture as two, every second row and column of each."""
     message = json.loads((source / "intrinsic.json").read_text())
-    message["width"], message["height"] = message["width"] // 2, message["height"] // 2
+    message["width"] //= 2
+    message["height"] //= 2
     message["intrinsic_matrix"] = [0.5 * value for value in message["intrinsic_matrix"][:8]] + [1.0]
     colour = cv2.imread(str(source / "color" / "00000.jpg"))[::2, ::2]
     depths = sorted((source / "depth").iterdir())

@@ -90,8 +90,8 @@ def test_a_unit_has_the_recordings_lens_where_its_size_is_the_cameras() -> None:
     config, same = unit_config(CAMERA, moved)
     assert same
     assert camera_of(config).nominal_lens.fx == pytest.approx(lens.fx + 1)
-    for size in ((lens.width + 1, lens.height), (lens.width, lens.height + 1)):
-        other_lens = Lens(*size, lens.fx + 1, lens.fy, lens.cx, lens.cy)
+    for width, height in ((lens.width + 1, lens.height), (lens.width, lens.height + 1)):
+        other_lens = Lens(width, height, lens.fx + 1, lens.fy, lens.cx, lens.cy)
         config, same = unit_config(CAMERA, other_lens)
         assert not same
         assert camera_of(config).nominal_lens.fx == pytest.approx(lens.fx)

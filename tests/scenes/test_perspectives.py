@@ -71,19 +71,11 @@ def test_fewer_views_are_the_first_of_more(
     more,
 ):
     kind_of = {"arc": ArcViews, "grid": GridViews}[kind]
-    fewer, longer = (
-        poses_of(
-            kind_of(
-                kind=kind,
-                count=n,
-                spread_deg=30.0,
-                distance_jitter_mm=20.0,
-                aim_jitter_mm=9.0,
-            ),
-            POSE,
-        )
-        for n in (count, count + more)
+    views = kind_of(
+        kind=kind, count=count, spread_deg=30.0, distance_jitter_mm=20.0, aim_jitter_mm=9.0
     )
+    fewer = poses_of(views, POSE)
+    longer = poses_of(views.model_copy(update={"count": count + more}), POSE)
     assert longer[:count] == fewer
     assert len(set(longer)) == count + more
 

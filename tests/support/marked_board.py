@@ -75,8 +75,9 @@ def _colour(pose: np.ndarray, strips: tuple[tuple[float, float], ...]) -> np.nda
     """(h, w, 3) uint8: grey board with red strips, each pixel the mean of its rays, black beyond
     the rim."""
     part = (np.arange(FINE) + 0.5) / FINE - 0.5
-    v, u = (axis[..., None] for axis in np.mgrid[: LENS.height, : LENS.width])
-    dv, du = (axis.ravel() for axis in np.meshgrid(part, part, indexing="ij"))
+    v, u = np.mgrid[: LENS.height, : LENS.width][..., None]
+    dv = np.repeat(part, len(part))
+    du = np.tile(part, len(part))
     _, xy = _meet(pose, LENS.slopes(u + du, v + dv), 0.0)
     colour = np.where(_on_board(xy)[..., None], [150.0, 148.0, 140.0], 0.0)
     for x, y in strips:

@@ -76,7 +76,9 @@ class Scene:
         With a thickness, faces of the same number behind its edges close a box."""
         z, a, b = self.plane(np.asarray(centre, float), normal)
         turn = np.deg2rad(roll_deg)
-        a, b = a * np.cos(turn) - b * np.sin(turn), a * np.sin(turn) + b * np.cos(turn)
+        turned_a = a * np.cos(turn) - b * np.sin(turn)
+        b = a * np.sin(turn) + b * np.cos(turn)
+        a = turned_a
         inside = (np.abs(a) < size_m[0] / 2) & (np.abs(b) < size_m[1] / 2)
         for hole_a, hole_b, radius in holes:
             inside &= np.hypot(a - hole_a, b - hole_b) > radius
@@ -279,7 +281,8 @@ def bent_sheet(random, scene):
     scene.cylinder(1, centre, [random.uniform(-0.2, 0.2), 1, 0], radius, 0.2, inner)
     other = scene.slopes[..., 0] * scene.z
     beyond = (np.abs(other) > random.uniform(0.15, 0.24)) & (scene.name == 1)
-    scene.z[beyond], scene.name[beyond] = np.inf, -1
+    scene.z[beyond] = np.inf
+    scene.name[beyond] = -1
     scene.wall(0, away + random.uniform(0.5, 1.2))
 
 

@@ -120,10 +120,8 @@ class ClusterEngine:
         # mean duration of a trial; at first, each trial counts as a whole bundle
         self._mean_s = BUNDLE_S
         self._looked = float("-inf")
-        self._lacking, self._lacking_since = (
-            "",
-            time.monotonic(),
-        )  # lacking for the waiting jobs, and since when
+        self._lacking = ""  # what the waiting jobs lack
+        self._lacking_since = time.monotonic()
         self._nonce = secrets.token_hex(16)  # identifies this driver to the nodes
         # a file that shows whether a node sees the folder; the cache of renders treats it as a
         # leftover
@@ -389,7 +387,8 @@ class ClusterEngine:
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
             fix = "install tofpod on the workers just as here"
         if lacking != self._lacking:
-            self._lacking, self._lacking_since = lacking, time.monotonic()
+            self._lacking = lacking
+            self._lacking_since = time.monotonic()
         if lacking == "worker" and self._scheduler.startswith("jobqueue:"):
             self._print_once(
                 f"waiting for workers of {self._scheduler}, as long as its queue takes"

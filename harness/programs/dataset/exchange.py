@@ -341,7 +341,7 @@ def _qos(latched: bool) -> tuple[Any, ...]:
         QosTime,
     )
 
-    endless = QosTime(*FOREVER)
+    endless = QosTime(sec=FOREVER[0], nsec=FOREVER[1])
     profile = Qos(
         history=QosHistory.KEEP_LAST,
         depth=10,

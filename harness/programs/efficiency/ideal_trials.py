@@ -110,18 +110,26 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     inside = np.concatenate(list(set_up.outlines.values()))
     board = batch.board or 0
     names = tuple(str(damage.id) for damage in set_up.truth)
-    facts = (
-        float(np.prod(set_up.pitch_mm)) * MM**2,
-        float((~np.isfinite(clear_z_m.ravel()[inside])).mean()),
-    )
-    shown = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut])
+    pixel_m2 = float(np.prod(set_up.pitch_mm)) * MM**2
+    lost_share = float((~np.isfinite(clear_z_m.ravel()[inside])).mean())
+    shown_signals_m = np.nan_to_num(signals_m[:, *cut])
+    shown_surface = surface[:, *cut]
     views = {}
     for point in {point.config.capture.frames: point for point in points}.values():
         noise_m, is_known = _noise_m(set_up, board, point, surface, intact)
         deviation_m = _deviation_m(noise_m, is_known)
         sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], is_known[:, *cut])
         view = BoardView(
-            board, names, seen[cut], deviation_m[cut], *shown, sums, UNITS_A_BOARD, *facts
+            board=board,
+            holes=names,
+            known=seen[cut],
+            deviation_m=deviation_m[cut],
+            signals_m=shown_signals_m,
+            surface=shown_surface,
+            sums=sums,
+            units=UNITS_A_BOARD,
+            pixel_m2=pixel_m2,
+            lost=lost_share,
         )
         views[point.config.capture.frames] = view
     return views

@@ -68,7 +68,9 @@ class Scan:
             raise UserError(
                 f"{recording.name}: the lens is not known, and damage cannot be placed", fix=fix
             )
-        self.recording, self.lens, self.slopes = recording, recording.lens, recording.slopes
+        self.recording = recording
+        self.lens = recording.lens
+        self.slopes = recording.slopes
         self.frames = list(recording.frames())
         self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES], recording.z_step_m)
         self.whole = self.averaged(self.frames)
@@ -257,7 +259,8 @@ def placements(
     units = [unit_config(camera, scan.lens) for scan in scans]
     placed_count = number = empty = 0
     while placed_count < targets:
-        scan, (config, same) = scans[number % len(scans)], units[number % len(scans)]
+        scan = scans[number % len(scans)]
+        config, same = units[number % len(scans)]
         placed = damages_placed(scan, family, camera, "damaged", number)
         empty = 0 if placed.damages else empty + 1
         if empty > MOST_EMPTY:
@@ -310,7 +313,8 @@ def judge_scans(
     has two groups of that many frames or more, every second group sets the threshold; otherwise
     the same frames do both, and a warning says so."""
     record = TrialRecord()
-    warnings, calibrated = [text for scan in scans if (text := scan.left_out(family))], {}
+    warnings = [text for scan in scans if (text := scan.left_out(family))]
+    calibrated: dict[int, int] = {}
     for count in frames:
         groups = [
             (scan, slice(k, k + count))

@@ -321,6 +321,12 @@ def _limits(run: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def _count_in(trials: Mapping[str, Any], name: str) -> int:
+    """Return a number of trials in a provenance; 0 where it is missing or not a number."""
+    count = trials.get(name)
+    return count if type(count) is int and count >= 0 else 0
+
+
 def described(run: Path) -> dict[str, Any]:
     """Describe a results folder as JSON types. ``state`` is complete, unfinished, running or
     broken."""
@@ -352,9 +358,15 @@ def described(run: Path) -> dict[str, Any]:
         return row | {"note": f"broken: provenance.json: {error}"}
     trials = facts.get("trials")
     trials = trials if isinstance(trials, dict) else {}
-    counts = [trials.get(name) for name in ("done", "resumed", "failed")]
-    done, resumed, failed = (count if type(count) is int and count >= 0 else 0 for count in counts)
-    state = "running" if in_use(run) else "unfinished" if failed else "complete"
+    done = _count_in(trials, "done")
+    resumed = _count_in(trials, "resumed")
+    failed = _count_in(trials, "failed")
+    if in_use(run):
+        state = "running"
+    elif failed:
+        state = "unfinished"
+    else:
+        state = "complete"
     note = f"{state}: {many(done + resumed, 'trial')}" + (f", {failed} failed" if failed else "")
     version = facts.get("results_version")
     started = facts.get("started")

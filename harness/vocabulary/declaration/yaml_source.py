@@ -98,7 +98,8 @@ class DeclarationError(UserError):
     """All problems of an experiment, in the order of the file."""
 
     def __init__(self, origin: str, problems: Iterable[Problem]) -> None:
-        self.origin, self.problems = origin, in_order(problems)
+        self.origin = origin
+        self.problems = in_order(problems)
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         lines = [*map(str, self.problems[:MAX_PROBLEMS])]
         lines += (

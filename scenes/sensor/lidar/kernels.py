@@ -72,7 +72,9 @@ def _derivatives(spectrum: np.ndarray, angle: float) -> tuple[float, float, floa
     slope = 0.0
     bend = 0.0
     for k in range(lines):
-        re, im = re * step_re - im * step_im, re * step_im + im * step_re
+        turned_re = re * step_re - im * step_im
+        im = re * step_im + im * step_re
+        re = turned_re
         a = spectrum[k]
         b = spectrum[lines + k]
         even = a * re + b * im

@@ -4,6 +4,7 @@ points to itself."""
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -59,16 +60,17 @@ trees = st.recursive(
 
 
 def paths_in(data: Any, above: KeyPath = ()) -> list[KeyPath]:
-    inner = (
-        data.items()
-        if isinstance(data, dict)
-        else enumerate(data)
-        if isinstance(data, list)
-        else ()
-    )
-    return [
-        path for key, value in inner for path in [(*above, key), *paths_in(value, (*above, key))]
-    ]
+    inner: Iterable[tuple[Any, Any]] = ()
+    if isinstance(data, dict):
+        inner = data.items()
+    elif isinstance(data, list):
+        inner = enumerate(data)
+    paths = []
+    for key, value in inner:
+        path = (*above, key)
+        paths.append(path)
+        paths += paths_in(value, path)
+    return paths
 
 
 @settings(max_examples=30, deadline=None)

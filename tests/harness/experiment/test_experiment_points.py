@@ -184,7 +184,8 @@ def test_spelling_out_a_default_or_another_order_changes_no_digest(folder: Path)
     ],
 )
 def test_keys_cover_exactly_what_they_name(folder: Path, override: str, changes: set[str]) -> None:
-    (before,), (after,) = loaded(folder, BASE).points, loaded(folder, BASE, override).points
+    (before,) = loaded(folder, BASE).points
+    (after,) = loaded(folder, BASE, override).points
     changed = {"digest": before.digest != after.digest}
     changed["frames"] = before.frames_key != after.frames_key
     assert {name for name, differs in changed.items() if differs} == changes
@@ -201,7 +202,8 @@ def test_the_detectors_version_is_part_of_the_digest(
 
 
 def test_digests_do_not_depend_on_the_process(folder: Path) -> None:
-    first, second = (loaded(folder, BASE + SWEEP + STUDY) for _ in range(2))
+    first = loaded(folder, BASE + SWEEP + STUDY)
+    second = loaded(folder, BASE + SWEEP + STUDY)
     assert first.digest == second.digest
     assert [point.digest for point in first.points] == [point.digest for point in second.points]
 

@@ -242,7 +242,10 @@ def test_one_blob_of_one_unit_decides_its_calibration_and_units_spread_it(study_
         study_of(study_out, tmp_path / "one", *asked),
         study_of(study_out, tmp_path / "units", *asked, UNITS),
     )
-    of_one, of_units = ([limit_of(one, draws=10) for one in record.set_ups] for record in records)
+    limits = []
+    for record in records:
+        limits.append([limit_of(set_up, draws=10) for set_up in record.set_ups])
+    of_one, of_units = limits
     assert set_by(of_one)[0].same_pixels == 4, "of 5 boards"
     assert set_by(of_units)[0].same_pixels == 1
     assert "highest score on the same pixels" in threshold_warnings(of_one)[0]

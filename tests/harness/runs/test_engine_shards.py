@@ -88,7 +88,8 @@ def test_every_judged_trial_belongs_to_one_shard(home, count):
 
 def test_a_shard_renders_only_what_it_needs(home):
     study = plan(home)
-    (first, then), (_, all_then) = parts_of(study, Shard(1, 4)), parts_of(study, Shard(1, 1))
+    first, then = parts_of(study, Shard(1, 4))
+    _, all_then = parts_of(study, Shard(1, 1))
     own_rows = {path for parts in (*first, *then) for part in parts for path in part.batch.paths}
     judged = {path for parts in all_then for part in parts for path in part.batch.paths}
     assert judged - own_rows

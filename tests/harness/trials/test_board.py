@@ -101,7 +101,8 @@ def test_what_is_intact_lies_away_from_rim_and_hole(board: Board) -> None:
     assert (rows.min(), rows.max()) == (INTACT_MARGIN_PX, h - 1 - INTACT_MARGIN_PX)
     assert (columns.min(), columns.max()) == (INTACT_MARGIN_PX, w - 1 - INTACT_MARGIN_PX)
     hole_rows, hole_columns = np.unravel_index(board.outlines[7], (h, w))
-    row, column = hole_rows[0], hole_columns[0]
+    row = hole_rows[0]
+    column = hole_columns[0]
     assert not board.intact[row, column - INTACT_MARGIN_PX]
     assert board.intact[row, hole_columns.min() - INTACT_MARGIN_PX - 1]
     assert board.bare[row, column]

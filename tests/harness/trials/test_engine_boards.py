@@ -80,7 +80,8 @@ def judgement_of(*, damaged: bool = True, threshold: float = 4.0) -> Judgement:
     )
     score = np.zeros(x.shape)
     score[:, 90:] = np.nan
-    score[29, 19], score[10, 50] = 9.0, 5.0
+    score[29, 19] = 9.0
+    score[10, 50] = 5.0
     hit = Detection(score[29, 19], np.array([(29, 19)[0] * 100 + (29, 19)[1]]), points[29, 19])
     call = Detection(score[10, 50], np.array([(10, 50)[0] * 100 + (10, 50)[1]]), points[10, 50])
 

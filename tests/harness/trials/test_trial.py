@@ -106,7 +106,7 @@ def test_a_hole_free_board_shows_noise_and_errors(hole_free: Board) -> None:
     assert noise.pitch_u_mm == pytest.approx(DISTANCE_M / lens.fx / MM, rel=0.005)
     assert noise.pitch_v_mm == pytest.approx(DISTANCE_M / lens.fy / MM, rel=0.005)
     capture = capture_of(trial_before(hole_free), 0, hole_free, 2)
-    first, second = (frame.z_m for frame in capture.frames())
+    first, second = [frame.z_m for frame in capture.frames()]
     inside = np.isfinite(first - second) & hole_free.bare
     expected_mm = np.std((first - second)[inside]) / np.sqrt(2) / MM
     assert noise.single_frame_mm == pytest.approx(expected_mm, rel=0.05)

@@ -141,7 +141,9 @@ def test_the_program_says_where_the_camera_is_blind(
     folder = tmp_path / "coverage" / "tiny"
     assert printed.startswith("warning: 0 of 1 pose suggested")  # warnings stand first
     assert "\nDamage with a diameter of 8 mm is found nine times in ten on " in printed
-    patches, poses = (pd.read_parquet(folder / table.files[1]) for table in COVERAGE_TABLES[:2])
+    patches_table, poses_table = COVERAGE_TABLES[:2]
+    patches = pd.read_parquet(folder / patches_table.files[1])
+    poses = pd.read_parquet(folder / poses_table.files[1])
     assert patches["area_m2"].sum() == pytest.approx(0.3048 * 0.2032)
     # the rim is cropped away, and what is in the middle is not
     rim = (patches["x_mm"].abs() > 150) | (patches["y_mm"].abs() > 100)

@@ -236,10 +236,11 @@ def test_on_identical_frames_the_signs_of_boards_are_tossed():
 
 
 def test_luck_with_the_calibration_is_the_same_only_where_the_threshold_is():
-    first, second = (
+    studies = [
         replace(unflawed(np.arange(16) < k), calibration_runs=20, frames_digest="same")
         for k in (5, 16)
-    )
+    ]
+    first, second = studies
     signs = calls_change(first, replace(second, threshold=first.threshold * 1.0), 2.0)
     pair = calls_change(first, replace(second, threshold=first.threshold * 1.01), 2.0)
     arguments = calls_change(
@@ -521,7 +522,9 @@ def test_the_effective_threshold_is_where_half_of_the_signals_are_found(seed):
     ends = effective(signal > 0)[0], effective(signal < 0)[0]
     assert ends == pytest.approx((signal.min(), signal.max()), rel=1e-12)
     level, variance = effective(hit)
-    b0, b1 = (fit := fit_hit_miss(signal, hit, log_size=True)).b0, fit.b1
+    fit = fit_hit_miss(signal, hit, log_size=True)
+    b0 = fit.b0
+    b1 = fit.b1
     assert b0 + b1 * np.log(level) == pytest.approx(0, abs=1e-9) and 0 < variance < 1
     assert np.isnan(effective(signal < 1.1)).all(), "hits fall as signals grow"
 

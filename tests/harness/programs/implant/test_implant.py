@@ -79,10 +79,11 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
     for each in (target, target.hole_free()):
         view, _ = cached_view(each, camera.optics, RenderConfig(), tmp_path)
         units.append(SimulatedUnit(camera, NOISE, view))
-    observed, bare = (
-        np.stack([frame.z_m for frame in unit.capture(48, 1, name).frames()]).astype(float)
-        for unit, name in zip(units, "ab", strict=True)
-    )
+    stacks = []
+    for unit, name in zip(units, "ab", strict=True):
+        frames = [frame.z_m for frame in unit.capture(48, 1, name).frames()]
+        stacks.append(np.stack(frames).astype(float))
+    observed, bare = stacks
     T = target.pose.T_camera_board
     position = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
     config, same = unit_config(CAMERA, camera.nominal_lens)

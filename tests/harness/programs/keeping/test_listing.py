@@ -226,10 +226,8 @@ def test_whatever_stands_in_settings_and_limits_the_list_goes_on(tmp_path, capsy
 
 
 def test_latest_is_a_relative_link_that_follows_the_newest_run(tmp_path):
-    first, second = (
-        results(tmp_path, digit * 16, trials={"done": 1}, started=f"2026-11-2{digit}")
-        for digit in "12"
-    )
+    first = results(tmp_path, "1" * 16, trials={"done": 1}, started="2026-11-21")
+    second = results(tmp_path, "2" * 16, trials={"done": 1}, started="2026-11-22")
     link = first.parent / "latest"
     for run in (first, second, first):
         point_to(run)
@@ -273,10 +271,8 @@ def test_a_latest_of_somebody_else_is_left_alone(tmp_path, capsys, kind):
 
 
 def test_latest_neither_counts_twice_nor_outlives_its_run(tmp_path, capsys):
-    first, second = (
-        results(tmp_path, digit * 16, trials={"done": 1}, started=f"2026-11-2{digit}")
-        for digit in "12"
-    )
+    first = results(tmp_path, "1" * 16, trials={"done": 1}, started="2026-11-21")
+    second = results(tmp_path, "2" * 16, trials={"done": 1}, started="2026-11-22")
     point_to(second)
     assert set(listed(capsys, tmp_path)) == {first.name, second.name}
     assert clean.main(["results", "study/latest", "--yes", "--out", str(tmp_path)]) == 2
@@ -386,7 +382,8 @@ def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
 
 
 def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
-    first, second = (results(tmp_path, digit * 16, records=2) for digit in "01")
+    first = results(tmp_path, "0" * 16, records=2)
+    second = results(tmp_path, "1" * 16, records=2)
     with locked(second):
         assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 2
     assert "another sweep" in capsys.readouterr().err
