@@ -24,7 +24,7 @@ from harness.inspection import arguments as cli
 from harness.inspection import output
 from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
-from harness.inspection.verdict import CLASSES, FLAGS, Verdict, calls_text, verdict_of
+from harness.inspection.verdict import CLASSES, FLAGS, InspectionVerdict, calls_text, verdict_of
 from harness.records import outputs
 from harness.report.blocks import plain
 from harness.report.findings import Judged, write_findings
@@ -69,7 +69,7 @@ class Inspection:
     """Units of score."""
     threshold_origin: str
     """Where the threshold comes from, in words."""
-    verdict: Verdict
+    verdict: InspectionVerdict
     """The answer."""
 
     @property
@@ -426,7 +426,7 @@ def _conditions(run: Inspection) -> str:
     return ", ".join(parts)
 
 
-def _summary_rows(verdict: Verdict) -> list[tuple[str, str]]:
+def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
     """Return the figures of the verdict."""
     rows = [(name, str(count)) for name, count in verdict.counts.items()]
     extent = verdict.extent

@@ -1,5 +1,5 @@
-"""What an inspection says: the class, the flags and the name of each finding, how much of the part
-was judged, and the one sentence that answers."""
+"""The verdict of an inspection: class, flags and name of each finding, how much of the part was
+judged, and the sentence that answers."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def _cut_by_the_rim(
 
 @dataclass(frozen=True)
 class Extent:
-    """How much of a part was judged; NaN where it is unknown."""
+    """The judged part of a target; NaN where it is unknown."""
 
     judged_m2: float
     """Area of the fitted surface at the pixels that were judged."""
@@ -276,7 +276,7 @@ SINGULARS = {"hole or dent": "small hole or dent"}
 
 
 @dataclass(frozen=True)
-class Verdict:
+class InspectionVerdict:
     """The answer of an inspection."""
 
     sentence: str
@@ -303,7 +303,9 @@ class Verdict:
         }
 
 
-def verdict_of(result: Judged, threshold: float, outline: np.ndarray | None = None) -> Verdict:
+def verdict_of(
+    result: Judged, threshold: float, outline: np.ndarray | None = None
+) -> InspectionVerdict:
     """Return the answer. ``outline``: see `extent_of`."""
     findings = result.findings
     counts = {name: 0 for name in CLASSES}
@@ -317,7 +319,7 @@ def verdict_of(result: Judged, threshold: float, outline: np.ndarray | None = No
     clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not findings)]
     clauses += _other_clauses(findings, is_further=bool(terms))
     clauses.append(_calls_clause(expected))
-    return Verdict("; ".join(clauses) + ".", counts, terms, extent, expected)
+    return InspectionVerdict("; ".join(clauses) + ".", counts, terms, extent, expected)
 
 
 def expected_calls(evidence: Evidence, threshold: float) -> float:

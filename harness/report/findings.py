@@ -109,7 +109,7 @@ def probability(value: float) -> str:
 
 @dataclass(frozen=True)
 class Remark:
-    """What is said of a finding besides its numbers; see the fields of `Finding`."""
+    """Words about a finding besides its numbers; see the fields of `Finding`."""
 
     certainty: str
     flags: str

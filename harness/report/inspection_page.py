@@ -36,7 +36,7 @@ SMALL_PX = 200
 
 @dataclass(frozen=True)
 class PageText:
-    """What stands on the page besides what `Judged` holds."""
+    """Text of the page besides the findings."""
 
     title: str
     sentence: str
