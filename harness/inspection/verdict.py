@@ -19,7 +19,8 @@ SURE = "sure"
 DOUBTFUL = "doubtful"
 RIM_OR_BLIND = "rim or blind"
 CLASSES = {
-    SURE: "noise explains each with a probability below 0.05",
+    SURE: "noise explains each with a probability below 0.05; where this is unknown, the score is"
+    " well above the threshold",
     DOUBTFUL: "noise may explain them",
     RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
 }

@@ -25,6 +25,8 @@ PLAN_PX = 480
 """Longer side of the picture of a cloud without a pixel grid."""
 LEAST_RADIUS = 0.012
 """Least radius of a mark, as a share of the picture's longer side."""
+MOST_ROWS = 20
+"""Most rows of a class that are shown unfolded."""
 FEW = 25
 """Up to so many findings the numbers are large."""
 DEVIATION = "distance from the surface"
@@ -192,6 +194,7 @@ def numbered_picture(judged: Judged, picture: Picture, name: str) -> Markup:
             font=round(size * max(width, height), 2),
             image=data_url(picture.rgb),
             sharp=max(width, height) <= SMALL_PX,
+            kind="" if len(findings) <= FEW else " many",
             marks=marks,
             name=name,
         )
@@ -298,7 +301,10 @@ def class_sections(findings: Sequence[Finding], classes: Mapping[str, str]) -> l
         sections.append(tag("h3", f"{name[0].upper()}{name[1:]}: {count}"))
         if members:
             sections.append(tag("p", f"{meaning[0].upper()}{meaning[1:]}.", kind="note"))
-            sections.append(findings_grid(members).html())
+            sections.append(findings_grid(members[:MOST_ROWS]).html())
+            further = members[MOST_ROWS:]
+            if further:
+                sections.append(fold(f"{len(further)} more", findings_grid(further).html()))
     return sections
 
 
@@ -308,7 +314,7 @@ def findings_grid(findings: Sequence[Finding]) -> Grid:
         "no.": lambda finding: str(finding.id),
         "what": lambda finding: finding.term or finding.kind,
         "flags": lambda finding: ", ".join(finding.flags.split()).replace("_", " "),
-        "width (mm)": lambda finding: _number(finding.diameter_mm, 1),
+        "width (mm)": _width,
         "depth (mm)": lambda finding: _number(finding.depth_mm, 2),
         "x (mm)": lambda finding: _number(finding.x_mm, 1),
         "y (mm)": lambda finding: _number(finding.y_mm, 1),
@@ -316,10 +322,15 @@ def findings_grid(findings: Sequence[Finding]) -> Grid:
         "score": lambda finding: f"{finding.score:.2f}",
         "probability of noise": lambda finding: probability(finding.noise_probability),
     }
-    if any(finding.is_long for finding in findings):
-        columns["long: mm, degrees"] = lambda finding: finding.long_text or UNKNOWN_TEXT
     rows = [[text(finding) for text in columns.values()] for finding in findings]
     return Grid.of(columns, rows, left=3, kind="findings")
+
+
+def _width(finding: Finding) -> str:
+    """Return the diameter, or length and width of a long finding."""
+    if finding.is_long:
+        return f"{finding.length_mm:.1f} × {finding.width_mm:.1f}"
+    return _number(finding.diameter_mm, 1)
 
 
 def _number(value: float, digits: int) -> str:
