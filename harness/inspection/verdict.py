@@ -28,8 +28,8 @@ CLASSES = {
 FLAGS = {
     "faint": "noise may explain it",
     "at_rim": "reaches the rim of the judged area: may be larger than stated",
-    "open_behind": "shows what lies far behind, or nothing: where the camera's filter mixes its rim"
-    " into it, it may be wider than stated by the reach of the noise",
+    "open_behind": "shows what lies far behind, or nothing: may be wider than stated by up to the"
+    " noise's reach, where the camera's filter mixes the rim with what is behind",
     "size_from_contour": "no model of a hole fits: its diameter is that of its outline at half"
     " depth",
     "size_from_extent": "no model of a hole fits: its diameter is that of its outermost points",
