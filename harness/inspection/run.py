@@ -23,17 +23,20 @@ from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
 from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
+from harness.inspection.limit import Limit, limit_of
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
 from harness.inspection.verdict import CLASSES, FLAGS, InspectionVerdict, calls_text, verdict_of
 from harness.records import outputs
-from harness.report.blocks import plain
+from harness.report.blocks import joined, paragraph, plain
 from harness.report.findings import Judged, write_findings
 from harness.vocabulary.files import plain_json
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.provenance import record
-from harness.vocabulary.text import many
+from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from detectors.recordings import Recording
     from detectors.views.mapping.merge import Mapped
     from detectors.views.mapping.settings import MappingConfig
@@ -71,6 +74,8 @@ class Inspection:
     """Where the threshold comes from, in words."""
     verdict: InspectionVerdict
     """The answer."""
+    limit: Limit | None
+    """The sizes that would have been missed; None if they were not asked for."""
 
     @property
     def cell_m(self) -> float | None:
@@ -85,6 +90,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     paths = arguments.paths[: config.views] if config else arguments.paths
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
+    cli.limit_depth_m(arguments)
     detector, settings = _detector_of(arguments, config)
     flat_field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
     guesses: Sequence[np.ndarray | None] = (None,) * len(paths)
@@ -142,6 +148,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         threshold=threshold,
         threshold_origin=threshold_origin,
         verdict=verdict_of(result, threshold, _outline(choices, mapped)),
+        limit=_limit(arguments, detector, result, threshold),
     )
 
 
@@ -152,6 +159,15 @@ def _outline(choices: Sequence[Choice | None], mapped: Mapped | None) -> np.ndar
     if mapped is not None or choice is None or not choice.candidates:
         return None
     return choice.candidates[choice.taken - 1].outline
+
+
+def _limit(
+    arguments: argparse.Namespace, detector: Detector, result: Judged, threshold: float
+) -> Limit | None:
+    """Return the sizes that would have been missed, if they were asked for."""
+    if arguments.limit is None:
+        return None
+    return limit_of(detector, result, threshold, cli.limit_depth_m(arguments))
 
 
 def _detector_of(
@@ -228,6 +244,8 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
     print(f"threshold: {_threshold_text(run)}")
+    if run.limit is not None:
+        print(f"limit: {run.limit.text}")
     findings = run.result.findings
     if findings:
         output.print_classes(run.verdict.counts)
@@ -343,6 +361,7 @@ def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dic
         **_capture_facts(run),
         "threshold": {"k": run.threshold, "mm": threshold_mm, "from": run.threshold_origin},
         "verdict": run.verdict.facts,
+        "limit": None if run.limit is None else run.limit.facts,
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
@@ -390,8 +409,6 @@ def _file_facts(path: Path) -> dict[str, str]:
 
 def _page_html(run: Inspection, subject: str, scene: Scene3d, provenance: Mapping[str, Any]) -> str:
     """Return report.html as text."""
-    from markupsafe import Markup
-
     from harness.report.inspection_page import PageText, inspection_html
 
     text = PageText(
@@ -404,7 +421,7 @@ def _page_html(run: Inspection, subject: str, scene: Scene3d, provenance: Mappin
         summary=tuple(_summary_rows(run.verdict)),
         judged=tuple(_judged_rows(run)),
         facts=tuple(_fact_rows(run)),
-        limit=Markup(""),
+        limit=_limit_section(run.limit),
         files=_files_text(run),
         provenance=provenance,
     )
@@ -487,6 +504,24 @@ def _fact_rows(run: Inspection) -> list[tuple[str, str]]:
     if choice is not None:
         rows.append(("choice of the detector", plain(choice)))
     return rows
+
+
+def _limit_section(limit: Limit | None) -> Markup:
+    """Return the section on sizes that would have been missed; empty if nobody asked."""
+    if limit is None:
+        return joined(())
+    heads = ("width (mm)", "depth (mm)", "found", "95 % interval")
+    rows = []
+    for size in limit.sizes:
+        share = f"{100 * size.low:.0f} to {100 * size.high:.0f} %"
+        found = f"{size.hits} of {size.places}"
+        rows.append((f"{size.diameter_mm:.2f}", f"{size.depth_mm:.2f}", found, share))
+    sentence = f"{limit.text[0].upper()}{limit.text[1:]}."
+    how = (
+        "Flat discs were pressed into this capture's cloud at places without findings, blurred by"
+        " the camera's filter, and searched by the same detector at the same threshold."
+    )
+    return joined([paragraph(sentence), paragraph(how), Grid.of(heads, rows).html()])
 
 
 def _registration_text(registration: Mapping[str, Any]) -> str:

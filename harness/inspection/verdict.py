@@ -67,7 +67,7 @@ def with_remarks(result: Judged, threshold: float) -> Judged:
     bare = replace(result, remarks=())
     least_score = clear_score(result.evidence, threshold)
     cut = _cut_by_the_rim(result.cloud, result.evidence, result.detections)
-    floor_mm = least_floor_mm(result.cloud)
+    floor_mm = least_floor_mm(result.cloud, result.evidence)
     remarks = []
     for finding, is_cut in zip(bare.findings, cut, strict=True):
         flags = flags_of(finding, is_cut=is_cut, least_score=least_score)
@@ -133,19 +133,21 @@ def term_of(finding: Finding, floor_mm: float) -> str:
     return "dent" if finding.diameter_mm >= floor_mm else "hole or dent"
 
 
-def least_floor_mm(cloud: Cloud) -> float:
+def least_floor_mm(cloud: Cloud, evidence: Evidence) -> float:
     """Return the width of damage whose floor the camera's filter leaves visible; 0 without a pixel
     grid, where no filter is known."""
     if not cloud.organised:
         return 0.0
     filter_px = max(cloud.noise_reach_px, LEAST_FILTER_PX)
-    return FLOOR_FILTERS * filter_px * pitch_mm(cloud)
+    return FLOOR_FILTERS * filter_px * pitch_mm(cloud, evidence)
 
 
-def pitch_mm(cloud: Cloud) -> float:
-    """Return the typical distance in x between neighbours of a pixel grid; NaN if no pixel has a
-    neighbour."""
-    steps_m = np.abs(np.diff(cloud.points_m[..., 0], axis=1))
+def pitch_mm(cloud: Cloud, evidence: Evidence) -> float:
+    """Return the typical distance in x between neighbours in a row of the judged area; NaN if no
+    pixel has a neighbour."""
+    is_judged = np.isfinite(evidence.residual_m)
+    x_m = np.where(is_judged, surface_points_m(cloud, evidence.surface_z_m)[..., 0], np.nan)
+    steps_m = np.abs(np.diff(x_m, axis=1))
     finite_m = steps_m[np.isfinite(steps_m)]
     return float(np.median(finite_m)) / MM if len(finite_m) else math.nan
 
@@ -207,15 +209,24 @@ def pixel_areas_m2(cloud: Cloud, surface_z_m: np.ndarray) -> np.ndarray:
     """Return (h, w): the area of the fitted surface that each pixel sees, NaN where neither
     neighbour is known. Without a pixel grid it is the area of the cloud's plan view in x and y,
     spread over its points: the surface's slope is not counted."""
-    rays = cloud.points_m[..., :2]
-    if cloud.projection == "central":
-        rays = rays * (surface_z_m / cloud.points_m[..., 2])[..., None]
-    surface_m = np.concatenate([rays, surface_z_m[..., None]], axis=-1)
+    surface_m = surface_points_m(cloud, surface_z_m)
     if not cloud.organised:
         return _plan_areas_m2(surface_m)
-    along_row = _neighbour_steps(surface_m, axis=1)
-    along_column = _neighbour_steps(surface_m, axis=0)
+    along_row, along_column = surface_steps_m(surface_m)
     return np.asarray(np.linalg.norm(np.cross(along_row, along_column), axis=-1))
+
+
+def surface_points_m(cloud: Cloud, surface_z_m: np.ndarray) -> np.ndarray:
+    """Return (h, w, 3): where each pixel's ray meets the fitted surface."""
+    across_m = cloud.points_m[..., :2]
+    if cloud.projection == "central":
+        across_m = across_m * (surface_z_m / cloud.points_m[..., 2])[..., None]
+    return np.concatenate([across_m, surface_z_m[..., None]], axis=-1)
+
+
+def surface_steps_m(surface_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps (h, w, 3) to the neighbours along the row and along the column."""
+    return _neighbour_steps(surface_m, axis=1), _neighbour_steps(surface_m, axis=0)
 
 
 def _neighbour_steps(surface_m: np.ndarray, axis: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from harness.inspection.verdict import (
     extent_of,
     flags_of,
     least_floor_mm,
+    pitch_mm,
     term_of,
     verdict_of,
     with_remarks,
@@ -176,9 +177,20 @@ def test_a_dent_is_less_deep_than_a_quarter_of_its_width_and_shows_its_floor(
 def test_a_floor_is_seen_from_three_widths_of_the_filter():
     """Pixels of 2 mm: three times the lens' blur of 2 pixels, or of a filter of 5 pixels."""
     cloud = plane_cloud()
-    assert least_floor_mm(cloud) == pytest.approx(12.0)
-    assert least_floor_mm(replace(cloud, noise_reach_px=5.0)) == pytest.approx(30.0)
-    assert least_floor_mm(replace(cloud, organised=False)) == 0.0
+    evidence = evidence_of(cloud)
+    assert least_floor_mm(cloud, evidence) == pytest.approx(12.0)
+    assert least_floor_mm(replace(cloud, noise_reach_px=5.0), evidence) == pytest.approx(30.0)
+    assert least_floor_mm(replace(cloud, organised=False), evidence) == 0.0
+
+
+def test_a_wall_behind_the_part_does_not_change_the_size_of_its_pixels():
+    cloud = plane_cloud()
+    behind = cloud.points_m.copy()
+    behind[:, 20:] *= 3.0
+    residual = np.zeros((40, 60))
+    residual[:, 20:] = np.nan
+    evidence = evidence_of(cloud, residual_m=residual)
+    assert pitch_mm(replace(cloud, points_m=behind), evidence) == pytest.approx(2.0)
 
 
 # ---- areas
