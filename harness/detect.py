@@ -69,6 +69,12 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     add("--flat-field", type=Path, metavar="FILE.npz", help=flat)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
+    limit = (
+        "state which sizes would have been missed, from damage of this depth that is pressed into "
+        "the capture (default: half as deep as wide); takes an analysis for each of up to nine "
+        "sizes"
+    )
+    add("--limit", nargs="?", const="", metavar="DEPTH", help=limit)
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is one view. --crop cuts the target out of each view, and the detector "

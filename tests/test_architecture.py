@@ -41,7 +41,13 @@ ALLOWED = {
         "detectors.interface",
     ),
     "harness.testing": ("detectors",),
-    "harness.inspection": ("harness.records", "harness.report", "scenes.sensor", "detectors"),
+    "harness.inspection": (
+        "harness.records",
+        "harness.evaluation",
+        "harness.report",
+        "scenes.sensor",
+        "detectors",
+    ),
     "harness.trials": (
         "harness.records",
         "harness.evaluation",

@@ -25,6 +25,8 @@ def rows_of(truths):
             "depth_mm": f"{depth}",
             "u_px": "0",
             "v_px": "0",
+            "certainty": "sure",
+            "flags": "",
         }
     return rows
 
@@ -62,6 +64,33 @@ def test_wrong_answers_are_wrong(board):
         assert score.verdict == "wrong" and why in score.why[0], (why, score.why)
         assert scored(*board, 0, "warning: not sure\n", rows).verdict == "warned"
         assert scored(*board, 0, "8 frames\nwarning: too late\n", rows).verdict == "wrong"
+
+
+def test_a_wrong_size_is_warned_of_by_a_flag_that_says_why(board):
+    true = rows_of(board[2])
+    clear = [row for row, truth in zip(true, board[2], strict=True) if truth.clear]
+    for flags, verdict in (
+        ("at_rim", "warned"),
+        ("open_behind faint", "warned"),
+        ("size_from_contour", "wrong"),
+    ):
+        wide = {"diameter_mm": "200", "flags": flags}
+        rows = [{**row, **wide} if row is clear[0] else row for row in true]
+        assert scored(*board, 0, "", rows).verdict == verdict
+        missing_too = [row for row in rows if row is not clear[1]]
+        assert scored(*board, 0, "", missing_too).verdict == "wrong"
+
+
+def test_three_doubtful_false_findings_are_right_and_four_are_not(board):
+    true = rows_of(board[2])
+    depth_mm = true[0]["z_mm"]
+    places = [{"x_mm": f"{x}", "y_mm": "30", "z_mm": depth_mm} for x in (-40, -10, 10, 40)]
+    stray = [{**true[0], **place, "certainty": "doubtful"} for place in places]
+    assert scored(*board, 0, "", [*true, *stray[:3]]).verdict == "right"
+    four = scored(*board, 0, "", [*true, *stray])
+    assert four.verdict == "wrong" and four.why == ("4 doubtful ones false",)
+    sure = [{**row, "certainty": "sure"} for row in stray[:2]]
+    assert scored(*board, 0, "", [*true, *sure]).why == ("2 false",)
 
 
 def test_a_refusal_is_a_warning_and_a_traceback_is_not(board):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json
+from harness.vocabulary.program import length_m
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version
 
 if TYPE_CHECKING:
@@ -122,6 +123,19 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
         raise UserError(
             message, fix="use --threshold with a value at which undamaged views have no finding"
         )
+
+
+def limit_depth_m(arguments: argparse.Namespace) -> float | None:
+    """Return the depth of --limit; None if none is stated. Raises UserError if it is no length, or
+    if several views are judged without a grid."""
+    text = getattr(arguments, "limit", None)
+    if not text:
+        return None
+    try:
+        return length_m("limit", text)
+    except UserError as mistake:
+        fix = f"write a depth, such as --limit 2mm, or put --limit after the paths: {mistake.fix}"
+        raise UserError(mistake.message, legal=mistake.legal, fix=fix) from mistake
 
 
 def refuse_repeats(paths: Sequence[Path]) -> None:

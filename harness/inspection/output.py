@@ -12,7 +12,7 @@ import numpy as np
 
 from detectors.crop import AutoCrop, Choice, choice_of, described_text
 from harness.records.examples import Circle3d, Scene3d
-from harness.report.findings import Finding, Judged, save_targets
+from harness.report.findings import Finding, Judged, probability, save_targets
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.text import Grid, show
 
@@ -179,11 +179,34 @@ def threshold_text(threshold: float, evidence: Evidence) -> str:
     )
 
 
-def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
-    """Print the findings, strongest first. ``grid``: the unit of u and v."""
+MOST_ROWS = 20
+"""Most findings that the terminal lists."""
+
+
+def print_classes(counts: Mapping[str, int]) -> None:
+    """Print the number of findings of each class, in one line."""
+    parts = [f"{count} {name}" for name, count in counts.items()]
+    print(f"classes: {', '.join(parts)}")
+
+
+def print_findings(findings: Sequence[Finding], grid: str = "px", is_written: bool = True) -> None:
+    """Print the strongest findings and the number of the others. ``grid``: the unit of u and v;
+    ``is_written``: all of them are written to a file."""
     if not findings:
         print("no findings")
         return
+    shown = findings[:MOST_ROWS]
+    show([_findings_grid(shown, grid)])
+    further = len(findings) - len(shown)
+    if further:
+        print(f"... and {further} more{_where_written(is_written)}")
+
+
+def _where_written(is_written: bool) -> str:
+    return " in findings.csv" if is_written else " (--out DIR writes all of them)"
+
+
+def _findings_grid(findings: Sequence[Finding], grid: str) -> Grid:
     columns = {
         "u_px": f"u {grid}",
         "v_px": f"v {grid}",
@@ -191,83 +214,92 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
         "y_mm": "y mm",
         "z_mm": "z mm",
     }
-    heads = (
-        "id",
-        "kind",
-        *columns.values(),
-        "diam. mm",
-        "from",
-        "depth mm",
-        "vol. mm3",
-        "points",
-        "score",
-    )
+    heads = ["id", "what", *columns.values(), "diam. mm", "depth mm", "score", "class", "p(noise)"]
     rows = []
-    for f in findings:
-        sizes = (
-            number(f.diameter_mm, 1),
-            f.size_from,
-            number(f.depth_mm, 2),
-            number(f.volume_mm3, 1),
-        )
-        rows.append(
-            (
-                f.id,
-                f.kind,
-                *(number(getattr(f, key), 1) for key in columns),
-                *sizes,
-                f.points,
-                f"{f.score:.2f}",
-            )
-        )
-    if any(f.is_long for f in findings):
-        heads += ("long damage: mm, degrees",)
-        long = [
-            f"{f.length_mm:.1f} x {f.width_mm:.1f}, {f.angle_deg:.0f}" if f.is_long else "-"
-            for f in findings
-        ]
-        rows = [(*row, text) for row, text in zip(rows, long, strict=True)]
-    show([Grid.of(heads, rows, left=0)])
+    for finding in findings:
+        row = [finding.id, finding.term or finding.kind]
+        row += [number(getattr(finding, key), 1) for key in columns]
+        row += [number(finding.diameter_mm, 1), number(finding.depth_mm, 2)]
+        row += [f"{finding.score:.2f}", finding.certainty, probability(finding.noise_probability)]
+        rows.append(row)
+    if any(finding.is_long for finding in findings):
+        heads.append("long damage: mm, degrees")
+        for row, finding in zip(rows, findings, strict=True):
+            row.append(finding.long_text or "-")
+    heads.append("flags")
+    for row, finding in zip(rows, findings, strict=True):
+        row.append(finding.flags)
+    return Grid.of(heads, rows, left=2)
 
 
-def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
-    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around
-    each finding."""
+FARTHEST_FROM_PART = 1.0
+"""Points that are farther before or behind the part than this share of its width are not shown:
+the room behind it would make it small."""
+
+
+def scene_of(judged: Judged, facts: Sequence[tuple[str, str]], mapped: Mapped | None) -> Scene3d:
+    """Return the valid points about the part (x right, y down, z away, mm), with a ring around
+    each finding. ``facts``: name and value of what stands beside the cloud; ``mapped``: the views
+    of a merged cloud, all of whose points are shown."""
     cloud = judged.cloud
-    merged = mapped.merged
-    valid = cloud.valid.reshape(-1)
-    detected = np.zeros(valid.size, bool)
+    shown = cloud.valid.reshape(-1)
+    if mapped is None:
+        shown = shown & _near_part(judged).reshape(-1)
+    detected = np.zeros(shown.size, bool)
     for detection in judged.detections:
         detected[detection.pixels] = True
-    rgb = (
-        None
-        if cloud.rgb is None
-        else np.clip(np.nan_to_num(cloud.rgb.reshape(-1, 3)[valid]), 0, 255)
-    )
-    circles = [
-        Circle3d(
-            place_mm,
-            np.array([0.0, 0.0, -1.0]),
-            f.diameter_mm,
-            f"{f.id}: {f.diameter_mm:.1f}",
-            "finding",
-        )
-        for f in judged.findings
-        if np.isfinite([*(place_mm := np.array([f.x_mm, f.y_mm, f.z_mm])), f.diameter_mm]).all()
-    ]
+    rgb = None
+    if cloud.rgb is not None:
+        colours = np.nan_to_num(cloud.rgb.reshape(-1, 3)[shown])
+        rgb = np.clip(colours, 0, 255).astype(np.uint8)
     return Scene3d(
-        points_mm=cloud.points_m.reshape(-1, 3)[valid] / MM,
+        points_mm=cloud.points_m.reshape(-1, 3)[shown] / MM,
         frame="camera",
-        rgb=None if rgb is None else rgb.astype(np.uint8),
-        residual_mm=judged.evidence.residual_m.reshape(-1)[valid] / MM,
-        view_of=mapped.view_of_points()[valid],
-        view_names=merged.views_used,
-        detected=detected[valid],
-        circles=tuple(circles),
-        facts=(
-            ("views", str(len(merged.views_used))),
-            ("frames in all", str(sum(view.view.cloud.n_frames for view in mapped.views))),
-            ("registration", mapped.registrations[-1].method),
-            ("findings", str(len(judged.findings))),
-        ),
+        rgb=rgb,
+        residual_mm=judged.evidence.residual_m.reshape(-1)[shown] / MM,
+        view_of=None if mapped is None else mapped.view_of_points()[shown],
+        view_names=() if mapped is None else mapped.merged.views_used,
+        detected=detected[shown],
+        circles=_rings(judged.findings),
+        facts=tuple(facts),
     )
+
+
+def _near_part(judged: Judged) -> np.ndarray:
+    """Return (h, w) bool: points in the box of what was judged, `FARTHEST_FROM_PART` larger."""
+    points_m = judged.cloud.points_m
+    is_judged = np.isfinite(judged.evidence.residual_m) & judged.cloud.valid
+    part_m = points_m[is_judged]
+    if not len(part_m):
+        return judged.cloud.valid
+    low_m = part_m.min(axis=0)
+    high_m = part_m.max(axis=0)
+    beyond_m = FARTHEST_FROM_PART * float((high_m - low_m)[:2].max())
+    margin_m = np.array([0.1 * beyond_m, 0.1 * beyond_m, beyond_m])
+    with np.errstate(invalid="ignore"):
+        inside = (points_m >= low_m - margin_m) & (points_m <= high_m + margin_m)
+    return np.asarray(inside.all(axis=-1))
+
+
+def _rings(findings: Sequence[Finding]) -> tuple[Circle3d, ...]:
+    """Return a ring around each finding with a place and a diameter."""
+    rings = []
+    for finding in findings:
+        centre_mm = np.array([finding.x_mm, finding.y_mm, finding.z_mm])
+        if not np.isfinite([*centre_mm, finding.diameter_mm]).all():
+            continue
+        label = f"{finding.id}: {finding.diameter_mm:.1f}"
+        to_camera = np.array([0.0, 0.0, -1.0])
+        rings.append(Circle3d(centre_mm, to_camera, finding.diameter_mm, label, "finding"))
+    return tuple(rings)
+
+
+def map_facts(mapped: Mapped, judged: Judged) -> list[tuple[str, str]]:
+    """Return what stands beside a merged cloud."""
+    frames = sum(view.view.cloud.n_frames for view in mapped.views)
+    return [
+        ("views", str(len(mapped.merged.views_used))),
+        ("frames in all", str(frames)),
+        ("registration", mapped.registrations[-1].method),
+        ("findings", str(len(judged.findings))),
+    ]

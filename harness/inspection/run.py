@@ -7,6 +7,7 @@ import argparse
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,30 +16,31 @@ import numpy as np
 
 from detectors.averages.average import RECORDED, average, unsteadiness
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
-from detectors.crop import Choice
+from detectors.crop import Choice, described_text
 from detectors.interface import Detector
 from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
-from harness.inspection.judging import (
-    analysed,
-    judged,
-    refuse_thresholds,
-    threshold_of,
-    with_faint_warning,
-    with_size_warnings,
-)
+from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
+from harness.inspection.limit import Limit, limit_of
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
+from harness.inspection.verdict import CLASSES, FLAGS, InspectionVerdict, calls_text, verdict_of
+from harness.records import outputs
+from harness.report.blocks import joined, paragraph, plain
 from harness.report.findings import Judged, write_findings
 from harness.vocabulary.files import plain_json
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.provenance import record
+from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from detectors.recordings import Recording
     from detectors.views.mapping.merge import Mapped
     from detectors.views.mapping.settings import MappingConfig
+    from harness.records.examples import Scene3d
 
 FileWriter = Callable[[Path], object]
 
@@ -70,6 +72,10 @@ class Inspection:
     """Units of score."""
     threshold_origin: str
     """Where the threshold comes from, in words."""
+    verdict: InspectionVerdict
+    """The answer."""
+    limit: Limit | None
+    """The sizes that would have been missed; None if they were not asked for."""
 
     @property
     def cell_m(self) -> float | None:
@@ -84,6 +90,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     paths = arguments.paths[: config.views] if config else arguments.paths
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
+    cli.limit_depth_m(arguments)
     detector, settings = _detector_of(arguments, config)
     flat_field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
     guesses: Sequence[np.ndarray | None] = (None,) * len(paths)
@@ -127,9 +134,6 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         arguments, detector, cloud, evidence, silent_threshold
     )
     result = judged(detector, cloud, evidence, threshold)
-    if mapped is None:
-        result = with_faint_warning(result, threshold)
-    result = with_size_warnings(result)
     return Inspection(
         arguments=arguments,
         recordings=recordings,
@@ -143,7 +147,27 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         result=result,
         threshold=threshold,
         threshold_origin=threshold_origin,
+        verdict=verdict_of(result, threshold, _outline(choices, mapped)),
+        limit=_limit(arguments, detector, result, threshold),
     )
+
+
+def _outline(choices: Sequence[Choice | None], mapped: Mapped | None) -> np.ndarray | None:
+    """Return the outline (h, w) bool of the target that was taken; None for a map, or if none was
+    sought."""
+    choice = choices[0]
+    if mapped is not None or choice is None or not choice.candidates:
+        return None
+    return choice.candidates[choice.taken - 1].outline
+
+
+def _limit(
+    arguments: argparse.Namespace, detector: Detector, result: Judged, threshold: float
+) -> Limit | None:
+    """Return the sizes that would have been missed, if they were asked for."""
+    if arguments.limit is None:
+        return None
+    return limit_of(detector, result, threshold, cli.limit_depth_m(arguments))
 
 
 def _detector_of(
@@ -197,27 +221,47 @@ def _capture_doubts(
     return list(dict.fromkeys(found))
 
 
-def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> None:
-    """Print warnings (``further_warnings`` last), the capture, the surface, the threshold and the
-    findings."""
-    evidence = run.result.evidence
+def warnings_of(run: Inspection) -> tuple[str, ...]:
+    """Return the doubts about the answer as a whole. With several views, doubts about their
+    targets were printed before the registration."""
     warnings = [warning for recording in run.recordings for warning in recording.warnings]
     choice = run.choices[0]
     if run.mapped is None and choice:
-        # with several views, doubts about their targets were printed before the registration
         warnings += choice.warnings
-    output.print_warnings((*warnings, *evidence.warnings, *further_warnings))
+    return (*warnings, *run.result.evidence.warnings)
+
+
+def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> None:
+    """Print warnings (``further_warnings`` last), the verdict, the capture, the surface, the
+    threshold, the classes and the strongest findings."""
+    output.print_warnings((*warnings_of(run), *further_warnings))
+    print(run.verdict.sentence)
     if run.mapped is None:
         _print_capture(run)
     else:
         _print_map(run, run.mapped)
-    unit = evidence.unit or f"{output.mm(evidence.scale_m)} at the median point"
-    print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {unit}")
+    print(f"surface: {_surface_text(run)}")
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
-    threshold = output.threshold_text(run.threshold, evidence)
-    print(f"threshold: {threshold} ({run.threshold_origin})")
-    output.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
+    print(f"threshold: {_threshold_text(run)}")
+    if run.limit is not None:
+        print(f"limit: {run.limit.text}")
+    findings = run.result.findings
+    if findings:
+        output.print_classes(run.verdict.counts)
+    grid = "px" if run.cell_m is None else "cell"
+    output.print_findings(findings, grid, is_written=run.arguments.out is not None)
+
+
+def _surface_text(run: Inspection) -> str:
+    evidence = run.result.evidence
+    unit = evidence.unit or f"{output.mm(evidence.scale_m)} at the median point"
+    return f"{evidence.notes.get('surface', '')}; one unit of score is {unit}"
+
+
+def _threshold_text(run: Inspection) -> str:
+    limit = output.threshold_text(run.threshold, run.result.evidence)
+    return f"{limit} ({run.threshold_origin})"
 
 
 def _print_capture(run: Inspection) -> None:
@@ -262,6 +306,8 @@ def write_inspection(
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {len(run.result.detections)} findings beyond {limit}"
     files: dict[str, FileWriter] = dict(further_files or {})
+    facts = _facts(run, command, further_inputs)
+    scene = output.scene_of(run.result, _scene_facts(run), mapped)
     if mapped is None:
         cloud_name = "cloud.ply"
         files |= output.pictures(run.choices[0])
@@ -269,18 +315,26 @@ def write_inspection(
         from harness.report.view3d import write_view3d
 
         cloud_name = "merged.ply"
-        scene = output.scene_of(mapped, run.result)
         registrations = plain_json(run.registrations)
         files["registrations.json"] = lambda path: path.write_text(registrations, encoding="utf-8")
         files["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
             files |= output.pictures(choice, f"targets-{number}.png")
-    facts = _facts(run, command, further_inputs)
+    page = partial(_page_html, run, subject, scene, facts["provenance"])
+    files[outputs.INSPECTION_PAGE.name] = lambda path: path.write_text(page(), encoding="utf-8")
     written = write_findings(
         run.arguments.out, run.result, facts, title, cloud_name=cloud_name, beside=files
     )
     for path in written:
         print(f"wrote {path}")
+
+
+def _scene_facts(run: Inspection) -> list[tuple[str, str]]:
+    """Return what stands beside the cloud."""
+    if run.mapped is not None:
+        return output.map_facts(run.mapped, run.result)
+    frames = str(run.result.cloud.n_frames)
+    return [("frames averaged", frames), ("findings", str(len(run.result.findings)))]
 
 
 def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dict[str, Any]:
@@ -306,6 +360,8 @@ def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dic
     return {
         **_capture_facts(run),
         "threshold": {"k": run.threshold, "mm": threshold_mm, "from": run.threshold_origin},
+        "verdict": run.verdict.facts,
+        "limit": None if run.limit is None else run.limit.facts,
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
@@ -346,3 +402,144 @@ def _file_facts(path: Path) -> dict[str, str]:
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {"path": str(path), "sha256": digest}
+
+
+# ---------------------------------------------------------------- the page
+
+
+def _page_html(run: Inspection, subject: str, scene: Scene3d, provenance: Mapping[str, Any]) -> str:
+    """Return report.html as text."""
+    from harness.report.inspection_page import PageText, inspection_html
+
+    text = PageText(
+        title=subject,
+        sentence=run.verdict.sentence,
+        conditions=_conditions(run),
+        warnings=warnings_of(run),
+        classes=CLASSES,
+        flags=FLAGS,
+        summary=tuple(_summary_rows(run.verdict)),
+        judged=tuple(_judged_rows(run)),
+        facts=tuple(_fact_rows(run)),
+        limit=_limit_section(run.limit),
+        files=_files_text(run),
+        provenance=provenance,
+    )
+    return inspection_html(run.result, scene, text)
+
+
+def _conditions(run: Inspection) -> str:
+    """Return the frames, the distance and the detector in a few words."""
+    cloud = run.result.cloud
+    is_judged = np.isfinite(run.result.evidence.residual_m)
+    parts = [many(cloud.n_frames, "frame")]
+    if run.mapped is not None:
+        views = many(len(run.mapped.merged.views_used), "view")
+        parts = [f"{views} merged"]
+    elif is_judged.any():
+        distance_m = float(np.median(run.result.evidence.surface_z_m[is_judged]))
+        parts.append(f"{distance_m:.2f} m away")
+    parts.append(f"detector {run.detector.name} {run.detector.version}")
+    return ", ".join(parts)
+
+
+def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
+    """Return the figures of the verdict."""
+    rows = [(name, str(count)) for name, count in verdict.counts.items()]
+    extent = verdict.extent
+    if np.isfinite(extent.judged_m2):
+        rows.append(("judged", f"{1e4 * extent.judged_m2:.4g} cm2"))
+    if np.isfinite(extent.judged_share):
+        rows.append(("share of the part", f"{100 * extent.judged_share:.0f} %"))
+    if np.isfinite(extent.blind_m2):
+        rows.append(("blind", f"{1e4 * extent.blind_m2:.3g} cm2"))
+    expected = verdict.expected_false_calls
+    text = "unknown" if np.isnan(expected) else calls_text(expected)
+    rows.append(("expected false calls", text))
+    return rows
+
+
+def _judged_rows(run: Inspection) -> list[tuple[str, str]]:
+    """Return what was judged and what not."""
+    extent = run.verdict.extent
+    rows = []
+    if np.isfinite(extent.judged_m2):
+        share = ""
+        if np.isfinite(extent.judged_share):
+            share = f", {100 * extent.judged_share:.0f} % of the part's outline"
+        rows.append(("judged", f"{1e4 * extent.judged_m2:.4g} cm2{share}"))
+    missing = run.result.missing
+    if missing is not None:
+        blind = f"{1e4 * extent.blind_m2:.3g} cm2, {100 * missing.blind:.2g} % of the outline"
+        rows.append(("blind: no light came back", blind))
+    null = run.result.evidence.notes.get("own_null")
+    if null is not None:
+        rim = f"{null['rim_pixels']} pixels, not judged"
+        rows.append(("rim mixed with what lies behind", rim))
+        objects = f"{null['objects']} places, whose bumps are not taken as noise"
+        rows.append(("objects, printed marks and edges in the picture", objects))
+    choice = run.choices[0]
+    if run.mapped is None and choice is not None:
+        for number, candidate in enumerate(choice.candidates, start=1):
+            role = "taken" if number == choice.taken else f"not judged: --target {number}"
+            rows.append((f"surface {number}", f"{described_text(candidate)} ({role})"))
+    pieces = run.result.evidence.notes.get("pieces")
+    if pieces is not None:
+        rows.append(("pieces of the part", plain(pieces)))
+    return rows
+
+
+def _fact_rows(run: Inspection) -> list[tuple[str, str]]:
+    """Return how the capture was read and judged."""
+    rows = []
+    for recording in run.recordings:
+        rows.append((recording.name, "; ".join((recording.unit_text, *recording.notes))))
+    for left_out in run.result.cloud.left_out:
+        rows.append(("left out", f"{left_out.name}: {left_out.why}"))
+    for registration in run.registrations.get("views", ()):
+        rows.append((f"registration of {registration['view']}", _registration_text(registration)))
+    rows.append(("surface", _surface_text(run)))
+    rows.append(("threshold", _threshold_text(run)))
+    choice = run.result.evidence.notes.get("choice")
+    if choice is not None:
+        rows.append(("choice of the detector", plain(choice)))
+    return rows
+
+
+def _limit_section(limit: Limit | None) -> Markup:
+    """Return the section on sizes that would have been missed; empty if nobody asked."""
+    if limit is None:
+        return joined(())
+    heads = ("width (mm)", "depth (mm)", "found", "95 % interval")
+    rows = []
+    for size in limit.sizes:
+        share = f"{100 * size.low:.0f} to {100 * size.high:.0f} %"
+        found = f"{size.hits} of {size.places}"
+        rows.append((f"{size.diameter_mm:.2f}", f"{size.depth_mm:.2f}", found, share))
+    sentence = f"{limit.text[0].upper()}{limit.text[1:]}."
+    how = (
+        "Flat discs were pressed into this capture's cloud at places without findings, blurred by"
+        " the camera's filter, and searched by the same detector at the same threshold."
+    )
+    return joined([paragraph(sentence), paragraph(how), Grid.of(heads, rows).html()])
+
+
+def _registration_text(registration: Mapping[str, Any]) -> str:
+    residual = output.number(registration["residual_mm"], 3)
+    in_plane = output.number(registration["predicted_in_plane_mm"], 3)
+    across = output.number(registration["predicted_across_mm"], 3)
+    return (
+        f"{registration['method']}, residual {residual} mm, predicted error {in_plane} mm in plane"
+        f" and {across} mm across"
+    )
+
+
+def _files_text(run: Inspection) -> dict[str, str]:
+    """Return the files beside the page, with their content."""
+    files = {
+        output_file.name: output_file.note
+        for output_file in (outputs.FINDINGS, outputs.FINDINGS_DATA, outputs.ANNOTATED)
+    }
+    cloud_name = outputs.CLOUD.name if run.mapped is None else "merged.ply"
+    files[cloud_name] = outputs.CLOUD.note
+    return files

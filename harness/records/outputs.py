@@ -49,6 +49,12 @@ FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
 FINDINGS_DATA = Output(
     "findings.json", "findings by both measures, target, settings, origin", "capture", "capture"
 )
+INSPECTION_PAGE = Output(
+    REPORT.name,
+    "the verdict, the findings in picture and cloud, and the table",
+    "capture",
+    "capture",
+)
 ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
 TARGETS = Output(
     "targets.png", "the targets that were found, with the chosen target", "capture", "capture"
@@ -72,6 +78,7 @@ FILES = (
     ATLAS_PICTURE,
     FINDINGS,
     FINDINGS_DATA,
+    INSPECTION_PAGE,
     ANNOTATED,
     TARGETS,
     BLIND,

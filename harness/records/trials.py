@@ -625,6 +625,33 @@ FINDINGS_OF_CAPTURE = Table(
             "angle of the rectangle's length from x towards y (down), -90 to 90",
         ),
         Column(
+            "noise_probability",
+            "",
+            "noise_probability",
+            "probability that noise alone made it; empty where unknown",
+        ),
+        Column(
+            "certainty",
+            "",
+            "certainty",
+            "sure; doubtful (noise may explain it); rim or blind (its rest was not seen, or no"
+            " light came back)",
+        ),
+        Column(
+            "flags",
+            "",
+            "flags",
+            "remarks, separated by spaces: faint, at_rim, open_behind, size_from_contour,"
+            " size_from_extent, depth_from_extreme (docs/recordings.md)",
+        ),
+        Column(
+            "term",
+            "",
+            "term",
+            "hole; dent (a floor was seen, less deep than a quarter of the width); hole or dent"
+            " (too narrow to see a floor); slot (long); bump; no return",
+        ),
+        Column(
             "findings_version",
             "",
             lambda finding: FINDINGS_VERSION,

@@ -172,7 +172,7 @@ def closing(
     return [
         *parts,
         heading("Provenance"),
-        fold("Cost, versions and command", cost, _origin(provenance), *command),
+        fold("Cost, versions and command", cost, origin_table(provenance), *command),
         fold("The resolved experiment", tag("pre", experiment_yaml_text)),
     ]
 
@@ -197,7 +197,7 @@ def _failures(failures: Iterable[Mapping[str, str]]) -> list[Markup]:
     return parts
 
 
-def _origin(provenance: Mapping[str, Any]) -> Markup:
+def origin_table(provenance: Mapping[str, Any]) -> Markup:
     """Return the table of all keys that have no section of their own."""
     remaining_keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
     lines = []

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,11 +78,42 @@ class Finding:
     points) or ``area`` (no return)."""
     depth_from: str
     """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
+    noise_probability: float = math.nan
+    """Probability that noise alone made it; NaN where unknown."""
+    certainty: str = ""
+    """``sure``, ``doubtful`` or ``rim or blind``; empty where nobody has judged it."""
+    flags: str = ""
+    """Remarks on it, as words separated by spaces (`harness.inspection.verdict.FLAGS`)."""
+    term: str = ""
+    """``hole``, ``dent``, ``hole or dent``, ``slot``, ``bump`` or ``no return``."""
 
     @property
     def is_long(self) -> bool:
         """True if it is `ELONGATED`, so that its diameter is of little use."""
         return self.length_mm > ELONGATED * max(self.width_mm, LEAST_WIDTH_MM)
+
+    @property
+    def long_text(self) -> str:
+        """Length, width and angle of a long finding, else an empty text."""
+        if not self.is_long:
+            return ""
+        return f"{self.length_mm:.1f} x {self.width_mm:.1f}, {self.angle_deg:.0f}"
+
+
+def probability(value: float) -> str:
+    """Return a probability of noise with one digit that means something; ``unknown`` for NaN."""
+    if math.isnan(value):
+        return "unknown"
+    return f"{value:.1g}" if value >= 1e-4 else "< 0.0001"
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Words about a finding besides its numbers; see the fields of `Finding`."""
+
+    certainty: str
+    flags: str
+    term: str
 
 
 @dataclass(frozen=True)
@@ -99,15 +130,23 @@ class Judged:
     """The size and place of each cluster."""
     missing: MissingReturns | None = None
     """Missing returns; None without a pixel grid."""
+    remarks: tuple[Remark, ...] = ()
+    """One for each finding, or none at all."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The findings, numbered from 1, strongest first."""
         pairs = zip(self.detections, self.measurements, strict=True)
-        return tuple(
+        measured_only = [
             finding_of(number, self.evidence, detection, measured)
             for number, (detection, measured) in enumerate(pairs, start=1)
-        )
+        ]
+        if not self.remarks:
+            return tuple(measured_only)
+        remarked = []
+        for finding, remark in zip(measured_only, self.remarks, strict=True):
+            remarked.append(replace(finding, **vars(remark)))
+        return tuple(remarked)
 
 
 def finding_of(
@@ -272,7 +311,7 @@ def findings_figure(
     view in mm."""
     has_image = cloud.organised and cloud.rgb is not None
     panels = 2 if has_image else 1
-    box = _around(cloud, np.isfinite(evidence.residual_m))
+    box = part_box(cloud, np.isfinite(evidence.residual_m))
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
@@ -312,7 +351,7 @@ def save_blind_map(
 ) -> None:
     """Write a PNG with each pixel's share of frames without a return, the outline, and findings
     without a return."""
-    box = _around(cloud, missing.outline)
+    box = part_box(cloud, missing.outline)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -360,7 +399,7 @@ def save_targets(
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        axes.imshow(_view(grid), interpolation="nearest")
+        axes.imshow(view_of_grid(grid), interpolation="nearest")
         axes.set_axis_off()
         colours = iter(OTHERS * 2)
         for number, (outline, text) in enumerate(zip(outlines, texts, strict=True), start=1):
@@ -437,7 +476,7 @@ def _height_in(box: Box) -> float:
     return WIDTH_IN * 0.82 * max(bottom - top, 1e-9) / max(right - left, 1e-9) + 0.5
 
 
-def _around(cloud: Cloud, part: np.ndarray) -> Box:
+def part_box(cloud: Cloud, part: np.ndarray) -> Box:
     """Return the box of a part (h, w) bool of the cloud's grid with a margin of a twelfth, inside
     the whole box."""
     left, right, bottom, top = _edges(cloud)
@@ -518,7 +557,7 @@ def _bytes(rgb: Any) -> np.ndarray:
     return np.clip(np.nan_to_num(np.asarray(rgb)), 0, 255).astype(np.uint8)
 
 
-def _view(grid: Cloud) -> np.ndarray:
+def view_of_grid(grid: Cloud) -> np.ndarray:
     """Return (h, w, 3) bytes: colour, else amplitude, else depth."""
     if grid.rgb is not None and np.isfinite(grid.rgb).any():
         return _bytes(grid.rgb)

@@ -92,7 +92,8 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     assert (
         detect.main([str(before_wall), "--out", str(tmp_path / "out"), "--false-calls", "0.1"]) == 0
     )
-    first, second = capsys.readouterr().out.splitlines()[:2]
+    verdict, first, second = capsys.readouterr().out.splitlines()[:3]
+    assert verdict.startswith("One hole found on 0.0")
     assert (
         first.startswith("target 1 of 2: 0.50 m away (0.49 to 0.51 m), 30")
         and " % of the view, tilted by 6" in first
@@ -105,7 +106,7 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     assert (picture == (255, 0, 255)).all(axis=-1).sum() > 1000
     assert [row["kind"] for row in rows_of(tmp_path / "out" / "findings.csv")] == ["hole"]
     assert detect.main([str(before_wall), "--target", "2"]) == 0
-    first, second = capsys.readouterr().out.splitlines()[:2]
+    _, first, second = capsys.readouterr().out.splitlines()[:3]
     assert first.startswith("target 2 of 2: 1.20 m away") and second.startswith(
         "  instead, with --target 1: 0.50 m"
     )
@@ -133,15 +134,25 @@ def test_it_finds_the_hole_and_writes_everything(
     assert "left out: depth/00002.png: the whole range jumps by +18" in printed
     assert "from this capture's own null: 0.1 false calls expected" in printed
     assert sorted(path.name for path in out.iterdir()) == sorted(
-        ("annotated.png", "blind.png", "cloud.ply", "findings.csv", "findings.json", "targets.png")
+        (
+            "annotated.png",
+            "blind.png",
+            "cloud.ply",
+            "findings.csv",
+            "findings.json",
+            "report.html",
+            "targets.png",
+        )
     )
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
     columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,length_mm,width_mm"
-    assert header == f"{columns},angle_deg,findings_version\n"
+    said = "noise_probability,certainty,flags,term"
+    assert header == f"{columns},angle_deg,{said},findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     assert row["kind"] == "hole"
-    number = {key: float(value) for key, value in row.items() if key != "kind"}
+    words = ("kind", "noise_probability", "certainty", "flags", "term")
+    number = {key: float(value) for key, value in row.items() if key not in words}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
     position = [number["x_mm"], number["y_mm"], number["z_mm"]]
     np.testing.assert_allclose(position, TRUE_CENTRE_MM, atol=1.0)
@@ -185,8 +196,14 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     (finding,) = message["findings"]
     row = rows_of(out / "findings.csv")[0]
     assert row["kind"] == finding["kind"] == "hole"
+    assert [row[name] for name in ("certainty", "flags", "term")] == ["sure", "", "hole"]
+    assert row["noise_probability"] == "" and finding["noise_probability"] is None
     for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {
         "kind",
+        "noise_probability",
+        "certainty",
+        "flags",
+        "term",
         "findings_version",
     }:
         assert float(row[column]) == pytest.approx(finding[column], abs=1e-4)
@@ -326,36 +343,46 @@ def test_the_crop_decides_what_is_searched(
     assert len(rows_of(tmp_path / "out" / "findings.csv")) == found
 
 
+@pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize(("left_u_px", "is_cut"), [(45, False), (plane.HOLE_U, True)])
-def test_a_finding_that_the_crop_cuts_is_told_first(
-    capture: Path, capsys: pytest.CaptureFixture[str], left_u_px: float, is_cut: bool
+def test_a_finding_that_the_crop_cuts_is_flagged_and_no_doubt_about_the_answer(
+    capture: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    left_u_px: float,
+    is_cut: bool,
 ) -> None:
-    corners = f"{left_u_px},2,80,2,80,60,{left_u_px},60"
-    assert detect.main([str(capture), "--crop", f"polygon:{corners}", "--threshold", "8"]) == 0
+    crop = f"polygon:{left_u_px},2,80,2,80,60,{left_u_px},60"
+    arguments = [str(capture), "--crop", crop, "--threshold", "8", "--out", str(tmp_path / "out")]
+    assert detect.main(arguments) == 0
+    (row,) = rows_of(tmp_path / "out" / "findings.csv")
+    assert ("at_rim" in row["flags"].split()) == is_cut
+    assert row["certainty"] == ("rim or blind" if is_cut else "sure")
     printed = capsys.readouterr().out
-    assert (
-        printed.startswith("warning: findings that reach the rim of the judged area (1)") == is_cut
-    )
+    assert "warning" not in printed
+    assert printed.startswith("No damage is sure on" if is_cut else "One hole found on")
+    assert ("one place is cut by the rim" in printed) == is_cut
 
 
-@pytest.mark.parametrize(("blur_px", "is_doubted"), [(1, False), (5, True)])
-def test_a_filter_that_hides_the_rim_of_a_hole_to_the_room_behind_is_told_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], blur_px: int, is_doubted: bool
+@pytest.mark.usefixtures("unpictured")
+def test_a_hole_to_the_room_behind_is_flagged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(1)
     v, u = np.mgrid[:120, :160]
-    clean = np.where(np.hypot(u - 90, v - 50) < 8, 2500.0, 700.0)
-    white = rng.standard_normal((8, 120, 160))
-    noise = np.stack([blur_px * cv2.blur(each, (blur_px, blur_px)) for each in white])
-    np.save(tmp_path / "depth.npy", np.rint(clean + noise).astype(np.uint16))
+    is_open = np.hypot(u - 90, v - 50) < 8
+    is_pit = np.hypot(u - 40, v - 80) < 8
+    clean = np.where(is_open, 2500.0, np.where(is_pit, 740.0, 700.0))
+    frames = clean + rng.standard_normal((8, 120, 160))
+    np.save(tmp_path / "depth.npy", np.rint(frames).astype(np.uint16))
     (tmp_path / "lens.json").write_text('{"fx": 400, "fy": 400, "cx": 80, "cy": 60}')
-    assert (
-        detect.main([str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "lens.json")]) == 0
-    )
-    printed = capsys.readouterr().out
-    assert (
-        "show what lies far behind, or nothing (1), may be up to" in printed.split("target 1")[0]
-    ) == is_doubted
+    lens = ["--intrinsics", str(tmp_path / "lens.json")]
+    out = ["--out", str(tmp_path / "out"), "--false-calls", "0.01"]
+    assert detect.main([str(tmp_path / "depth.npy"), *lens, *out]) == 0
+    through, pit = rows_of(tmp_path / "out" / "findings.csv")[:2]
+    assert "open_behind" in through["flags"].split()
+    assert "open_behind" not in pit["flags"].split()
+    assert capsys.readouterr().out.startswith("Two holes found on 0.059 m2 of the part; ")
 
 
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

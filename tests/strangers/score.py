@@ -19,6 +19,11 @@ from tests.strangers.world import View
 NEAR_MM = 12.0
 FALSE_CALLS = 1
 """False findings that a right answer may hold; none of them on another surface than the target."""
+DOUBTFUL_CALLS = 3
+"""False findings of the class "doubtful" that a right answer may hold besides: with one expected,
+more than three happen by chance in 2 % of captures."""
+CAUSES = {"at_rim", "open_behind"}
+"""Flags that warn of a wrong size."""
 FACTOR = 1.5
 """A size is right within this factor of what may rightly be called the size ..."""
 PIXELS = 2.0
@@ -89,17 +94,29 @@ def scored(
     if missed:
         shown = ", ".join(_shown(truth) for truth in missed[:3])
         why.append(f"{len(missed)} of {len(clear)} missed ({shown})")
+    unmatched = [r for r, truth in zip(rows, matched, strict=True) if truth is None]
     elsewhere, false = _unmatched(
-        stranger, view, [r for r, truth in zip(rows, matched, strict=True) if truth is None]
+        stranger, view, [row for row in unmatched if row["certainty"] != "doubtful"]
     )
+    doubtful_elsewhere, doubtful = _unmatched(
+        stranger, view, [row for row in unmatched if row["certainty"] == "doubtful"]
+    )
+    doubtful += doubtful_elsewhere
     if elsewhere:
         why.append(f"{elsewhere} on another surface")
     if false > FALSE_CALLS:
         why.append(f"{false} false")
-    why += _misjudged(stranger, rows, matched)
+    if doubtful > DOUBTFUL_CALLS:
+        why.append(f"{doubtful} doubtful ones false")
+    misjudged, is_flagged = _misjudged(stranger, rows, matched)
+    why += misjudged
+    is_only_flagged = bool(misjudged) and is_flagged and why == misjudged
+    is_warned = bool(warnings) or is_only_flagged
     if stranger.doubtful and not warnings:
         why.append("no word about a target that is none")
-    verdict = "warned" if warnings and (why or stranger.doubtful) else "wrong" if why else "right"
+    verdict = "right"
+    if why:
+        verdict = "warned" if is_warned else "wrong"
     if stranger.doubtful and warnings and code == 0:
         verdict = "warned"
     return Score(
@@ -109,7 +126,7 @@ def scored(
         said,
         len(clear),
         len(clear) - len(missed),
-        false + elsewhere,
+        false + elsewhere + doubtful,
     )
 
 
@@ -165,10 +182,11 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
 
 def _misjudged(
     stranger: Stranger, rows: list[dict[str, str]], matched: list[Truth | None]
-) -> list[str]:
+) -> tuple[list[str], bool]:
     """Wrong signs and sizes of the clearly visible damages, each by the strongest finding at its
-    place."""
+    place, and whether the flags of each of them warn of a wrong size."""
     why = []
+    is_flagged = True
     done = set()
     for row, truth in zip(rows, matched, strict=True):
         if truth is None or not truth.clear or id(truth) in done:
@@ -176,7 +194,9 @@ def _misjudged(
         done.add(id(truth))
         if row["kind"] != truth.kind and "no return" not in (row["kind"], truth.kind):
             why.append(f"a {row['kind']} where a {truth.kind} is ({_shown(truth)})")
+            is_flagged = False
             continue
+        before = len(why)
         pitch_mm = 1e3 * truth.centre_m[2] / stranger.camera.f_px
         diameter = float(row["diameter_mm"] or "nan")
         low, high = (1e3 * d for d in truth.diameter_m)
@@ -191,7 +211,9 @@ def _misjudged(
         )
         if judged and (depth < low / FACTOR - slack or depth > high * FACTOR + slack):
             why.append(f"depth {depth:.1f} mm of {low:.1f}..{high:.1f}")
-    return why
+        if len(why) > before and not CAUSES & set(row["flags"].split()):
+            is_flagged = False
+    return why, is_flagged
 
 
 def _shown(truth: Truth) -> str:

@@ -1,0 +1,419 @@
+"""The verdict of an inspection: class, flags and name of each finding, how much of the part was
+judged, and the sentence that answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from detectors.interface import Detection, Evidence, MissingReturns
+from detectors.pixels.masks import grown, holes_filled
+from harness.report.findings import Finding, Judged, Remark
+from harness.vocabulary.geometry import MM, Cloud
+
+SURE = "sure"
+DOUBTFUL = "doubtful"
+RIM_OR_BLIND = "rim or blind"
+CLASSES = {
+    SURE: "noise explains each with a probability below 0.05; where this is unknown, the score is"
+    " well above the threshold",
+    DOUBTFUL: "noise may explain them",
+    RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
+}
+"""The classes of findings, with their meaning."""
+FLAGS = {
+    "faint": "noise may explain it",
+    "at_rim": "reaches the rim of the judged area: may be larger than stated",
+    "open_behind": "shows what lies far behind, or nothing: may be wider than stated by up to the"
+    " noise's reach, where the camera's filter mixes the rim with what is behind",
+    "size_from_contour": "no model of a hole fits: its diameter is that of its outline at half"
+    " depth",
+    "size_from_extent": "no model of a hole fits: its diameter is that of its outermost points",
+    "depth_from_extreme": "its depth is that of its deepest point, which noise makes deeper",
+}
+"""The flags of findings, with their meaning."""
+MOST_NOISE = 0.05
+"""Probability of noise from which a finding is doubtful. Each sure finding is real with at least
+95 %, so that fewer than one in 20 of them are expected to be false, however many there are."""
+CLEAR_RATIO = 1.5
+"""Ratio of score to threshold from which a finding with unknown odds is not faint. At 1.5 times a
+threshold of 5, normal noise is rarer by a factor of exp(15.6), and noise that falls like
+exp(-score) by exp(2.5)."""
+FAINT_CALLS = 0.05
+"""Noise explains a finding if at least this many false calls of its score are expected."""
+OPEN_MM = 75.0
+"""Depth beyond which a hole shows objects far behind it."""
+DENT_RATIO = 0.25
+"""A dent is less deep than this share of its width; a hemisphere has 0.5."""
+FLOOR_FILTERS = 3.0
+"""Widths of the camera's filter in a damage whose floor is seen: one on each side is the blurred
+rim, and one remains between them."""
+LEAST_FILTER_PX = 2.0
+"""Width of the lens' blur, with which a camera without a filter is counted."""
+
+POINTS_IN_SQUARE = 6
+"""Mean number of points in a square of the plan view that measures a cloud without a grid: a
+random cloud leaves exp(-6) of them empty."""
+
+# ---------------------------------------------------------------- each finding
+
+
+def with_remarks(result: Judged, threshold: float) -> Judged:
+    """Give each finding its class, its flags and its term. ``threshold``: units of score."""
+    bare = replace(result, remarks=())
+    least_score = clear_score(result.evidence, threshold)
+    cut = _cut_by_the_rim(result.cloud, result.evidence, result.detections)
+    floor_mm = least_floor_mm(result.cloud, result.evidence)
+    remarks = []
+    for finding, is_cut in zip(bare.findings, cut, strict=True):
+        flags = flags_of(finding, is_cut=is_cut, least_score=least_score)
+        term = term_of(finding, floor_mm)
+        remarks.append(Remark(certainty=class_of(finding, flags), flags=" ".join(flags), term=term))
+    return replace(result, remarks=tuple(remarks))
+
+
+def flags_of(finding: Finding, *, is_cut: bool, least_score: float) -> tuple[str, ...]:
+    """Return the flags of a finding. ``is_cut``: it reaches the rim; ``least_score``: a finding
+    with unknown odds and a lower score is faint."""
+    present = {
+        "faint": is_faint(finding, least_score),
+        "at_rim": is_cut,
+        "open_behind": finding.kind == "no return" or finding.depth_mm > OPEN_MM,
+        "size_from_contour": finding.size_from == "contour",
+        "size_from_extent": finding.size_from == "extent",
+        "depth_from_extreme": finding.depth_from == "extreme residual",
+    }
+    return tuple(flag for flag in FLAGS if present[flag])
+
+
+def is_faint(finding: Finding, least_score: float) -> bool:
+    """Return whether noise may explain a finding. Missing returns have their own law of chance,
+    which makes them findings only where chance expects 0.01 of them in a capture."""
+    if finding.kind == "no return":
+        return False
+    if math.isnan(finding.noise_probability):
+        return finding.score < least_score
+    return finding.noise_probability >= MOST_NOISE
+
+
+def clear_score(evidence: Evidence, threshold: float) -> float:
+    """Return the score from which a finding with unknown odds is not faint.
+
+    Where the capture set its own threshold, it is the score at which `FAINT_CALLS` are expected.
+    The logarithm of the number of false calls is assumed to fall with the square of the score, as
+    for normal noise, through the peaks above the floor and the upper 95 % bound of the number
+    expected at the threshold. Otherwise it is `CLEAR_RATIO` times the threshold."""
+    null = evidence.notes.get("own_null", {"threshold": None})
+    if threshold != null["threshold"] or not 0 < null["high"] < null["peaks"]:
+        return CLEAR_RATIO * threshold
+    rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
+    further = math.log(max(null["high"] / FAINT_CALLS, 1.0)) / rate
+    return math.sqrt(threshold**2 + further)
+
+
+def class_of(finding: Finding, flags: Sequence[str]) -> str:
+    """Return the class of a finding with these flags."""
+    if "at_rim" in flags or finding.kind == "no return":
+        return RIM_OR_BLIND
+    return DOUBTFUL if "faint" in flags else SURE
+
+
+def term_of(finding: Finding, floor_mm: float) -> str:
+    """Return the name of what was found. ``floor_mm``: the least width at which a floor is seen."""
+    if finding.kind != "hole":
+        return finding.kind
+    if finding.is_long:
+        return "slot"
+    if not finding.depth_mm < DENT_RATIO * finding.diameter_mm:
+        return "hole"
+    return "dent" if finding.diameter_mm >= floor_mm else "hole or dent"
+
+
+def least_floor_mm(cloud: Cloud, evidence: Evidence) -> float:
+    """Return the width of damage whose floor the camera's filter leaves visible; 0 without a pixel
+    grid, where no filter is known."""
+    if not cloud.organised:
+        return 0.0
+    filter_px = max(cloud.noise_reach_px, LEAST_FILTER_PX)
+    return FLOOR_FILTERS * filter_px * pitch_mm(cloud, evidence)
+
+
+def pitch_mm(cloud: Cloud, evidence: Evidence) -> float:
+    """Return the typical distance in x between neighbours in a row of the judged area; NaN if no
+    pixel has a neighbour."""
+    is_judged = np.isfinite(evidence.residual_m)
+    x_m = np.where(is_judged, surface_points_m(cloud, evidence.surface_z_m)[..., 0], np.nan)
+    steps_m = np.abs(np.diff(x_m, axis=1))
+    finite_m = steps_m[np.isfinite(steps_m)]
+    return float(np.median(finite_m)) / MM if len(finite_m) else math.nan
+
+
+def _cut_by_the_rim(
+    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]
+) -> tuple[bool, ...]:
+    """Return whether each detection reaches the rim of the judged area, so that the rest of it was
+    not seen; all False without a pixel grid."""
+    if not cloud.organised:
+        return (False,) * len(detections)
+    is_judged = holes_filled(np.isfinite(evidence.residual_m))
+    outside = np.pad(~is_judged, 1, constant_values=True)
+    is_rim = grown(outside, 1)[1:-1, 1:-1].ravel()
+    return tuple(bool(is_rim[detection.pixels].any()) for detection in detections)
+
+
+# ---------------------------------------------------------------- what was judged
+
+
+@dataclass(frozen=True)
+class Extent:
+    """The judged part of a target; NaN where it is unknown."""
+
+    judged_m2: float
+    """Area of the fitted surface at the pixels that were judged."""
+    judged_share: float
+    """Share of the part's outline that was judged."""
+    blind_m2: float
+    """Area inside the outline from which no light came back."""
+
+
+def extent_of(result: Judged, outline: np.ndarray | None) -> Extent:
+    """Return how much was judged. ``outline`` (h, w) bool: the part, or None if it was not sought;
+    then the outline of the judged area takes its place."""
+    areas_m2 = pixel_areas_m2(result.cloud, result.evidence.surface_z_m)
+    is_judged = np.isfinite(result.evidence.residual_m)
+    typical_m2 = math.nan
+    if np.isfinite(areas_m2[is_judged]).any():
+        typical_m2 = float(np.nanmedian(areas_m2[is_judged]))
+    known_m2 = np.where(np.isfinite(areas_m2), areas_m2, typical_m2)
+    judged_m2 = float(known_m2[is_judged].sum())
+    part = outline
+    if part is None and result.missing is not None:
+        part = result.missing.outline
+    share = math.nan
+    if part is not None and part.shape == is_judged.shape:
+        share = float((is_judged & part).sum() / max(part.sum(), 1))
+    return Extent(judged_m2, share, _blind_m2(result.missing, typical_m2))
+
+
+def _blind_m2(missing: MissingReturns | None, pixel_m2: float) -> float:
+    if missing is None:
+        return math.nan
+    return float(missing.blind * missing.outline.sum() * pixel_m2)
+
+
+def pixel_areas_m2(cloud: Cloud, surface_z_m: np.ndarray) -> np.ndarray:
+    """Return (h, w): the area of the fitted surface that each pixel sees, NaN where neither
+    neighbour is known. Without a pixel grid it is the area of the cloud's plan view in x and y,
+    spread over its points: the surface's slope is not counted."""
+    surface_m = surface_points_m(cloud, surface_z_m)
+    if not cloud.organised:
+        return _plan_areas_m2(surface_m)
+    along_row, along_column = surface_steps_m(surface_m)
+    return np.asarray(np.linalg.norm(np.cross(along_row, along_column), axis=-1))
+
+
+def surface_points_m(cloud: Cloud, surface_z_m: np.ndarray) -> np.ndarray:
+    """Return (h, w, 3): where each pixel's ray meets the fitted surface."""
+    across_m = cloud.points_m[..., :2]
+    if cloud.projection == "central":
+        across_m = across_m * (surface_z_m / cloud.points_m[..., 2])[..., None]
+    return np.concatenate([across_m, surface_z_m[..., None]], axis=-1)
+
+
+def surface_steps_m(surface_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps (h, w, 3) to the neighbours along the row and along the column."""
+    return _neighbour_steps(surface_m, axis=1), _neighbour_steps(surface_m, axis=0)
+
+
+def _neighbour_steps(surface_m: np.ndarray, axis: int) -> np.ndarray:
+    """Return (h, w, 3): the step to the next pixel, or else from the one before."""
+    steps = np.full_like(surface_m, np.nan)
+    between = np.diff(surface_m, axis=axis)
+    later = [slice(None)] * 3
+    earlier = [slice(None)] * 3
+    later[axis] = slice(1, None)
+    earlier[axis] = slice(None, -1)
+    steps[tuple(later)] = between
+    known = np.isfinite(between).all(axis=-1)
+    steps[tuple(earlier)][known] = between[known]
+    return steps
+
+
+def _plan_areas_m2(surface_m: np.ndarray) -> np.ndarray:
+    """Return (h, w): the area of occupied squares of a plan view, spread evenly over the points.
+
+    The squares hold about `POINTS_IN_SQUARE` points, so that few inside the cloud are empty."""
+    areas = np.full(surface_m.shape[:2], np.nan)
+    known = np.isfinite(surface_m).all(axis=-1)
+    plan_m = surface_m[known][:, :2]
+    if len(plan_m) < 2 * POINTS_IN_SQUARE:
+        return areas
+    box_m2 = float(np.prod(np.ptp(plan_m, axis=0)))
+    side_m = math.sqrt(max(box_m2, 1e-12) * POINTS_IN_SQUARE / len(plan_m))
+    squares = np.unique(np.floor((plan_m - plan_m.min(axis=0)) / side_m), axis=0)
+    areas[known] = len(squares) * side_m**2 / len(plan_m)
+    return areas
+
+
+# ---------------------------------------------------------------- the sentence
+
+WORDS = (
+    "no",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+)
+PLURALS = {
+    "hole": "holes",
+    "slot": "slots",
+    "dent": "dents",
+    "hole or dent": "small holes or dents",
+    "bump": "bumps",
+}
+"""Terms of findings that can be sure, in the order of the sentence."""
+SINGULARS = {"hole or dent": "small hole or dent"}
+
+
+@dataclass(frozen=True)
+class InspectionVerdict:
+    """The answer of an inspection."""
+
+    sentence: str
+    """It in one sentence."""
+    counts: dict[str, int]
+    """Number of findings by class."""
+    sure_terms: dict[str, int]
+    """Number of sure findings by term."""
+    extent: Extent
+    expected_false_calls: float
+    """False calls expected in the capture; NaN where unknown."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Return it as plain data, for the JSON."""
+        return {
+            "sentence": self.sentence,
+            "counts": self.counts,
+            "sure": self.sure_terms,
+            "judged_area_m2": self.extent.judged_m2,
+            "judged_share_of_outline": self.extent.judged_share,
+            "blind_area_m2": self.extent.blind_m2,
+            "expected_false_calls": self.expected_false_calls,
+        }
+
+
+def verdict_of(
+    result: Judged, threshold: float, outline: np.ndarray | None = None
+) -> InspectionVerdict:
+    """Return the answer. ``outline``: see `extent_of`."""
+    findings = result.findings
+    counts = {name: 0 for name in CLASSES}
+    terms: dict[str, int] = {}
+    for finding in findings:
+        counts[finding.certainty] += 1
+        if finding.certainty == SURE:
+            terms[finding.term] = terms.get(finding.term, 0) + 1
+    extent = extent_of(result, outline)
+    expected = expected_calls(result.evidence, threshold)
+    clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not findings)]
+    clauses += _other_clauses(findings, is_further=bool(terms))
+    clauses.append(_calls_clause(expected))
+    return InspectionVerdict("; ".join(clauses) + ".", counts, terms, extent, expected)
+
+
+def expected_calls(evidence: Evidence, threshold: float) -> float:
+    """Return the number of false calls expected at the threshold, NaN unless the capture set it."""
+    null = evidence.notes.get("own_null", {"threshold": None})
+    if threshold != null["threshold"]:
+        return math.nan
+    return float(null["expected"])
+
+
+def _sure_clause(terms: dict[str, int], area_m2: float, *, is_empty: bool) -> str:
+    """Return the first clause. ``is_empty``: there is no finding of any class."""
+    counted = []
+    for term in PLURALS:
+        if terms.get(term):
+            counted.append(counted_text(terms[term], term))
+    start = "no damage is sure"
+    if is_empty:
+        start = "no damage found"
+    if counted:
+        start = f"{joined_words(counted)} found"
+    return f"{start[0].upper()}{start[1:]} on {area_text(area_m2)}the part"
+
+
+def counted_text(count: int, term: str) -> str:
+    """Return ``three holes``, ``one dent``, ``44 bumps``."""
+    word = WORDS[count] if count < len(WORDS) else str(count)
+    name = SINGULARS.get(term, term) if count == 1 else PLURALS[term]
+    return f"{word} {name}"
+
+
+def joined_words(parts: Sequence[str]) -> str:
+    """Return ``a``, ``a and b``, or ``a, b and c``."""
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def area_text(area_m2: float) -> str:
+    """Return ``0.12 m2 of `` or ``45 cm2 of ``; empty where the area is unknown."""
+    if not (math.isfinite(area_m2) and area_m2 > 0):
+        return ""
+    if area_m2 < 0.01:
+        return f"{1e4 * area_m2:.2g} cm2 of "
+    return f"{area_m2:.2g} m2 of "
+
+
+def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str]:
+    """Return a clause for the doubtful findings, for those at the rim and for those without a
+    return, if there are any."""
+    doubtful = 0
+    cut = 0
+    blind = 0
+    for finding in findings:
+        doubtful += finding.certainty == DOUBTFUL
+        if finding.certainty == RIM_OR_BLIND:
+            blind += finding.kind == "no return"
+            cut += finding.kind != "no return"
+    clauses = []
+    for count, one, several in (
+        (doubtful, "is doubtful", "are doubtful"),
+        (cut, "is cut by the rim", "are cut by the rim"),
+        (blind, "returned no light", "returned no light"),
+    ):
+        if count:
+            word = WORDS[count] if count < len(WORDS) else str(count)
+            further = " further" if is_further and not clauses else ""
+            place = "place" if count == 1 else "places"
+            clauses.append(f"{word}{further} {place} {one if count == 1 else several}")
+    return clauses
+
+
+def _calls_clause(expected: float) -> str:
+    if math.isnan(expected):
+        return "the number of false calls is unknown"
+    return f"{calls_text(expected)} false calls expected"
+
+
+def calls_text(expected: float) -> str:
+    """Return a number of false calls with a digit that means something; 0 below 1e-4."""
+    if expected >= 0.1:
+        return f"{expected:.1f}"
+    if expected >= 1e-4:
+        return f"{expected:.1g}"
+    return "0"
