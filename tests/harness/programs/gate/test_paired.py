@@ -526,6 +526,8 @@ def test_pairs_that_cannot_be_compared_keep_their_order() -> None:
     assert row.first is not None and row.second is not None
     assert row.first.record is first.set_ups[0]
     assert row.second.record is second.set_ups[0]
+    untested = ComparedSetUps(row.first, row.second)
+    assert untested.limit_p == untested.calls_p == untested.signal_p == (1.0, 1.0)
 
 
 @pytest.mark.parametrize(
