@@ -385,6 +385,26 @@ def test_points_in_a_line_give_a_plane_that_faces_the_camera() -> None:
     assert best.tolist() == [1 / 2.25, 0.0, 0.0]
 
 
+def test_distant_points_give_a_plane_that_faces_the_camera() -> None:
+    """No three of them are close enough for a tried plane."""
+    z = np.full((300, 300), np.nan)
+    z[20::120, 20::120] = [[1.0, 1.1, 1.2], [1.3, 1.4, 1.5], [1.6, 1.7, 1.8]]
+    best = _best_candidate(z, _with_ones(grid(300, 300)), np.isfinite(z), 1e-3, 0)
+    assert best.tolist() == [1 / 1.4, 0.0, 0.0]
+
+
+def test_the_part_with_most_points_on_the_plane_is_taken() -> None:
+    """The larger part lies 1.5 tolerances to either side of the plane."""
+    slopes = grid(50, 60)
+    tolerance_m = 2e-3
+    v, u = np.mgrid[:50, :60]
+    z = np.where((u + v) % 2 == 0, 1.0 + 1.5 * tolerance_m, 1.0 - 1.5 * tolerance_m)
+    z[:, :25] = 1.0
+    z[:, 25] = np.nan
+    planes = find_planes(z, slopes, tolerance_m, least_px=1000)
+    assert any(np.array_equal(mask, u < 25) for _, mask in planes)
+
+
 def test_connected_points_within_two_tolerances_belong_to_a_plane() -> None:
     slopes = grid(60, 60)
     tolerance_m = 5e-3
