@@ -16,6 +16,7 @@ from harness.programs.camera.camera_file import (
     _field,
     _gain,
     _of_unit,
+    _refitted,
     _text,
     camera_of_size,
     with_lens,
@@ -247,8 +248,70 @@ def test_the_emitter_covers_every_pixel_with_a_return() -> None:
     assert "cutoff_half_angle_deg" not in dict(_field(camera, measured))
 
 
-def test_a_camera_is_known_by_its_size() -> None:
+@pytest.mark.parametrize(
+    ("share", "faint"),
+    [
+        # half way between shares of 0.6 and 0.1, on a logarithmic scale: a fifth of the way
+        ([0.9, 0.6, 0.1], 20.0 * 2**0.2),
+        ([0.5, 0.3, 0.1], 10.0),
+        ([0.49, 0.3, 0.1], None),
+        ([0.9, 0.6, 0.5], None),
+    ],
+)
+def test_faint_pixels_are_gated_where_half_of_them_are_lost(
+    monkeypatch: pytest.MonkeyPatch, share: list[float], faint: float | None
+) -> None:
+    """In the units of the known camera, whose amplitudes are half of the recorded ones."""
     lens = known().nominal_lens
+
+    def capture(amplitude: float) -> Any:
+        return SimpleNamespace(
+            lens=lens,
+            step_m=MM,
+            z_m=np.ones((4, 1, 3)),
+            slopes=np.zeros((1, 3, 2)),
+            amplitude=np.array([[amplitude, amplitude, 1e6]]),
+            steady=np.array([[True, True, False]]),
+        )
+
+    monkeypatch.setattr(camera_file, "_gain", lambda camera, *_: (camera, 700.0))
+    monkeypatch.setattr(camera_file, "simulated", lambda *_: [capture(30.0)])
+
+    def field(rms_m: float) -> Any:
+        return SimpleNamespace(field=SimpleNamespace(rms_m=rms_m, warnings=()))
+
+    of_simulated = SimpleNamespace(pattern=field(0.2 * MM))
+    monkeypatch.setattr(measure, "characteristics", lambda stacks: of_simulated)
+    levels = np.array([10.0, 20.0, 40.0])
+    measured = measurements(
+        captures=[capture(60.0)],
+        surfaces=["a surface"],
+        pattern=field(0.5 * MM),
+        dropouts=measure.Dropouts(levels, np.array(share), np.ones(3)),
+    )
+    facts = values(_refitted("azure_kinect_nfov", measured, 0.8, "s"))
+    assert facts["photons.signal_electrons"].value == 700.0
+    nominal_mm = known().fixed_pattern.smooth_mm.value
+    assert facts["fixed_pattern.smooth_mm"].value == pytest.approx(2.5 * nominal_mm)
+    gate = facts.get("engine.min_amplitude_units")
+    assert (gate is None) == (faint is None)
+    if gate is not None and faint is not None:
+        assert gate.value == pytest.approx(faint / 2.0)
+
+
+def test_a_camera_is_known_by_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = known().nominal_lens
+    assert camera_of_size(load_camera("pmd_flexx2").nominal_lens) == "pmd_flexx2"
+    of_kinect = load_camera("kinect_v2").nominal_lens
+    with pytest.raises(UserError, match="several cameras have 512 x 424 pixels"):
+        camera_of_size(of_kinect)
+
+    def is_guessed(camera: Any) -> bool:
+        return camera.name != "kinect_v2"
+
+    monkeypatch.setattr(camera_file, "guessed_precision", is_guessed)
+    assert camera_of_size(of_kinect) == "kinect_v2"
+    assert camera_of_size(load_camera("pmd_flexx2").nominal_lens) == "pmd_flexx2"
     assert with_lens("azure_kinect_nfov", lens).nominal_lens.fx == pytest.approx(lens.fx)
     with pytest.raises(UserError, match="no simulated camera has 7 x 5 pixels"):
         camera_of_size(Lens(7, 5, 9.0, 9.0, 3.0, 2.0))
