@@ -196,10 +196,10 @@ def _row(
 
 
 def _errors(name: str, errors: pd.Series) -> dict[str, float]:
-    """Return the columns ``<name>_*`` of errors in mm."""
+    """Return the columns ``<name>_*`` of errors in mm; NaN where there are too few."""
     return {
-        f"{name}_bias_mm": float(errors.mean()) if len(errors) else np.nan,
-        f"{name}_std_mm": float(errors.std()) if len(errors) > 1 else np.nan,
+        f"{name}_bias_mm": float(errors.mean()),
+        f"{name}_std_mm": float(errors.std()),
         f"{name}_n": len(errors),
     }
 

@@ -467,6 +467,13 @@ def _slopes_kept(  # type: ignore[no-untyped-def]
                 number += 1
 
 
+def _told_closely(closely: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Return the pixels (h, w) bool that count as edges because ``closely`` (h, w) says so: above
+    1 anywhere, above 0 beside an ``edge`` (h, w) bool."""
+    beside_edge = ndimage.binary_dilation(edge, EIGHT_AROUND)
+    return np.asarray((closely > 1) | ((closely > 0) & beside_edge))
+
+
 def direct_light(
     lit: LitScene,
     slopes: np.ndarray,
@@ -489,8 +496,7 @@ def direct_light(
     central = sums.central
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
     if closely is not None:
-        beside_edge = ndimage.binary_dilation(edge, EIGHT_AROUND)
-        edge |= (closely > 1) | ((closely > 0) & beside_edge)
+        edge |= _told_closely(closely, edge)
     reach = 2 * footprint.reach_px + 1
     edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
     fine = edge if roughly is None else edge & ~roughly

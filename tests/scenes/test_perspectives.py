@@ -3,6 +3,8 @@ them."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +15,23 @@ from scipy.spatial.transform import Rotation
 
 from harness.experiment.load import load_experiment
 from harness.vocabulary.declaration.yaml_source import DeclarationError
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert, transform_points
+from harness.vocabulary.seeds import random_stream
 from scenes.perspectives import (
     ArcViews,
     GridViews,
     HandHeldViews,
     ListedViews,
     T_reference_view_of,
+    _walk,
+    check_in_view,
     guessed_T_reference_view,
     poses_of,
+    seen_region,
 )
-from scenes.target.custom import PoseConfig
+from scenes.sensor.camera import load_camera
+from scenes.target.custom import BoardConfig, PoseConfig, TargetConfig
 
 POSE = PoseConfig(
     distance_m=0.7,
@@ -92,6 +100,158 @@ def test_a_hand_held_walk_stays_within_its_sway_and_moves_little_between_views()
     turns = np.array([[p.tilt_x_deg - 3, p.tilt_y_deg - 4, p.roll_deg] for p in poses])
     assert np.abs(turns).max(axis=0) == pytest.approx([10, 10, 5])
     assert np.abs(np.diff(turns, axis=0)).max() < 3
+
+
+def test_a_walk_is_a_sum_of_slow_sines() -> None:
+    """Written out: three sines for each of six paths, from the place of the first view, scaled to
+    the sway; half as much roll, and half as much towards the target."""
+    views = HandHeldViews(kind="hand_held", count=7, sway_deg=10.0, sway_mm=40.0, seed=5)
+    rng = random_stream(5, "hand-held")
+    phases = rng.uniform(0, 2 * np.pi, (6, 3))
+    cycles = rng.uniform(0.3, 1.5, (6, 3))
+    steps = np.array(_walk(views))
+    for path, reach in enumerate((10.0, 10.0, 5.0, 40.0, 40.0, 20.0)):
+        heights = []
+        for time in np.arange(7) / 6:
+            sines = [
+                math.sin(2 * math.pi * cycle * time + phase)
+                for cycle, phase in zip(cycles[path], phases[path], strict=True)
+            ]
+            heights.append(sum(sines))
+        moved = np.array(heights) - heights[0]
+        assert steps[:, path] == pytest.approx(moved / np.abs(moved).max() * reach)
+    poses = poses_of(views, POSE)
+    assert poses[3].offset_x_mm == pytest.approx(steps[3, 3])
+    assert poses[3].offset_y_mm == pytest.approx(steps[3, 4])
+    assert poses[3].distance_m == pytest.approx(0.7 + steps[3, 5] / 1000)
+    alone = HandHeldViews(kind="hand_held", count=1)
+    assert poses_of(alone, POSE) == (POSE,)
+
+
+def test_the_views_of_an_arc_and_of_a_grid_come_coarse_to_fine() -> None:
+    shares = [0, 1, -1, 1 / 2, -1 / 2, 1 / 4, -1 / 4, 3 / 4, -3 / 4, 1 / 8, -1 / 8, 3 / 8]
+    arc = poses_of(ArcViews(kind="arc", count=12, spread_deg=80.0, about="x"), PoseConfig())
+    assert [pose.tilt_x_deg for pose in arc] == pytest.approx([40.0 * share for share in shares])
+    assert {pose.tilt_y_deg for pose in arc} == {0.0}
+    grid = poses_of(GridViews(kind="grid", count=25, spread_deg=40.0), PoseConfig())
+    turns = [(pose.tilt_x_deg, pose.tilt_y_deg) for pose in grid]
+    ticks = (-20.0, -10.0, 0.0, 10.0, 20.0)
+    assert sorted(turns) == sorted((x, y) for x in ticks for y in ticks)
+    away = [np.hypot(*turn) for turn in turns]
+    # the centre; four corners, four sides; then from (20, 10) inwards
+    assert away[1:5] == pytest.approx(4 * [np.hypot(20, 20)])
+    assert away[5:9] == pytest.approx(4 * [20.0])
+    assert away[9:] == pytest.approx(8 * [np.hypot(20, 10)] + 4 * [np.hypot(10, 10)] + 4 * [10.0])
+    assert turns[1:3] == [(-20.0, -20.0), (-20.0, 20.0)]
+
+
+def test_views_but_the_first_deviate_as_stated() -> None:
+    """Of 199 views, a deviation is known to 5 %."""
+    views = ArcViews(
+        kind="arc", count=200, spread_deg=1e-9, distance_jitter_mm=20.0, aim_jitter_mm=5.0
+    )
+    poses = poses_of(views, POSE)
+    assert poses[0] == POSE
+    shifts_mm = np.array(
+        [[pose.offset_x_mm, pose.offset_y_mm, 1000 * (pose.distance_m - 0.7)] for pose in poses[1:]]
+    )
+    assert shifts_mm.std(axis=0) == pytest.approx([5.0, 5.0, 20.0], rel=0.2)
+    assert np.abs(shifts_mm.mean(axis=0) / [5.0, 5.0, 20.0]).max() < 0.25
+    assert np.abs(np.corrcoef(shifts_mm.T) - np.eye(3)).max() < 0.25
+
+
+def test_the_directions_of_guesses_are_even() -> None:
+    """Axes and shifts of 199 guesses: the mean of each part of a unit vector is 0 within 0.04."""
+    views = ArcViews(kind="arc", count=200, spread_deg=40.0, guess_error_deg=3.0)
+    poses = poses_of(views, POSE)
+    centre = poses[0].T_camera_board[:3, 3]
+    directions = []
+    for number in range(1, 200):
+        true = T_reference_view_of(poses, number)
+        error = guessed_T_reference_view(views, poses, number) @ invert(true)
+        turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+        shift = transform_points(error, centre) - centre
+        directions.append(np.concatenate([turn / np.radians(3.0), shift / 0.01]))
+    assert np.abs(np.mean(directions, axis=0)).max() < 0.17
+    assert (np.array(directions) ** 2).mean(axis=0) == pytest.approx(np.full(6, 1 / 3), abs=0.09)
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "tilt_deg", "problem"),
+    [
+        (0.3, 0.0, None),
+        (0.2, 0.0, "lies 0.200 to"),
+        (4.2, 0.0, "lies 4.200 to"),
+        (3.8, 0.0, None),
+        (0.135, 60.0, "nearest point is 0.048 m"),
+        (0.137, 60.0, "lies 0.050 to"),
+    ],
+)
+def test_a_target_out_of_range_is_told(
+    distance_m: float, tilt_deg: float, problem: str | None
+) -> None:
+    """The range along the axis of a camera that sees from 0.25 to 4 m. A face partly in range
+    counts."""
+    optics = replace(
+        load_camera("azure_kinect_nfov").optics,
+        nearest_m=0.25,
+        farthest_m=4.0,
+        limits_along="axis",
+    )
+    target = TargetConfig(
+        name="custom",
+        board=BoardConfig(width_mm=200.0, height_mm=100.0, thickness_mm=5.0),
+        pose=PoseConfig(distance_m=distance_m, tilt_y_deg=tilt_deg),
+    )
+    if problem is None:
+        check_in_view(target, optics)
+        return
+    with pytest.raises(UserError, match=problem):
+        check_in_view(target, optics)
+
+
+def test_ranges_along_the_ray_are_longer() -> None:
+    """The farthest corner of a face of 400 x 300 mm at 0.5 m lies sqrt(0.25 + 0.04 + 0.0225) m
+    away along the ray, 0.5 m along the axis."""
+    target = TargetConfig(
+        name="custom",
+        board=BoardConfig(width_mm=400.0, height_mm=300.0, thickness_mm=5.0),
+        pose=PoseConfig(distance_m=0.5),
+    )
+    for nearest_m, along, fits in (
+        (0.55, "ray", True),
+        (0.56, "ray", False),
+        (0.51, "axis", False),
+        (0.49, "axis", True),
+    ):
+        optics = replace(
+            load_camera("azure_kinect_nfov").optics, nearest_m=nearest_m, limits_along=along
+        )
+        if fits:
+            check_in_view(target, optics)
+        else:
+            with pytest.raises(UserError, match=r"lies 0.500 to 0.\d+ m"):
+                check_in_view(target, optics)
+
+
+def test_the_region_of_a_face_holds_its_pixels() -> None:
+    """A face of 200 x 100 mm across the axis at 1 m; half out of view, it is the whole sensor."""
+    optics = load_camera("azure_kinect_nfov").optics
+    lens = optics.lens
+    board = BoardConfig(width_mm=200.0, height_mm=100.0, thickness_mm=5.0)
+    target = TargetConfig(name="custom", board=board, pose=PoseConfig(distance_m=1.0))
+    region = seen_region(target, optics)
+    x_m, y_m = np.meshgrid(np.linspace(-0.1, 0.1, 201), np.linspace(-0.05, 0.05, 101))
+    pixels = lens.project(np.stack([x_m, y_m, np.ones_like(x_m)], axis=-1)).reshape(-1, 2)
+    left, top = np.floor(pixels.min(axis=0))
+    right, bottom = np.ceil(pixels.max(axis=0))
+    bounds = (region.row0, region.row1, region.col0, region.col1)
+    assert bounds == (top, bottom + 1, left, right + 1)
+    wide = target.model_copy(update={"pose": PoseConfig(distance_m=1.0, offset_x_mm=700.0)})
+    assert seen_region(wide, optics) == lens.whole
+    gone = target.model_copy(update={"pose": PoseConfig(distance_m=1.0, offset_x_mm=5000.0)})
+    with pytest.raises(UserError, match="is out of view"):
+        seen_region(gone, optics)
 
 
 def test_the_guess_is_wrong_by_what_it_says_about_the_targets_centre():

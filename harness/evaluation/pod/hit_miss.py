@@ -270,8 +270,7 @@ def _tested(
     ceiling: Range,
 ) -> FloorCeilingTest:
     """Test the likeliest curve with floor and ceiling in these ranges."""
-    plain = np.append(fit.maximum, [0.0, 1.0])
-    likeliest, value = _search(fit.data, plain, floor, ceiling)
+    likeliest, value = _search(fit.data, fit.maximum, floor, ceiling)
     statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
     tail_of_one, tail_of_two = stats.chi2.sf(statistic, [1, 2])
     p_value = 0.5 * tail_of_one
@@ -326,8 +325,8 @@ def _search(
     ceiling: Range,
 ) -> tuple[np.ndarray, float]:
     """Return the likeliest curve (4,) with floor and ceiling in these ranges, and its
-    log-likelihood, from the best points of a coarse grid. ``plain`` (4,): the likeliest curve
-    without them."""
+    log-likelihood, from the best points of a coarse grid. ``plain`` (2,): intercept and slope of
+    the likeliest curve without them."""
     floors = sorted({float(np.clip(level, *floor)) for level in (0.02, 0.1, 0.25)})
     ceilings = sorted({float(np.clip(level, *ceiling)) for level in (0.75, 0.9, 0.98)})
     levels = np.array([*product(floors, ceilings)])

@@ -11,6 +11,7 @@ import pytest
 from harness.evaluation.set_ups import (
     RESAMPLES,
     Ladder,
+    _errors,
     compare_set_ups,
     found_limit_mm,
     set_ups_of,
@@ -81,6 +82,19 @@ def test_errors_of_measures_are_over_trials_of_found_holes(two_variants: Tables)
     assert row["extent_place_n"] == 36
     assert row["extent_place_bias_mm"] == pytest.approx(place_error.mean())
     assert row["extent_place_std_mm"] == pytest.approx(place_error.std(ddof=1))
+
+
+def test_the_deviation_of_errors_needs_two() -> None:
+    assert _errors("a", pd.Series([1.0, 4.0])) == {
+        "a_bias_mm": 2.5,
+        "a_std_mm": pytest.approx(np.sqrt(4.5)),
+        "a_n": 2,
+    }
+    single = _errors("a", pd.Series([3.0]))
+    assert single["a_bias_mm"] == 3.0
+    assert np.isnan(single["a_std_mm"])
+    nothing = _errors("a", pd.Series([], dtype=float))
+    assert np.isnan([nothing["a_bias_mm"], nothing["a_std_mm"]]).all()
 
 
 def test_two_largest_holes_leave_no_distances(two_variants: Tables) -> None:

@@ -11,7 +11,14 @@ import pytest
 from harness.vocabulary.geometry import Lens, Region
 from scenes.optics import RenderConfig
 from scenes.render import indirect, view
-from scenes.render.direct import DirectLight, OffFace, _error_m, _LaneSums, _slopes_kept
+from scenes.render.direct import (
+    DirectLight,
+    OffFace,
+    _error_m,
+    _LaneSums,
+    _slopes_kept,
+    _told_closely,
+)
 from scenes.render.indirect import BATCHES, PATHS_A_LANE, PathWork, _gather, _sobol
 from scenes.render.range_noise import range_noise_m
 from scenes.render.view import _at_holes, _expected_noise_m, _inside_outline, _light_in_pixels
@@ -366,3 +373,17 @@ def test_indirect_light_adds_face_and_pixels(monkeypatch: pytest.MonkeyPatch) ->
     assert noise_m[0, 0] == pytest.approx(3e-4)
     assert noise_m[0, 1] == pytest.approx(np.hypot(4e-4, from_paths_m[0]))
     assert noise_m[0, 2] == pytest.approx(from_paths_m[1])
+
+
+def test_pixels_are_sampled_closely_beside_edges_or_anywhere() -> None:
+    """The eight pixels around an edge count where 1 is asked, all where 2 is."""
+    edge = np.zeros((7, 9), bool)
+    edge[3, 4] = True
+    beside = np.zeros((7, 9), bool)
+    beside[2:5, 3:6] = True
+    assert np.array_equal(_told_closely(np.ones((7, 9), int), edge), beside)
+    closely = np.zeros((7, 9), int)
+    closely[3, 5] = 1
+    closely[0, 0] = 1
+    closely[6, 8] = 2
+    assert np.argwhere(_told_closely(closely, edge)).tolist() == [[3, 5], [6, 8]]

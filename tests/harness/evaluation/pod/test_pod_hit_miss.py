@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, stats
 
+from harness.evaluation.pod import hit_miss
 from harness.evaluation.pod.curve import LINKS, HitsAndMisses, link_cdf, link_ppf, profile
 from harness.evaluation.pod.hit_miss import (
+    _metric_root,
     _search,
     band,
     bound,
@@ -147,6 +150,30 @@ def test_statsmodels_agrees(link: str) -> None:
     assert fit.deviance == pytest.approx(expected.deviance, rel=1e-10)
 
 
+@pytest.mark.parametrize("log_size", [False, True])
+def test_the_covariance_of_a_curve_is_by_the_delta_method(log_size: bool) -> None:
+    """Numeric slopes of mu = -b0 / b1 and sigma = 1 / b1."""
+    fit = fit_hit_miss(*simulated(60, seed=5), log_size=log_size)
+
+    def curve(b: np.ndarray) -> np.ndarray:
+        return np.array([-b[0] / b[1], 1 / b[1]])
+
+    b = np.array([fit.b0, fit.b1])
+    assert curve(b) == pytest.approx([fit.curve.mu, fit.curve.sigma])
+    step = 1e-6 * np.eye(2)
+    slopes = np.stack([(curve(b + h) - curve(b - h)) / 2e-6 for h in step], axis=1)
+    expected = slopes @ fit.covariance @ slopes.T
+    assert fit.curve.covariance == pytest.approx(expected, rel=1e-5)
+
+
+def test_notes_tell_separation_and_inspections() -> None:
+    sizes = np.arange(1.0, 9.0)
+    overlapping = np.array([0, 0, 1, 0, 0, 1, 1, 1])
+    assert fit_hit_miss(sizes, overlapping).notes == ()
+    (separated,) = fit_hit_miss(sizes, sizes > 4).notes
+    assert "separation" in separated
+
+
 # bounds
 
 
@@ -198,6 +225,32 @@ def test_the_band_of_a_small_study_holds_all_curves_of_the_likelihood_ratio_set(
     low, high = band(fit, at_mm)
     assert low == pytest.approx(link_cdf(link, predictors.min(axis=0)), abs=0.02)
     assert high == pytest.approx(link_cdf(link, predictors.max(axis=0)), abs=0.02)
+
+
+def test_a_band_in_blocks_of_curves_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory for less than one curve is memory for one curve at a time."""
+    fit = fit_hit_miss(*simulated(60, seed=5))
+    at_mm = np.array([2.5, 4.0, 6.0])
+    whole = band(fit, at_mm)
+    for cells in (59, 200):
+        monkeypatch.setattr(hit_miss, "CELLS", cells)
+        for level, expected in zip(band(fit, at_mm), whole, strict=True):
+            assert level == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("repeats", [1.0, 4.0])
+def test_rays_are_scaled_by_the_covariance_in_standardised_sizes(repeats: float) -> None:
+    """b0' = b0 + b1 centre and b1' = b1 spread. Of a singular covariance, the root spans both
+    directions, the other with 1 % of the largest deviation."""
+    fit = replace(fit_hit_miss(*simulated(60, seed=5)), repeats=repeats)
+    scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
+    root = _metric_root(fit)
+    assert root @ root.T == pytest.approx(scale @ fit.covariance @ scale.T / repeats)
+    flat = replace(fit, centre=0.0, spread=1.0, covariance=repeats * np.diag([0.0, 4.0]))
+    root = _metric_root(flat)
+    assert root @ root.T == pytest.approx(np.diag([4e-4, 4.0]))
+    root = _metric_root(replace(flat, covariance=np.zeros((2, 2))))
+    assert root @ root.T == pytest.approx(1e-12 * np.eye(2))
 
 
 def test_a_weak_study_demonstrates_nothing_and_says_why() -> None:
@@ -369,9 +422,8 @@ def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
         ).fun
         for start in starts
     ]
-    likelihood = _search(
-        data, np.append(fit_hit_miss(sizes, hits).maximum, [0.0, 1.0]), (0.0, 0.5), (0.5, 1.0)
-    )[1]
+    plain = fit_hit_miss(sizes, hits).maximum
+    likelihood = _search(data, plain, (0.0, 0.5), (0.5, 1.0))[1]
     assert -likelihood <= min(losses) + 5e-5
 
 

@@ -98,8 +98,8 @@ def test_a_design_effect_by_hand(log_size: bool) -> None:
     units, from the scores of a logit and its information."""
     rng = np.random.default_rng(3)
     size_mm = rng.uniform(2.0, 9.0, 24)
-    inspections = np.full(24, 2.0)
-    hits = rng.binomial(2, 1 / (1 + np.exp(5.5 - size_mm))).astype(float)
+    inspections = 1.0 + np.arange(24) % 3
+    hits = rng.binomial(inspections.astype(int), 1 / (1 + np.exp(5.5 - size_mm))).astype(float)
     board = np.arange(24) % 6
     x = np.log(size_mm) if log_size else size_mm
     mu = np.log(5.4) if log_size else 5.4

@@ -10,9 +10,18 @@ from harness.evaluation.intervals import (
     false_call_rate,
     threshold_for_rate,
 )
-from harness.evaluation.pod.curve import PodCurve
-from harness.programs.inspections.design_statistics import design, even_sizes
+from harness.evaluation.pod.curve import LINKS, PodCurve
+from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
+from harness.programs.inspections.design_statistics import (
+    StudyPlan,
+    curve_through,
+    design,
+    even_sizes,
+    hole_free,
+    recommend,
+)
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.seeds import random_stream
 
 GUESS = PodCurve("logit", False, 10.0, 2.0, np.zeros((2, 2)))
 
@@ -98,3 +107,66 @@ def test_mistakes_of_the_user() -> None:
         false_call_rate(1, 0.0)
     with pytest.raises(UserError, match="highest score is a number"):
         threshold_for_rate([np.nan, 1.0], 1.0, 1.0)
+
+
+@pytest.mark.parametrize("link", LINKS)
+@pytest.mark.parametrize("log_size", [False, True])
+def test_a_guess_goes_through_its_two_sizes(link: str, log_size: bool) -> None:
+    curve = curve_through(3.0, 5.0, link, log_size=log_size)
+    assert curve.pod(np.array([3.0, 5.0])) == pytest.approx([0.5, 0.9])
+    assert (curve.link, curve.log_size) == (link, log_size)
+    assert np.array_equal(curve.covariance, np.zeros((2, 2)))
+    for a50, a90 in ((5.0, 5.0), (5.0, 3.0), (0.0, 3.0), (3.0, np.inf)):
+        with pytest.raises(UserError, match="must grow with size"):
+            curve_through(a50, a90)
+
+
+def test_the_plan_is_that_of_its_simulated_studies() -> None:
+    """Twenty studies by hand: their bounds, of which the 2nd, 10th and 18th are told."""
+    guess = curve_through(3.0, 5.0)
+    (plan,) = design(guess, [40], (1.0, 9.0), studies=20, seed=3)
+    sizes = 1.0 + 8.0 * (np.arange(40) + 0.5) / 40
+    assert plan.sizes == pytest.approx(sizes)
+    luck = random_stream(3, "pod design", 40, "uniform").random((20, 40))
+    bounds = []
+    for hits in luck < guess.pod(sizes):
+        bounds.append(bound(fit_hit_miss(sizes, hits), 0.9, 0.95).value)
+    ordered = np.sort(bounds)
+    assert (plan.low, plan.bound, plan.high) == pytest.approx(tuple(ordered[[1, 9, 17]]))
+    assert plan.demonstrated == np.isfinite(bounds).mean()
+    assert plan.true_size == pytest.approx(5.0)
+    assert (plan.targets, plan.studies) == (40, 20)
+
+
+def a_plan(targets: int, high: float) -> StudyPlan:
+    return StudyPlan(targets, 20, 5.0, high, high, high, 1.0, np.zeros(0))
+
+
+def test_the_fewest_targets_that_show_the_goal_are_recommended() -> None:
+    """With at least the 60 targets of the handbook, if any plan has them."""
+    plans = [a_plan(120, 6.0), a_plan(40, 6.5), a_plan(60, 7.0), a_plan(80, 6.5)]
+    assert recommend(plans) == (plans[2], None)
+    assert recommend(plans, 7.0) == (plans[2], True)
+    assert recommend(plans, 6.9) == (plans[3], True)
+    assert recommend(plans, 6.0) == (plans[0], True)
+    assert recommend(plans, 5.9) == (plans[0], False)
+    few = [a_plan(20, 6.0), a_plan(30, 7.0)]
+    assert recommend(few) == (few[1], None)
+    assert recommend(few, 6.0) == (few[1], False)
+
+
+def test_hole_free_boards_by_hand() -> None:
+    """At 2 false calls per m2 on boards of 0.1 m2, 18 % of boards call: 5.5 scores and one more
+    space between them are needed, so 5; and exp(-2 A) = 5 % gives A = 1.498 m2, 15 boards."""
+    need = hole_free(2.0, 0.1)
+    assert need.calibration_boards == 5
+    assert need.silent_m2 == pytest.approx(np.log(20.0) / 2.0)
+    assert need.silent_boards == 15
+    # the highest of five scores: a sixth of boards call
+    assert need.expected_per_m2 == pytest.approx(-np.log(1 - 1 / 6) / 0.1, rel=0.2)
+    assert need.upper_per_m2 > need.expected_per_m2
+    exact = hole_free(float(-np.log(0.8)), 1.0)
+    assert exact.calibration_boards == 4
+    for wrong in ((0.0, 0.1), (2.0, 0.0), (np.inf, 0.1)):
+        with pytest.raises(UserError, match="false calls per m2 on boards"):
+            hole_free(*wrong)

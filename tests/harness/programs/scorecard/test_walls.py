@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from harness.stills.statistics import (
-    correlation,
-    covariance,
-    deviations,
-    fixed_pattern,
-    robust_inverse_fit,
-)
+from harness.stills.statistics import fixed_pattern, robust_inverse_fit
 from harness.vocabulary.geometry import Region
 from scenes.sensor.camera import load_camera
 from tests.validation.azure_walls import Wall, WallCheck, check_folder, walls_camera
@@ -74,28 +68,6 @@ def test_a_planted_fixed_pattern_is_found_again(smooth_mm, pixel_mm):
     assert max(white_before_m(pattern), 0) * 1e3 == pytest.approx(pixel_mm, abs=0.04)
     if pixel_mm == 0:
         assert length_px(pattern) == pytest.approx(5.6, abs=0.4)
-
-
-def test_covariance_and_correlation_by_hand():
-    d = np.array([[[1.0, 2.0, 0.0], [3.0, -1.0, 5.0]]])
-    where = np.array([[True, True, False], [True, True, True]])
-    # along x: pairs (1, 2), (3, -1), (-1, 5); along y: (1, 3), (2, -1)
-    assert covariance(d, where, 1, 0) == pytest.approx(
-        ((2 - 3 - 5) / 3, ((1 + 9 + 1) / 3 + (4 + 1 + 25) / 3) / 2)
-    )
-    assert covariance(d, where, 0, 1) == pytest.approx(
-        ((3 - 2) / 2, ((1 + 4) / 2 + (9 + 1) / 2) / 2)
-    )
-    assert correlation(d, where, 1, 0) == pytest.approx(-2 / (41 / 6))
-    assert correlation(d, where, 0, 1) == pytest.approx(0.5 / 3.75)
-
-
-def test_common_jitter_is_taken_off_only_on_request():
-    rng = np.random.default_rng(1)
-    z = rng.standard_normal((30, 1, 1)) + 0 * rng.standard_normal((30, 8, 9))
-    where = np.ones((8, 9), bool)
-    assert deviations(z, where, keep_jitter=True).std() == pytest.approx(z[:, 0, 0].std())
-    assert np.abs(deviations(z, where, keep_jitter=False)).max() < 1e-12
 
 
 def test_a_plane_is_exact_and_outliers_do_not_move_it():

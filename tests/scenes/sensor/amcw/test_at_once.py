@@ -30,7 +30,7 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
 from scenes.sensor.amcw.light import light_of_samples
-from scenes.sensor.amcw.linear_frames import BEND, SCALE
+from scenes.sensor.amcw.linear_frames import BEND, SCALE, UNEVEN
 from scenes.sensor.camera import camera_of
 from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
@@ -120,6 +120,39 @@ def unit_before_hole(name: str, behind_mm: float, jump_rate: float | None = None
             0.6,
         ),
     )
+
+
+def test_windows_that_reach_beyond_the_image_have_no_moves_there() -> None:
+    """A tilted plane behind a straight edge in the corner of the sensor: what lies outside has no
+    noise, and changes nothing."""
+    name = "kinect_v2_libfreenect2"
+    config = CameraConfig(name=name, effects=STILL, numbers=numbers_of(name))
+    camera = camera_of(config)
+    region = Region(0, 24, 0, 40)
+    slopes = camera.nominal_lens.region_slopes(region)
+    middle = float(np.median(slopes[..., 0]))
+    back = Plane(FRONT.distance_m + 30.0 * MM, FRONT.slope_x, FRONT.slope_y)
+
+    def covers(slopes: np.ndarray) -> np.ndarray:
+        return np.isfinite(slopes[..., 0]) & (slopes[..., 0] < middle)
+
+    unit = SimulatedUnit(camera, config, layered_view(camera, region, FRONT, back, covers, 0.6))
+    summer = unit.at_once
+    assert summer is not None
+    linear = summer.linear
+    assert np.isfinite(linear.moves).all()
+    height, width = summer.shape
+    uneven = np.flatnonzero(linear.kind == UNEVEN)
+    rows, columns = np.divmod(uneven, width)
+    side = round(np.sqrt(linear.moves.shape[1]))
+    windows = linear.moves[linear.row[uneven]].reshape(-1, side, side)
+    beyond = np.arange(side) - side // 2
+    outside_rows = (rows[:, None] + beyond < 0) | (rows[:, None] + beyond >= height)
+    outside_columns = (columns[:, None] + beyond < 0) | (columns[:, None] + beyond >= width)
+    outside = outside_rows[:, :, None] | outside_columns[:, None, :]
+    assert (windows[outside] == 0.0).all()
+    assert np.abs(windows).sum(axis=(1, 2)).min() > 0.0
+    assert (rows < 2).any() or (columns < 2).any()
 
 
 @lru_cache

@@ -12,9 +12,9 @@ from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import _edge_fails, _may_fly
-from scenes.sensor.amcw.even import even_pixels, fill_even
+from scenes.sensor.amcw.even import EvenMoves, even_pixels, fill_even
 from scenes.sensor.amcw.light import Light
-from scenes.sensor.amcw.linear import linearised, unknown_filtered
+from scenes.sensor.amcw.linear import Filtered, linearised, unknown_filtered
 from scenes.sensor.camera import camera_of
 from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
@@ -24,10 +24,13 @@ SHAPE = (15, 17)
 INNER = (slice(4, -4), slice(4, -4))
 
 
-def even_light(noise: float) -> Light:
-    """One frequency of a bright, gently tilted surface."""
+def even_light(noise: float, checked: bool = False) -> Light:
+    """One frequency of a bright, gently tilted surface, or of one whose pixels lie alternately
+    nearer and farther, so that each differs from the mean around it."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     phase = (0.01 * u + 0.006 * v).reshape(1, -1)
+    if checked:
+        phase = 0.02 * ((u + v) % 2).reshape(1, -1)
     amplitude = (300.0 + 2.0 * u - v).reshape(1, -1)
     phase_noise = np.full(amplitude.shape, noise)
     return Light(
@@ -52,17 +55,17 @@ def settings_of(by_amplitude: bool) -> kernels.FilterSettings:
     )
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.1])
-@pytest.mark.parametrize("by_amplitude", [False, True])
-def test_even_pixels_are_filled_as_the_linear_model_would(by_amplitude: bool, noise: float):
-    light = even_light(noise)
-    settings = settings_of(by_amplitude)
+def filled_both_ways(
+    light: Light, settings: kernels.FilterSettings
+) -> tuple[np.ndarray, Filtered, EvenMoves, Filtered, np.ndarray]:
+    """The even pixels (flat indices), what they are filled with and their moves; the same by the
+    linear model."""
     n = SHAPE[0] * SHAPE[1]
     alone = np.empty((1, 3, *SHAPE), f4)
     edge = np.empty((1, *SHAPE), f4)
     planes = np.stack([light.phasor.real, light.phasor.imag])
     unit = planes.reshape(2, *SHAPE)
-    strength = light.amplitude if by_amplitude else light.mean_amplitude
+    strength = light.amplitude if settings.by_amplitude else light.mean_amplitude
     kernels.filter_image(unit, strength.reshape(SHAPE), settings, alone[0], edge[0])
     flat_edge = edge.reshape(1, n)
     lost = np.zeros(n, bool)
@@ -74,6 +77,15 @@ def test_even_pixels_are_filled_as_the_linear_model_would(by_amplitude: bool, no
     expected = unknown_filtered(1, n)
     pixels = np.flatnonzero(even)
     expected_moves = linearised(pixels, light, settings, SHAPE, lost, expected)[0]
+    return pixels, filtered, moves, expected, expected_moves
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.1])
+@pytest.mark.parametrize("by_amplitude", [False, True])
+def test_even_pixels_are_filled_as_the_linear_model_would(by_amplitude: bool, noise: float):
+    settings = settings_of(by_amplitude)
+    light = even_light(noise)
+    pixels, filtered, moves, expected, expected_moves = filled_both_ways(light, settings)
     tolerances = {
         "phasor": 1e-4,
         "amplitude": 3e-4,
@@ -98,6 +110,22 @@ def test_even_pixels_are_filled_as_the_linear_model_would(by_amplitude: bool, no
     corner = by_neighbour * settings.space[0, 0]
     assert corner == pytest.approx(expected_moves[:, 0], rel=0.05)
     assert moves.by_centre[0] == pytest.approx(expected_moves[:, 12], rel=0.015)
+
+
+@pytest.mark.parametrize("by_amplitude", [False, True])
+def test_noise_moves_the_mean_towards_the_centres_own_phase(by_amplitude: bool) -> None:
+    """By a 25th of the distance of 0.01 rad, as noise of 0.1 rad lowers the neighbours' weights by
+    3.6 x 0.01."""
+    light = even_light(0.1, checked=True)
+    pixels, filtered, _, expected, _ = filled_both_ways(light, settings_of(by_amplitude))
+    turn = np.angle(filtered.phasor[0, pixels] / expected.phasor[0, pixels])
+    assert np.abs(turn).max() < 5e-5
+    still_light = even_light(1e-3, checked=True)
+    pixels, still, *_ = filled_both_ways(still_light, settings_of(by_amplitude))
+    moved = np.angle(filtered.phasor[0, pixels] / still.phasor[0, pixels])
+    own = np.angle(light.phasor[0, pixels] / still.phasor[0, pixels])
+    assert moved == pytest.approx(0.036 * own, rel=0.15)
+    assert np.abs(own).min() > 0.008
 
 
 def test_pixels_that_are_not_even():
