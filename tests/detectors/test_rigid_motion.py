@@ -65,8 +65,8 @@ def test_a_motion_turns_about_its_centre_and_then_shifts() -> None:
     T = moved_by(np.array([0.0, 0.0, np.pi / 2, *shift_m]), centre_m)
     np.testing.assert_allclose(T @ [*centre_m, 1.0], [*(centre_m + shift_m), 1.0], atol=1e-15)
     # a quarter turn about z takes x to y
-    point = centre_m + [0.5, 0.0, 0.25]
-    expected = centre_m + [0.0, 0.5, 0.25] + shift_m
+    point = centre_m + np.array([0.5, 0.0, 0.25])
+    expected = centre_m + np.array([0.0, 0.5, 0.25]) + shift_m
     np.testing.assert_allclose(T @ [*point, 1.0], [*expected, 1.0], atol=1e-15)
 
 
