@@ -255,7 +255,9 @@ def test_the_error_of_a_blob_with_mixed_rims_has_its_rim_and_the_strays_around(p
         np.testing.assert_allclose(blob.contrast, contrast, atol=1e-9)
         places = np.stack([blob.pixels % LENS.width, blob.pixels // LENS.width], axis=1)
         np.testing.assert_allclose(places - blob.grid, (places - blob.grid)[0] + 0 * places)
-        np.testing.assert_array_equal(np.sort(blob.pixels[blob.weights > 1e-9]), np.flatnonzero(outer))
+        np.testing.assert_array_equal(
+            np.sort(blob.pixels[blob.weights > 1e-9]), np.flatnonzero(outer)
+        )
     else:
         assert strays > 0.02
         np.testing.assert_allclose(blob.grid_covariance, expected, rtol=0.05, atol=1e-6)
