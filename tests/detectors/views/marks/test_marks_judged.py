@@ -283,7 +283,7 @@ def test_groups_are_sorted_by_size_and_small_ones_are_none() -> None:
     rgb = plain_board()
     coloured = np.zeros(V.shape, bool)
     for u, side in ((30, 3), (70, 2), (110, 9), (160, 6)):
-        spot = (U >= u) & (U < u + side) & (V >= 80) & (V < 80 + side)
+        spot = (u <= U) & (u + side > U) & (V >= 80) & (80 + side > V)
         rgb[spot] = (200.0, 30.0, 90.0)
         coloured |= spot
     cloud = pictured(rgb)

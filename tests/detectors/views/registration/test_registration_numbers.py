@@ -55,7 +55,7 @@ def test_the_covariance_of_icp_is_that_of_its_cost() -> None:
     """Curvature by differences of the cost with new pairs, over motions that move the points by
     one pitch, root mean square; the scatter of the gradients by cubes."""
     fixed = sheet(1, 900)
-    moved = np.concatenate([sheet(2, 600), sheet(3, 30) + [0.0, 0.3, 0.0]])
+    moved = np.concatenate([sheet(2, 600), sheet(3, 30) + np.array([0.0, 0.3, 0.0])])
     pitch_m = 2 * PITCH_M
     limit_m = 3 * pitch_m
     centre = moved.mean(axis=0)
@@ -227,7 +227,7 @@ def view_of(points_m: np.ndarray, guess: np.ndarray | None = None) -> PreparedVi
 )
 def test_a_pose_far_from_its_guess_is_not_credible(turn_deg, shift_m, is_credible) -> None:
     """By 30 degrees, or by 0.1 m at the target's middle: the guess is in the first view's frame."""
-    points = sheet(6) + [0.3, 0.0, 0.0]
+    points = sheet(6) + np.array([0.3, 0.0, 0.0])
     first_guess = moved_by(np.array([0.2, 0.1, -0.3, 1.0, 2.0, 3.0]), np.zeros(3))
     guess = moved_by(np.array([0.1, -0.2, 0.1, 0.5, -0.1, 0.2]), np.zeros(3))
     reference = view_of(points, first_guess)
