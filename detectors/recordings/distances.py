@@ -166,7 +166,7 @@ def _is_largest(number: float, dtype: np.dtype) -> bool:
 
 
 def _is_full_scale(number: float) -> bool:
-    """Return whether a number is one to three below the power of two of 11 bits or more."""
+    """Return whether a number is a power of two of 11 bits or more, or one or two below it."""
     bits = math.log2(number + 3) if number < 2**32 else 0
     return bits >= 11 and number == int(number) and 2 ** int(bits) - number in (0, 1, 2)
 

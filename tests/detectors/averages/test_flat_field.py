@@ -13,8 +13,20 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from detectors.averages.flat_captures import Separated, flattened, separated
+from detectors.averages.flat_captures import (
+    FlatCapture,
+    PatternChange,
+    Separated,
+    _averaged,
+    _change,
+    _disagreement_m2,
+    _groups,
+    _moved,
+    flattened,
+    separated,
+)
 from detectors.averages.flat_field import (
+    NEAR_ENOUGH,
     FlatField,
     corrected,
     doubts,
@@ -238,6 +250,213 @@ def test_few_frames_cannot_tell_their_noise():
     cloud = replace(capture(0, wall(0.0)), n_frames=2)
     with pytest.raises(UserError, match="2 frames: too few to estimate the noise"):
         flattened(cloud, cloud.valid, "short")
+
+
+def lone(
+    distance_m: float,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    residual_m: np.ndarray | None = None,
+    variance_m2: float = 1.0,
+    places_m: np.ndarray | None = None,
+) -> FlatCapture:
+    """A capture of a few pixels."""
+    normal = np.array([*tilt, -1.0])
+    residual_m = np.zeros((4, 5)) if residual_m is None else residual_m
+    return FlatCapture(
+        name="lone",
+        frames=50,
+        distance_m=distance_m,
+        normal=normal / np.linalg.norm(normal),
+        residual_m=residual_m,
+        variance_m2=np.where(np.isfinite(residual_m), variance_m2, np.nan),
+        places_m=places_m,
+    )
+
+
+@pytest.mark.parametrize(
+    ("distances_m", "expected"),
+    [
+        ([1.0], [[0]]),
+        ([1.0, 0.5, 0.9, 0.55], [[1, 3], [0, 2]]),
+        # a ratio of just `NEAR_ENOUGH` is near, and counts from the nearest of the group
+        ([NEAR_ENOUGH * 0.5, 0.5], [[0, 1]]),
+        ([0.5, NEAR_ENOUGH * 0.501], [[0], [1]]),
+        ([1.0, 1.15, 1.25, 0.95], [[0, 3], [1, 2]]),
+        ([3.0, 2.0, 1.0], [[2], [1], [0]]),
+    ],
+)
+def test_captures_at_similar_distances_are_one_group(distances_m, expected) -> None:
+    assert list(_groups(distances_m)) == expected
+
+
+def test_an_average_over_captures_weighs_by_the_variance() -> None:
+    residuals = np.array([[[1.0, 2.0, np.nan]], [[4.0, np.nan, np.nan]]])
+    variances = np.array([[[1.0, 3.0, np.nan]], [[2.0, np.nan, np.nan]]])
+    mean, variance = _averaged(residuals, variances)
+    np.testing.assert_allclose(mean, [[(1.0 + 4.0 / 2.0) / 1.5, 2.0, np.nan]])
+    np.testing.assert_allclose(variance, [[1 / 1.5, 3.0, np.nan]])
+
+
+def test_the_disagreement_is_the_variance_beyond_the_noise() -> None:
+    residuals = np.array([[[1.0, 2.0, 5.0]], [[4.0, 2.5, np.nan]], [[np.nan, 6.0, np.nan]]])
+    variances = np.full(residuals.shape, 0.5)
+    variances[1] = 0.7
+    counts = np.isfinite(residuals).sum(axis=0)
+    # pixel 0: 4.5 between two values, their noise 0.6; pixel 1: 4.75 among three, noise 1.7 / 3
+    expected = ((4.5 - 0.6) + (4.75 - 1.7 / 3)) / 2
+    assert _disagreement_m2(residuals, variances, counts) == pytest.approx(expected)
+    assert _disagreement_m2(residuals, 50.0 * variances, counts) == 0.0
+    alone = np.where(counts > 1, np.nan, residuals[0])
+    assert _disagreement_m2(alone[None], variances[:1], counts * (counts == 1)) == 0.0
+
+
+def test_a_change_of_the_pattern_is_that_of_the_means() -> None:
+    random = np.random.default_rng(5)
+    patterns = random.normal(size=(4, 6, 7))
+    patterns[0, 0, 0] = np.nan
+    patterns[2:, 5, 6] = np.nan
+    variances = random.uniform(0.5, 2.0, patterns.shape)
+    change = _change(patterns, variances, [0, 1], [2, 3])
+    assert change is not None
+    weights = np.where(np.isfinite(patterns), 1.0 / variances, 0.0)
+    values = np.nan_to_num(patterns)
+    common = np.ones((6, 7), bool)
+    common[5, 6] = False
+    first = ((values * weights)[:2].sum(axis=0) / weights[:2].sum(axis=0))[common]
+    second = ((values * weights)[2:].sum(axis=0)[common]) / weights[2:].sum(axis=0)[common]
+    noise = (1 / weights[:2].sum(axis=0))[common] + 1 / weights[2:].sum(axis=0)[common]
+    assert change.difference_m == pytest.approx(np.sqrt(np.mean((first - second) ** 2)))
+    assert change.noise_m == pytest.approx(np.sqrt(np.mean(noise)))
+    assert change.correlation == pytest.approx(np.corrcoef(first, second)[0, 1])
+    assert PatternChange(0.0, 5.0, 3.0).excess_m == pytest.approx(4.0)
+    assert PatternChange(0.0, 3.0, 5.0).excess_m == 0.0
+    # no captures on a side, or fewer than two common pixels
+    assert _change(patterns, variances, [], [2]) is None
+    assert _change(patterns, variances, [2], []) is None
+    for pixels, is_known in ((1, False), (2, True)):
+        few = np.full((2, 6, 7), np.nan)
+        few[:, 0, :pixels] = [[[1.0, 2.0]], [[3.0, 5.0]]][0][0][:pixels]
+        assert (_change(few, variances, [0], [1]) is not None) == is_known
+
+
+@pytest.mark.parametrize(
+    ("others", "is_moved"),
+    [
+        ([lone(0.5)], False),
+        ([lone(0.5019)], False),
+        ([lone(0.5021)], True),
+        ([lone(0.4979)], True),
+        ([lone(0.5), lone(0.5021)], True),
+        ([lone(0.5, (0.0029, 0.0))], False),
+        ([lone(0.5, (0.0031, 0.0))], True),
+        ([lone(0.5, (0.0, -0.0031))], True),
+        ([lone(0.5, (0.0022, 0.0022))], True),
+    ],
+)
+def test_a_camera_has_moved_if_its_plane_has(others, is_moved) -> None:
+    """By more than 2 mm, or by more than 0.003 rad."""
+    assert _moved([lone(0.5), *others]) == is_moved
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "is_moved"),
+    [((0.029, 0.0), False), ((0.031, 0.0), True), ((0.0, -0.031), True), ((0.022, 0.022), True)],
+)
+def test_a_camera_with_a_pose_has_moved_if_its_places_have(shift_m, is_moved) -> None:
+    """By 30 mm along the surface; poses count more than planes."""
+    places = np.random.default_rng(6).normal(size=(4, 5, 2))
+    first = lone(0.5, places_m=places)
+    second = lone(0.9, places_m=places + shift_m)
+    assert _moved([first, second]) == is_moved
+    assert _moved([first, first, second]) == is_moved
+
+
+def test_facts_of_a_capture_count_its_finite_pixels() -> None:
+    residual_m = np.zeros((4, 5))
+    residual_m[0, :3] = np.nan
+    capture_3 = lone(0.5, (0.0, np.tan(np.radians(20.0))), residual_m, 9e-6)
+    assert capture_3.pixels == 17
+    assert capture_3.noise_m == pytest.approx(3e-3)
+    assert capture_3.tilt_deg == pytest.approx(20.0)
+
+
+def test_a_flattened_plane_states_its_distance_normal_and_noise() -> None:
+    """A plane tilted by 20 degrees about y and 10 about x: its normal by hand, residuals along the
+    ray, and the variance of z over the cosine of the ray squared."""
+    slopes = LENS.region_slopes(LENS.whole)
+    normal = np.array([np.sin(0.35), 0.18, -np.cos(0.35)])
+    normal /= np.linalg.norm(normal)
+    z_m = 0.8 * normal[2] / (slopes @ normal[:2] + normal[2])
+    length = np.sqrt(1 + (slopes**2).sum(axis=-1))
+    bump_m = np.zeros(z_m.shape)
+    noise_m = 0.02 * MM * np.random.default_rng(7).standard_normal(z_m.shape)
+    # outliers are off by more than six deviations, to both sides
+    for row, bump_mm in ((20, -0.13), (40, -0.11), (60, 0.11), (80, 0.13)):
+        bump_m[row, 50:54] = bump_mm * MM
+        noise_m[row, 50:54] = 0.0
+    seen_m = z_m + (bump_m + noise_m) / length
+    points = np.concatenate([slopes * seen_m[..., None], seen_m[..., None]], axis=-1)
+    cloud = replace(
+        capture(0, wall(0.0)),
+        points_m=points,
+        variance_m2=np.full(z_m.shape, 4e-8),
+    )
+    mask = cloud.valid & (np.arange(160) < 150)
+    plain = flattened(cloud, mask, "plane")
+    assert plain.places_m is None
+    assert plain.distance_m == pytest.approx(np.median(seen_m[mask]), rel=1e-9)
+    np.testing.assert_allclose(plain.normal, normal, atol=1e-4)
+    np.testing.assert_allclose(plain.variance_m2[mask], (4e-8 / FRAMES * length**2)[mask])
+    assert np.isnan(plain.variance_m2[~mask]).all()
+    kept = mask & (np.abs(bump_m) < 0.12 * MM)
+    np.testing.assert_array_equal(np.isfinite(plain.residual_m), kept)
+    np.testing.assert_allclose(plain.residual_m[kept], (bump_m + noise_m)[kept], atol=0.01 * MM)
+    assert np.nanmean(plain.residual_m) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_drifting_pattern_s_variance_holds_for_the_next_capture() -> None:
+    """Two parts that scatter by t about the pattern differ by 2 t^2 and their mean is off a third
+    by 3/2 t^2, which the variance gains: 3/4 of the excess squared."""
+    random = np.random.default_rng(8)
+    base = random.normal(size=(64, 64))
+    change = 0.5 * random.normal(size=(64, 64))
+    first = lone(0.5, residual_m=base * MM, variance_m2=1e-12)
+    second = lone(0.5, residual_m=(base + change) * MM, variance_m2=1e-12)
+    small_lens = Lens(64, 64, 100.0, 100.0, 32.0, 32.0)
+    result = separated([first, second], small_lens)
+    assert result.in_time is not None
+    excess_m = np.sqrt(np.mean(change**2)) * MM
+    assert result.in_time.excess_m == pytest.approx(excess_m, rel=1e-3)
+    assert result.in_range is None
+    assert not result.separated
+    # the disagreement of two values is half of their squared difference
+    shape_m2 = 0.5 * excess_m**2 - 1e-12
+    assert result.surface_m == pytest.approx(np.sqrt(shape_m2), rel=1e-6)
+    averaged_m2 = (shape_m2 + 1e-12) / 2
+    np.testing.assert_allclose(
+        result.field.variance_m2, averaged_m2 + 0.75 * result.in_time.excess_m**2, rtol=1e-6
+    )
+    np.testing.assert_allclose(result.field.error_m, (base + 0.5 * change) * MM, rtol=1e-6)
+    assert result.noise_m == pytest.approx(np.sqrt(np.mean(result.field.variance_m2)))
+    assert result.field.distances_m == (0.5, 0.5)
+    notes = result.field.warnings
+    assert f"changes from the first captures to the last by {excess_m / MM:.2g} mm" in notes[1]
+    # a change below a fifth of the pattern is stable
+    small = replace(second, residual_m=(base + 0.19 / 0.5 * change) * MM)
+    large = replace(second, residual_m=(base + 0.24 / 0.5 * change) * MM)
+    for other, count in ((small, 1), (large, 2)):
+        assert len(separated([first, other], small_lens).field.warnings) == count
+    # a difference of the size of its noise is no change
+    noisy_m2 = (0.5 * MM) ** 2
+    quiet = replace(first, variance_m2=np.full((64, 64), 0.4 * noisy_m2))
+    noisy = replace(second, variance_m2=np.full((64, 64), 0.4 * noisy_m2))
+    assert separated([quiet, noisy], small_lens).in_time.noise_m == pytest.approx(
+        np.sqrt(0.8 * noisy_m2)
+    )
+    for part, count in ((0.25, 2), (0.44, 1)):
+        quiet = replace(first, variance_m2=np.full((64, 64), part * noisy_m2))
+        noisy = replace(second, variance_m2=np.full((64, 64), part * noisy_m2))
+        assert len(separated([quiet, noisy], small_lens).field.warnings) == count
 
 
 # ---- the correction

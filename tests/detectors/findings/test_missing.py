@@ -10,11 +10,17 @@ import cv2
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from scipy.stats import binom, norm
+from scipy.stats import binom, multivariate_normal, norm
 
 from detectors import load_detector
 from detectors.findings.missing import (
     ALPHA,
+    LEAST_POINTS,
+    RING_PX,
+    _Chance,
+    _fields,
+    _square,
+    _tail,
     measure_missing,
     missing_evidence,
     missing_returns,
@@ -26,7 +32,7 @@ from harness.inspection.judging import judged as judged_cloud
 from harness.report.findings import write_findings
 from harness.tables.limits import LIMITS, notes_of
 from harness.testing.synthetic_clouds import LENS, SHAPE, plane, without
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud, Reason, Region
 from tests.support.synthetic_study import study_record
 
 V, U = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -392,3 +398,280 @@ def test_hits_by_missing_returns_stand_beside_those_by_depth() -> None:
     assert row_of_both[column].text == f"{hits + 5} of {n} ({hits} by depth, 5 by missing returns)"
     assert f"5 of {hits + 5} hits by missing returns alone" in "; ".join(notes_of(limits[0]))
     assert row_of_depth[column].text == f"{hits} of {n}"
+
+
+def embedded(cloud: Cloud, evidence: Evidence, margins: tuple) -> tuple[Cloud, Evidence]:
+    """The same in a larger picture, whose other pixels are valid but not judged."""
+
+    def padded(image: np.ndarray, value: float) -> np.ndarray:
+        further = ((0, 0),) * (image.ndim - 2)
+        return np.pad(image, (*margins, *further), constant_values=value)
+
+    (top, bottom), (left, right) = margins
+    region = cloud.region
+    around = Region(
+        region.row0 - top, region.row1 + bottom, region.col0 - left, region.col1 + right
+    )
+    larger = replace(
+        cloud,
+        points_m=padded(cloud.points_m, 3.0),
+        reason=padded(cloud.reason, 0),
+        count=padded(cloud.count, cloud.n_frames),
+        variance_m2=padded(cloud.variance_m2, 1e-6),
+        region=around,
+    )
+    score = padded(evidence.score, np.nan)
+    return larger, Evidence(score, score, padded(evidence.surface_z_m, 3.0), 1e-3)
+
+
+@pytest.mark.parametrize(
+    "margins",
+    [((2, 3), (5, 4)), ((3, 0), (0, 1)), ((0, 2), (1, 0))],
+)
+def test_what_lies_around_the_judged_area_changes_nothing(margins) -> None:
+    gone = scattered(np.random.default_rng(7), 0.2, 1) | disc(60.2, 45.3, 12)
+    gone[:20, :20] = False
+    gone |= disc(9.0, 9.0, 16)
+    cloud, evidence = looked(gone)
+    alone = missing_returns(cloud, evidence)
+    larger_cloud, larger_evidence = embedded(cloud, evidence, margins)
+    larger = missing_returns(larger_cloud, larger_evidence)
+    assert alone is not None
+    assert larger is not None
+    assert larger.facts == alone.facts
+    assert larger.outline.sum() == alone.outline.sum()
+    assert len(alone.detections) == len(larger.detections) >= 2
+    for before, after in zip(alone.detections, larger.detections, strict=True):
+        assert after.score == before.score
+        np.testing.assert_array_equal(after.centre_m, before.centre_m)
+        first = measure_missing(cloud, evidence, before)
+        second = measure_missing(larger_cloud, larger_evidence, after)
+        assert (second.u_px, second.v_px) == pytest.approx((first.u_px, first.v_px), abs=1e-9)
+        assert second.extent_diameter_m == first.extent_diameter_m
+
+
+def test_the_surface_at_a_hole_is_that_of_the_judged_pixels_around_it() -> None:
+    """Valid pixels that the detector did not judge, pixels within the hole, and those beyond the
+    ring do not count."""
+    gone = disc(60, 45, 20) & ~disc(60, 45, 6)
+    cloud, evidence = looked(gone, tilt=0.3)
+    missing = missing_returns(cloud, evidence)
+    assert missing is not None
+    (detection,) = missing.detections
+    expected = measure_missing(cloud, evidence, detection)
+    square = np.ones((2 * RING_PX + 1, 2 * RING_PX + 1), np.uint8)
+    area = disc(60, 45, 20)
+    ring = (cv2.dilate(area.astype(np.uint8), square) > 0) & ~area
+    unjudged = ring & (U > 68)
+    score = np.where(unjudged, np.nan, evidence.score)
+    surface = np.where(ring & ~unjudged, evidence.surface_z_m, 9.0)
+    points_m = np.where((ring & ~unjudged)[..., None], cloud.points_m, [7.0, 8.0, 9.0])
+    points_m[gone] = np.nan
+    elsewhere = replace(cloud, points_m=points_m)
+    other = measure_missing(
+        elsewhere, replace(evidence, score=score, surface_z_m=surface), detection
+    )
+    np.testing.assert_allclose(other.extent_centre_m, expected.extent_centre_m, atol=2e-5)
+    assert other.extent_diameter_m == pytest.approx(expected.extent_diameter_m, rel=2e-3)
+    # each judged pixel of the ring counts: one that is off moves the centre
+    for row, column in np.argwhere(ring & ~unjudged)[::5]:
+        surface_z_m = evidence.surface_z_m.copy()
+        surface_z_m[row, column] += 1.0
+        moved = measure_missing(cloud, replace(evidence, surface_z_m=surface_z_m), detection)
+        assert np.linalg.norm(moved.extent_centre_m - expected.extent_centre_m) > 1e-5
+
+
+def test_a_hole_whose_surroundings_are_not_judged_is_no_finding() -> None:
+    """Eight judged pixels do not determine a surface, nine do."""
+    gone = disc(60, 45, 8)
+    cloud, evidence = looked(gone)
+    rows, columns = np.nonzero(~gone & disc(60, 45, 11))
+    for count in (LEAST_POINTS - 1, LEAST_POINTS):
+        score = np.where(disc(60, 45, 30), np.nan, evidence.score)
+        score[rows[:count], columns[:count]] = 0.0
+        missing = missing_returns(cloud, replace(evidence, score=score))
+        assert missing is not None
+        assert len(missing.detections) == (count == LEAST_POINTS)
+
+
+@pytest.mark.parametrize("region", [Region(0, 90, 0, 120), Region(12, 102, 7, 127)])
+def test_a_place_is_in_pixels_of_the_whole_image_and_has_the_commonest_reason(region) -> None:
+    gone = disc(40.0, 51.0, 9)
+    cloud, evidence = looked(gone)
+    reason = cloud.reason.copy()
+    reason[gone] = Reason.LOW_AMPLITUDE
+    reason[gone & (U < 39)] = Reason.SATURATED
+    cloud = replace(cloud, region=region, reason=reason)
+    missing = missing_returns(cloud, evidence)
+    assert missing is not None
+    measured = measure_missing(cloud, evidence, missing.detections[0])
+    assert measured.u_px == pytest.approx(40.0 + region.col0, abs=1e-9)
+    assert measured.v_px == pytest.approx(51.0 + region.row0, abs=1e-9)
+    assert measured.model_note == "no return: too little light came back"
+
+
+def test_pixels_that_returned_in_a_fifth_of_the_frames_count_as_missing() -> None:
+    hole = disc(60, 45, 10)
+    cloud, evidence = looked(np.zeros(SHAPE, bool))
+    for frames, returned, expected in ((20, 4, 1), (20, 5, 0), (50, 10, 1), (50, 11, 0)):
+        rare = replace(
+            cloud, count=np.where(hole, returned, frames).astype(np.int32), n_frames=frames
+        )
+        missing = missing_returns(rare, evidence)
+        assert missing is not None
+        assert len(missing.detections) == expected
+        np.testing.assert_allclose(missing.unseen[hole], 1.0 - returned / frames)
+        assert not missing.unseen[~hole].any()
+
+
+def test_clusters_join_along_rows_and_columns_and_reach_the_edge_along_them() -> None:
+    """Nine pixels are a finding, eight are not; pixels that touch at corners are two clusters. A
+    cluster one pixel from the edge is enclosed."""
+    gone = np.zeros(SHAPE, bool)
+    gone[50:52, 50:54] = True
+    eight = missing_returns(*looked(gone))
+    assert eight is not None
+    assert not eight.detections
+    gone[50:52, 50:54] = False
+    gone[1:4, 1:4] = True  # one pixel from both edges
+    gone[20:23, 20:23] = True
+    gone[23:26, 23:26] = True  # touches at a corner only
+    gone[70:73, 117:120] = True  # at the right edge
+    gone[87:90, 60:63] = True  # at the lower edge
+    gone[0:3, 80:83] = True
+    gone[40:43, 0:3] = True
+    missing = missing_returns(*looked(gone))
+    assert missing is not None
+    firsts = [divmod(int(detection.pixels[0]), SHAPE[1]) for detection in missing.detections]
+    assert firsts == [(1, 1), (20, 20), (23, 23)]
+    # the outline is the judged area with gaps of up to two pixels closed
+    assert missing.blind == pytest.approx((9 + 18) / missing.outline.sum())
+    assert not missing.outline[70:73, 118:].any()
+    assert missing.outline[1:4, 1:4].all()
+
+
+def test_scattered_dropouts_alone_have_their_share_as_rate() -> None:
+    gone = np.zeros(SHAPE, bool)
+    gone[10:80:7, 10:110:9] = True
+    missing = missing_returns(*looked(gone))
+    assert missing is not None
+    assert missing.dropouts == pytest.approx(gone.mean())
+    assert missing.facts["expected_by_chance"] == 0.0
+    assert missing.least_points == LEAST_POINTS
+    assert not missing.detections
+    # beside a hole, the hole's pixels count neither as dropouts nor as known
+    hole = disc(60.4, 45.2, 14)
+    missing = missing_returns(*looked(gone | hole))
+    assert missing is not None
+    around = cv2.dilate(hole.astype(np.uint8), np.ones((3, 3))) > 0
+    rest = (gone & ~around).sum()
+    assert missing.dropouts == pytest.approx(rest / (gone.size - hole.sum()), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("chance", "points"),
+    [
+        (_Chance(0.1, 12, np.log(3.0), 0.4), 27),  # 12 + ln(300) / 0.4 = 26.3
+        (_Chance(0.1, 30, np.log(0.02), 0.3), 33),  # 30 + ln(2) / 0.3 = 32.3
+        (_Chance(0.1, 3, np.log(0.02), 0.3), LEAST_POINTS),
+    ],
+)
+def test_the_least_finding_is_the_smallest_that_chance_makes_too_seldom(chance, points) -> None:
+    assert chance.least_points == points
+    assert chance.log_expected(points) <= np.log(ALPHA)
+    assert chance.log_expected(chance.size) == pytest.approx(chance.log_number)
+    fall = chance.log_expected(20) - chance.log_expected(23)
+    assert fall == pytest.approx(3.0 * chance.fall)
+
+
+def test_the_tail_of_simulated_clusters_falls_like_a_geometric_distribution() -> None:
+    """Of 100 clusters of 1 to 12 pixels in 4 fields the largest 60 begin at 4 pixels; of those of
+    4 pixels and more, the mean excess plus two standard errors gives the fall."""
+    sizes = np.sort([1] * 25 + [3] * 10 + [4] * 15 + [5] * 20 + [8] * 20 + [12] * 10)
+    chance = _tail(0.03, sizes, 4)
+    excess = (20 * 1 + 20 * 4 + 10 * 8) / 65 * (1.0 + 2.0 / np.sqrt(65))
+    assert chance.rate == 0.03
+    assert chance.size == 4
+    assert chance.log_number == pytest.approx(np.log(65 / 4))
+    # in a geometric distribution of this mean, the share e / (1 + e) goes on
+    assert np.exp(-chance.fall) == pytest.approx(excess / (1.0 + excess))
+    # few clusters of one size: the slowest fall that is believed
+    assert _tail(0.03, np.array([1, 1, 1]), 4).fall == pytest.approx(np.log(2.0))
+    for count in (0, 1):
+        few = _tail(0.03, np.full(count, 5), 8)
+        assert few.size == 1
+        assert few.log_expected(1) == pytest.approx(np.log(1 / 8))
+        assert few.fall == pytest.approx(np.log(2.0))
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 5])
+def test_simulated_fields_are_means_over_squares(side: int) -> None:
+    """Of unit variance, with a correlation that falls evenly to 0 at the square's side."""
+    fields = np.stack(list(_fields((50, 70), side, 60)))
+    assert fields.shape == (60, 50, 70)
+    # 60 fields of 3500 pixels, of which side^2 share one value: four standard errors
+    tolerance = 4.0 * 2.0**0.5 * side / np.sqrt(fields.size)
+    assert fields.var() == pytest.approx(1.0, abs=tolerance)
+    for lag in range(1, 6):
+        expected = max(1.0 - lag / side, 0.0)
+        down = (fields[:, lag:] * fields[:, :-lag]).mean()
+        across = (fields[:, :, lag:] * fields[:, :, :-lag]).mean()
+        assert (down, across) == pytest.approx((expected, expected), abs=tolerance)
+
+
+@pytest.mark.parametrize(("rate", "side"), [(0.1, 1), (0.1, 2), (0.2, 3), (0.1, 4), (0.3, 5)])
+def test_the_square_is_the_one_that_makes_as_many_missing_neighbours(rate, side) -> None:
+    """Dropouts of a square have so many missing neighbours that no smaller square explains them,
+    and the pairs of neighbours are as frequent as the bivariate normal distribution says."""
+    level = ndtri(rate)
+    low = np.stack([field < level for field in _fields((300, 400), side, 4)])
+    known = np.ones(low[0].shape, bool)
+    sides = [_square(image, known, rate) for image in low]
+    turned = [_square(image.T, known.T, rate) for image in low]
+    assert turned == sides
+    # two standard errors: one field in 40 has a larger square
+    assert sorted(sides)[1] == sides[0] == side
+    correlation = 1.0 - 1.0 / side
+    both = multivariate_normal.cdf([level, level], cov=[[1.0, correlation], [correlation, 1.0]])
+    frequent = (low[:, 1:] & low[:, :-1]).mean()
+    assert frequent == pytest.approx(both, rel=0.05)
+
+
+def test_neighbours_that_are_not_known_do_not_count_as_returned() -> None:
+    """Pairs with missing pixels that are findings say nothing on the dropouts' square."""
+    field = next(_fields((300, 400), 3, 1))
+    missing = field < ndtri(0.2)
+    known = np.ones(missing.shape, bool)
+    known[::4] = False
+    known[:, ::5] = False
+    assert _square(missing & known, known, 0.2) == 3
+
+
+@pytest.mark.parametrize(
+    ("down", "across", "is_same"),
+    [(2, 2, True), (0, 2, True), (2, 0, True), (3, 0, False), (0, 3, False), (2, 3, False)],
+)
+def test_one_damage_reaches_two_pixels(down: int, across: int, is_same: bool) -> None:
+    """A small finding so far below and beside the corner of a place without return."""
+    gone = (U >= 40) & (U <= 60) & (V >= 30) & (V <= 50)
+    speck = np.zeros(SHAPE, bool)
+    speck[50 + down, 60 + across] = True
+    nothing = Detection(12.0, np.flatnonzero(gone), np.zeros(3), "no return")
+    kept = one_damage_once(SHAPE, (depth_finding(speck),), (nothing,))
+    assert len(kept) == (1 if is_same else 2)
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "distance_px", "is_same"),
+    [(10.0, 7, True), (10.0, 9, False), (20.0, 15, True), (20.0, 17, False), (4.0, 4, True)],
+)
+def test_a_finding_whose_centre_is_far_beside_is_another_damage(
+    radius_px: float, distance_px: int, is_same: bool
+) -> None:
+    """Its centre is 0.8 of its radius, or four pixels if that is more, beside a place without
+    return."""
+    gone = (U >= 20) & (U <= 60) & (V >= 5) & (V <= 85)
+    hole = np.hypot(U - 60 - distance_px, V - 45) <= radius_px
+    nothing = Detection(12.0, np.flatnonzero(gone), np.zeros(3), "no return")
+    kept = one_damage_once(SHAPE, (depth_finding(hole),), (nothing,))
+    assert len(kept) == (1 if is_same else 2)

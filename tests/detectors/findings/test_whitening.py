@@ -5,15 +5,21 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from detectors.findings import whitening_reference as reference
 from detectors.findings.templates import bank, window_of, worths
 from detectors.findings.whitening import (
     CONVERGED,
+    EDGE_PX,
+    FADED,
     GRID,
+    LEAST_POWER,
     LONGEST_LAG_PX,
     MOST_WHITENED,
     _spread,
+    centred,
+    correlated_products,
     correlation,
     covariance_factor,
     filters,
@@ -141,6 +147,108 @@ def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(side: in
     assert not solved[~known].any()
 
 
+class PlainDescent:
+    """The conjugate gradients of `inverse_times`, by NumPy's transforms in double precision."""
+
+    def __init__(self, known: np.ndarray, by_lag: np.ndarray) -> None:
+        self.known = known
+        self.grid = grid_of(known.shape)
+        self.small_grid = grid_of(known.shape, 2 * LONGEST_LAG_PX, 4)
+        least = LEAST_POWER * by_lag.max()
+        power = np.fft.rfft2(centred(by_lag, self.grid)).real
+        self.power = np.maximum(power, least)
+        small_power = np.fft.rfft2(centred(by_lag, self.small_grid)).real
+        self.small_power = np.maximum(small_power, least)
+        reach = np.arange(-6, 7)
+        bell = np.exp(-0.5 * (reach / 2.0) ** 2)
+        padded = self.padded(known.astype(float), self.small_grid)
+        around = self.smoothed(padded, bell / bell.sum())
+        self.known_around = self.cut(around)
+        self.damping = known * np.sqrt(self.known_around)
+        self.filling = (1.0 - padded) / (padded + self.blurred(padded) + FADED)
+
+    @staticmethod
+    def padded(image: np.ndarray, grid: tuple[int, ...]) -> np.ndarray:
+        result = np.zeros(grid)
+        result[: image.shape[0], : image.shape[1]] = image
+        return result
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        return image[: self.known.shape[0], : self.known.shape[1]]
+
+    @staticmethod
+    def smoothed(image: np.ndarray, taps: np.ndarray) -> np.ndarray:
+        down = ndimage.convolve1d(image, taps, axis=0, mode="constant")
+        return ndimage.convolve1d(down, taps, axis=1, mode="constant")
+
+    def blurred(self, image: np.ndarray) -> np.ndarray:
+        return self.smoothed(image, np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9.0)
+
+    def multiplied(self, image: np.ndarray) -> np.ndarray:
+        frequencies = np.fft.rfft2(self.padded(image, self.grid)) * self.power
+        return self.cut(np.fft.irfft2(frequencies, self.grid)) * self.known
+
+    def conditioned(self, image: np.ndarray) -> np.ndarray:
+        damped = self.padded(image * self.damping, self.small_grid)
+        filled = damped + self.filling * self.blurred(damped)
+        frequencies = np.fft.rfft2(filled) / self.small_power
+        whitened = np.fft.irfft2(frequencies, self.small_grid)
+        gathered = whitened + self.blurred(whitened * self.filling)
+        return self.cut(gathered) * self.damping
+
+    def solution(self, values: np.ndarray, start: np.ndarray, error: float, most: int) -> tuple:
+        """The solution, and the number of steps to it."""
+        at_edges = EDGE_PX * (1.0 - self.known_around)[self.known].sum()
+        enough = error**2 * min(at_edges, self.known.sum())
+        solution = self.known * start
+        residual = values * self.known - self.multiplied(solution)
+        conditioned = self.conditioned(residual)
+        direction = conditioned
+        product = (residual * conditioned).sum()
+        for step in range(most):
+            if product <= enough:
+                return solution, step
+            multiplied = self.multiplied(direction)
+            length = product / (direction * multiplied).sum()
+            solution = solution + length * direction
+            residual = residual - length * multiplied
+            conditioned = self.conditioned(residual)
+            last_product = product
+            product = (residual * conditioned).sum()
+            direction = conditioned + product / last_product * direction
+        return solution, most
+
+
+@pytest.mark.parametrize("is_ragged", [True, False])
+@pytest.mark.parametrize("error", [CONVERGED, 0.02])
+@pytest.mark.parametrize("is_started", [True, False])
+def test_a_descent_takes_the_steps_of_a_plain_one(is_ragged, error, is_started) -> None:
+    """Steps by another preconditioner end elsewhere within the error, so that the descent is the
+    described one if the solutions are equal to rounding, also long before it has converged."""
+    random = np.random.default_rng(8)
+    known = np.ones((70, 64), bool)
+    if is_ragged:
+        known = np.hypot(*(np.indices(known.shape) - 32.0)) < 26.0 + 6.0 * random.random(
+            known.shape
+        )
+        known &= random.random(known.shape) > 0.05
+    by_lag = noise_covariance(
+        blurred(3, (90, 120), 3),
+        np.ones((90, 120), bool),
+        (128, 160),
+    )
+    values = np.where(known, blurred(1, known.shape, 3), np.float32(0.0))
+    start = None
+    begun = np.zeros(known.shape)
+    if is_started:
+        start = (values * np.float32(0.5)).astype(np.float32)
+        begun = start
+    solved = inverse_times(values, known, filters(by_lag, known.shape), start, error)
+    expected, steps = PlainDescent(known, by_lag).solution(values, begun, error, 80)
+    assert 2 < steps < 80
+    np.testing.assert_allclose(solved, expected, atol=2e-3 * np.abs(expected).max())
+
+
 def test_a_solution_goes_on_from_another() -> None:
     known = np.random.default_rng(6).random(SHAPE) > 0.1
     by_lag = noise_covariance(
@@ -209,3 +317,34 @@ def test_too_many_pixels_have_no_factor() -> None:
         used = np.ones((1, pixels), bool)
         factor = covariance_factor(used, white, 1.0, np.zeros((1, pixels)))
         assert (factor is not None) == is_factored
+
+
+@pytest.mark.parametrize(("across", "down"), [(1, 1), (3, 2), (2, 5)])
+def test_products_of_columns_count_their_sums_over_windows(across: int, down: int) -> None:
+    """Beside the sums of each window that overlaps the columns, one by one."""
+    columns = np.random.default_rng(9).standard_normal((7, 6, 3))
+    padded = np.pad(columns, ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
+    sums = []
+    for row in range(7 + down - 1):
+        for column in range(6 + across - 1):
+            window = padded[row : row + down, column : column + across]
+            sums.append(window.sum(axis=(0, 1)))
+    stacked = np.array(sums)
+    result = correlated_products(columns, across, down)
+    np.testing.assert_allclose(result, stacked.T @ stacked, rtol=1e-12)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.8])
+def test_a_covariance_fades_by_parzens_window(share: float) -> None:
+    """Of equal values everywhere, the mean product is 1 at all lags."""
+    lag = round(share * LONGEST_LAG_PX)
+    ones = np.ones((100, 90), np.float32)
+    faded = noise_covariance(ones, np.ones(ones.shape, bool), grid_of(ones.shape))
+    relative = lag / LONGEST_LAG_PX
+    # Parzen's window is a cubic B-spline
+    spline = 2.0 * (1.0 - relative) ** 3 - 8.0 * max(0.5 - relative, 0.0) ** 3
+    middle = LONGEST_LAG_PX
+    for row, column in ((middle + lag, middle), (middle, middle - lag)):
+        assert faded[row, column] == pytest.approx(spline, abs=1e-5)
+    assert faded[0, middle] == pytest.approx(0.0, abs=1e-7)
+    assert faded[0, 0] == pytest.approx(0.0, abs=1e-7)

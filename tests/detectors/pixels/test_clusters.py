@@ -74,6 +74,91 @@ def test_points_are_joined_up_to_the_distance_and_no_farther(direction) -> None:
         assert labels.max() + 1 == count
 
 
+def directions(seed: int, count: int) -> np.ndarray:
+    """Unit vectors (n, 3): all along axes and diagonals, and ``count`` random ones."""
+    grid = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
+    random = np.random.default_rng(seed).normal(size=(count, 3))
+    vectors = np.concatenate([grid[np.any(grid != 0, axis=1)], random])
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("distance_m", [0.01, 0.3])
+def test_pairs_are_joined_up_to_the_distance_wherever_they_lie_in_their_cells(distance_m) -> None:
+    """Also two points at the ends of the diagonal of one cell, which are not compared."""
+    vectors = np.tile(directions(1, 100), (5, 1))
+    random = np.random.default_rng(2)
+    firsts = random.uniform(0.0, 1.0, vectors.shape) * distance_m
+    firsts[:26] = 0.0  # the corner of a cell
+    firsts[:, 0] += 20.0 * distance_m * np.arange(len(firsts))
+    for factor, is_joined in ((0.9999, True), (1.0001, False)):
+        seconds = firsts + factor * distance_m * vectors
+        # points in the first cell's corner, so that cells begin there
+        corner = np.minimum(firsts.min(axis=0), seconds.min(axis=0))
+        points = np.concatenate([firsts, seconds, [corner]])
+        labels = euclidean_clusters(points, distance_m)
+        np.testing.assert_array_equal(labels[: len(firsts)] == labels[len(firsts) : -1], is_joined)
+
+
+def test_the_diagonal_of_the_first_cell_is_no_longer_than_the_distance() -> None:
+    for factor, count in ((0.9999, 1), (1.0001, 2)):
+        points = np.zeros((2, 3))
+        points[1] = factor * 0.01 / np.sqrt(3.0)
+        assert euclidean_clusters(points, 0.01).max() + 1 == count
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_as_many_cells_as_their_keys_hold_are_legal_along_each_axis(axis: int) -> None:
+    cell_m = 0.01 / np.sqrt(3.0)
+    points = np.zeros((5, 3))
+    points[1, axis] = 0.009
+    points[2:4, axis] = 0.99999 * 2**20 * cell_m
+    points[3] += 0.004
+    points[4, axis] = 0.5 * 2**20 * cell_m
+    np.testing.assert_array_equal(euclidean_clusters(points, 0.01), [0, 0, 1, 1, 2])
+    points[2:4, axis] *= 1.0001
+    with pytest.raises(UserError, match="cannot be clustered"):
+        euclidean_clusters(points, 0.01)
+
+
+def strength_by_trial(
+    points: np.ndarray,
+    scores: np.ndarray,
+    distance_m: float,
+    min_points: int,
+) -> float:
+    """The lowest threshold at which no cluster of some points is left: the largest score s so that
+    the points with a score of s and more hold a cluster."""
+    for score in -np.sort(-scores):
+        labels = brute_force(points[scores >= score], distance_m)
+        if np.bincount(labels).max() >= min_points:
+            return float(score)
+    return 0.0
+
+
+@pytest.mark.parametrize("min_points", [1, 2, 4])
+def test_strengths_are_the_scores_at_which_the_last_part_falls_apart(min_points: int) -> None:
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        points = random.uniform(0, 0.1, (120, 3)) * [1.0, 1.0, 0.2]
+        scores = random.exponential(size=120)
+        thresholds = np.array([0.0, 0.3, 1.0])
+        labels, strengths = nested_clusters(points, scores, 0.011, min_points, thresholds)
+        for level, threshold in enumerate(thresholds):
+            above = np.flatnonzero(scores > threshold)
+            parts = brute_force(points[above], 0.011)
+            count = 0
+            for number in range(parts.max() + 1):
+                part = above[parts == number]
+                if len(part) < min_points:
+                    assert (labels[level, part] == -1).all()
+                    continue
+                assert (labels[level, part] == count).all()
+                expected = strength_by_trial(points[part], scores[part], 0.011, min_points)
+                assert strengths[level, count] == expected
+                count += 1
+            assert labels[level].max() == count - 1
+
+
 def test_nested_clusters_are_those_of_each_threshold() -> None:
     """Labels at several thresholds beside clusters of the points above each, and the threshold at
     which each is gone."""

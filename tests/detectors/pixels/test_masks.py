@@ -1,15 +1,28 @@
-"""Links, components, normals and turns of the automatic crop against plain ones."""
+"""Masks against SciPy's morphology; links, components, normals and turns of the automatic crop
+against plain ones."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from detectors.pixels.masks import components
+from detectors.pixels.masks import (
+    components,
+    grown,
+    holes_filled,
+    inset,
+    nearest_pixel,
+    notches_filled,
+    on_grid,
+    parts_with,
+    shrunk,
+)
 from detectors.surfaces.smooth_surfaces import links, turns, unit_normals
 
 
@@ -115,3 +128,160 @@ def test_normals_and_their_turns_equal_plain_ones(half: int) -> None:
 
 def test_a_line_of_points_has_no_normal() -> None:
     assert not unit_normals(rough_points(0, h=1)).any()
+
+
+def blotches(seed: int, shape: tuple[int, int] = (40, 53)) -> np.ndarray:
+    """A mask of smooth parts with holes, some of them cut by the edge of the picture."""
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.5)
+    return np.asarray(noise > 0.0)
+
+
+def ellipse(radius_px: int) -> np.ndarray:
+    """OpenCV's round structuring element, by its definition: each row is a circle's chord."""
+    side = 2 * radius_px + 1
+    offset = np.arange(side) - radius_px
+    half = np.rint(np.sqrt(radius_px**2 - offset**2))
+    return np.asarray(np.abs(offset)[None, :] <= half[:, None])
+
+
+def test_values_stand_at_the_pixels_of_their_mask_in_order() -> None:
+    mask = np.array([[True, False, True], [False, True, False]])
+    image = on_grid(np.array([1.0, 2.0, 3.0]), mask)
+    np.testing.assert_array_equal(image, [[1.0, np.nan, 2.0], [np.nan, 3.0, np.nan]])
+
+
+@pytest.mark.parametrize("seed", [3, 7, 9])
+def test_filled_holes_are_those_of_scipy(seed: int) -> None:
+    mask = blotches(seed)
+    filled = ndimage.binary_fill_holes(mask)
+    assert (filled != mask).any()
+    np.testing.assert_array_equal(holes_filled(mask), filled)
+    np.testing.assert_array_equal(holes_filled(mask, 1), np.pad(filled, 1))
+
+
+@pytest.mark.parametrize("pixels", [1, 3])
+def test_masks_grow_and_shrink_as_those_of_scipy(pixels: int) -> None:
+    mask = blotches(7)
+    square = np.ones((2 * pixels + 1, 2 * pixels + 1), dtype=bool)
+    np.testing.assert_array_equal(grown(mask, pixels), ndimage.binary_dilation(mask, square))
+    round_one = grown(mask, pixels, cv2.MORPH_ELLIPSE)
+    np.testing.assert_array_equal(round_one, ndimage.binary_dilation(mask, ellipse(pixels)))
+    smaller = ndimage.binary_erosion(mask, square, border_value=1)
+    np.testing.assert_array_equal(shrunk(mask, 2 * pixels + 1), smaller)
+    assert smaller.any()
+
+
+@pytest.mark.parametrize("pixels", [0, 1, 3])
+def test_an_inset_takes_the_outer_rim_alone(pixels: int) -> None:
+    mask = blotches(9)
+    filled = ndimage.binary_fill_holes(mask)
+    within = ndimage.binary_erosion(filled, ellipse(pixels), border_value=1)
+    np.testing.assert_array_equal(inset(mask, pixels), mask & within)
+    if pixels:
+        assert (inset(mask, pixels) != mask).any()
+        assert (within & ~mask).any()
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+@pytest.mark.parametrize("least", [0, 1, 12])
+def test_parts_with_a_seed_are_those_of_scipy(connectivity: int, least: int) -> None:
+    random = np.random.default_rng(9)
+    mask = random.random((40, 53)) < 0.4
+    seeds = random.random(mask.shape) < 0.1
+    structure = ndimage.generate_binary_structure(2, connectivity // 4)
+    labels, count = ndimage.label(mask, structure)
+    expected = np.zeros(mask.shape, dtype=bool)
+    for number in range(1, count + 1):
+        part = labels == number
+        if (part & seeds).any() and part.sum() >= least:
+            expected |= part
+    assert expected.any()
+    assert (mask & ~expected).any()
+    np.testing.assert_array_equal(parts_with(mask, seeds, connectivity, least), expected)
+
+
+def test_a_part_of_just_enough_pixels_counts_and_one_of_fewer_does_not() -> None:
+    mask = np.zeros((5, 9), dtype=bool)
+    mask[1:3, 1:4] = True  # 6 pixels
+    mask[1:3, 6:8] = True  # 4 pixels
+    for least, expected in ((4, [True, True]), (5, [True, False]), (6, [True, False])):
+        kept = parts_with(mask, mask, least=least)
+        assert [kept[1, 1], kept[1, 6]] == expected
+    assert not parts_with(mask, mask, least=7).any()
+    # by default parts touch at corners, and no part is too small
+    mask[3, 4] = True
+    seeds = np.zeros_like(mask)
+    seeds[3, 4] = True
+    assert parts_with(mask, seeds)[1, 1]
+    assert not parts_with(mask, seeds, connectivity=4)[1, 1]
+    assert parts_with(mask, seeds, connectivity=4)[3, 4]
+
+
+def test_the_nearest_pixel_is_that_of_scipy() -> None:
+    mask = np.random.default_rng(10).random((30, 41)) < 0.02
+    distance_px, nearest = nearest_pixel(mask)
+    exact_px = ndimage.distance_transform_edt(~mask)
+    rows, columns = np.indices(mask.shape)
+    nearest_rows, nearest_columns = np.divmod(nearest, mask.shape[1])
+    assert mask[nearest_rows, nearest_columns].all()
+    np.testing.assert_array_equal(nearest[mask], np.flatnonzero(mask))
+    to_nearest_px = np.hypot(nearest_rows - rows, nearest_columns - columns)
+    # OpenCV's distances by masks of 3 x 3 err by up to 10 %
+    np.testing.assert_allclose(to_nearest_px, exact_px, rtol=0.1)
+    np.testing.assert_allclose(distance_px, exact_px, rtol=0.1)
+
+
+def plate_without_discs(seed: int) -> np.ndarray:
+    """A plate without holes in a picture, of which discs at its edge and a corner are cut out."""
+    random = np.random.default_rng(seed)
+    v, u = np.mgrid[:100, :120]
+    plate = (v >= 20) & (v < 80) & (u >= 8) & (u < 88)
+    plate[20:30, 8:23] = False
+    outline = [(20, 48), (80, 38), (45, 8), (55, 88), (80, 73), (20, 73)]
+    for row, column in outline:
+        towards_middle = np.sign([50 - row, 48 - column]) * random.uniform(0.0, 6.0)
+        at = np.array([row, column]) + towards_middle
+        plate &= np.hypot(v - at[0], u - at[1]) > random.uniform(2.0, 14.0)
+    return np.asarray(ndimage.binary_fill_holes(plate))
+
+
+@pytest.mark.parametrize("radius_px", [8, 13])
+def test_filled_notches_are_those_of_scipy(radius_px: int) -> None:
+    """A closing with a disc, and the parts of what it adds that hold a disc of a quarter of its
+    radius."""
+    filled_sizes = []
+    for seed in range(12):
+        mask = plate_without_discs(seed)
+        padded = np.pad(mask, radius_px + 1)
+        closed = ndimage.binary_closing(padded, ellipse(radius_px))
+        closed = closed[radius_px + 1 : -radius_px - 1, radius_px + 1 : -radius_px - 1]
+        gaps = ndimage.binary_fill_holes(closed) & ~mask
+        # the distance to the middle of the next pixel is half a pixel more than that to its edge
+        deep = ndimage.distance_transform_edt(np.pad(gaps, 1))[1:-1, 1:-1] > 1 + radius_px / 4
+        expected = mask | ndimage.binary_propagation(deep, mask=gaps)
+        np.testing.assert_array_equal(notches_filled(mask, radius_px), expected)
+        filled_sizes.append((expected & ~mask).sum())
+        assert (gaps & ~expected).any()
+    assert np.count_nonzero(filled_sizes) > 4
+
+
+@pytest.mark.parametrize("radius_px", [8, 16, 24])
+def test_a_notch_counts_from_a_disc_of_a_quarter_of_the_radius_on(radius_px: int) -> None:
+    """The widest disc in a half-open gap of square sides has half the gap's width."""
+    for width_px, is_filled in ((radius_px // 2 - 1, False), (radius_px // 2 + 3, True)):
+        mask = np.pad(np.ones((60, 80), dtype=bool), 20)
+        mask[20:50, 60 : 60 + width_px] = False
+        filled = notches_filled(mask, radius_px)
+        assert filled[40, 60 : 60 + width_px].all() == is_filled
+        assert (filled != mask).any() == is_filled
+
+
+def test_no_pixel_has_no_notch() -> None:
+    assert not notches_filled(np.zeros((9, 9), dtype=bool), 3).any()
+
+
+def test_a_notch_may_touch_the_edge_of_the_picture() -> None:
+    mask = np.ones((50, 60), dtype=bool)
+    mask[:12, 20:32] = False
+    filled = notches_filled(mask, 10)
+    assert filled[5:12, 20:32].all()

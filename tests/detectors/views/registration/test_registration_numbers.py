@@ -1,0 +1,360 @@
+"""Numbers of a registration against plain ones: the covariance of ICP, the sandwich, limits of
+trust, widening, sampling."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from detectors.rigid_motion import moved_by
+from detectors.views.marks.mark import MarkSet
+from detectors.views.registration import register, registered
+from detectors.views.registration.by_points import (
+    LEAST_VARIANCE,
+    _covariance,
+    coherent_point_drift,
+)
+from detectors.views.registration.settings import CpdRegistration
+from detectors.views.view import PreparedView, View
+from harness.vocabulary.geometry import Cloud, Lens, transform_points
+
+PITCH_M = 2e-3
+
+
+def sheet(seed: int, points: int = 500) -> np.ndarray:
+    """Points (n, 3) of a bent sheet of 0.2 m x 0.1 m."""
+    random = np.random.default_rng(seed)
+    x, y = random.uniform(-1.0, 1.0, (2, points)) * [[0.1], [0.05]]
+    z = 0.7 + 0.02 * np.sin(30 * x) * np.cos(40 * y)
+    return np.stack([x, y, z], axis=1) + 3e-4 * random.standard_normal((points, 3))
+
+
+def plain_sandwich(
+    curvature: np.ndarray,
+    scores: np.ndarray,
+    points: np.ndarray,
+    pitch_m: float,
+) -> np.ndarray:
+    """H^-1 S H^-1, S from cubes of five pitches."""
+    corner = points.min(axis=0)
+    sums: dict[tuple, np.ndarray] = {}
+    for point, score in zip(points, scores, strict=True):
+        cube = tuple(np.floor((point - corner) / (5 * pitch_m)).astype(int).tolist())
+        sums[cube] = sums.get(cube, np.zeros(6)) + score
+    scatter = sum(np.outer(total, total) for total in sums.values())
+    inverse = np.linalg.inv(curvature)
+    return inverse @ (scatter * len(sums) / (len(sums) - 1)) @ inverse
+
+
+def test_the_covariance_of_icp_is_that_of_its_cost() -> None:
+    """Curvature by differences of the cost with new pairs, over motions that move the points by
+    one pitch, root mean square; the scatter of the gradients by cubes."""
+    fixed = sheet(1, 900)
+    moved = np.concatenate([sheet(2, 600), sheet(3, 30) + np.array([0.0, 0.3, 0.0])])
+    pitch_m = 2 * PITCH_M
+    limit_m = 3 * pitch_m
+    centre = moved.mean(axis=0)
+    arm = moved - centre
+
+    def displacements(motion: np.ndarray) -> np.ndarray:
+        return np.cross(motion[:3], arm) + motion[3:]
+
+    def cost(motion: np.ndarray) -> float:
+        nearest = cdist(moved + displacements(motion), fixed).min(axis=1)
+        return 0.5 * float(np.sum(np.minimum(nearest, limit_m) ** 2))
+
+    steps = []
+    for unit in np.eye(6):
+        size = np.sqrt(np.mean(np.sum(displacements(unit) ** 2, axis=1)))
+        steps.append(unit * pitch_m / size)
+    curvature = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            first = 0.5 * steps[i] if i == j else steps[i]
+            second = 0.5 * steps[j] if i == j else steps[j]
+            mixed = cost(first + second) + cost(-first - second)
+            mixed -= cost(first - second) + cost(second - first)
+            curvature[i, j] = mixed / (4 * first[i] * second[j])
+    distances = cdist(moved, fixed)
+    nearest = distances.argmin(axis=1)
+    off = moved - fixed[nearest]
+    off[distances.min(axis=1) >= limit_m] = 0.0
+    assert 0 < (off == 0).all(axis=1).sum() < 200
+    scores = np.concatenate([np.cross(arm, off), off], axis=1)
+    scores -= scores.mean(axis=0)
+    expected = plain_sandwich(curvature, scores, moved, pitch_m)
+    result = _covariance(cKDTree(fixed), moved, limit_m, pitch_m)
+    np.testing.assert_allclose(result, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_sandwich_is_that_of_sums_over_cubes() -> None:
+    random = np.random.default_rng(3)
+    points = random.uniform(0.0, 0.06, (200, 3))
+    scores = random.standard_normal((200, 6)) * [1.0, 2.0, 0.5, 30.0, 10.0, 20.0]
+    root = random.standard_normal((6, 6))
+    curvature = root @ root.T + 3.0 * np.eye(6)
+    result = registered.clustered_sandwich(curvature, scores, points, PITCH_M)
+    expected = plain_sandwich(curvature, scores, points, PITCH_M)
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
+    np.testing.assert_array_equal(result, result.T)
+
+
+def test_a_sandwich_needs_seven_cubes_and_a_definite_curvature() -> None:
+    random = np.random.default_rng(4)
+    corners = np.arange(7)[:, None] * [5.01 * PITCH_M, 0.0, 0.0]
+    points = np.repeat(corners, 3, axis=0)
+    scores = random.standard_normal((21, 6))
+    definite = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    assert np.isfinite(registered.clustered_sandwich(definite, scores, points, PITCH_M)).all()
+    few = registered.clustered_sandwich(definite, scores[:18], points[:18], PITCH_M)
+    assert np.isnan(few).all()
+    for worst in (-1e-3, 0.0):
+        indefinite = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, worst])
+        assert np.isnan(registered.clustered_sandwich(indefinite, scores, points, PITCH_M)).all()
+
+
+def test_clouds_that_coincide_have_the_least_width() -> None:
+    """The drift ends at half of its least variance, in units of the fixed cloud's size."""
+    points = sheet(5, 60)
+    drift = coherent_point_drift(
+        points, points, CpdRegistration(outlier_ratio=0.0, tolerance=1e-300)
+    )
+    scale = np.sqrt(np.sum(np.var(points, axis=0)))
+    assert pytest.approx(10 * np.finfo(float).eps) == LEAST_VARIANCE
+    assert drift.sigma_m == pytest.approx(scale * np.sqrt(5 * np.finfo(float).eps), rel=1e-6)
+    assert drift.converged
+
+
+# --- trust ---
+
+
+def agreement(**values: float) -> register.Agreement:
+    fields = {
+        "beside": 1.0,
+        "overlap": 1.0,
+        "apart_m": 0.0,
+        "marks_m": float("nan"),
+        "pitch_m": 1e-3,
+        "noise_m": 1.5e-3,
+        "grids_m": 1e-3 / np.sqrt(6.0),
+        "scatter": 0.2,
+        "marks_scatter": 0.3,
+    }
+    return register.Agreement(**{**fields, **values})
+
+
+@pytest.mark.parametrize(
+    ("values", "limit_mm", "what"),
+    [
+        # noise of 1.5 mm and 2 mm of blur: 2.5 mm, plus a fifth
+        ({}, 3.0, "surfaces"),
+        # pixels coarser than the blur
+        ({"pitch_m": 3.6e-3}, 3.9 * 1.2, "surfaces"),
+        # marks: also two grids of 1 mm / sqrt 6
+        ({}, np.hypot(2.5, 1 / np.sqrt(6.0)) * 1.3, "marks"),
+    ],
+)
+def test_views_farther_apart_than_their_noise_and_the_blur_are_refused(values, limit_mm, what):
+    field = "apart_m" if what == "surfaces" else "marks_m"
+    for factor, is_refused in ((0.999, False), (1.001, True)):
+        text = register._apart(agreement(**{**values, field: factor * limit_mm * 1e-3}))
+        assert bool(text) == is_refused
+        if is_refused:
+            assert what in text
+            assert f"(up to {limit_mm:.1f} mm are merged)" in text
+
+
+def test_a_covariance_is_widened_by_what_noise_does_not_explain() -> None:
+    """Noise 1 mm and a predicted error of 0.5 mm across explain 1.118 mm of 2 mm; with the rest,
+    0.4 mm within and 0.3 mm of the grids, 2.1 mm of the marks' 5 mm is explained."""
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-8
+    registration = registered.Registration("v", "marks", np.eye(4), covariance=covariance)
+    normal = np.array([0.6, 0.0, -0.8])
+    seen = agreement(noise_m=1e-3, grids_m=3e-4, apart_m=2e-3, marks_m=5e-3)
+    result = register._widened(registration, normal, 4e-4, 5e-4, seen)
+    across_mm2 = 4.0 - (1.0 + 0.25)
+    within_mm2 = 25.0 - (1.0 + 0.25 + 0.16 + 0.09 + across_mm2)
+    along = np.outer(normal, normal)
+    added = across_mm2 * along + 0.5 * within_mm2 * (np.eye(3) - along)
+    expected = covariance.copy()
+    expected[3:, 3:] += 1e-6 * added
+    np.testing.assert_allclose(result.covariance, expected, rtol=1e-12, atol=1e-18)
+    sizes = f"{np.sqrt(across_mm2):.2g} mm across and {np.sqrt(within_mm2):.2g} mm along"
+    assert sizes in result.notes[0]
+    # what the scatter allows is no such error
+    quiet = replace(seen, apart_m=1.19 * np.hypot(1e-3, 5e-4), marks_m=1.29e-3 * np.sqrt(1.5))
+    assert register._widened(registration, normal, 4e-4, 5e-4, quiet) is registration
+    loud = replace(quiet, apart_m=1.21 * np.hypot(1e-3, 5e-4))
+    widened = register._widened(registration, normal, 4e-4, 5e-4, loud)
+    beyond_mm2 = 1.25 * (1.21**2 - 1.0)
+    np.testing.assert_allclose(
+        (widened.covariance - covariance)[3:, 3:], 1e-6 * beyond_mm2 * along, atol=1e-18
+    )
+    assert "along" not in widened.notes[0]
+
+
+def view_of(points_m: np.ndarray, guess: np.ndarray | None = None) -> PreparedView:
+    """A view of points without a grid."""
+    count = len(points_m)
+    flat = np.zeros((1, count), np.uint8)
+    cloud = Cloud(
+        points_m=points_m[None],
+        reason=flat,
+        count=flat + 1,
+        variance_m2=np.full((1, count), np.nan),
+        region=Lens(count, 1, 1.0, 1.0, 0.0, 0.0).whole,
+        z_step_m=0.0,
+        n_frames=1,
+        organised=False,
+    )
+    return PreparedView(View("v", cloud, guess), cloud.valid, MarkSet((), np.zeros(0, int)))
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "shift_m", "is_credible"),
+    [
+        (29.9, 0.0, True),
+        (30.1, 0.0, False),
+        (0.0, 0.099, True),
+        (0.0, 0.101, False),
+        (29.9, 0.099, True),
+    ],
+)
+def test_a_pose_far_from_its_guess_is_not_credible(turn_deg, shift_m, is_credible) -> None:
+    """By 30 degrees, or by 0.1 m at the target's middle: the guess is in the first view's frame."""
+    points = sheet(6) + np.array([0.3, 0.0, 0.0])
+    first_guess = moved_by(np.array([0.2, 0.1, -0.3, 1.0, 2.0, 3.0]), np.zeros(3))
+    guess = moved_by(np.array([0.1, -0.2, 0.1, 0.5, -0.1, 0.2]), np.zeros(3))
+    reference = view_of(points, first_guess)
+    view = view_of(points, first_guess @ guess)
+    placed = transform_points(guess, points.mean(axis=0))
+    axis = np.array([0.6, 0.0, 0.8])
+    motion = np.concatenate([np.deg2rad(turn_deg) * axis, shift_m * np.array([0.0, -0.6, 0.8])])
+    registration = registered.Registration("v", "icp", moved_by(motion, placed) @ guess)
+    text = register._jump(registration, reference, view)
+    assert (text == "") == is_credible
+    if text:
+        assert text.startswith(f"is {turn_deg:.0f} degrees and {1e3 * shift_m:.0f} mm away")
+    assert register._jump(registration, view_of(points), view) == ""
+
+
+# --- sampling ---
+
+
+def test_a_plane_through_points_faces_the_camera() -> None:
+    random = np.random.default_rng(7)
+    normal = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
+    basis = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    plane = random.uniform(-0.1, 0.1, (50, 2)) @ basis[:, :2].T + [0.0, 0.1, 0.8]
+    centre, found_normal = registered.plane_through(plane)
+    np.testing.assert_allclose(found_normal, normal, atol=1e-9)
+    np.testing.assert_allclose(centre, plane.mean(axis=0))
+    centre, found_normal = registered.plane_through(plane[:2])
+    np.testing.assert_allclose(found_normal, [0.0, 0.0, -1.0])
+    np.testing.assert_allclose(centre, plane[:2].mean(axis=0))
+
+
+def gridded(noise_m: float, tilt: float, lens: Lens, step_m: float = 0.0) -> PreparedView:
+    slopes = lens.region_slopes(lens.whole)
+    z_m = 0.8 / (1.0 - tilt * slopes[..., 0])
+    z_m = z_m + noise_m * np.random.default_rng(8).standard_normal(z_m.shape)
+    cloud = Cloud(
+        points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
+        reason=np.zeros(z_m.shape, np.uint8),
+        count=np.full(z_m.shape, 9),
+        variance_m2=np.full(z_m.shape, np.nan),
+        region=lens.whole,
+        z_step_m=step_m,
+        n_frames=9,
+        lens=lens,
+    )
+    return PreparedView(View("v", cloud, None), cloud.valid, MarkSet((), np.zeros(0, int)))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.8])
+def test_the_sampling_of_a_grid_is_that_of_its_coarser_axis(tilt: float) -> None:
+    """Pixels twice as wide as high, or tilted about y."""
+    for fx, fy in ((200.0, 400.0), (400.0, 400.0)):
+        lens = Lens(61, 51, fx, fy, 30.0, 25.0)
+        view = gridded(2e-4, tilt, lens)
+        sampling = registered.sampling_of(view)
+        across = 0.8 / fx * np.hypot(1.0, tilt)
+        assert sampling.pitch_m == pytest.approx(max(across, 0.8 / fy), rel=0.03)
+        points = view.points_m
+        diagonal = np.linalg.norm(points.max(axis=0) - points.min(axis=0))
+        assert sampling.extent_m == pytest.approx(diagonal / 2)
+        np.testing.assert_allclose(sampling.centre_m, points.mean(axis=0))
+        if tilt == 0.0:
+            assert sampling.noise_m == pytest.approx(2e-4, rel=0.06)
+
+
+def test_the_noise_is_no_less_than_rounding_leaves_in_the_mean() -> None:
+    lens = Lens(61, 51, 400.0, 400.0, 30.0, 25.0)
+    coarse = registered.sampling_of(gridded(0.0, 0.0, lens, step_m=6e-3))
+    assert coarse.noise_m == pytest.approx(6e-3 / np.sqrt(12.0 * 9))
+
+
+@pytest.mark.parametrize(("count", "limit", "kept"), [(10, 10, 10), (11, 10, 6), (25, 10, 9)])
+def test_thinned_points_are_evenly_strided(count: int, limit: int, kept: int) -> None:
+    points = np.arange(3.0 * count).reshape(count, 3)
+    result = registered.thinned(points, limit)
+    assert len(result) == kept
+    np.testing.assert_array_equal(result, points[:: -(-count // limit)])
+
+
+def test_moves_and_independent_values_are_counted() -> None:
+    points = sheet(9)
+    motion = np.array([0.0, 0.0, 0.02, 0.001, -0.002, 0.003])
+    change = moved_by(motion, np.zeros(3))
+    moves = transform_points(change, points) - points
+    expected = np.sqrt(np.mean(np.linalg.norm(moves, axis=1) ** 2))
+    assert registered.moved_m(change, points) == pytest.approx(expected)
+    assert registered.independent(24) == 1.0
+    assert registered.independent(250) == 10.0
+
+
+def test_agreement_counts_points_beside_and_together() -> None:
+    """A flat reference and a view of which a quarter lies 4 mm behind, and a quarter beyond its
+    edge."""
+    grid = np.stack(np.meshgrid(np.arange(40), np.arange(40)), axis=-1).reshape(-1, 2) * 1e-3
+    reference_points = np.column_stack([grid, np.full(len(grid), 0.8)])
+    random = np.random.default_rng(10)
+    points = reference_points + [0.0, 0.0, 1e-4] * random.standard_normal((len(grid), 1))
+    quarter = len(grid) // 4
+    points[:quarter, 2] += 4e-3
+    points[-quarter:, 1] += 0.05
+    reference = view_of(reference_points)
+    view = view_of(points)
+    sampling = replace(registered.sampling_of(reference), pitch_m=1e-3, noise_m=2e-4)
+    result = register._agreement(reference, sampling, view, np.eye(4))
+    assert result.beside == pytest.approx(0.75, abs=0.01)
+    assert result.overlap == pytest.approx(0.5, abs=0.01)
+    of_view = registered.sampling_of(view)
+    assert result.pitch_m == pytest.approx(max(1e-3, of_view.pitch_m))
+    assert result.noise_m == pytest.approx(np.hypot(2e-4, of_view.noise_m))
+    assert result.grids_m == pytest.approx(result.pitch_m / np.sqrt(6.0))
+    beside = 0.75 * len(grid)
+    assert result.scatter == pytest.approx(3.09 * 1.65 / np.sqrt(2 * beside / 25), rel=0.02)
+    # two thirds at 0.1 mm, a third at 4 mm: the median is that of the smaller ones' upper quarter
+    assert result.apart_m == pytest.approx(1e-4 * 1.15 / 0.6745, rel=0.15)
+    assert np.isnan(result.marks_m)
+    assert result.marks_scatter == pytest.approx(3.09 / np.sqrt(2.0))
+
+
+def test_agreement_of_marks_leaves_the_farthest_tenth_out() -> None:
+    points = sheet(11, 400)
+    indices = np.arange(0, 400, 4)
+    reference = replace(view_of(points), marks=MarkSet((), indices))
+    off = np.zeros((400, 3))
+    off[indices[:90], 2] = 2e-4
+    off[indices[90:], 2] = 0.5
+    view = replace(view_of(points + off), marks=MarkSet((), indices))
+    sampling = registered.sampling_of(reference)
+    result = register._agreement(reference, sampling, view, np.eye(4))
+    assert result.marks_m == pytest.approx(2e-4, rel=1e-6)
+    assert result.marks_scatter == pytest.approx(3.09 / np.sqrt(2 * 100 / 25))
