@@ -19,6 +19,7 @@ from detectors.pixels.masks import (
     shrunk,
 )
 from detectors.pixels.noise import quantile_of
+from detectors.surfaces.pieces import joined_pieces
 from harness.vocabulary.geometry import MM, Cloud, Region
 
 MAX_SURFACE_TILT = 6.0  # tan(80.5 degrees): a steeper step is an edge
@@ -41,6 +42,8 @@ CONTACT_SIGMAS = 3.0
 RIM_TURN_DEG = 10.0
 """Largest turn of a rim from the surface inside it, beyond the bend of that surface."""
 MOST_SURFACES = 8
+MOST_PIECES = 24
+"""Most further pieces that are compared with the surfaces."""
 WIDE_PART = 0.1
 """Least share of pixels at the middle of a full window: a smoothed step has no such pixel."""
 WIDEST_SLOPE = 5.7
@@ -93,7 +96,9 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     normals = unit_normals(smooth)
     bent = turns(normals, half, math.cos(math.radians(crease_deg)))
     cores, sizes = components(valid & ~bent, right, down)
+    small = cores.copy()
     count = _keep_large(cores, sizes, window)
+    small[cores > 0] = 0
 
     # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given
     # back if no step and no other surface's core separates them from the core
@@ -113,10 +118,40 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     masks = _joined(masks, cores, local, contact_m, math.radians(crease_deg / 2.0))
     _share_contested(masks, cores, local)
     _trim_rims(masks, cores, has_return, local, window, reach, contact_m)
+    seen_m = np.where(valid[..., None], points, np.nan)
+    masks = _with_pieces(masks, small, seen_m, contact_m, reach)
     filled = masks.copy()
     for number, mask in enumerate(masks):
         filled[number] = holes_filled(mask)
     return Surfaces(masks & has_return, filled, contact_m, reach)
+
+
+def _with_pieces(
+    masks: np.ndarray,
+    small: np.ndarray,
+    points_m: np.ndarray,
+    apart_m: float,
+    reach: int,
+) -> np.ndarray:
+    """Return the surfaces with those joined that are pieces of one, and with further pieces among
+    the ``small`` cores (h, w), which are numbered."""
+    if not len(masks):
+        return masks
+    sizes = np.bincount(small.ravel())
+    sizes[0] = 0
+    numbers = np.argsort(-sizes, kind="stable")[:MOST_PIECES]
+    numbers = numbers[sizes[numbers] >= LEAST_PX]
+    taken = masks.any(axis=0)
+    pieces = list(masks)
+    for number in numbers:
+        grown_core = grown(small == number, reach) & ~taken & np.isfinite(points_m[..., 2])
+        pieces.append(grown_core)
+    groups = joined_pieces(pieces, points_m, apart_m)
+    surfaces = []
+    for group in groups:
+        if group[0] < len(masks):
+            surfaces.append(np.logical_or.reduce([pieces[number] for number in group]))
+    return np.array(surfaces)
 
 
 def _bridged(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
