@@ -19,6 +19,7 @@ from detectors.pixels.masks import (
     shrunk,
 )
 from detectors.pixels.noise import quantile_of
+from detectors.surfaces.faces import extruded_faces
 from detectors.surfaces.pieces import joined_pieces
 from harness.vocabulary.geometry import MM, Cloud, Region
 
@@ -42,6 +43,8 @@ CONTACT_SIGMAS = 3.0
 RIM_TURN_DEG = 10.0
 """Largest turn of a rim from the surface inside it, beyond the bend of that surface."""
 MOST_SURFACES = 8
+FACES_FROM = 1.1
+"""Least area without a step, in areas of a surface, in which further faces are sought."""
 MOST_PIECES = 24
 """Most further pieces that are compared with the surfaces."""
 WIDE_PART = 0.1
@@ -120,6 +123,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     _trim_rims(masks, cores, has_return, local, window, reach, contact_m)
     seen_m = np.where(valid[..., None], points, np.nan)
     masks = _with_pieces(masks, small, seen_m, contact_m, reach)
+    unbroken = components(valid, right, down)[0]
+    masks = _with_faces(masks, unbroken, seen_m, contact_m, central)
     filled = masks.copy()
     for number, mask in enumerate(masks):
         filled[number] = holes_filled(mask)
@@ -152,6 +157,46 @@ def _with_pieces(
         if group[0] < len(masks):
             surfaces.append(np.logical_or.reduce([pieces[number] for number in group]))
     return np.array(surfaces)
+
+
+def _with_faces(
+    masks: np.ndarray,
+    unbroken: np.ndarray,
+    points_m: np.ndarray,
+    apart_m: float,
+    central: bool,
+) -> np.ndarray:
+    """Return the surfaces, each with all faces of the extruded part of which it is one: a sheet's
+    flats and webs. ``unbroken`` (h, w): numbers of the areas without a step, which end no surface
+    at a crease."""
+    surfaces = list(masks)
+    for number in _areas_of(masks, unbroken):
+        area = unbroken == number
+        inside = [surface for surface in surfaces if _lies_in(surface, area)]
+        largest = max(inside, key=np.count_nonzero)
+        if np.count_nonzero(area) <= FACES_FROM * np.count_nonzero(largest):
+            continue
+        part = extruded_faces(area, largest, points_m, apart_m, central)
+        if part is not None:
+            part = part | largest
+            surfaces = [part, *[surface for surface in surfaces if not _lies_in(surface, part)]]
+    return np.array(surfaces).reshape(-1, *unbroken.shape)
+
+
+def _areas_of(masks: np.ndarray, unbroken: np.ndarray) -> list[int]:
+    """Return the numbers of the areas (h, w) that include most of a surface."""
+    numbers = []
+    for mask in masks:
+        counts = np.bincount(unbroken[mask], minlength=2)
+        counts[0] = 0
+        number = int(counts.argmax())
+        if counts[number] > 0.5 * np.count_nonzero(mask) and number not in numbers:
+            numbers.append(number)
+    return numbers
+
+
+def _lies_in(surface: np.ndarray, area: np.ndarray) -> bool:
+    return np.count_nonzero(surface & area) > 0.5 * np.count_nonzero(surface)
 
 
 def _bridged(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
