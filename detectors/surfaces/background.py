@@ -15,11 +15,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
-import numba
 import numpy as np
 
 from detectors.pixels.masks import grown, on_grid
+from detectors.pixels.medians import group_medians
 from detectors.pixels.noise import median_of, sigma_of
+from detectors.surfaces.extruded import Profile, direction_of, profiled
 from detectors.surfaces.free_form import free_form, picture_places
 from detectors.surfaces.reference import laid_on
 from detectors.surfaces.surface import (
@@ -125,7 +126,7 @@ class _Cells:
     def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
         """Return the cells with medians and deviations of the points' residuals (n,); some cells
         are then dropped."""
-        medians, deviations = _group_medians(residuals, self.cell_of_point, len(self.points))
+        medians, deviations = group_medians(residuals, self.cell_of_point, len(self.points))
         z = fit(self.points) + medians
         is_judged = np.isfinite(z)
         moved = self.points.copy()
@@ -236,7 +237,34 @@ def _shape_of(points: np.ndarray, cells: _Cells, config: SurfaceConfig) -> tuple
     both."""
     sample = points[:: max(1, len(points) // 8192)]
     _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"))
-    shape = _chosen(cells.refreshed(points[:, 2] - start(points), start), config)
+    cells = cells.refreshed(points[:, 2] - start(points), start)
+    shapes, errors = _formula_shapes(cells)
+    worth = WORTH * cells.pixel_noise
+    best = shapes[_simplest(errors, worth)]
+    base = shapes[int(np.argmin([tile_errors.mean() for tile_errors in errors]))]
+    profile = _profile(points, cells, start, best) if config.shape == "auto" else None
+    if profile is not None:
+        cells = cells.refreshed(points[:, 2] - profile(points), profile)
+        best = _extruded_shape(profile, cells)
+        base = best
+    shape = _with_free_form(cells, best, base, config)
+    return _refined(points, cells, shape)
+
+
+def _profile(points: np.ndarray, cells: _Cells, start: Fit, best: _Shape) -> Profile | None:
+    """Return the extruded surface of points (n, 3), if it explains them better than the ``best``
+    smooth shape; ``start`` is a surface of degree 2."""
+    in_cells = cells.cell_of_point[cells.cell_of_point >= 0]
+    pitch = cells.side / float(np.sqrt(np.median(np.bincount(in_cells))))
+    directed = direction_of(points, start, pitch, cells.central)
+    if directed is None:
+        return None
+    smooth, _ = _refined(points, cells, best)
+    return profiled(directed, smooth.fit, points)
+
+
+def _refined(points: np.ndarray, cells: _Cells, shape: _Shape) -> tuple[_Shape, _Cells]:
+    """Return the shape fitted to cells that are centred on it, and these."""
     for _ in range(2):
         cells = cells.refreshed(points[:, 2] - shape.fit(points), shape.fit)
         refined = _fitted(cells, shape.name, shape.fit_to, shape.wavelength, widened=True)
@@ -277,7 +305,7 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:
         return ""
-    medians, deviations = _group_medians(residual_m[mask], cells.cell_of_point, len(cells.points))
+    medians, deviations = group_medians(residual_m[mask], cells.cell_of_point, len(cells.points))
     level_noise = _cell_noise(cells.image(medians))[0]
     flat = np.column_stack([cells.points[:, :2], medians])
     level = replace(cells, points=flat, noise=deviations, level_noise=level_noise)
@@ -346,54 +374,6 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
     )
 
 
-@numba.njit(cache=True, nogil=True)
-def _group_medians(
-    values: np.ndarray,
-    group: np.ndarray,
-    groups: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of each group's finite values, and their median distance from it over
-    0.6745; else NaN."""
-    starts = np.zeros(groups + 1, np.int64)
-    for i in range(len(values)):
-        if group[i] >= 0 and np.isfinite(values[i]):
-            starts[group[i] + 1] += 1
-    starts = np.cumsum(starts)
-    next_slot = starts[:-1].copy()
-    grouped = np.empty(starts[-1])
-    for i in range(len(values)):
-        if group[i] >= 0 and np.isfinite(values[i]):
-            grouped[next_slot[group[i]]] = values[i]
-            next_slot[group[i]] += 1
-    medians = np.full(groups, np.nan)
-    deviations = np.full(groups, np.nan)
-    for g in range(groups):
-        if starts[g + 1] > starts[g]:
-            members = grouped[starts[g] : starts[g + 1]]
-            medians[g] = _median(members)
-            deviations[g] = _median(np.abs(members - medians[g])) / 0.6745
-    return medians, deviations
-
-
-@numba.njit(cache=True, nogil=True)
-def _median(values: np.ndarray) -> float:
-    """Return the median of values (n,), which it sorts (Shell 1959): numba's own takes 2 s longer
-    to compile."""
-    gap = len(values) // 2
-    while gap > 0:
-        for i in range(gap, len(values)):
-            value = values[i]
-            j = i
-            while j >= gap and values[j - gap] > value:
-                values[j] = values[j - gap]
-                j -= gap
-            values[j] = value
-        gap //= 2
-    lower = values[(len(values) - 1) // 2]
-    upper = values[len(values) // 2]
-    return 0.5 * (lower + upper)
-
-
 def _cell_noise(image: np.ndarray) -> tuple[float, float]:
     """Return the deviation of cells' medians and their neighbours' correlation, from second
     differences."""
@@ -415,12 +395,12 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
     return deviation, float(np.clip(correlation, 0.0, 0.5))
 
 
-def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
-    """Return the simplest shape that predicts left-out cells about as well as any."""
+def _formula_shapes(cells: _Cells) -> tuple[list[_Shape], list[np.ndarray]]:
+    """Return the shapes with few coefficients, simplest first, and each one's errors (tiles,) of
+    prediction."""
     shapes: list[_Shape] = []
     errors: list[np.ndarray] = []
     worth = WORTH * cells.pixel_noise
-    auto = config.shape == "auto"
     for name, fit_to in _formulas(cells.central):
         shape = _fitted(cells, name, fit_to, None)
         if shape is not None:
@@ -429,11 +409,22 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
         # the search ends after two more that predict no better
         if len(shapes) > 2 and _simplest(errors, worth) <= len(shapes) - 3:
             break
-    best = shapes[_simplest(errors, worth)]
+    return shapes, errors
+
+
+def _extruded_shape(profile: Profile, cells: _Cells) -> _Shape:
+    """Return an extruded profile, which is fitted to points and not to cells, as a shape."""
+    turn_deg = float(np.degrees(np.arctan2(profile.along[1], profile.along[0]))) % 180.0
+    name = f"extruded profile along {turn_deg:.0f} degrees"
+    return _Shape(name, lambda points, weights: profile, profile, cells.weights, None)
+
+
+def _with_free_form(cells: _Cells, best: _Shape, base: _Shape, config: SurfaceConfig) -> _Shape:
+    """Return the best shape, or if it leaves structure the free form over ``base`` that predicts
+    left-out cells significantly better."""
+    auto = config.shape == "auto"
     if auto and _misfit(cells, best.fit, "")[1]["misfit_share"] < FREE_FORM_FROM:
         return best
-    mean_errors = [tile_errors.mean() for tile_errors in errors]
-    base = shapes[int(np.argmin(mean_errors))]
     free = [best] if auto else []
     for length_cells in _wavelengths(cells, config):
         wavelength = length_cells * cells.side
@@ -443,6 +434,7 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
         fitted = _fitted(cells, "free form", fit_to, wavelength)
         if fitted is not None:
             free.append(fitted)
+    worth = WORTH * cells.pixel_noise
     return free[_simplest([_prediction_errors(cells, shape) for shape in free], worth)]
 
 
@@ -528,7 +520,7 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
     error[~np.isfinite(error)] = 1e3
     keys = down * (across.max() + 1) + across
     _, tile = np.unique(keys, return_inverse=True)
-    medians, _ = _group_medians(np.abs(error), tile, int(tile.max()) + 1)
+    medians, _ = group_medians(np.abs(error), tile, int(tile.max()) + 1)
     return medians
 
 

@@ -19,6 +19,8 @@ from detectors.pixels.masks import (
     shrunk,
 )
 from detectors.pixels.noise import quantile_of
+from detectors.surfaces.faces import extruded_faces
+from detectors.surfaces.pieces import joined_pieces
 from harness.vocabulary.geometry import MM, Cloud, Region
 
 MAX_SURFACE_TILT = 6.0  # tan(80.5 degrees): a steeper step is an edge
@@ -41,6 +43,10 @@ CONTACT_SIGMAS = 3.0
 RIM_TURN_DEG = 10.0
 """Largest turn of a rim from the surface inside it, beyond the bend of that surface."""
 MOST_SURFACES = 8
+FACES_FROM = 1.1
+"""Least area without a step, in areas of a surface, in which further faces are sought."""
+MOST_PIECES = 24
+"""Most further pieces that are compared with the surfaces."""
 WIDE_PART = 0.1
 """Least share of pixels at the middle of a full window: a smoothed step has no such pixel."""
 WIDEST_SLOPE = 5.7
@@ -93,7 +99,9 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     normals = unit_normals(smooth)
     bent = turns(normals, half, math.cos(math.radians(crease_deg)))
     cores, sizes = components(valid & ~bent, right, down)
+    small = cores.copy()
     count = _keep_large(cores, sizes, window)
+    small[cores > 0] = 0
 
     # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given
     # back if no step and no other surface's core separates them from the core
@@ -113,10 +121,82 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     masks = _joined(masks, cores, local, contact_m, math.radians(crease_deg / 2.0))
     _share_contested(masks, cores, local)
     _trim_rims(masks, cores, has_return, local, window, reach, contact_m)
+    seen_m = np.where(valid[..., None], points, np.nan)
+    masks = _with_pieces(masks, small, seen_m, contact_m, reach)
+    unbroken = components(valid, right, down)[0]
+    masks = _with_faces(masks, unbroken, seen_m, contact_m, central)
     filled = masks.copy()
     for number, mask in enumerate(masks):
         filled[number] = holes_filled(mask)
     return Surfaces(masks & has_return, filled, contact_m, reach)
+
+
+def _with_pieces(
+    masks: np.ndarray,
+    small: np.ndarray,
+    points_m: np.ndarray,
+    apart_m: float,
+    reach: int,
+) -> np.ndarray:
+    """Return the surfaces with those joined that are pieces of one, and with further pieces among
+    the ``small`` cores (h, w), which are numbered."""
+    if not len(masks):
+        return masks
+    sizes = np.bincount(small.ravel())
+    sizes[0] = 0
+    numbers = np.argsort(-sizes, kind="stable")[:MOST_PIECES]
+    numbers = numbers[sizes[numbers] >= LEAST_PX]
+    taken = masks.any(axis=0)
+    pieces = list(masks)
+    for number in numbers:
+        grown_core = grown(small == number, reach) & ~taken & np.isfinite(points_m[..., 2])
+        pieces.append(grown_core)
+    groups = joined_pieces(pieces, points_m, apart_m)
+    surfaces = []
+    for group in groups:
+        if group[0] < len(masks):
+            surfaces.append(np.logical_or.reduce([pieces[number] for number in group]))
+    return np.array(surfaces)
+
+
+def _with_faces(
+    masks: np.ndarray,
+    unbroken: np.ndarray,
+    points_m: np.ndarray,
+    apart_m: float,
+    central: bool,
+) -> np.ndarray:
+    """Return the surfaces, each with all faces of the extruded part of which it is one: a sheet's
+    flats and webs. ``unbroken`` (h, w): numbers of the areas without a step, which end no surface
+    at a crease."""
+    surfaces = list(masks)
+    for number in _areas_of(masks, unbroken):
+        area = unbroken == number
+        inside = [surface for surface in surfaces if _lies_in(surface, area)]
+        largest = max(inside, key=np.count_nonzero)
+        if np.count_nonzero(area) <= FACES_FROM * np.count_nonzero(largest):
+            continue
+        part = extruded_faces(area, largest, points_m, apart_m, central)
+        if part is not None:
+            part = part | largest
+            surfaces = [part, *[surface for surface in surfaces if not _lies_in(surface, part)]]
+    return np.array(surfaces).reshape(-1, *unbroken.shape)
+
+
+def _areas_of(masks: np.ndarray, unbroken: np.ndarray) -> list[int]:
+    """Return the numbers of the areas (h, w) that include most of a surface."""
+    numbers = []
+    for mask in masks:
+        counts = np.bincount(unbroken[mask], minlength=2)
+        counts[0] = 0
+        number = int(counts.argmax())
+        if counts[number] > 0.5 * np.count_nonzero(mask) and number not in numbers:
+            numbers.append(number)
+    return numbers
+
+
+def _lies_in(surface: np.ndarray, area: np.ndarray) -> bool:
+    return np.count_nonzero(surface & area) > 0.5 * np.count_nonzero(surface)
 
 
 def _bridged(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:

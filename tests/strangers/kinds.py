@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tests.strangers.recording import Format, Noise, Stranger
-from tests.strangers.world import Camera, Damage, Surface, with_damage
+from tests.strangers.world import Camera, Damage, Surface, meet, with_damage
 
 Rng = np.random.Generator
 KINDS: dict[str, Callable[[Rng], Stranger]] = {}
@@ -347,6 +347,171 @@ def bent_sheet(rng: Rng) -> Stranger:
 def corrugated(rng: Rng) -> Stranger:
     pitch = rng.uniform(0.08, 0.2)
     return _shaped(rng, "waves", pitch * rng.uniform(0.02, 0.06), pitch, n=2)
+
+
+# ---- parts of several faces, with joints, behind things
+# --------------------------------------------------------------------------------------------------
+
+
+def _on_faces(
+    rng: Rng, cam: Camera, surface: Surface, xs_m: np.ndarray, half_m: float, n: int, depth_m: float
+) -> Surface:
+    """``n`` damages in the view on faces about the lines x = ``xs_m``, which reach ``half_m`` to
+    either side."""
+    d = surface.origin_m[2]
+    view = 0.4 * d * np.array([cam.width, cam.height]) / cam.f_px
+    half = np.minimum([surface.half_x_m, surface.half_y_m], view)
+    damages: list[Damage] = []
+    for _ in range(60 * n):
+        radius = min(rng.uniform(0.006, 0.014), 0.7 * half_m)
+        x = float(rng.choice(xs_m)) + rng.uniform(-0.3, 0.3) * (half_m - radius)
+        y = rng.uniform(-0.85, 0.85) * half[1]
+        near = [np.hypot(x - o.x_m, y - o.y_m) < 0.05 for o in damages]
+        if len(damages) < n and abs(x) < half[0] - radius and not any(near):
+            profile = str(rng.choice(["flat", "bowl"]))
+            damages.append(
+                Damage(x, y, radius, depth_m if profile == "flat" else 0.4 * radius, profile)
+            )
+    return with_damage(surface, damages)
+
+
+def _sheet(rng: Rng, cam: Camera, shape: str, bend_m: float, pitch_m: float) -> Surface:
+    """A profiled board that fills the view or most of it."""
+    target = board(rng, cam, (0.6, 1.0), tilt=(0, 15), share=(0.75, 1.3), spin=(-90, 90))
+    return replace(target, shape=shape, bend_m=bend_m, pitch_m=pitch_m)
+
+
+def _multiples(pitch_m: float, offset: float = 0.0) -> np.ndarray:
+    return pitch_m * (np.arange(-12, 13) + offset)
+
+
+@kind
+def trapezoidal_sheet(rng: Rng) -> Stranger:
+    cam = camera(rng, *CAMERAS[:3])
+    pitch = rng.uniform(0.13, 0.25)
+    sheet = _sheet(rng, cam, "trapezoids", rng.uniform(0.012, 0.03), pitch)
+    flats = np.concatenate([_multiples(pitch), _multiples(pitch, 0.5)])
+    sheet = _on_faces(rng, cam, sheet, flats, 0.2 * pitch, int(rng.integers(0, 5)), 0.006)
+    return Stranger([sheet, wall(sheet, rng.uniform(0.3, 0.8))], cam, usual(rng))
+
+
+@kind
+def corrugated_sheet(rng: Rng) -> Stranger:
+    """A roof's waves: a quarter to a third as high as half a period."""
+    cam = camera(rng, *CAMERAS[:3])
+    pitch = rng.uniform(0.075, 0.18)
+    sheet = _sheet(rng, cam, "waves", pitch * rng.uniform(0.08, 0.12), pitch)
+    crests = np.concatenate([_multiples(pitch, 0.25), _multiples(pitch, 0.75)])
+    sheet = _on_faces(rng, cam, sheet, crests, 0.2 * pitch, int(rng.integers(0, 5)), 0.006)
+    return Stranger([sheet, wall(sheet, rng.uniform(0.3, 0.8))], cam, usual(rng))
+
+
+@kind
+def cabled_wall(rng: Rng) -> Stranger:
+    """Cables that cross the whole view cut a wall into pieces."""
+    cam = camera(rng, *CAMERAS[:4])
+    target = filling(rng, cam, (0.6, 1.0))
+    d = float(target.origin_m[2])
+    cables = []
+    keep_off = []
+    steps = int(rng.integers(2, 5))
+    for place in np.linspace(-0.28, 0.28, steps) * d * cam.width / cam.f_px:
+        radius = rng.uniform(0.004, 0.012)
+        high = radius + rng.uniform(0.0, 0.06)
+        turn = float(rng.uniform(-12, 12))
+        base = target.point_m(float(place), 0.0) - target.R @ np.array([0, 0, high + radius])
+        turned_R = target.R @ cv2.Rodrigues(np.array([0.0, 0.0, np.radians(turn)]))[0]
+        cables.append(
+            Surface(base, turned_R, 0.999 * radius, 3.0, "cylinder", radius, is_object=True)
+        )
+        keep_off.append((place, turn, radius))
+    target = damaged(rng, cam, target, 9, radius_mm=(6, 14), depth_mm=(4, 10))
+    free = []
+    for damage in target.damages:
+        clear = True
+        for place, turn, radius in keep_off:
+            off = damage.x_m - place + damage.y_m * np.tan(np.radians(turn))
+            clear = clear and abs(off) > damage.radius_m + radius + 0.035
+        if clear:
+            free.append(damage)
+    return Stranger([replace(target, damages=tuple(free[:5])), *cables], cam, usual(rng))
+
+
+@kind
+def ribbed_wall(rng: Rng) -> Stranger:
+    cam = camera(rng, *CAMERAS[:3])
+    pitch = rng.uniform(0.14, 0.25)
+    target = replace(filling(rng, cam, (0.6, 1.0)), half_x_m=1.5, half_y_m=1.5)
+    target = replace(target, shape="ribs", bend_m=rng.uniform(0.015, 0.04), pitch_m=pitch)
+    target = _on_faces(rng, cam, target, _multiples(pitch), 0.25 * pitch, 4, 0.006)
+    return Stranger([target], cam, usual(rng))
+
+
+def _joined(rng: Rng, shape: str, depth_m: float, pitch_m: float, n: int) -> Stranger:
+    cam = camera(rng, *CAMERAS[:3])
+    target = filling(rng, cam, (0.6, 1.0))
+    spin = cv2.Rodrigues(np.array([0.0, 0.0, rng.uniform(-1.5, 1.5)]))[0]
+    target = replace(target, R=target.R @ spin, half_x_m=1.5, half_y_m=1.5)
+    target = replace(target, shape=shape, bend_m=depth_m, pitch_m=pitch_m)
+    if n:
+        target = _on_faces(rng, cam, target, _multiples(pitch_m), 0.25 * pitch_m, n, 0.006)
+    return Stranger([target], cam, usual(rng))
+
+
+@kind
+def floor_boards(rng: Rng) -> Stranger:
+    return _joined(rng, "boards", rng.uniform(0.0015, 0.004), rng.uniform(0.09, 0.2), 0)
+
+
+@kind
+def damaged_floor_boards(rng: Rng) -> Stranger:
+    return _joined(rng, "boards", rng.uniform(0.0015, 0.004), rng.uniform(0.09, 0.2), 3)
+
+
+@kind
+def brick_wall(rng: Rng) -> Stranger:
+    n = 3 * int(rng.integers(2))
+    return _joined(rng, "bricks", rng.uniform(0.002, 0.006), 0.25, n)
+
+
+def _car_door(rng: Rng, crease: float, handle: bool) -> Stranger:
+    cam = camera(rng, *CAMERAS[:3])
+    target = board(rng, cam, (0.7, 1.1), tilt=(0, 15), share=(0.8, 1.2), spin=(-10, 10))
+    target = replace(target, shape="door", bend_m=crease, pitch_m=0.2 if handle else 0.0)
+    return Stranger([target, wall(target, rng.uniform(0.3, 0.8))], cam, usual(rng))
+
+
+@kind
+def curved_door(rng: Rng) -> Stranger:
+    """Undamaged, with or without a crease."""
+    return _car_door(rng, float(rng.choice([0.0, rng.uniform(0.05, 0.3)])), False)
+
+
+def _without_handle(created: Stranger) -> Stranger:
+    """Findings on the handle and its bowl are neither right nor false."""
+    target = created.surfaces[0]
+    hit = meet(target, created.camera.slopes())
+    across = np.abs(hit.x_m - 0.5 * target.half_x_m) < 0.13
+    return replace(created, ignored=across & (np.abs(hit.y_m) < 0.045))
+
+
+@kind
+def car_door(rng: Rng) -> Stranger:
+    return _without_handle(_car_door(rng, rng.uniform(0.1, 0.3), True))
+
+
+@kind
+def dented_car_door(rng: Rng) -> Stranger:
+    created = _car_door(rng, rng.uniform(0.1, 0.3), True)
+    target = created.surfaces[0]
+    dents_ = []
+    for x, y in ((-0.6, -0.65), (-0.5, 0.2), (-0.1, 0.6)):
+        radius = rng.uniform(0.012, 0.022)
+        x_m = (x + rng.uniform(-0.1, 0.1)) * min(target.half_x_m, 0.3)
+        y_m = y * min(target.half_y_m, 0.25)
+        dents_.append(Damage(x_m, y_m, radius, 0.25 * radius, "bowl"))
+    dented = with_damage(target, dents_)
+    return _without_handle(replace(created, surfaces=[dented, *created.surfaces[1:]]))
 
 
 # ---- things on and before the target

@@ -18,6 +18,10 @@ STEPS = 12
 """
 
 
+MARCH = 48
+"""Steps by which rays are followed through the layer of a steep shape."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """Pinhole with OpenCV's distortion (k1 k2 p1 p2 k3); focal length and centre in pixels."""
@@ -72,9 +76,12 @@ class Damage:
 @dataclass(frozen=True)
 class Surface:
     """z = g(x, y) by ``shape``: plane, cylinder, sphere (``bend_m`` = radius; negative: seen from
-    inside), saddle, bent, waves (``bend_m`` = amplitude or rise, ``pitch_m`` = period). ``R`` has
-    the surface's axes as columns in the camera frame; ``outline``: box or disc, of the half
-    extents."""
+    inside), saddle, bent, waves (``bend_m`` = amplitude or rise, ``pitch_m`` = period), trapezoids
+    (``bend_m`` = height of the flats, two fifths of the period each), ribs (``bend_m`` high, a
+    fifth of the period), boards (grooves along y, ``bend_m`` deep), bricks (joints ``bend_m`` deep;
+    ``pitch_m`` = length of a brick), door (a curved sheet with a crease along x of ``bend_m`` slope,
+    and with a bowl and a handle across if ``pitch_m`` > 0). ``R`` has the surface's axes as columns
+    in the camera frame; ``outline``: box or disc, of the half extents."""
 
     origin_m: np.ndarray
     R: np.ndarray
@@ -103,6 +110,8 @@ class Surface:
             return r * (s * s + 0.4 * s**3 + 0.3 * s * (y / self.half_y_m))
         if self.shape == "waves":
             return r * np.sin(2 * np.pi * x / self.pitch_m)
+        if self.shape in PROFILES:
+            return PROFILES[self.shape](self, x, y)
         return np.zeros_like(x)
 
     def normal(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -117,6 +126,68 @@ class Surface:
         """The point (3,) above (x, y), camera frame."""
         z = float(self.height_m(np.array(x), np.array(y)))
         return self.origin_m + self.R @ np.array([x, y, z])
+
+
+def _phase(x: np.ndarray, pitch_m: float) -> np.ndarray:
+    """Distance (m) from the middle of the nearest period."""
+    return np.abs(x - pitch_m * np.round(x / pitch_m))
+
+
+def _trapezoids(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Flats in front where x is a multiple of the period, webs of a tenth of it."""
+    pitch_m = surface.pitch_m
+    return surface.bend_m * np.clip((_phase(x, pitch_m) / pitch_m - 0.2) / 0.1, 0.0, 1.0)
+
+
+def _ribs(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Ribs in front of a wall, midway between multiples of the period; their sides are 1 mm wide."""
+    inner = _phase(x, surface.pitch_m) - 0.4 * surface.pitch_m
+    return -surface.bend_m * np.clip(inner / 1e-3, 0.0, 1.0)
+
+
+def _groove(off_m: np.ndarray, depth_m: float, width_m: float) -> np.ndarray:
+    """A groove about ``off_m`` = 0 with sides that take a fifth of its width each."""
+    return depth_m * np.clip((0.5 * width_m - off_m) / (0.2 * width_m), 0.0, 1.0)
+
+
+def _boards(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return _groove(_phase(x - 0.5 * surface.pitch_m, surface.pitch_m), surface.bend_m, 4e-3)
+
+
+def _bricks(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Courses along x, a third of a brick's length high, each shifted by half a brick."""
+    length_m = surface.pitch_m
+    course = np.round(3.0 * y / length_m)
+    bed = _phase(y - length_m / 6.0, length_m / 3.0)
+    head = _phase(x - 0.5 * length_m * (course % 2), length_m)
+    return _groove(np.minimum(bed, head), surface.bend_m, 10e-3)
+
+
+def _door(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Curved more towards its top; the slope changes at the crease, which is 12 mm wide."""
+    down = y / surface.half_y_m
+    along = x / surface.half_x_m
+    sheet = 0.05 * surface.half_y_m * down**2 * (1.6 - 0.8 * down)
+    sheet = sheet + 0.02 * surface.half_x_m * along**2
+    above = y + 0.3 * surface.half_y_m - 0.05 * x
+    sheet = sheet + 0.5 * surface.bend_m * np.hypot(above, 6e-3)
+    if surface.pitch_m <= 0:
+        return sheet
+    u = (x - 0.5 * surface.half_x_m) / 0.10
+    v = y / 0.03
+    bowl = 0.02 * np.exp(-((u**2 + v**2) ** 2))
+    bar = 0.035 * (np.abs(u) < 0.9) * np.clip((0.010 - np.abs(y)) / 3e-3, 0.0, 1.0)
+    return sheet + bowl - bar
+
+
+PROFILES = {
+    "trapezoids": _trapezoids,
+    "ribs": _ribs,
+    "boards": _boards,
+    "bricks": _bricks,
+    "door": _door,
+}
+"""Steep shapes by name; rays are followed to them step by step."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +210,8 @@ def meet(surface: Surface, slopes: np.ndarray) -> Hit:
     with np.errstate(divide="ignore", invalid="ignore"):
         if surface.shape in ("cylinder", "sphere"):
             z = _round(surface, start, (dx, dy, dz))
+        elif surface.shape in (*PROFILES, "waves"):
+            z = _marched(surface, start, (dx, dy, dz))
         else:
             z = -start[2] / dz
             for _ in range(STEPS if surface.shape != "plane" else 0):
@@ -155,6 +228,34 @@ def meet(surface: Surface, slopes: np.ndarray) -> Hit:
         x = np.where(met, x, np.nan)
         y = np.where(met, y, np.nan)
     return Hit(z, x, y, rays, start)
+
+
+def _marched(surface: Surface, start: np.ndarray, ray: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Camera z where rays first meet a steep height field: `MARCH` even steps through the layer
+    that holds it, then halvings."""
+    dx, dy, dz = ray
+    x_m, y_m = np.meshgrid(
+        np.linspace(-surface.half_x_m, surface.half_x_m, 2001),
+        np.linspace(-surface.half_y_m, surface.half_y_m, 301),
+    )
+    heights_m = surface.height_m(x_m, y_m)
+    low = (heights_m.min() - 1e-4 - start[2]) / dz
+    step = (heights_m.max() + 2e-4 - heights_m.min()) / dz / MARCH
+
+    def above(z: np.ndarray) -> np.ndarray:
+        x = np.clip(start[0] + z * dx, -surface.half_x_m, surface.half_x_m)
+        y = np.clip(start[1] + z * dy, -surface.half_y_m, surface.half_y_m)
+        return start[2] + z * dz < surface.height_m(x, y)
+
+    free = np.ones(dz.shape, bool)
+    z = low
+    for _ in range(MARCH):
+        free &= above(z + step)
+        z = np.where(free, z + step, z)
+    for _ in range(12):
+        step = step / 2
+        z = np.where(above(z + step), z + step, z)
+    return z
 
 
 def _round(surface: Surface, start: np.ndarray, ray: tuple[np.ndarray, ...]) -> np.ndarray:

@@ -1,0 +1,342 @@
+"""Surfaces that are extruded along a direction: profiled sheets, ribs, boards with joints.
+
+Seen along the direction of extrusion, a camera's rays are rays of a plane that leave one point, and
+the surface is a curve in that plane: its inverse distance is a function of the ray's slope alone,
+whatever the perspective. The function is the median over all rays of a slope, so damage that takes
+less than half of the visible length along the direction does not move it.
+
+Not modelled: damage that runs through the whole view along the direction, which is taken for a
+joint; a profile that changes along the direction by more than a polynomial of degree 2."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from detectors.pixels.medians import group_medians
+from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
+
+SEARCHED = 8_000  # points from which a tilt and a twist are found
+COARSE_SEARCHED = 60_000  # points from which a direction is searched
+FINE_PX = 1.5  # width of the strips in the fine search
+COARSE_PX = 4.0  # side of the blocks whose means show a direction
+TURNS = 180
+"""Number of directions tried: a joint 4 pixels wide and 250 long is blurred by one degree."""
+DIRECTED = 1.5
+"""Least variance that a profile along the best direction explains, in variances along the median
+direction: an isotropic residual has none."""
+CLIP_SIGMAS = 5.0  # to which residuals are clipped, so that damage does not choose a direction
+LEAST_LENGTH_M = 0.04
+"""Least visible length along the direction from which a place of the profile is known."""
+LEAST_POINTS = 12
+STEEP = 3.7  # tan(75 degrees): a steeper place is a step, beside which pixels mix both of its sides
+SEEN = 0.5  # least departure from a smooth surface, as a share of a pixel's noise
+GAIN_SIGMAS = 4.0
+"""Least significance of a profile's gain over a smooth surface."""
+BANDS = 10
+"""Number of bands along the direction, of which every other one is predicted from the others."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A surface that is extruded along a direction."""
+
+    along: np.ndarray
+    """(3,): unit vector of the direction."""
+    across: np.ndarray
+    """(3,): unit vector across it, in the surface's mean plane."""
+    ahead: np.ndarray
+    """(3,): unit vector normal to both, away from the camera."""
+    first: float
+    """Slope (or, with parallel rays, place in metres) of the first knot."""
+    step: float
+    """Distance of the knots."""
+    curve: np.ndarray
+    """(k,): inverse distance ahead at each knot, or the distance where rays are parallel; NaN where
+    it is unknown."""
+    central: bool
+    """Whether rays leave the origin, else they run along z."""
+    twist: Fit | None = None
+    """z that is added, from a polynomial."""
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Return z (n,) of the surface on the rays of points (n, 3); NaN where it is unknown."""
+        slopes, ahead = self.slopes(points)
+        z = self._z(points, self._curve_at(slopes), ahead)
+        if self.twist is not None:
+            z = z + self.twist(points)
+        return z
+
+    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return each ray's place (n,) across the direction, and its share ahead (n,)."""
+        if self.central:
+            rays = points / points[:, 2:]
+            ahead = rays @ self.ahead
+            return (rays @ self.across) / ahead, ahead
+        return points @ self.across, np.full(len(points), self.ahead[2])
+
+    def lengths(self, points: np.ndarray) -> np.ndarray:
+        """Return each point's place (n,) along the direction, as `slopes` across it."""
+        if self.central:
+            return (points @ self.along) / (points @ self.ahead)
+        return points @ self.along
+
+    def knots(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the number (n,) of the knot nearest to each place."""
+        return np.rint((slopes - self.first) / self.step).astype(np.int64)
+
+    def _curve_at(self, slopes: np.ndarray) -> np.ndarray:
+        position = np.clip((slopes - self.first) / self.step, 0.0, len(self.curve) - 1.0)
+        left = np.minimum(np.nan_to_num(position).astype(np.int64), len(self.curve) - 2)
+        share = position - left
+        return self.curve[left] * (1.0 - share) + self.curve[left + 1] * share
+
+    def _z(self, points: np.ndarray, curve: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        if self.central:
+            return 1.0 / (curve * ahead)
+        beside = points[:, :2] @ self.ahead[:2]
+        return (curve - beside) / ahead
+
+    def _curve_of(self, points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        """Return the curve's value (n,) that puts the surface through each point."""
+        z = points[:, 2]
+        if self.twist is not None:
+            z = z - self.twist(points)
+        if self.central:
+            return 1.0 / (z * ahead)
+        return points[:, :2] @ self.ahead[:2] + z * ahead
+
+    def fitted(self, points: np.ndarray) -> Profile:
+        """Return the profile with the curve of medians of points (n, 3)."""
+        slopes, ahead = self.slopes(points)
+        low = float(slopes.min())
+        count = max(math.ceil((float(slopes.max()) - low) / self.step) + 1, 2)
+        result = replace(self, first=low, curve=np.zeros(count))
+        knots = result.knots(slopes)
+        values = self._curve_of(points, ahead)
+        curve = group_medians(values, knots, count)[0]
+        curve = _filled(curve)
+        # on a slope, values beside a knot differ from it by the slope itself
+        result = replace(result, curve=curve)
+        rest = group_medians(values - result._curve_at(slopes), knots, count)[0]
+        return replace(result, curve=curve + np.nan_to_num(rest))
+
+    def trusted(self, points: np.ndarray) -> Profile:
+        """Return the profile, unknown where points (n, 3) show less than `LEAST_LENGTH_M` of it,
+        and beside steps."""
+        slopes, _ = self.slopes(points)
+        knots = self.knots(slopes)
+        count = len(self.curve)
+        number = np.bincount(knots, minlength=count)
+        # the visible length: the number of points, each a knot's distance long
+        distance_m = np.abs(1.0 / self.curve) if self.central else 1.0
+        visible_m = number * self.step * distance_m
+        unknown = (visible_m < LEAST_LENGTH_M) | (number < LEAST_POINTS)
+        steps = np.abs(np.diff(1.0 / self.curve if self.central else self.curve))
+        width_m = self.step * (distance_m[1:] if self.central else 1.0)
+        is_step = steps > STEEP * width_m
+        for shift in (-1, 0, 1, 2):
+            index = np.flatnonzero(is_step) + shift
+            unknown[index[(index >= 0) & (index < count)]] = True
+        return replace(self, curve=np.where(unknown, np.nan, self.curve))
+
+
+def _filled(curve: np.ndarray) -> np.ndarray:
+    """Return a curve (k,) with unknown knots interpolated."""
+    known = np.isfinite(curve)
+    knots = np.arange(len(curve))
+    return np.interp(knots, knots[known], curve[known])
+
+
+def picked(points: np.ndarray, most: int) -> np.ndarray:
+    """Return at most this many of the points (n, 3): at random, because an even step would meet the
+    same columns of the picture in every row."""
+    if len(points) <= most:
+        return points
+    return points[np.random.default_rng(0).integers(len(points), size=most)]
+
+
+def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> Profile | None:
+    """Return the profile, not yet fitted, along whose direction points (n, 3) depart least from a
+    smooth surface ``base``; None if no direction stands out.
+
+    ``pitch``: distance of neighbouring pixels in x/z, or in metres where rays are parallel."""
+    sample = picked(points, COARSE_SEARCHED)
+    normal = _normal(sample, central)
+    frame = _frame(normal, 0.0, pitch, central)
+    on_base = sample.copy()
+    on_base[:, 2] = base(sample)
+    if central:
+        on_base[:, :2] *= (on_base[:, 2] / sample[:, 2])[:, None]
+    across, ahead = frame.slopes(sample)
+    along = frame.lengths(sample)
+    values = frame._curve_of(sample, ahead) - frame._curve_of(on_base, ahead)
+    turns = math.pi / TURNS * np.arange(TURNS)
+    blocks = _block_means(across, along, values, COARSE_PX * pitch)
+    explained = _explained(blocks, turns, COARSE_PX * pitch)
+    if explained.max() < DIRECTED * float(np.median(explained)):
+        return None
+    turn = float(turns[explained.argmax()])
+    for reach in (math.pi / TURNS, math.pi / TURNS / 10):
+        turns = turn + reach * np.linspace(-1.2, 1.2, 25)
+        explained = _explained((across, along, values), turns, FINE_PX * pitch)
+        turn = float(turns[explained.argmax()])
+    return _refined(points, normal, turn, pitch, central)
+
+
+def _explained(
+    places: tuple[np.ndarray, np.ndarray, np.ndarray], turns: np.ndarray, width: float
+) -> np.ndarray:
+    """Return, for each turn, the sum of squares of clipped values that their means in strips of a
+    ``width`` explain. ``places``: places across and along, and values (n,)."""
+    across, along, values = places
+    scale = max(float(np.median(np.abs(values))) / 0.6745, 1e-12)
+    clipped = np.clip(values, -CLIP_SIGMAS * scale, CLIP_SIGMAS * scale)
+    clipped = clipped - clipped.mean()
+    explained = np.zeros(len(turns))
+    for number, turn in enumerate(turns):
+        place = across * math.cos(turn) + along * math.sin(turn)
+        strips = ((place - place.min()) / width).astype(np.int64)
+        counts = np.bincount(strips)
+        sums = np.bincount(strips, clipped)
+        explained[number] = float((sums**2 / np.maximum(counts, 1)).sum())
+    return explained
+
+
+def _normal(points: np.ndarray, central: bool) -> np.ndarray:
+    """Return the unit normal (3,), away from the camera, of the mean plane of points (n, 3)."""
+    sample = picked(points, SEARCHED)
+    centred = sample - sample.mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    normal = axes[:, 0]
+    towards = sample.mean(axis=0) if central else np.array([0.0, 0.0, 1.0])
+    return normal if normal @ towards > 0 else -normal
+
+
+def _frame(normal: np.ndarray, turn: float, step: float, central: bool) -> Profile:
+    """Return a profile without a curve whose direction is turned by ``turn`` about the normal."""
+    right = np.array([1.0, 0.0, 0.0])
+    right = right - (right @ normal) * normal
+    right = right / np.linalg.norm(right)
+    down = np.cross(normal, right)
+    across = math.cos(turn) * right + math.sin(turn) * down
+    return _directed(np.cross(normal, across), normal, step, central)
+
+
+def _directed(along: np.ndarray, normal: np.ndarray, step: float, central: bool) -> Profile:
+    """Return a profile without a curve along a direction (3,)."""
+    along = along / np.linalg.norm(along)
+    facing = normal if central else np.array([0.0, 0.0, 1.0])
+    ahead = facing - (facing @ along) * along
+    ahead = ahead / np.linalg.norm(ahead)
+    return Profile(
+        along=along,
+        across=np.cross(along, ahead),
+        ahead=ahead,
+        first=0.0,
+        step=step,
+        curve=np.zeros(2),
+        central=central,
+    )
+
+
+def _block_means(
+    across: np.ndarray, along: np.ndarray, values: np.ndarray, side: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return places across and along (b,) and the mean of the values (n,) of square blocks."""
+    columns = np.floor((across - across.min()) / side).astype(np.int64)
+    rows = np.floor((along - along.min()) / side).astype(np.int64)
+    width = int(columns.max()) + 1
+    keys = rows * width + columns
+    counts = np.bincount(keys)
+    used = counts >= max(1.0, 0.3 * float(np.median(counts[counts > 0])))
+    sums = np.bincount(keys, values)
+    row, column = np.divmod(np.flatnonzero(used), width)
+    return (column + 0.5) * side, (row + 0.5) * side, sums[used] / counts[used]
+
+
+def _refined(
+    points: np.ndarray, normal: np.ndarray, turn: float, pitch: float, central: bool
+) -> Profile:
+    """Return the profile whose turn and tilt leave the least residuals, searched from ``turn``."""
+    sample = picked(points, SEARCHED)
+
+    def of(change: np.ndarray) -> Profile:
+        frame = _frame(normal, turn + float(change[0]), pitch, central)
+        return _directed(frame.along + float(change[1]) * normal, normal, pitch, central)
+
+    start = of(np.zeros(2)).fitted(sample)
+    size = np.abs(sample[:, 2] - start(sample))
+    limit = max(3.0 * float(np.median(size)), 1e-6)
+
+    def remaining(change: np.ndarray) -> float:
+        residuals = np.abs(sample[:, 2] - of(change).fitted(sample)(sample))
+        return float(np.minimum(residuals, limit).mean())
+
+    simplex = np.array([[0.0, 0.0], [5e-4, 0.0], [0.0, 5e-3]])
+    options = {"initial_simplex": simplex, "xatol": 5e-5, "fatol": 1e-3 * limit, "maxfev": 30}
+    found = minimize(remaining, np.zeros(2), method="Nelder-Mead", options=options)
+    return of(found.x)
+
+
+def with_twist(profile: Profile, points: np.ndarray) -> Profile:
+    """Return the profile fitted to points (n, 3), plus the polynomial of degree 2 that their
+    residuals follow."""
+    fitted = profile.fitted(points)
+    sample = picked(points, SEARCHED)
+    for _ in range(2):
+        residuals = sample[:, 2] - replace(fitted, twist=None)(sample)
+        scale = max(float(np.median(np.abs(residuals))) / 0.6745, 1e-9)
+        weights = bisquare_weights(residuals, 6.0 * scale)
+        flat = np.column_stack([sample[:, :2], residuals])
+        fitted = replace(profile, twist=polynomial(flat, weights, degree=2)).fitted(points)
+    return fitted
+
+
+def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
+    """Return whether an extruded surface explains points (n, 3) better than a ``smooth`` one.
+
+    Every other band along the direction shows where the profile departs from the smooth surface by
+    more than `SEEN` of the noise, and predicts the other bands there: the errors must be smaller in
+    the bands on average, significantly, because what is extruded is in each of them."""
+    lengths = profile.lengths(points)
+    extent = max(float(np.ptp(lengths)), 1e-12)
+    band = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
+    band = np.minimum(band, BANDS - 1)
+    departures = points[:, 2] - smooth(points)
+    gain = np.full(len(points), np.nan)
+    for parity in (0, 1):
+        inside = band % 2 == parity
+        if not inside.any() or inside.all():
+            return False
+        other = profile.fitted(points[~inside])
+        errors = np.abs(points[inside, 2] - other(points[inside]))
+        noise = float(np.nanmedian(errors)) / 0.6745
+        limit = CLIP_SIGMAS * noise
+        sizes = np.abs(departures[inside])
+        knots = other.knots(other.slopes(points)[0]).clip(0, len(other.curve) - 1)
+        medians, _ = group_medians(departures[~inside], knots[~inside], len(other.curve))
+        departs = np.abs(np.nan_to_num(medians)) > SEEN * noise
+        gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise
+        gain[inside] = np.where(departs[knots[inside]], gains, np.nan)
+    known = np.isfinite(gain)
+    counts = np.bincount(band[known], minlength=BANDS)
+    enough = counts >= LEAST_POINTS
+    if enough.sum() <= BANDS / 2:
+        return False
+    means = np.bincount(band[known], gain[known], minlength=BANDS)[enough] / counts[enough]
+    standard_error = float(means.std(ddof=1)) / math.sqrt(len(means))
+    return float(means.mean()) > GAIN_SIGMAS * standard_error
+
+
+def profiled(profile: Profile, smooth: Fit, points: np.ndarray) -> Profile | None:
+    """Return the profile of `direction_of` fitted to points (n, 3), if it explains them better than
+    a ``smooth`` surface."""
+    sample = picked(points, COARSE_SEARCHED)
+    profile = with_twist(profile, sample)
+    if not explains_better(profile, smooth, sample):
+        return None
+    return profile.fitted(points).trusted(points)
