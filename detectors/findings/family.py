@@ -24,9 +24,16 @@ PRIOR: dict[Shape, float] = {"disc": 0.6, "cap": 0.2, "bowl": 0.2, "slot": 0.2}
 hides the shape."""
 WIDER: dict[Shape, float] = {"disc": 1.0, "cap": 1.25, "bowl": 1.6, "slot": 1.0}
 """Mouth of each shape, in mouths of a disc with the same volume and deepest residual."""
-LEAST_WEIGHT = 0.05  # a shape with less says nothing about the size
-SHARPER_GAIN = 9.0
-"""Gain in the information criterion that accepts another blur than the noise's."""
+SHARPER_LOSS = 9.0
+"""Penalty in the information criterion of another blur than the noise's."""
+RADIUS_ERROR_PX = 0.05
+"""Error of the model's radius on simulated clouds, in pixels."""
+DIAMETER_ERROR: dict[Shape, float] = {"disc": 0.01, "cap": 0.035, "bowl": 0.035, "slot": 0.02}
+"""Error of the model's diameter on simulated clouds, as a share of it: light between the slopes of
+a dent changes its profile."""
+DEPTH_ERROR = 0.06
+"""Error of the model's depth on simulated clouds, as a share of it: light between floor, slopes and
+walls lengthens its way."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +79,54 @@ class Size:
         return self.best.shape if self.weights[self.best.shape] >= 0.5 else None
 
 
-def criterion(fit: HoleFit) -> float:
-    """Return the Bayesian information criterion of a fit; the variance of its residuals is
-    unknown."""
-    parameters = 7 if fit.shape == "slot" else 5
-    independent = max(fit.independent, parameters + 1.0)
-    per_pixel = max(fit.chi_square, 1e-12) / independent
-    return independent * math.log(per_pixel) + parameters * math.log(independent)
+@dataclass(frozen=True)
+class Candidate:
+    """A fit that has converged."""
+
+    fit: HoleFit
+    patch: HolePatch
+    """The pixels, and the blur of this fit."""
+    sharper: bool = False
+    """True if the blur is smaller than that of the noise."""
+
+    @property
+    def criterion(self) -> float:
+        """Bayesian information criterion; the variance of the residuals is unknown."""
+        fit = self.fit
+        parameters = 7 if fit.shape == "slot" else 5
+        independent = max(fit.independent, parameters + 1.0)
+        per_pixel = max(fit.chi_square, 1e-12) / independent
+        penalty = parameters * math.log(independent) + SHARPER_LOSS * self.sharper
+        return independent * math.log(per_pixel) + penalty
+
+    @property
+    def raised(self) -> float:
+        """Factor by which what the shape does not explain raises the variance of sizes."""
+        fit = self.fit
+        per_pixel = fit.chi_square / max(fit.independent, 1.0)
+        excess = max(per_pixel - 1.0, 0.0)
+        pixel_m2 = math.sqrt(float(np.linalg.det(self.patch.metric_m2)))
+        pixels = math.pi * fit.radius_m**2 * math.exp(fit.stretch) / pixel_m2
+        share = fit.independent / (np.count_nonzero(self.patch.used) + self.patch.left_out)
+        return 1.0 + min(pixels * share, fit.independent) * excess / (1.0 + excess)
+
+    @property
+    def diameter_variance_m2(self) -> float:
+        """Variance of the diameter."""
+        fit = self.fit
+        diameter_m = _diameter_m(fit)
+        by_stretch = 0.5 * diameter_m if fit.shape == "slot" else 0.0
+        slopes = np.array([diameter_m / fit.radius_m, by_stretch])
+        fitted_m2 = float(slopes @ fit.covariance[np.ix_([2, 6], [2, 6])] @ slopes)
+        pixel_m2 = float(np.trace(self.patch.metric_m2)) / 2.0
+        edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * pixel_m2
+        return self.raised * fitted_m2 + edge_m2 + (DIAMETER_ERROR[fit.shape] * diameter_m) ** 2
+
+    @property
+    def depth_variance_m2(self) -> float:
+        """Variance of the depth along the optical axis."""
+        fitted_m2 = float(self.fit.covariance[3, 3])
+        return self.raised * fitted_m2 + (DEPTH_ERROR * self.fit.depth_m) ** 2
 
 
 def sized(
@@ -89,27 +137,21 @@ def sized(
 ) -> Size | None:
     """Fit the shapes and average them; None if no fit has converged. ``sharper_px``: further sides
     of the blur to try."""
-    fits = _fits(patch, start, shapes)
-    if not fits:
-        return None
-    best = min(fits, key=criterion)
-    best_patch = patch
-    least = criterion(best) - SHARPER_GAIN
+    patches = [patch]
     for side in sharper_px:
-        sharper_patch = replace(patch, blur_px=(side, side), shared_px=patch.shared_px)
-        sharper = _fit(sharper_patch, start, best.shape)
-        if sharper.converged and criterion(sharper) < least:
-            least = criterion(sharper)
-            best_patch = sharper_patch
-    if best_patch is not patch:
-        fits = _fits(best_patch, start, shapes)
-    return averaged(fits, best_patch) if fits else None
-
-
-def _fits(patch: HolePatch, start: Start, shapes: Sequence[Shape]) -> list[HoleFit]:
-    """Return the fits of shapes that have converged."""
-    fits = [_fit(patch, start, shape) for shape in shapes]
-    return [fit for fit in fits if fit.converged and fit.covariance[2, 2] > 0.0]
+        patches.append(replace(patch, blur_px=(side, side)))
+    candidates = []
+    for shape in shapes:
+        radius_m = start.radius_m * WIDER[shape]
+        if shape == "slot":
+            radius_m *= math.exp(-0.5 * start.stretch)
+        first = replace(start, radius_m=radius_m)
+        for blurred in patches:
+            fit = _fit(blurred, first, shape)
+            if fit.converged and 0.0 < fit.covariance[2, 2] < np.inf:
+                candidates.append(Candidate(fit, blurred, blurred is not patch))
+                first = _start_after(fit)
+    return averaged(candidates) if candidates else None
 
 
 def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:
@@ -118,7 +160,7 @@ def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:
         patch,
         start.u_px,
         start.v_px,
-        start.radius_m * WIDER[shape] * math.exp(-0.5 * start.stretch * (shape == "slot")),
+        start.radius_m,
         start.depth_m,
         start.offset_m,
         shape=shape,
@@ -127,25 +169,40 @@ def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:
     )
 
 
-def averaged(fits: Sequence[HoleFit], patch: HolePatch) -> Size:
+def _start_after(fit: HoleFit) -> Start:
+    """Return a fit's numbers as start values: another blur changes them little."""
+    return Start(
+        u_px=fit.u_px,
+        v_px=fit.v_px,
+        radius_m=fit.radius_m,
+        depth_m=fit.depth_m,
+        offset_m=fit.offset_m,
+        stretch=fit.stretch,
+        angle_rad=fit.angle_rad,
+    )
+
+
+def averaged(candidates: Sequence[Candidate]) -> Size:
     """Return the average of fits to the same pixels."""
-    criteria = np.array([criterion(fit) for fit in fits])
-    priors = np.array([PRIOR[fit.shape] for fit in fits])
+    criteria = np.array([candidate.criterion for candidate in candidates])
+    priors = np.array([PRIOR[candidate.fit.shape] for candidate in candidates])
     weights = priors * np.exp(-0.5 * (criteria - criteria.min()))
     weights = weights / weights.sum()
-    weights = np.where(weights < LEAST_WEIGHT, 0.0, weights)
-    weights = weights / weights.sum()
-    raised = np.array([_raised(fit, patch) for fit in fits])
-    diameters_m = np.array([_diameter_m(fit) for fit in fits])
-    diameter_m2 = raised * [_diameter_variance_m2(fit) for fit in fits]
-    depths_m = np.array([fit.depth_m for fit in fits])
-    depth_m2 = raised * [fit.covariance[3, 3] for fit in fits]
+    diameters_m = np.array([_diameter_m(candidate.fit) for candidate in candidates])
+    diameter_m2 = np.array([candidate.diameter_variance_m2 for candidate in candidates])
+    depths_m = np.array([candidate.fit.depth_m for candidate in candidates])
+    depth_m2 = np.array([candidate.depth_variance_m2 for candidate in candidates])
     diameter_m, diameter_se_m = mixture(weights, diameters_m, diameter_m2)
     depth_m, depth_se_m = mixture(weights, depths_m, depth_m2)
+    by_shape: dict[Shape, float] = {}
+    for candidate, weight in zip(candidates, weights.tolist(), strict=True):
+        shape = candidate.fit.shape
+        by_shape[shape] = by_shape.get(shape, 0.0) + weight
+    best = candidates[int(weights.argmax())]
     return Size(
-        best=fits[int(weights.argmax())],
-        patch=patch,
-        weights={fit.shape: float(weight) for fit, weight in zip(fits, weights, strict=True)},
+        best=best.fit,
+        patch=best.patch,
+        weights=by_shape,
         diameter_m=diameter_m,
         diameter_se_m=diameter_se_m,
         depth_m=depth_m,
@@ -164,16 +221,6 @@ def mixture(
     return mean, math.sqrt(max(variance, 0.0))
 
 
-def _raised(fit: HoleFit, patch: HolePatch) -> float:
-    """Return the factor by which what the shape does not explain raises the variance of sizes."""
-    per_pixel = fit.chi_square / max(fit.independent, 1.0)
-    excess = max(per_pixel - 1.0, 0.0)
-    pixel_m2 = math.sqrt(float(np.linalg.det(patch.metric_m2)))
-    pixels = math.pi * fit.radius_m**2 * math.exp(fit.stretch) / pixel_m2
-    share = fit.independent / (np.count_nonzero(patch.used) + patch.left_out)
-    return 1.0 + min(pixels * share, fit.independent) * excess / (1.0 + excess)
-
-
 def _diameter_m(fit: HoleFit) -> float:
     """Return the diameter of the mouth; of a slot, that of the circle with its area."""
     diameter_m = 2.0 * fit.radius_m
@@ -181,10 +228,3 @@ def _diameter_m(fit: HoleFit) -> float:
         return diameter_m * math.sqrt(4.0 / math.pi * math.exp(fit.stretch))
     return diameter_m
 
-
-def _diameter_variance_m2(fit: HoleFit) -> float:
-    """Return the variance of `_diameter_m`."""
-    by_radius = _diameter_m(fit) / fit.radius_m
-    by_stretch = 0.5 * _diameter_m(fit) if fit.shape == "slot" else 0.0
-    slopes = np.array([by_radius, by_stretch])
-    return float(slopes @ fit.covariance[np.ix_([2, 6], [2, 6])] @ slopes)

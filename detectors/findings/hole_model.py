@@ -57,8 +57,6 @@ WALL_PRIOR = (0.5, 12.0**-0.5)
 """Prior mean and standard deviation of the wall, which is uniform from 0 to 1."""
 MODEL_ERROR = 0.05
 """Error by light between wall and floor, on simulated clouds, as a share of a pixel's depth."""
-RADIUS_ERROR_PX = 0.05  # the same of the fitted radius, in pixels
-DEPTH_ERROR = 0.05  # the same of the fitted depth, as a share of it
 MOST_MISFIT = 1.5
 """Largest misfit of a valid fit: simulations with the model's optics give 0.3 to 1.05, with others
 1.1 to 3."""
@@ -467,10 +465,7 @@ def _likelihood_covariance(
     errors of radius and depth."""
     information = derivatives @ derivatives.T
     information[5, 5] += WALL_PRIOR[1] ** -2
-    covariance = np.linalg.pinv(information, hermitian=True) * variance
-    covariance[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
-    covariance[3, 3] += (DEPTH_ERROR * depth_m) ** 2
-    return covariance
+    return np.linalg.pinv(information, hermitian=True) * variance
 
 
 def sandwich_covariance(
