@@ -13,17 +13,16 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
+from detectors.findings.family import Size, Start, sized
 from detectors.findings.hole_model import (
-    MOST_MISFIT,
-    HoleFit,
     HolePatch,
-    fit_hole,
     normal_of,
     pictures,
     sight,
     straight_sight,
     whitened,
 )
+from detectors.findings.shapes import Shape
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN
 from detectors.pixels.masks import grown, parts_with
@@ -39,13 +38,18 @@ NEAR_BLURS = 1.4
 """Distance from a detection, in sides of the blur, up to which all pixels count if the noise's
 correlation is known. Leaving out 15 of 16 farther pixels raises the standard errors of diameter
 and depth by 0.5 to 1.5 %."""
-EXPLAINED = 0.5
-"""Least share of a detection's mean residual that its fit must explain: correlated noise may
-absorb a smooth dent."""
+EXPLAINED = 0.7
+"""Least share of a detection's squared residual that its fit must explain: correlated noise may
+absorb a smooth dent, and a ragged damage has no shape."""
+MARGIN_SHARE = 0.4
+"""Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
+FINE_BLUR_PX = 3.0  # a blur is at least as wide as this in the pixels of the fit
+MOST_SIDE_PX = 36  # side of a patch from which means over squares of pixels are fitted
+LONG = 0.35  # logarithm of length over width from which a slot is tried
+MOST_STRETCH = 2.5  # largest start value of it
 SHARPER_PX = (1.0, 2.0, 3.0, 5.0)
 """Blurs, smaller than the noise's, that are tried for a recording: noise may be blurred more than
 the scene."""
-SHARPER_GAIN = 9.0  # gain in chi square that accepts them
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
 shows through."""
@@ -205,20 +209,41 @@ def measure_detection(
         width_m=width_m,
         along=along,
     )
-    fit, doubt = _modelled(around, config, by_lag)
-    if fit is None:
+    size, doubt = _modelled(around, config, by_lag)
+    if size is None:
         return _by_contour(measured, around, doubt)
-    errors = np.sqrt(np.diag(fit.covariance))
+    fit = size.best
     spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
-    return replace(
+    measured = replace(
         around.positioned(measured, fit.u_px, fit.v_px),
-        model_diameter_m=2.0 * fit.radius_m,
-        model_diameter_se_m=2.0 * float(errors[2]),
-        model_depth_m=fit.depth_m,
-        model_depth_se_m=float(errors[3]),
+        model_diameter_m=size.diameter_m,
+        model_diameter_se_m=size.diameter_se_m,
+        model_depth_m=size.depth_m,
+        model_depth_se_m=size.depth_se_m,
+        normal_share=around.normal_share,
+        sight_share=around.sight_share,
         # standard error along one axis: the two axes on the surface share the trace
         model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
+        shape=size.shape or "",
         model_note="",
+    )
+    return _as_slot(measured, around, size) if size.shape == "slot" else measured
+
+
+def _as_slot(measured: Measurement, around: _Surroundings, size: Size) -> Measurement:
+    """Return a measurement with the sides and the direction of a fitted slot."""
+    fit = size.best
+    sides_m = 2.0 * fit.radius_m * np.array([math.exp(fit.stretch), 1.0])
+    angle_rad = fit.angle_rad
+    if fit.stretch < 0.0:
+        sides_m = sides_m[::-1]
+        angle_rad += 0.5 * math.pi
+    right, down = around.axes
+    return replace(
+        measured,
+        length_m=float(sides_m[0]),
+        width_m=float(sides_m[1]),
+        along=math.cos(angle_rad) * right + math.sin(angle_rad) * down,
     )
 
 
@@ -231,6 +256,8 @@ class _Surroundings:
     """(h, w) bool: the detection's pixels."""
     near: np.ndarray
     """(h, w) bool: these grown by one more than ``reach_px``."""
+    binned: int
+    """Side of the squares of the cloud's pixels whose means are the patch's pixels."""
     invalid: np.ndarray
     """(h, w) bool: pixels without a range."""
     offset_m: float
@@ -241,6 +268,10 @@ class _Surroundings:
     """Its largest residual (the 90th percentile) beyond the offset, above 0 on either side."""
     reach_px: int
     """Half of the blur."""
+    normal_share: float
+    """Depth normal to the surface over depth along the optical axis."""
+    sight_share: float
+    """Depth along the line of sight over depth along the optical axis."""
     u0: float
     """Centroid of the detection's pixels in the patch, along columns."""
     v0: float
@@ -257,6 +288,13 @@ class _Surroundings:
         """Area of one pixel on the surface."""
         return math.hypot(*normal_of(self.per_px_m))
 
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors (3,) on the surface along the rows, and across them towards larger v."""
+        right = self.per_px_m[0] / np.linalg.norm(self.per_px_m[0])
+        down = self.per_px_m[1] - (self.per_px_m[1] @ right) * right
+        return right, down / np.linalg.norm(down)
+
     def positioned(
         self,
         measured: Measurement,
@@ -268,8 +306,8 @@ class _Surroundings:
         dv = v - self.v0
         return replace(
             measured,
-            u_px=du + measured.u_px,
-            v_px=dv + measured.v_px,
+            u_px=self.binned * du + measured.u_px,
+            v_px=self.binned * dv + measured.v_px,
             model_centre_m=self.origin_m + du * self.per_px_m[0] + dv * self.per_px_m[1],
         )
 
@@ -280,8 +318,9 @@ def _surroundings(
     detection: Detection,
     config: HoleModelConfig,
 ) -> _Surroundings | None:
-    """Cut out the detection with a margin of twice the blur on each side; None with too few valid
-    pixels around."""
+    """Cut out the detection with a margin of twice the blur or `MARGIN_SHARE` of its size on each
+    side, in means over squares of pixels where these are small; None with too few valid pixels
+    around."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
     blur_px = blur_in_cells(cloud, config)
@@ -291,12 +330,39 @@ def _surroundings(
         int(columns.min()),
         int(columns.max()) + 1,
     )
-    corner = tight.grown(math.ceil(2 * max(blur_px)) + 2, h, w)
+    widest = max(tight.row1 - tight.row0, tight.col1 - tight.col0)
+    margin_px = math.ceil(max(2 * max(blur_px) + 2, MARGIN_SHARE * widest))
+    corner = tight.grown(margin_px, h, w)
     cut = corner.within(Region(0, h, 0, w))
     residual_m = evidence.residual_m[cut]
     points_m = cloud.points_m[cut]
     own = np.zeros(residual_m.shape, dtype=bool)
     own[rows - corner.row0, columns - corner.col0] = True
+    plane = local_plane(
+        points_m,
+        evidence.surface_z_m[cut],
+        np.isfinite(residual_m),
+        own,
+        cloud.projection,
+    )
+    if plane is None:
+        return None
+    origin_m, per_px_m = plane
+    u0, v0 = _centroid(own)
+    by_blur = int(min(blur_px) / FINE_BLUR_PX)
+    by_size = max(residual_m.shape) // MOST_SIDE_PX
+    binned = max(by_blur, by_size, 1)
+    invalid = ~np.isfinite(points_m[..., 2])
+    if binned > 1:
+        residual_m = _means(residual_m, binned)
+        coverage = _means(own.astype(float), binned)
+        own = coverage >= min(0.5, coverage.max())
+        invalid = _means(invalid.astype(float), binned) > 0.5
+        per_px_m = binned * per_px_m
+        u0 = (u0 + 0.5) / binned - 0.5
+        v0 = (v0 + 0.5) / binned - 0.5
+        blur_u, blur_v = blur_px
+        blur_px = (_binned_blur(blur_u, binned), _binned_blur(blur_v, binned))
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
     near = grown(own, reach_px + 1)
@@ -305,24 +371,13 @@ def _surroundings(
         return None
     offset_m = median_of(ring_m)
     noise_m = sigma_of(ring_m - offset_m)
-    plane = local_plane(
-        points_m,
-        evidence.surface_z_m[cut],
-        finite,
-        own,
-        cloud.projection,
-    )
-    if plane is None:
-        return None
-    origin_m, per_px_m = plane
     # large residuals that do not touch the detection are other damage; the blur spreads it
     limit_m = OTHER_DAMAGE_SIGMAS * max(noise_m, 1e-9)
     stands_out = (np.abs(residual_m - offset_m) > limit_m) | own
     other_damage = stands_out & ~parts_with(stands_out, own)
     used = finite & (own | ~grown(other_damage, reach_px))
-    deviations_m = residual_m[own] - offset_m
+    deviations_m = residual_m[own & finite] - offset_m
     sign = 1.0 if deviations_m.sum() >= 0 else -1.0
-    u0, v0 = _centroid(own)
     patch = HolePatch(
         residual_m=residual_m,
         used=used,
@@ -330,22 +385,59 @@ def _surroundings(
         blur_px=blur_px,
         noise_m=noise_m,
         sights=_sights(cloud, origin_m, per_px_m, config),
+        shared_px=blur_px,
     )
+    normal = normal_of(per_px_m)
+    ray = np.array([0.0, 0.0, 1.0])
+    if cloud.projection == "central":
+        ray = origin_m / origin_m[2]
+    sharper_px = [side for side in SHARPER_PX if side < cloud.noise_reach_px]
     return _Surroundings(
         patch=patch,
         own=own,
         near=near,
-        invalid=~np.isfinite(points_m[..., 2]),
+        binned=binned,
+        invalid=invalid,
         offset_m=offset_m,
         sign=sign,
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
+        normal_share=float(abs(normal @ ray) / math.hypot(*normal)),
+        sight_share=float(np.linalg.norm(ray)),
         u0=u0,
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
-        sharper_px=tuple(side for side in SHARPER_PX if side < cloud.noise_reach_px),
+        sharper_px=tuple(_binned_blur(side, binned) for side in sharper_px),
     )
+
+
+def _means(picture: np.ndarray, side: int) -> np.ndarray:
+    """Return the means (h // side, w // side) of a picture's known pixels over squares; NaN where
+    fewer than half are known."""
+    height, width = (length // side for length in picture.shape)
+    squares = picture[: height * side, : width * side].reshape(height, side, width, side)
+    known = np.isfinite(squares)
+    counts = known.sum(axis=(1, 3))
+    sums = np.where(known, squares, 0.0).sum(axis=(1, 3))
+    return np.where(2 * counts >= side**2, sums / np.maximum(counts, 1), np.nan)
+
+
+def _binned_blur(blur_px: float, binned: int) -> float:
+    """Return the side, in means over squares of pixels, of a blur: second moments add."""
+    return math.sqrt(blur_px**2 + binned**2 - 1.0) / binned
+
+
+def _binned_correlation(by_lag: np.ndarray, binned: int) -> np.ndarray:
+    """Return the correlation (odd, odd) by lag of means over squares of pixels."""
+    if binned == 1:
+        return by_lag
+    shared = np.convolve(np.ones(binned), np.ones(binned))  # pairs of pixels by lag
+    summed = cv2.sepFilter2D(by_lag, -1, shared, shared, borderType=cv2.BORDER_CONSTANT)
+    middle_row = len(summed) // 2
+    middle_column = summed.shape[1] // 2
+    covariance = summed[middle_row % binned :: binned, middle_column % binned :: binned]
+    return covariance / summed[middle_row, middle_column]
 
 
 def _centroid(mask: np.ndarray) -> tuple[float, float]:
@@ -467,77 +559,79 @@ def _modelled(
         return None, DARK
     if around.peak_m > config.linear_depth_mm * MM:
         return None, too_deep
-    if around.patch.used.sum() < 6:
+    if around.patch.used.sum() < 8:
         return None, MISFIT
-    fit, patch = _fitted(around, by_lag)
-    if not _explains(around, fit, patch):
+    size = _sized(around, by_lag)
+    if size is None or not _explains(around, size):
         return None, MISFIT
-    if abs(fit.depth_m) > config.linear_depth_mm * MM:
+    if abs(size.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep
-    # the share of each pixel that the disc covers
-    flat = np.array([[fit.u_px, fit.v_px, fit.radius_m, -1.0, 0.0]])
-    disc = -pictures(replace(patch, blur_px=(1.0, 1.0)), flat)[0]
+    # the share of each pixel that the mouth covers
+    fit = size.best
+    flat = np.array([[fit.u_px, fit.v_px, fit.radius_m, -1.0, 0.0, fit.stretch, fit.angle_rad]])
+    sharp = replace(size.patch, blur_px=(1.0, 1.0))
+    mouth: Shape = "slot" if fit.shape == "slot" else "disc"
+    disc = -pictures(sharp, flat, mouth)[0]
     if float(disc[invalid].sum()) > config.largest_invalid * float(disc.sum()):
         return None, DARK
-    # rounding can make the variance of a singular fit negative
-    variance = float(fit.covariance[2, 2])
-    if not 0 < variance < (config.largest_relative_error * fit.radius_m) ** 2:
+    # a fit that leaves the radius open has a singular covariance
+    if not fit.covariance[2, 2] < (config.largest_relative_error * fit.radius_m) ** 2:
         return None, AMBIGUOUS
-    return fit, ""
+    return size, ""
 
 
-def _fitted(around: _Surroundings, by_lag: np.ndarray | None) -> tuple[HoleFit, HolePatch]:
-    """Return the fitted hole, and the patch with the blur with which it fits best."""
+def _sized(around: _Surroundings, by_lag: np.ndarray | None) -> Size | None:
+    """Return the averaged size by the family of shapes."""
     patch = around.patch
-    start = _start(around)
     if by_lag is not None:
         reach_px = round(NEAR_BLURS * max(patch.blur_px))
         near = grown(around.own, reach_px, cv2.MORPH_ELLIPSE)
-        patch = whitened(patch, by_lag, around.offset_m, near)
-    fit = fit_hole(patch, *start)
-    if not fit.misfit:
-        return fit, patch
-    best_patch = patch
-    pixels = int(patch.used.sum()) + patch.left_out
-    for side in around.sharper_px:
-        sharper_patch = replace(patch, blur_px=(side, side))
-        sharper = fit_hole(sharper_patch, *start)
-        gain = pixels * (fit.misfit**2 - sharper.misfit**2)
-        least_gain = SHARPER_GAIN * sharper.misfit**2 if fit.converged else 0.0
-        if sharper.converged and gain > least_gain:
-            fit = sharper
-            best_patch = sharper_patch
-    return fit, best_patch
+        by_binned_lag = _binned_correlation(by_lag, around.binned)
+        patch = whitened(patch, by_binned_lag, around.offset_m, near)
+    start = _start(around)
+    shapes: tuple[Shape, ...] = ("disc", "cap", "bowl")
+    if start.stretch > LONG:
+        shapes = (*shapes, "slot")
+    return sized(patch, start, shapes, around.sharper_px)
 
 
-def _start(around: _Surroundings) -> tuple[float, float, float, float, float]:
-    """Return start values of u, v, radius, depth and offset: the centroid of the deviation, the
-    radius that gives its volume, and its peak."""
+def _start(around: _Surroundings) -> Start:
+    """Return start values: the centroid of the deviation, the radius that gives its volume, its
+    peak, and the sides and the direction of its second moments."""
     near = grown(around.own, around.reach_px) & around.patch.used
     weight = np.maximum(around.sign * (around.patch.residual_m[near] - around.offset_m), 0.0)
     rows, columns = np.nonzero(near)
     total = max(float(weight.sum()), 1e-12)
-    u = float(weight @ columns) / total
-    v = float(weight @ rows) / total
-    radius_m = float(np.sqrt(total * around.area_m2 / (np.pi * around.peak_m)))
-    return u, v, radius_m, around.sign * around.peak_m, around.offset_m
+    length_m, width_m, along = _sides(around, around.near & around.patch.used)
+    stretch = 0.0
+    angle_rad = 0.0
+    if width_m > 0.0:
+        right, down = around.axes
+        stretch = min(math.log(length_m / width_m), MOST_STRETCH)
+        angle_rad = math.atan2(along @ down, along @ right)
+    return Start(
+        u_px=float(weight @ columns) / total,
+        v_px=float(weight @ rows) / total,
+        radius_m=float(np.sqrt(total * around.area_m2 / (np.pi * around.peak_m))),
+        depth_m=around.sign * around.peak_m,
+        offset_m=around.offset_m,
+        stretch=stretch,
+        angle_rad=angle_rad,
+    )
 
 
-def _explains(
-    around: _Surroundings,
-    fit: HoleFit,
-    patch: HolePatch,
-) -> bool:
-    """Return whether a fit has converged near the detection and explains its residual."""
+def _explains(around: _Surroundings, size: Size) -> bool:
+    """Return whether the best shape lies near the detection and explains its residual."""
+    fit = size.best
     h, w = around.own.shape
     row = round(fit.v_px)
     column = round(fit.u_px)
     if not (0 <= row < h and 0 <= column < w and around.near[row, column]):
         return False
-    hole = np.array([[fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.wall]])
-    fitted_m = pictures(patch, hole)[0][around.own].mean()
-    share = fitted_m / (patch.residual_m[around.own].mean() - fit.offset_m)
-    return bool(fit.converged and fit.misfit < MOST_MISFIT and share > EXPLAINED)
+    inside = around.near & around.patch.used
+    seen_m = around.patch.residual_m[inside] - fit.offset_m
+    left_m = seen_m - pictures(size.patch, fit.numbers[None], fit.shape)[0][inside]
+    return bool(left_m @ left_m < (1.0 - EXPLAINED) * (seen_m @ seen_m))
 
 
 # --- the contour at half depth, elsewhere ---
