@@ -211,6 +211,16 @@ def test_the_area_of_a_plane_counts_its_slope(projection: str):
     assert extent.judged_m2 == pytest.approx(plan_m2 * math.sqrt(1.25), rel=2e-3)
 
 
+def test_the_area_is_that_of_the_surface_and_not_of_what_lies_behind_it():
+    """A hole that shows what lies three times as far away has the area of its mouth."""
+    cloud = plane_cloud()
+    deep = cloud.points_m.copy()
+    deep[10:20, 10:20] *= 3.0
+    evidence = evidence_of(cloud)
+    extent = extent_of(Judged(replace(cloud, points_m=deep), evidence, (), ()), None)
+    assert extent.judged_m2 == pytest.approx(2400 * PITCH_M**2, rel=1e-6)
+
+
 def test_the_share_is_that_of_the_outline_and_the_blind_area_that_of_its_pixels():
     cloud = plane_cloud()
     residual = np.zeros((40, 60))
