@@ -18,6 +18,7 @@ from harness.inspection.limit import (
     fitted,
     free_area,
     limit_of,
+    next_step,
     places_for,
     pressed_in,
 )
