@@ -12,6 +12,7 @@ import numpy as np
 from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
 from detectors.findings.null import OwnThreshold, each_object_once, own_threshold
+from detectors.findings.odds import noise_probabilities
 from detectors.interface import Detection, Detector, Evidence, Measurement
 from detectors.pixels.masks import grown, holes_filled
 from detectors.surfaces.background import misfit
@@ -23,12 +24,14 @@ from harness.vocabulary.geometry import MM, Cloud
 DEFAULT_K = 5.0
 """Robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond.
 """
-FAINT_CALLS = 0.05
-"""Noise explains a finding if at least this many false calls of its score are expected."""
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
-NULL_FACTS = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
-"""Facts of a capture's own threshold that are stored with the findings."""
+NULL_FACTS = ("threshold", "expected", "at_marks", "low", "high")
+"""Facts of a capture's own threshold that are stored with the findings if it can be trusted."""
+PEAK_FACTS = ("peaks", "floor", "objects", "rim_pixels")
+"""Facts that are stored in any case."""
+LEAST_AT_MARKS = 0.05
+"""Fewest expected calls at marks that the output states: 0.1 when rounded."""
 OPEN_MM = 75.0
 """Depth beyond which a hole shows objects far behind it."""
 FILTER_PX = 3.0
@@ -36,8 +39,8 @@ FILTER_PX = 3.0
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage above a threshold and missing returns, each damage and each object once, and
-    measure them."""
+    """Find damage above a threshold and missing returns, each damage and each object once, measure
+    them, and state how likely noise made them."""
     missing = missing_returns(cloud, evidence)
     without_return = () if missing is None else missing.detections
     above_threshold = detector.find(cloud, evidence, threshold)
@@ -46,7 +49,8 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     measurements = tuple(
         _measured(detector, cloud, evidence, detection) for detection in detections
     )
-    return Judged(cloud, evidence, detections, measurements, missing)
+    probabilities = noise_probabilities(cloud, evidence, detections, missing)
+    return Judged(cloud, evidence, detections, measurements, missing, probabilities)
 
 
 def _measured(
@@ -112,8 +116,7 @@ def threshold_of(
 
     wanted_calls = arguments.false_calls or cli.DEFAULT_FALSE_CALLS
     own = own_threshold(detector, cloud, evidence, wanted_calls)
-    own_null = {name: getattr(own, name) for name in NULL_FACTS}
-    notes: dict[str, Any] = {**evidence.notes, "own_null": own_null}
+    notes: dict[str, Any] = {**evidence.notes, "own_null": null_facts(own)}
     searched = replace(own.evidence, notes=notes)
     peaks = _peaks_text(own, cloud)
     if own.doubts:
@@ -127,16 +130,29 @@ def threshold_of(
         return k, origin, replace(searched, warnings=(*evidence.warnings, *warnings))
     expected = f"{_calls_text(own.expected)} false calls expected"
     interval = f"95 % interval {_calls_text(own.low)} to {_calls_text(own.high)}"
-    origin = f"from this capture's own null: {expected}, {interval}, from {peaks}"
+    at_marks = ""
+    if own.at_marks >= LEAST_AT_MARKS:
+        at_marks = f", {_calls_text(own.at_marks)} of them at objects, print and edges"
+    origin = f"from this capture's own null: {expected}{at_marks}, {interval}, from {peaks}"
     return own.threshold, origin, searched
+
+
+def null_facts(own: OwnThreshold) -> dict[str, Any]:
+    """Return the facts of a capture's own threshold as plain data; the expected numbers are NaN
+    and the laws are missing if they cannot be trusted."""
+    facts: dict[str, Any] = {name: getattr(own, name) for name in PEAK_FACTS}
+    if own.doubts:
+        facts.update(dict.fromkeys(NULL_FACTS, math.nan))
+        facts["tails"] = {}
+    else:
+        facts.update({name: getattr(own, name) for name in NULL_FACTS})
+        facts["tails"] = {name: tail.facts for name, tail in own.tails.items()}
+    return facts
 
 
 def _peaks_text(own: OwnThreshold, cloud: Cloud) -> str:
     """Say from how many peaks a capture's own threshold comes, and what limits them."""
     text = f"{own.peaks} peaks towards the camera"
-    if own.objects:
-        beside = "expect more beside objects, tags and edges in the picture"
-        text += f"; {beside} ({own.objects} places)"
     if not cloud.organised:
         text += "; objects on the target were not sought"
     if own.rim_pixels:
@@ -152,33 +168,6 @@ def _calls_text(expected: float) -> str:
     if expected >= 1e-4:
         return f"{expected:.1g}"
     return "0"
-
-
-def with_faint_warning(result: Judged, threshold: float) -> Judged:
-    """Add a warning if noise explains more of the findings than the expected false calls, in a
-    capture that set its own threshold.
-
-    The logarithm of the number of false calls is assumed to fall with the square of the score, as
-    for normal noise, through the peaks above the floor and the upper 95 % bound of the number
-    expected at the threshold."""
-    null = result.evidence.notes.get("own_null", {"threshold": None})
-    if threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
-        return result
-    rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
-    sure_score = math.sqrt(threshold**2 + math.log(null["high"] / FAINT_CALLS) / rate)
-    faint = []
-    for finding in result.findings:
-        if finding.kind != "no return" and finding.score < sure_score:
-            faint.append(str(finding.id))
-    if len(faint) <= max(null["expected"], 1.0) + 1e-6:
-        return result
-    faint_findings = f"{len(faint)} of {len(result.findings)} findings ({', '.join(faint)})"
-    expected = f"{_calls_text(null['expected'])} false calls are expected"
-    warning = (
-        f"{faint_findings} are so faint that noise explains them: "
-        f"{expected}, with scores up to about {sure_score:.2g}"
-    )
-    return replace(result, evidence=with_warnings(result.evidence, warning))
 
 
 def with_size_warnings(result: Judged) -> Judged:

@@ -26,7 +26,6 @@ from harness.inspection.judging import (
     judged,
     refuse_thresholds,
     threshold_of,
-    with_faint_warning,
     with_size_warnings,
 )
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
@@ -127,8 +126,6 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         arguments, detector, cloud, evidence, silent_threshold
     )
     result = judged(detector, cloud, evidence, threshold)
-    if mapped is None:
-        result = with_faint_warning(result, threshold)
     result = with_size_warnings(result)
     return Inspection(
         arguments=arguments,

@@ -625,6 +625,12 @@ FINDINGS_OF_CAPTURE = Table(
             "angle of the rectangle's length from x towards y (down), -90 to 90",
         ),
         Column(
+            "noise_probability",
+            "",
+            "noise_probability",
+            "probability that it is a false call; empty if the capture sets no threshold itself",
+        ),
+        Column(
             "findings_version",
             "",
             lambda finding: FINDINGS_VERSION,

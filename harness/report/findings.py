@@ -78,6 +78,9 @@ class Finding:
     points) or ``area`` (no return)."""
     depth_from: str
     """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
+    noise_probability: float = math.nan
+    """Probability that it is a false call: noise, or what an object or print makes of the measured
+    distance. NaN if the capture does not set its own threshold."""
 
     @property
     def is_long(self) -> bool:
@@ -99,19 +102,27 @@ class Judged:
     """The size and place of each cluster."""
     missing: MissingReturns | None = None
     """Missing returns; None without a pixel grid."""
+    noise_probabilities: tuple[float, ...] = ()
+    """Each finding's probability of being a false call, NaN if unknown; empty if all are."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The findings, numbered from 1, strongest first."""
-        pairs = zip(self.detections, self.measurements, strict=True)
+        unknown = (math.nan,) * len(self.detections)
+        probabilities = self.noise_probabilities or unknown
+        triples = zip(self.detections, self.measurements, probabilities, strict=True)
         return tuple(
-            finding_of(number, self.evidence, detection, measured)
-            for number, (detection, measured) in enumerate(pairs, start=1)
+            finding_of(number, self.evidence, detection, measured, probability)
+            for number, (detection, measured, probability) in enumerate(triples, start=1)
         )
 
 
 def finding_of(
-    number: int, evidence: Evidence, detection: Detection, measured: Measurement
+    number: int,
+    evidence: Evidence,
+    detection: Detection,
+    measured: Measurement,
+    noise_probability: float = math.nan,
 ) -> Finding:
     """Return the row of a detection: the model's numbers if they exist, or else those of the
     extents."""
@@ -146,6 +157,7 @@ def finding_of(
         angle_deg=angle_deg,
         size_from=size_from,
         depth_from=depth_from,
+        noise_probability=noise_probability,
     )
 
 
