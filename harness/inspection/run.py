@@ -476,7 +476,9 @@ def _judged_rows(run: Inspection) -> list[tuple[str, str]]:
     if null is not None:
         rim = f"{null['rim_pixels']} pixels, not judged"
         rows.append(("rim mixed with what lies behind", rim))
-        objects = f"{null['objects']} places, whose bumps are not taken as noise"
+        objects = f"{null['objects']} places"
+        if np.isfinite(null["at_marks"]):
+            objects += f", {calls_text(null['at_marks'])} false calls expected there"
         rows.append(("objects, printed marks and edges in the picture", objects))
     choice = run.choices[0]
     if run.mapped is None and choice is not None:

@@ -19,14 +19,14 @@ SURE = "sure"
 DOUBTFUL = "doubtful"
 RIM_OR_BLIND = "rim or blind"
 CLASSES = {
-    SURE: "noise explains each with a probability below 0.05; where this is unknown, the score is"
-    " well above the threshold",
-    DOUBTFUL: "noise may explain them",
+    SURE: "each is a false call with a probability below 0.05; where this is unknown, its score is"
+    " at least 1.5 times the threshold",
+    DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them",
     RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
 }
 """The classes of findings, with their meaning."""
 FLAGS = {
-    "faint": "noise may explain it",
+    "faint": "noise, or what an object or print makes of the distance, may explain it",
     "at_rim": "reaches the rim of the judged area: may be larger than stated",
     "open_behind": "shows what lies far behind, or nothing: may be wider than stated by up to the"
     " noise's reach, where the camera's filter mixes the rim with what is behind",
@@ -37,14 +37,13 @@ FLAGS = {
 }
 """The flags of findings, with their meaning."""
 MOST_NOISE = 0.05
-"""Probability of noise from which a finding is doubtful. Each sure finding is real with at least
-95 %, so that fewer than one in 20 of them are expected to be false, however many there are."""
+"""Probability of a false call from which a finding is doubtful. Each sure finding is real with at
+least 95 %, so that fewer than one in 20 of them are expected to be false, however many there are.
+"""
 CLEAR_RATIO = 1.5
 """Ratio of score to threshold from which a finding with unknown odds is not faint. At 1.5 times a
 threshold of 5, normal noise is rarer by a factor of exp(15.6), and noise that falls like
 exp(-score) by exp(2.5)."""
-FAINT_CALLS = 0.05
-"""Noise explains a finding if at least this many false calls of its score are expected."""
 OPEN_MM = 75.0
 """Depth beyond which a hole shows objects far behind it."""
 DENT_RATIO = 0.25
@@ -65,7 +64,7 @@ random cloud leaves exp(-6) of them empty."""
 def with_remarks(result: Judged, threshold: float) -> Judged:
     """Give each finding its class, its flags and its term. ``threshold``: units of score."""
     bare = replace(result, remarks=())
-    least_score = clear_score(result.evidence, threshold)
+    least_score = CLEAR_RATIO * threshold
     cut = _cut_by_the_rim(result.cloud, result.evidence, result.detections)
     floor_mm = least_floor_mm(result.cloud, result.evidence)
     remarks = []
@@ -98,21 +97,6 @@ def is_faint(finding: Finding, least_score: float) -> bool:
     if math.isnan(finding.noise_probability):
         return finding.score < least_score
     return finding.noise_probability >= MOST_NOISE
-
-
-def clear_score(evidence: Evidence, threshold: float) -> float:
-    """Return the score from which a finding with unknown odds is not faint.
-
-    Where the capture set its own threshold, it is the score at which `FAINT_CALLS` are expected.
-    The logarithm of the number of false calls is assumed to fall with the square of the score, as
-    for normal noise, through the peaks above the floor and the upper 95 % bound of the number
-    expected at the threshold. Otherwise it is `CLEAR_RATIO` times the threshold."""
-    null = evidence.notes.get("own_null", {"threshold": None})
-    if threshold != null["threshold"] or not 0 < null["high"] < null["peaks"]:
-        return CLEAR_RATIO * threshold
-    rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
-    further = math.log(max(null["high"] / FAINT_CALLS, 1.0)) / rate
-    return math.sqrt(threshold**2 + further)
 
 
 def class_of(finding: Finding, flags: Sequence[str]) -> str:

@@ -628,7 +628,7 @@ FINDINGS_OF_CAPTURE = Table(
             "noise_probability",
             "",
             "noise_probability",
-            "probability that noise alone made it; empty where unknown",
+            "probability that it is a false call; empty if the capture sets no threshold itself",
         ),
         Column(
             "certainty",

@@ -79,7 +79,8 @@ class Finding:
     depth_from: str
     """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
     noise_probability: float = math.nan
-    """Probability that noise alone made it; NaN where unknown."""
+    """Probability that it is a false call: noise, or what an object or print makes of the measured
+    distance. NaN if the capture does not set its own threshold."""
     certainty: str = ""
     """``sure``, ``doubtful`` or ``rim or blind``; empty where nobody has judged it."""
     flags: str = ""
@@ -130,19 +131,23 @@ class Judged:
     """The size and place of each cluster."""
     missing: MissingReturns | None = None
     """Missing returns; None without a pixel grid."""
+    noise_probabilities: tuple[float, ...] = ()
+    """Each finding's probability of being a false call, NaN if unknown; empty if all are."""
     remarks: tuple[Remark, ...] = ()
     """One for each finding, or none at all."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The findings, numbered from 1, strongest first."""
-        pairs = zip(self.detections, self.measurements, strict=True)
-        measured_only = [
-            finding_of(number, self.evidence, detection, measured)
-            for number, (detection, measured) in enumerate(pairs, start=1)
-        ]
+        unknown = (math.nan,) * len(self.detections)
+        probabilities = self.noise_probabilities or unknown
+        triples = zip(self.detections, self.measurements, probabilities, strict=True)
+        measured_only = tuple(
+            finding_of(number, self.evidence, detection, measured, probability)
+            for number, (detection, measured, probability) in enumerate(triples, start=1)
+        )
         if not self.remarks:
-            return tuple(measured_only)
+            return measured_only
         remarked = []
         for finding, remark in zip(measured_only, self.remarks, strict=True):
             remarked.append(replace(finding, **vars(remark)))
@@ -150,7 +155,11 @@ class Judged:
 
 
 def finding_of(
-    number: int, evidence: Evidence, detection: Detection, measured: Measurement
+    number: int,
+    evidence: Evidence,
+    detection: Detection,
+    measured: Measurement,
+    noise_probability: float = math.nan,
 ) -> Finding:
     """Return the row of a detection: the model's numbers if they exist, or else those of the
     extents."""
@@ -185,6 +194,7 @@ def finding_of(
         angle_deg=angle_deg,
         size_from=size_from,
         depth_from=depth_from,
+        noise_probability=noise_probability,
     )
 
 
