@@ -284,6 +284,9 @@ class InspectionVerdict:
     extent: Extent
     expected_false_calls: float
     """False calls expected in the capture; NaN where unknown."""
+    expected_false_sure: float
+    """Number of sure findings that are expected to be false, the sum of their probabilities; NaN
+    where these are unknown."""
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -296,6 +299,7 @@ class InspectionVerdict:
             "judged_share_of_outline": self.extent.judged_share,
             "blind_area_m2": self.extent.blind_m2,
             "expected_false_calls": self.expected_false_calls,
+            "expected_false_sure": self.expected_false_sure,
         }
 
 
@@ -306,16 +310,25 @@ def verdict_of(
     findings = result.findings
     counts = {name: 0 for name in CLASSES}
     terms: dict[str, int] = {}
+    false_sure = 0.0
     for finding in findings:
         counts[finding.certainty] += 1
         if finding.certainty == SURE:
             terms[finding.term] = terms.get(finding.term, 0) + 1
+            false_sure += finding.noise_probability
     extent = extent_of(result, outline)
     expected = expected_calls(result.evidence, threshold)
     clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not findings)]
     clauses += _other_clauses(findings, is_further=bool(terms))
-    clauses.append(_calls_clause(expected))
-    return InspectionVerdict("; ".join(clauses) + ".", counts, terms, extent, expected)
+    clauses.append(_calls_clause(expected, false_sure if terms else math.nan))
+    return InspectionVerdict(
+        sentence="; ".join(clauses) + ".",
+        counts=counts,
+        sure_terms=terms,
+        extent=extent,
+        expected_false_calls=expected,
+        expected_false_sure=false_sure,
+    )
 
 
 def expected_calls(evidence: Evidence, threshold: float) -> float:
@@ -388,7 +401,10 @@ def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str
     return clauses
 
 
-def _calls_clause(expected: float) -> str:
+def _calls_clause(expected: float, false_sure: float) -> str:
+    """Return the clause on false calls: those among the sure findings, or else all of them."""
+    if not math.isnan(false_sure):
+        return f"{calls_text(false_sure)} false calls expected among the sure ones"
     if math.isnan(expected):
         return "the number of false calls is unknown"
     return f"{calls_text(expected)} false calls expected"

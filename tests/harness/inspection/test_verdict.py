@@ -256,6 +256,18 @@ def test_the_sentence_counts_what_is_sure_and_names_the_rest():
     assert said.facts["judged_area_m2"] == pytest.approx(0.0096)
 
 
+def test_with_odds_the_sentence_says_how_many_of_the_sure_are_false():
+    """0.01 + 0.02 of the sure ones; the doubtful one does not count."""
+    judged = replace(judged_of(20.0, 9.0, 8.0), noise_probabilities=(0.01, 0.02, 0.3))
+    said = verdict_of(with_remarks(judged, 5.0), 5.0)
+    assert said.sentence == (
+        "Two holes found on 96 cm2 of the part; one further place is doubtful;"
+        " 0.03 false calls expected among the sure ones."
+    )
+    assert said.expected_false_sure == pytest.approx(0.03)
+    assert said.expected_false_calls == 1.0
+
+
 def test_the_sentence_of_nothing_and_of_nothing_sure():
     nothing = verdict_of(with_remarks(judged_of(), 5.0), 5.0).sentence
     assert nothing == "No damage found on 96 cm2 of the part; 1.0 false calls expected."
