@@ -231,7 +231,7 @@ def places_for(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
     room_px = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     margin_px = radius_px + max(1.0, 0.5 * result.cloud.noise_reach_px)
     candidates = np.flatnonzero(room_px.ravel() > margin_px)
-    shuffled = random_stream(0, "limit", round(disc.diameter_m / MM, 6)).permutation(candidates)
+    shuffled = random_stream(0, "limit", f"{disc.diameter_m / MM:.6f} mm").permutation(candidates)
     area_px = math.pi * max(radius_px, 0.5) ** 2
     most = min(MOST_PLACES, max(1, int(MOST_SHARE * free.sum() / area_px)))
     apart_px = 2 * radius_px + APART_PX

@@ -387,7 +387,7 @@ def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str
         if finding.certainty == RIM_OR_BLIND:
             blind += finding.kind == "no return"
             cut += finding.kind != "no return"
-    clauses = []
+    clauses: list[str] = []
     for count, one, several in (
         (doubtful, "is doubtful", "are doubtful"),
         (cut, "is cut by the rim", "are cut by the rim"),

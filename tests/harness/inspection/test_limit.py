@@ -83,14 +83,14 @@ class WidthDetector:
 
 
 def judged_of(detector: Any, cloud: Cloud, pixels: np.ndarray | None = None) -> Judged:
-    detections = ()
+    detections: tuple[Detection, ...] = ()
     if pixels is not None:
         detections = (Detection(9.0, pixels, np.zeros(3)),)
     return Judged(cloud, detector.analyse(cloud), detections, ())
 
 
 @pytest.mark.parametrize("slope", [0.0, 1.0])
-def test_a_disc_is_as_deep_across_the_surface_as_it_says_and_as_wide(slope: float):
+def test_a_disc_is_as_deep_across_the_surface_as_it_says_and_as_wide(slope: float) -> None:
     detector = WidthDetector(slope)
     cloud = plane_cloud(slope)
     centre = 60 * SHAPE[1] + 70
@@ -110,7 +110,7 @@ def test_a_disc_is_as_deep_across_the_surface_as_it_says_and_as_wide(slope: floa
     assert len(floor) * seen_m2 == pytest.approx(math.pi * 0.015**2, rel=0.06)
 
 
-def test_the_filter_blurs_the_rim_and_leaves_the_volume():
+def test_the_filter_blurs_the_rim_and_leaves_the_volume() -> None:
     disc = Disc(diameter_m=0.03, depth_m=0.004)
     volumes = []
     for reach_px in (0.0, 5.0):
@@ -124,7 +124,7 @@ def test_the_filter_blurs_the_rim_and_leaves_the_volume():
     assert volumes[1] == pytest.approx(volumes[0], rel=1e-6)
 
 
-def test_centres_lie_apart_from_one_another_from_the_rim_and_from_findings():
+def test_centres_lie_apart_from_one_another_from_the_rim_and_from_findings() -> None:
     finding = (50 + np.arange(10))[:, None] * SHAPE[1] + np.arange(70, 80)
     judged = judged_of(WidthDetector(), plane_cloud(), finding.ravel())
 
@@ -141,7 +141,7 @@ def test_centres_lie_apart_from_one_another_from_the_rim_and_from_findings():
     assert (centres == places_for(judged, free_area(judged), disc)).all()
 
 
-def test_the_limit_is_the_detectors_own():
+def test_the_limit_is_the_detectors_own() -> None:
     """Discs of 4 mm depth and at least 80 pixels, which are 10.1 pixels or 20.2 mm wide."""
     judged = judged_of(WidthDetector(), plane_cloud())
     limit = limit_of(WidthDetector(least_px=80), judged, threshold=2.0, depth_m=0.004)
@@ -155,7 +155,7 @@ def test_the_limit_is_the_detectors_own():
     assert limit.facts["sizes"][0]["hits"] == 0
 
 
-def test_without_a_depth_discs_are_half_as_deep_as_wide():
+def test_without_a_depth_discs_are_half_as_deep_as_wide() -> None:
     judged = judged_of(WidthDetector(), plane_cloud())
     limit = limit_of(WidthDetector(), judged, threshold=1e-6)
     assert all(size.depth_mm == pytest.approx(size.diameter_mm / 2) for size in limit.sizes)
@@ -165,7 +165,7 @@ def test_without_a_depth_discs_are_half_as_deep_as_wide():
     assert math.isnan(nothing.a90_mm)
 
 
-def test_a_limit_beyond_the_largest_disc_is_not_stated():
+def test_a_limit_beyond_the_largest_disc_is_not_stated() -> None:
     sizes = [
         SizeCount(diameter_mm=10.0, depth_mm=1.0, hits=2, places=40, low=0.0, high=0.2),
         SizeCount(diameter_mm=20.0, depth_mm=1.0, hits=20, places=40, low=0.3, high=0.7),
@@ -174,7 +174,7 @@ def test_a_limit_beyond_the_largest_disc_is_not_stated():
     assert text.startswith("damage 1 mm deep is not found in 90 % of places up to 20 mm wide")
 
 
-def test_points_without_a_grid_and_areas_without_room_are_refused():
+def test_points_without_a_grid_and_areas_without_room_are_refused() -> None:
     judged = judged_of(WidthDetector(), plane_cloud())
     with pytest.raises(UserError, match="grid of pixels"):
         limit_of(WidthDetector(), replace(judged, cloud=replace(judged.cloud, organised=False)), 2)
@@ -183,7 +183,7 @@ def test_points_without_a_grid_and_areas_without_room_are_refused():
         limit_of(WidthDetector(), everywhere, 2.0)
 
 
-def test_sizes_go_down_until_few_are_found_and_up_until_nearly_all_are():
+def test_sizes_go_down_until_few_are_found_and_up_until_nearly_all_are() -> None:
     def size(hits: int) -> SizeCount:
         return SizeCount(diameter_mm=1.0, depth_mm=1.0, hits=hits, places=40, low=0.0, high=1.0)
 
@@ -196,7 +196,7 @@ def test_sizes_go_down_until_few_are_found_and_up_until_nearly_all_are():
     assert next_step({-4: size(40)}) is None
 
 
-def test_the_curve_is_over_the_logarithm_of_the_width():
+def test_the_curve_is_over_the_logarithm_of_the_width() -> None:
     """Hits of 1, 5 and 9 in 10 at 5, 10 and 20 mm: a logistic curve with odds of 1 at 10 mm and of
     9 at 20 mm, by symmetry of the logarithms."""
     sizes = []
