@@ -231,8 +231,8 @@ def _laws(
     """Return the threshold at which ``number`` are expected on one side away from marks, and the
     laws. ``judged`` (h, w) bool.
 
-    The rim has a law of its own if the peaks elsewhere do not explain as many high ones there; it
-    then gets its share of the number by area."""
+    The rim has a law of its own if the peaks elsewhere do not explain as many high ones there, at
+    least `FEWEST_PEAKS`; it then gets its share of the number by area."""
     tails = {PLAIN: _fitting_tail(peaks.scores, peaks.floor, number, _area_ratio(judged, marks))}
     threshold = max(tails[PLAIN].threshold(number), LEAST)
     if marks.count:
@@ -249,7 +249,8 @@ def _laws(
     inner_tail = _fitting_tail(inner, peaks.floor, inner_number, inner_ratio)
     inner_threshold = max(inner_tail.threshold(inner_number), LEAST)
     exceeding = int((outer > inner_threshold).sum())
-    if exceeding == 0 or special.gammainc(exceeding, share * number) > RIM_CHANCE:
+    # fewer than so many may be bumps
+    if exceeding < FEWEST_PEAKS or special.gammainc(exceeding, share * number) > RIM_CHANCE:
         return threshold, tails
     rim_tail = replace(
         Tail.of(outer, peaks.floor, THEORY_AT_MARKS), area_ratio=_area_ratio(rim, marks)
