@@ -13,6 +13,10 @@ Beside objects, print and edges false calls are more frequent, on both sides of 
 peaks in front of it there have a tail of their own, which predicts how many more calls that
 threshold lets pass. A small mark in the picture that lies within a finding is the finding itself.
 
+Where light from the target's edge mixes in, peaks along its rim are higher. If the peaks elsewhere
+do not explain those at the rim, these have a law of their own too, and scores at the rim are
+scaled down so that one threshold holds for both.
+
 Not modelled: noise that is asymmetric beyond what `skew_of` sees in the core; damage towards the
 camera that is no larger than the noise; objects on clouds without a grid, or that neither stand
 out nor are visible in a picture."""
@@ -91,7 +95,11 @@ PLAIN = "plain"
 """Name of the law of noise away from long marks."""
 MARKS = "at marks"
 """Name of the law at objects, print and edges."""
+RIM = "at the rim"
+"""Name of the law along the target's rim."""
 RIM_PX = 10  # depth of the target's rim
+RIM_CHANCE = 0.01
+"""Peaks at the rim have a law of their own if chance makes as many high ones more seldom."""
 RIM_CALLS = 2  # calls behind the surface along the rim that chance does not explain
 
 
@@ -118,13 +126,15 @@ class OwnThreshold:
     """Number of regions that are excluded as objects."""
     rim_pixels: int
     """Number of pixels along the rim that mix in what lies behind the target."""
+    rim_scale: float
+    """Factor of scores at the rim in ``evidence``; 1 if one law explains all peaks."""
     evidence: Evidence
-    """Evidence to search: without the rim pixels."""
+    """Evidence to search: without the rim pixels, and with scores at the rim scaled."""
     doubts: tuple[str, ...]
     """Full sentences on why the numbers cannot be trusted."""
     tails: dict[str, Tail]
-    """Laws of the false calls on one side of the surface, by `PLAIN` and `MARKS`; empty with too
-    few peaks."""
+    """Laws of the false calls on one side of the surface, by `PLAIN`, `RIM` and `MARKS`; empty
+    with too few peaks."""
 
 
 def own_threshold(
@@ -141,12 +151,12 @@ def own_threshold(
     covered = marks.covered
     n_objects = int(ndimage.label(covered)[1])
     before = _only(evidence, ~behind(evidence))
-    floor, peaks, peaks_at_marks = _peaks(detector, cloud, before, marks)
+    peaks = _peaks(detector, cloud, before, marks)
     doubts = _doubts_about_symmetry(evidence)
-    if len(peaks) < FEWEST_PEAKS:
+    if len(peaks.scores) < FEWEST_PEAKS:
         doubts.append(
-            f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a"
-            f" threshold (at least {FEWEST_PEAKS} are needed)"
+            f"only {len(peaks.scores)} peaks of noise stand out towards the camera, too few to set"
+            f" a threshold (at least {FEWEST_PEAKS} are needed)"
         )
         return OwnThreshold(
             threshold=float("nan"),
@@ -154,20 +164,20 @@ def own_threshold(
             at_marks=float("nan"),
             low=float("nan"),
             high=float("nan"),
-            peaks=len(peaks),
-            floor=floor,
+            peaks=len(peaks.scores),
+            floor=peaks.floor,
             objects=n_objects,
             rim_pixels=0,
+            rim_scale=1.0,
             evidence=evidence,
             doubts=tuple(doubts),
             tails={},
         )
     # half of the false calls lie in front of the surface, where the peaks are
-    tail = _fitting_tail(peaks, floor, false_calls / 2.0, _area_ratio(judged, marks))
-    threshold = max(tail.threshold(false_calls / 2.0), LEAST)
-    tails = {PLAIN: tail}
-    if marks.count:
-        tails[MARKS] = Tail.of(peaks_at_marks, floor, THEORY_AT_MARKS)
+    threshold, tails = _laws(peaks, judged, marks, false_calls / 2.0)
+    tail = tails[PLAIN]
+    rim_scale = tails[RIM].scale if RIM in tails else 1.0
+    evidence = with_rim_scaled(evidence, rim_scale)
     expected = {name: 2.0 * tail.expected(threshold) for name, tail in tails.items()}
     low, high = interval_of(tails, threshold)
     rim = np.zeros(judged.shape, bool)
@@ -195,6 +205,7 @@ def own_threshold(
         floor=tail.floor,
         objects=n_objects,
         rim_pixels=int(rim.sum()),
+        rim_scale=rim_scale,
         evidence=_only(evidence, ~rim),
         doubts=tuple(doubts),
         tails=tails,
@@ -209,6 +220,75 @@ def interval_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, flo
         drawn += 2.0 * tail.laws(DRAWS).expected(threshold)
     low, high = np.quantile(drawn, (0.025, 0.975))
     return float(low), float(high)
+
+
+def _laws(
+    peaks: _Peaks,
+    judged: np.ndarray,
+    marks: Marks,
+    number: float,
+) -> tuple[float, dict[str, Tail]]:
+    """Return the threshold at which ``number`` are expected on one side away from marks, and the
+    laws. ``judged`` (h, w) bool.
+
+    The rim has a law of its own if the peaks elsewhere do not explain as many high ones there, at
+    least `FEWEST_PEAKS`; it then gets its share of the number by area."""
+    tails = {PLAIN: _fitting_tail(peaks.scores, peaks.floor, number, _area_ratio(judged, marks))}
+    threshold = max(tails[PLAIN].threshold(number), LEAST)
+    if marks.count:
+        tails[MARKS] = Tail.of(peaks.at_marks, peaks.floor, THEORY_AT_MARKS)
+
+    rim = judged & _rim_of(judged)
+    share = float(rim.sum()) / float(judged.sum())
+    inner = peaks.scores[~peaks.is_at_rim]
+    outer = peaks.scores[peaks.is_at_rim]
+    if len(inner) < FEWEST_PEAKS or not 0.0 < share < 0.5:
+        return threshold, tails
+    inner_number = (1.0 - share) * number
+    inner_ratio = _area_ratio(judged & ~rim, marks)
+    inner_tail = _fitting_tail(inner, peaks.floor, inner_number, inner_ratio)
+    inner_threshold = max(inner_tail.threshold(inner_number), LEAST)
+    exceeding = int((outer > inner_threshold).sum())
+    # fewer than so many may be bumps
+    if exceeding < FEWEST_PEAKS or special.gammainc(exceeding, share * number) > RIM_CHANCE:
+        return threshold, tails
+    rim_tail = replace(
+        Tail.of(outer, peaks.floor, THEORY_AT_MARKS), area_ratio=_area_ratio(rim, marks)
+    )
+    rim_threshold = rim_tail.threshold(share * number)
+    if rim_threshold <= inner_threshold:
+        return threshold, tails
+    tails[PLAIN] = inner_tail
+    tails[RIM] = replace(rim_tail, scale=inner_threshold / rim_threshold)
+    return inner_threshold, tails
+
+
+def _rim_of(judged: np.ndarray) -> np.ndarray:
+    """Return (h, w) bool: the pixels along the rim of the judged ones, (h, w) bool."""
+    return _depth_px(holes_filled(judged)) <= RIM_PX
+
+
+def is_at_rim(evidence: Evidence, detection: Detection) -> bool:
+    """Return whether a finding's highest score lies along the rim of the judged area."""
+    return bool(
+        _rim_of(np.isfinite(evidence.residual_m)).reshape(-1)[_peak_of(evidence, detection)]
+    )
+
+
+def _peak_of(evidence: Evidence, detection: Detection) -> int:
+    """Return the flat index of a finding's highest score."""
+    scores = np.nan_to_num(evidence.score.reshape(-1)[detection.pixels])
+    return int(detection.pixels[np.argmax(scores)])
+
+
+def with_rim_scaled(evidence: Evidence, scale: float) -> Evidence:
+    """Return the evidence with scores along the rim multiplied by a scale, and by less up to twice
+    as far from it: a finding at the rim, as wide as the widest filters, is not cut in two."""
+    if scale == 1.0:
+        return evidence
+    depth_px = _depth_px(holes_filled(np.isfinite(evidence.residual_m)))
+    nearness = np.clip(2.0 - depth_px / RIM_PX, 0.0, 1.0)
+    return replace(evidence, score=evidence.score * scale**nearness)
 
 
 def _area_ratio(judged: np.ndarray, marks: Marks) -> float:
@@ -292,10 +372,12 @@ class Laws:
     """(k,): expected number of calls above the floor."""
     rates: np.ndarray
     """(k,): by which the logarithm of the number falls with the excess."""
+    scale: float
+    """Scores in the evidence over those of the law."""
 
     def expected(self, threshold: float) -> np.ndarray:
         """Return the expected number (k,) of calls above a threshold."""
-        ratio = np.array([threshold / self.floor])
+        ratio = np.array([threshold / (self.scale * self.floor)])
         excesses = np.zeros(len(self.numbers))
         for exponent in EXPONENTS:
             excesses[self.exponents == exponent] = _excess(ratio, exponent, self.floor)[0]
@@ -304,14 +386,15 @@ class Laws:
     def densities(self, scores: np.ndarray) -> np.ndarray:
         """Return the expected number (k, n) of calls per unit of score, at scores (n,) above the
         floor."""
-        ratios = scores / self.floor
+        floor = self.scale * self.floor
+        ratios = scores / floor
         falls = np.zeros((len(self.numbers), len(scores)))
         for exponent in EXPONENTS:
             excess = _excess(ratios, exponent, self.floor)
             slope = self.floor * (ratios ** (exponent - 1.0) - _crowd(self.floor) / ratios)
             chosen = self.exponents == exponent
             rates = self.rates[chosen, None]
-            falls[chosen] = rates * slope * np.exp(-rates * excess)
+            falls[chosen] = rates * slope / self.scale * np.exp(-rates * excess)
         return self.numbers[:, None] * falls
 
 
@@ -331,6 +414,8 @@ class Tail:
     """Weight of the theory of normal noise, in peaks."""
     area_ratio: float = 1.0
     """Area where calls are expected, over the area of the peaks."""
+    scale: float = 1.0
+    """Scores in the evidence over those of the peaks."""
 
     @property
     def number(self) -> float:
@@ -347,6 +432,7 @@ class Tail:
             "weights": self.weights.tolist(),
             "theory": self.theory,
             "area_ratio": self.area_ratio,
+            "scale": self.scale,
         }
 
     @classmethod
@@ -359,6 +445,7 @@ class Tail:
             weights=np.array(facts["weights"]),
             theory=facts["theory"],
             area_ratio=facts["area_ratio"],
+            scale=facts["scale"],
         )
 
     @classmethod
@@ -376,7 +463,7 @@ class Tail:
 
     def _excesses(self, threshold: float) -> np.ndarray:
         """Return the excess (e,) of a threshold by each exponent."""
-        ratio = np.array([threshold / self.floor])
+        ratio = np.array([threshold / (self.scale * self.floor)])
         return np.array([float(_excess(ratio, exponent, self.floor)[0]) for exponent in EXPONENTS])
 
     def expected(self, threshold: float) -> float:
@@ -389,18 +476,19 @@ class Tail:
     def threshold(self, number: float) -> float:
         """Return the threshold at which this number of peaks is expected; the floor if fewer are
         expected there."""
+        floor = self.scale * self.floor
         if number >= self.number:
-            return self.floor
+            return floor
 
         def surplus(log_ratio: float) -> float:
-            threshold = float(np.exp(log_ratio)) * self.floor
+            threshold = float(np.exp(log_ratio)) * floor
             return float(np.log(self.expected(threshold) / number))
 
         high = 2.0
-        while self.expected(high * self.floor) > number:
+        while self.expected(high * floor) > number:
             high *= 2.0
         log_ratio = optimize.brentq(surplus, 0.0, np.log(high))
-        return float(np.exp(log_ratio)) * self.floor
+        return float(np.exp(log_ratio)) * floor
 
     def interval(self, threshold: float) -> tuple[float, float]:
         """Return the central 95 % of the expected number of peaks above a threshold."""
@@ -418,6 +506,7 @@ class Tail:
             exponents=EXPONENTS[chosen],
             numbers=numbers,
             rates=steepness / self.sums[chosen],
+            scale=self.scale,
         )
 
 
@@ -441,21 +530,34 @@ def _crowd(floor: float) -> float:
     return min(floor**-2.0, 0.5)
 
 
+@dataclass(frozen=True)
+class _Peaks:
+    """Findings in front of the surface, which are false calls."""
+
+    floor: float
+    """Units of score; about `WANTED_PEAKS` of them away from marks exceed it."""
+    scores: np.ndarray
+    """(n,): of the findings above the floor away from marks."""
+    is_at_rim: np.ndarray
+    """(n,) bool: those along the rim."""
+    at_marks: np.ndarray
+    """(m,): scores of the findings at long marks."""
+
+
 def _peaks(
     detector: Detector,
     cloud: Cloud,
     before: Evidence,
     marks: Marks,
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return a floor with about `WANTED_PEAKS` findings above it away from marks, their scores
-    (n,), and the scores (m,) of findings above it at long marks.
+) -> _Peaks:
+    """Return the peaks in front of the surface.
 
     ``before``: evidence with scores in front of the surface only. Findings at small marks, and
     those on objects, which are no false calls, do not count."""
     evidence = _only(before, ~marks.covered)
     judged = evidence.score[np.isfinite(evidence.score)]
     if not (len(judged) and judged.max() > 0):
-        return 1.0, np.zeros(0), np.zeros(0)
+        return _Peaks(1.0, np.zeros(0), np.zeros(0, bool), np.zeros(0))
     least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
     steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
@@ -463,14 +565,24 @@ def _peaks(
     floor = thresholds[_floor_among(counts)]
     hidden = marks.covered.reshape(-1)
     proud = marks.proud.reshape(-1)
+    rim = np.zeros(hidden.shape, bool)
+    if cloud.organised:
+        rim = _rim_of(np.isfinite(before.residual_m)).reshape(-1)
     scores = []
+    at_rim = []
     scores_at_marks = []
     for detection in detector.find(cloud, before, floor):
         if not hidden[detection.pixels].any():
             scores.append(detection.score)
+            at_rim.append(rim[_peak_of(before, detection)])
         elif not proud[detection.pixels].any() and marks.hold(detection):
             scores_at_marks.append(detection.score)
-    return floor, np.array(scores), np.array(scores_at_marks)
+    return _Peaks(
+        floor=floor,
+        scores=np.array(scores),
+        is_at_rim=np.array(at_rim, bool),
+        at_marks=np.array(scores_at_marks),
+    )
 
 
 def _floor_among(counts: list[int]) -> int:

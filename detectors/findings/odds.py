@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special, stats
 
-from detectors.findings.null import MARKS, PLAIN, Tail, behind, marks_of
+from detectors.findings.null import MARKS, PLAIN, RIM, Tail, behind, is_at_rim, marks_of
 from detectors.interface import Detection, Evidence, MissingReturns
 from harness.vocabulary.geometry import Cloud
 
@@ -56,8 +56,8 @@ def noise_probabilities(
         else:
             null = evidence.notes["own_null"]
             threshold = null["threshold"]
-            tail_name = MARKS if group.startswith(MARKS) else PLAIN
-            drawn = Tail.from_facts(null["tails"][tail_name]).laws(LAWS)
+            place = group.split(", ")[0]
+            drawn = Tail.from_facts(null["tails"][place]).laws(LAWS)
             density = drawn.densities(scores[numbers])
             expected = drawn.expected(threshold)
         probabilities[numbers] = share_of_noise(scores[numbers], threshold, density, expected)
@@ -87,6 +87,8 @@ def _groups(
         place = PLAIN
         if marks is not None and detection.kind == "depth" and marks.hold(detection):
             place = MARKS
+        elif RIM in tails and is_at_rim(evidence, detection):
+            place = RIM
         groups.setdefault(f"{place}, {side}", []).append(number)
     return groups
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
-from detectors.findings.null import OwnThreshold, each_object_once, own_threshold
+from detectors.findings.null import RIM_PX, OwnThreshold, each_object_once, own_threshold
 from detectors.findings.odds import noise_probabilities
 from detectors.interface import Detection, Detector, Evidence, Measurement
 from detectors.surfaces.background import misfit
@@ -26,7 +26,7 @@ THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
 NULL_FACTS = ("threshold", "expected", "at_marks", "low", "high")
 """Facts of a capture's own threshold that are stored with the findings if it can be trusted."""
-PEAK_FACTS = ("peaks", "floor", "objects", "rim_pixels")
+PEAK_FACTS = ("peaks", "floor", "objects", "rim_pixels", "rim_scale")
 """Facts that are stored in any case."""
 LEAST_AT_MARKS = 0.05
 """Fewest expected calls at marks that the output states: 0.1 when rounded."""
@@ -150,6 +150,9 @@ def _peaks_text(own: OwnThreshold, cloud: Cloud) -> str:
     text = f"{own.peaks} peaks towards the camera"
     if not cloud.organised:
         text += "; objects on the target were not sought"
+    if own.rim_scale < 1.0:
+        rim = f"scores within {RIM_PX} pixels of the rim count {own.rim_scale:.2g} times"
+        text += f"; {rim}, because noise is higher there"
     if own.rim_pixels:
         rim = f"{own.rim_pixels} pixels along the rim"
         text += f"; {rim} are mixed with the background and are not judged"

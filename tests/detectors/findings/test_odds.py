@@ -12,6 +12,7 @@ from detectors import load_detector
 from detectors.findings.null import (
     MARKS,
     PLAIN,
+    RIM,
     OwnThreshold,
     Tail,
     interval_of,
@@ -46,14 +47,6 @@ CHECKED = [
     ("local", Case("Student's t", 1, 1)),
 ]
 SLOW = pytest.mark.slow  # a Monte Carlo campaign over all kinds of noise
-
-
-def normal_tail(calls: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return a law of 12,000 calls at 0 that falls with half of the square, by which ``calls`` are
-    expected above 5: the number above scores from 5, and its density, on a fine grid."""
-    scores = np.linspace(THRESHOLD, 12.0, 7001)
-    number = calls * np.exp(-(scores**2 - THRESHOLD**2) / 2.0)
-    return scores, number
 
 
 # ---------------------------------------------------------------- one group of findings
@@ -316,6 +309,96 @@ def test_a_tail_survives_as_plain_data() -> None:
     again = Tail.from_facts(tail.facts)
     assert again.expected(4.5) == tail.expected(4.5)
     assert again.number == 4.5
+
+
+# ---------------------------------------------------------------- the rim
+
+BOARD = np.s_[12:-12, 12:-12]
+
+
+def board(seed: int, loud: float, errors: int = 40) -> tuple[Cloud, np.ndarray]:
+    """Return a board of smooth noise within an empty frame, with a hole in its middle and, 4 pixels
+    from its outline, ``errors`` smooth errors of either sign that are up to ``loud`` deviations high; and
+    the distance (h, w) to its outline in pixels."""
+    random = np.random.default_rng([47, seed])
+    shape = (150, 190)
+    noise_m = 3e-3 * ndimage.uniform_filter(random.normal(size=shape), 3, mode="wrap")
+    inside = np.zeros(shape, bool)
+    inside[BOARD] = True
+    depth_px = ndimage.distance_transform_cdt(inside, "chessboard")
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    offset_m = noise_m + 4e-3 * (np.hypot(rows - 75, columns - 95) < 4.0)
+    places = random.choice(np.flatnonzero(depth_px == 4), errors, replace=False)
+    for place in places:
+        row, column = np.unravel_index(place, shape)
+        bump = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 8.0)
+        offset_m += random.choice([-1e-3, 1e-3]) * random.uniform(0.5, 1.0) * loud * bump
+    offset_m[~inside] = np.nan
+    return plane(offset_m), depth_px
+
+
+def test_a_loud_rim_does_not_raise_the_threshold_elsewhere() -> None:
+    """Errors at the rim have a law of their own, of which the search leaves few; findings keep
+    their whole scores away from the rim."""
+    calls = 0
+    for seed in range(5):
+        cloud, depth_px = board(seed, 10.0)
+        quiet, _ = board(seed, 0.0)
+        own, found = own_of(cloud)
+        plain, _ = own_of(quiet)
+        assert own.doubts == ()
+        assert own.rim_scale < 0.7
+        assert plain.rim_scale == 1.0
+        assert own.threshold == pytest.approx(plain.threshold, rel=0.3)
+        assert own.expected == pytest.approx(1.0, rel=1e-6)
+        assert own.low < 1.0 < own.high
+        detector = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
+        whole = detector.analyse(cloud).score
+        assert np.array_equal(own.evidence.score[depth_px > 20], whole[depth_px > 20])
+        outermost = (depth_px == 5) & (whole > 0)
+        ratio = own.evidence.score[outermost] / whole[outermost]
+        assert ratio == pytest.approx(own.rim_scale, rel=1e-9)
+        middle = int(np.ravel_multi_index((75, 95), cloud.valid.shape))
+        assert sum(middle in detection.pixels for detection in found) == 1
+        calls += len(found) - 1
+    assert calls <= 10
+
+
+def test_a_few_bumps_at_the_rim_are_no_loud_rim() -> None:
+    cloud, _ = board(1, 8.0, errors=5)
+    own, found = own_of(cloud)
+    assert own.rim_scale == 1.0
+    assert RIM not in own.tails
+    assert len(found) >= 3
+
+
+def test_calls_at_the_rim_are_weighed_by_its_law() -> None:
+    cloud, depth_px = board(0, 10.0)
+    own, _ = own_of(cloud)
+    facts = null_facts(own)
+    score = own.threshold * 1.2
+    at_rim = Detection(score, np.flatnonzero(depth_px == 4)[:3], np.zeros(3))
+    away = Detection(score, np.flatnonzero(depth_px == 40)[:3], np.zeros(3))
+
+    def probabilities() -> np.ndarray:
+        evidence = replace(own.evidence, notes={"own_null": facts})
+        alone = [noise_probabilities(cloud, evidence, (one,), None)[0] for one in (at_rim, away)]
+        return np.array(alone)
+
+    before = probabilities()
+    facts["tails"][RIM]["area_ratio"] *= 100.0
+    after = probabilities()
+    assert after[0] > before[0] + 0.1
+    assert before[1] == after[1]
+    # the law in scores of the evidence: it integrates to the number expected
+    rim = own.tails[RIM]
+    assert rim.scale == own.rim_scale
+    scores = np.linspace(own.threshold, 30.0 * own.threshold, 40001)
+    laws = rim.laws(200)
+    integral = np.trapezoid(laws.densities(scores), scores, axis=1)
+    difference = laws.expected(own.threshold) - laws.expected(30.0 * own.threshold)
+    assert integral == pytest.approx(difference, rel=1e-3)
+    assert rim.threshold(rim.expected(own.threshold)) == pytest.approx(own.threshold)
 
 
 # ---------------------------------------------------------------- what is unknown
