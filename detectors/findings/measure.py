@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import Size, Start, sized
+from detectors.findings.family import BLURS, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
     normal_of,
@@ -43,13 +43,10 @@ EXPLAINED = 0.7
 absorb a smooth dent, and a ragged damage has no shape."""
 MARGIN_SHARE = 0.4
 """Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
-FINE_BLUR_PX = 3.0  # a blur is at least as wide as this in the pixels of the fit
-MOST_SIDE_PX = 36  # side of a patch from which means over squares of pixels are fitted
-LONG = 0.35  # logarithm of length over width from which a slot is tried
+FINE_BLUR_PX = 2.0  # a blur is at least as wide as this in the pixels of the fit
+MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are fitted
+LONG = 0.5  # logarithm of length over width from which a slot is tried
 MOST_STRETCH = 2.5  # largest start value of it
-SHARPER_PX = (1.0, 2.0, 3.0, 5.0)
-"""Blurs, smaller than the noise's, that are tried for a recording: noise may be blurred more than
-the scene."""
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
 shows through."""
@@ -280,8 +277,8 @@ class _Surroundings:
     """(3,): the surface's point at (u0, v0)."""
     per_px_m: np.ndarray
     """(2, 3): the surface's derivatives by u and v."""
-    sharper_px: tuple[float, ...]
-    """Smaller blurs to try."""
+    blurs: tuple[tuple[float, bool, float], ...]
+    """The `BLURS` to try."""
 
     @property
     def area_m2(self) -> float:
@@ -391,7 +388,6 @@ def _surroundings(
     ray = np.array([0.0, 0.0, 1.0])
     if cloud.projection == "central":
         ray = origin_m / origin_m[2]
-    sharper_px = [side for side in SHARPER_PX if side < cloud.noise_reach_px]
     return _Surroundings(
         patch=patch,
         own=own,
@@ -408,7 +404,8 @@ def _surroundings(
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
-        sharper_px=tuple(_binned_blur(side, binned) for side in sharper_px),
+        # a simulated camera's blur is stated, a recording's is estimated
+        blurs=BLURS if cloud.noise_reach_px else BLURS[:1],
     )
 
 
@@ -592,7 +589,7 @@ def _sized(around: _Surroundings, by_lag: np.ndarray | None) -> Size | None:
     shapes: tuple[Shape, ...] = ("disc", "cap", "bowl")
     if start.stretch > LONG:
         shapes = (*shapes, "slot")
-    return sized(patch, start, shapes, around.sharper_px)
+    return sized(patch, start, shapes, around.blurs)
 
 
 def _start(around: _Surroundings) -> Start:
