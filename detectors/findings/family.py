@@ -161,10 +161,18 @@ def sized(
         first = replace(start, radius_m=radius_m)
         for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
-            if fit.converged and 0.0 < fit.covariance[2, 2] < (MOST_OPEN * fit.radius_m) ** 2:
+            if fit.converged and _is_determined(fit):
                 candidates.append(Candidate(fit, blurred, loss))
                 first = _start_after(fit)
     return averaged(candidates) if candidates else None
+
+
+def _is_determined(fit: HoleFit) -> bool:
+    """Return whether radius and depth are known, so that errors to first order mean something."""
+    radius_m2 = fit.covariance[2, 2]
+    depth_m2 = fit.covariance[3, 3]
+    radius_is_known = 0.0 < radius_m2 < (MOST_OPEN * fit.radius_m) ** 2
+    return bool(radius_is_known and depth_m2 < fit.depth_m**2)
 
 
 def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:

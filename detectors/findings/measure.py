@@ -1,7 +1,7 @@
 """Measures the size and the place of a detection: the thesis' extents, and a fitted model of a
-blurred hole. Where the model does not hold, the contour at half depth is measured instead. Depths
-are measured along the optical axis, positive behind the surface; sizes are measured on the
-surface."""
+damage, averaged over a family of shapes. Where the model does not hold, the contour at half depth
+is measured instead. Depths are fitted along the optical axis, positive behind the surface; a
+`Measurement` states them normal to the surface too. Sizes are measured on the surface."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import BLURS, Size, Start, sized
+from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
     normal_of,
     pictures,
     sight,
     straight_sight,
-    whitened,
 )
 from detectors.findings.shapes import Shape
 from detectors.interface import Detection, Evidence, Measurement
@@ -34,10 +33,6 @@ OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch with a larger residual that do not touch the detection belong to other
 damage."""
 FEWEST_AROUND = 12  # valid pixels around a detection
-NEAR_BLURS = 1.4
-"""Distance from a detection, in sides of the blur, up to which all pixels count if the noise's
-correlation is known. Leaving out 15 of 16 farther pixels raises the standard errors of diameter
-and depth by 0.5 to 1.5 %."""
 EXPLAINED = 0.7
 """Least share of a detection's squared residual that its fit must explain: correlated noise may
 absorb a smooth dent, and a ragged damage has no shape."""
@@ -50,6 +45,8 @@ MOST_STRETCH = 2.5  # largest start value of it
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
 shows through."""
+FLANK = (0.35, 0.65)
+"""Shares of the depth between whose contours that at half depth lies within a standard error."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 
 MISFIT = "the model of a blurred hole does not fit"
@@ -187,10 +184,8 @@ def measure_detection(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
-    by_lag: np.ndarray | None = None,
 ) -> Measurement:
-    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag`` (odd,
-    odd): the noise's correlation."""
+    """Measure a detection both ways; failed measurements are NaN, with a note."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     measured = measure_extents(cloud, detection, "too few valid pixels around it for a model")
@@ -206,7 +201,7 @@ def measure_detection(
         width_m=width_m,
         along=along,
     )
-    size, doubt = _modelled(around, config, by_lag)
+    size, doubt = _modelled(around, config)
     if size is None:
         return _by_contour(measured, around, doubt)
     fit = size.best
@@ -425,18 +420,6 @@ def _binned_blur(blur_px: float, binned: int) -> float:
     return math.sqrt(blur_px**2 + binned**2 - 1.0) / binned
 
 
-def _binned_correlation(by_lag: np.ndarray, binned: int) -> np.ndarray:
-    """Return the correlation (odd, odd) by lag of means over squares of pixels."""
-    if binned == 1:
-        return by_lag
-    shared = np.convolve(np.ones(binned), np.ones(binned))  # pairs of pixels by lag
-    summed = cv2.sepFilter2D(by_lag, -1, shared, shared, borderType=cv2.BORDER_CONSTANT)
-    middle_row = len(summed) // 2
-    middle_column = summed.shape[1] // 2
-    covariance = summed[middle_row % binned :: binned, middle_column % binned :: binned]
-    return covariance / summed[middle_row, middle_column]
-
-
 def _centroid(mask: np.ndarray) -> tuple[float, float]:
     """Return the mean column and the mean row of a mask's pixels."""
     rows, columns = np.nonzero(mask)
@@ -542,8 +525,7 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 def _modelled(
     around: _Surroundings,
     config: HoleModelConfig,
-    by_lag: np.ndarray | None,
-) -> tuple[HoleFit | None, str]:
+) -> tuple[Size | None, str]:
     """Return the fitted hole, or None and the reason why the model does not hold."""
     own = around.own
     invalid = around.invalid
@@ -558,7 +540,7 @@ def _modelled(
         return None, too_deep
     if around.patch.used.sum() < 8:
         return None, MISFIT
-    size = _sized(around, by_lag)
+    size = _sized(around)
     if size is None or not _explains(around, size):
         return None, MISFIT
     if abs(size.depth_m) > config.linear_depth_mm * MM:
@@ -577,19 +559,13 @@ def _modelled(
     return size, ""
 
 
-def _sized(around: _Surroundings, by_lag: np.ndarray | None) -> Size | None:
+def _sized(around: _Surroundings) -> Size | None:
     """Return the averaged size by the family of shapes."""
-    patch = around.patch
-    if by_lag is not None:
-        reach_px = round(NEAR_BLURS * max(patch.blur_px))
-        near = grown(around.own, reach_px, cv2.MORPH_ELLIPSE)
-        by_binned_lag = _binned_correlation(by_lag, around.binned)
-        patch = whitened(patch, by_binned_lag, around.offset_m, near)
     start = _start(around)
     shapes: tuple[Shape, ...] = ("disc", "cap", "bowl")
     if start.stretch > LONG:
         shapes = (*shapes, "slot")
-    return sized(patch, start, shapes, around.blurs)
+    return sized(around.patch, start, shapes, around.blurs)
 
 
 def _start(around: _Surroundings) -> Start:
@@ -640,13 +616,60 @@ def _by_contour(
     doubt: str,
 ) -> Measurement:
     """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels
-    without a range that touch the detection count as inside."""
+    without a range that touch the detection count as inside.
+
+    The diameter's standard error is half of the difference to the contours at the shares `FLANK` of
+    the depth, and what the blur moves a round contour. If no shape fits, the damage is ragged, and
+    its depth is the mean one, volume over area; else it is the deepest."""
     residual_m = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
     hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
     top_m = min(around.peak_m, OPEN_M)
     residual_m = np.minimum(residual_m, top_m)
     residual_m[hollow] = top_m
     residual_m[~around.patch.used & ~hollow] = 0.0
+    inside = _contour(around, residual_m, 0.5 * top_m)
+    if not inside.any():
+        return replace(measured, model_note=doubt + "; no half-depth contour")
+    rows, columns = np.nonzero(inside)
+    u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    diameter_m = _diameter_m(around, inside)
+    low, high = (_contour(around, residual_m, share * top_m) for share in FLANK)
+    flank_m = 0.5 * (_diameter_m(around, low) - _diameter_m(around, high))
+    blur_m2 = math.prod(around.patch.blur_px) * around.area_m2
+    moved_m = min(blur_m2 / (6.0 * diameter_m), 0.5 * diameter_m)
+    if doubt == AMBIGUOUS:
+        moved_m = 0.5 * diameter_m
+    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
+        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
+    diameter_se_m = math.hypot(flank_m, moved_m)
+    depth_m, depth_se_m = _contour_depth(around, inside, residual_m)
+    is_ragged = doubt == MISFIT
+    if is_ragged:
+        # the volume is known: the area's error is twice that of the diameter
+        area_m2 = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
+        volume_m3 = measured.volume_m3 / around.normal_share
+        depth_m = volume_m3 / area_m2
+        depth_se_m = abs(depth_m) * 2.0 * diameter_se_m / diameter_m
+    if hollow.sum() > around.own.sum():
+        depth_m = np.nan
+        depth_se_m = np.nan
+    return replace(
+        around.positioned(measured, u, v),
+        model_diameter_m=diameter_m,
+        model_diameter_se_m=diameter_se_m,
+        model_depth_m=depth_m,
+        model_depth_se_m=math.hypot(depth_se_m, DEPTH_ERROR * depth_m),
+        normal_share=around.normal_share,
+        sight_share=around.sight_share,
+        shape="ragged" if is_ragged else "",
+        model_note=doubt + "; measured at the half-depth contour",
+    )
+
+
+def _contour(around: _Surroundings, residual_m: np.ndarray, level_m: float) -> np.ndarray:
+    """Return where a residual (h, w), drawn `CONTOUR_ZOOM` times as fine, exceeds a level in one
+    piece with the detection."""
     height, width = residual_m.shape
     size = (CONTOUR_ZOOM * width, CONTOUR_ZOOM * height)
     fine_m = cv2.resize(residual_m, size, interpolation=cv2.INTER_LINEAR)
@@ -655,20 +678,31 @@ def _by_contour(
         size,
         interpolation=cv2.INTER_NEAREST,
     )
-    inside = parts_with(fine_m > 0.5 * top_m, seeds > 0)
-    if not inside.any():
-        return replace(measured, model_note=doubt + "; no half-depth contour")
-    rows, columns = np.nonzero(inside)
-    u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
-    v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    return parts_with(fine_m > level_m, seeds > 0)
+
+
+def _diameter_m(around: _Surroundings, inside: np.ndarray) -> float:
+    """Return the diameter of the circle with the area of a `_contour`."""
     area_m2 = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
-    diameter_m = 2.0 * float(np.sqrt(area_m2 / np.pi))
-    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
-        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
-    depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
-    return replace(
-        around.positioned(measured, u, v),
-        model_diameter_m=diameter_m,
-        model_depth_m=depth_m,
-        model_note=doubt + "; measured at the half-depth contour, without standard errors",
+    return 2.0 * math.sqrt(area_m2 / math.pi)
+
+
+def _contour_depth(
+    around: _Surroundings,
+    inside: np.ndarray,
+    residual_m: np.ndarray,
+) -> tuple[float, float]:
+    """Return the deepest residual along the optical axis, and its standard error: half of its
+    difference from the median inside, and the noise."""
+    height, width = residual_m.shape
+    coarse = cv2.resize(
+        inside.astype(np.uint8),
+        (width, height),
+        interpolation=cv2.INTER_NEAREST,
     )
+    depths_m = around.sign * (around.patch.residual_m - around.offset_m)
+    depths_m = depths_m[(coarse > 0) & np.isfinite(depths_m)]
+    if not len(depths_m):
+        return around.sign * around.peak_m, np.nan
+    spread_m = 0.5 * (around.peak_m - median_of(depths_m))
+    return around.sign * around.peak_m, math.hypot(spread_m, around.patch.noise_m)
