@@ -38,7 +38,7 @@ EXPLAINED = 0.7
 absorb a smooth dent, and a ragged damage has no shape."""
 MARGIN_SHARE = 0.4
 """Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
-FINE_BLUR_PX = 2.0  # a blur is at least as wide as this in the pixels of the fit
+FINE_BLUR_PX = 3.0  # a blur is at least as wide as this in the pixels of the fit
 MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are fitted
 LONG = 0.5  # logarithm of length over width from which a slot is tried
 MOST_STRETCH = 2.5  # largest start value of it
@@ -203,7 +203,9 @@ def measure_detection(
     )
     size, doubt = _modelled(around, config)
     if size is None:
-        return _by_contour(measured, around, doubt)
+        # a contour needs no fit, and so all pixels
+        fine = _surroundings(cloud, evidence, detection, config, most_binned=1)
+        return _by_contour(measured, fine or around, doubt)
     fit = size.best
     spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
     measured = replace(
@@ -309,10 +311,11 @@ def _surroundings(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
+    most_binned: int = 64,
 ) -> _Surroundings | None:
     """Cut out the detection with a margin of twice the blur or `MARGIN_SHARE` of its size on each
-    side, in means over squares of pixels where these are small; None with too few valid pixels
-    around."""
+    side, in means over squares of pixels where these are small, of ``most_binned`` pixels a side;
+    None with too few valid pixels around."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
     blur_px = blur_in_cells(cloud, config)
@@ -343,7 +346,7 @@ def _surroundings(
     u0, v0 = _centroid(own)
     by_blur = int(min(blur_px) / FINE_BLUR_PX)
     by_size = max(residual_m.shape) // MOST_SIDE_PX
-    binned = max(by_blur, by_size, 1)
+    binned = min(max(by_blur, by_size, 1), most_binned)
     invalid = ~np.isfinite(points_m[..., 2])
     if binned > 1:
         residual_m = _means(residual_m, binned)
@@ -541,7 +544,9 @@ def _modelled(
     if around.patch.used.sum() < 8:
         return None, MISFIT
     size = _sized(around)
-    if size is None or not _explains(around, size):
+    if size is None:
+        return None, AMBIGUOUS
+    if not _explains(around, size):
         return None, MISFIT
     if abs(size.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep
