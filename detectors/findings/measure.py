@@ -38,7 +38,7 @@ EXPLAINED = 0.7
 absorb a smooth dent, and a ragged damage has no shape."""
 MARGIN_SHARE = 0.4
 """Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
-FINE_BLUR_PX = 3.0  # a blur is at least as wide as this in the pixels of the fit
+FINE_BLUR_PX = 2.0  # a recording's blur is at least as wide as this in the pixels of the fit
 MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are fitted
 LONG = 0.5  # logarithm of length over width from which a slot is tried
 MOST_STRETCH = 2.5  # largest start value of it
@@ -344,8 +344,10 @@ def _surroundings(
         return None
     origin_m, per_px_m = plane
     u0, v0 = _centroid(own)
-    by_blur = int(min(blur_px) / FINE_BLUR_PX)
+    by_blur = 1
     by_size = max(residual_m.shape) // MOST_SIDE_PX
+    if cloud.noise_reach_px:  # its blurs are many fits
+        by_blur = int(min(blur_px) / FINE_BLUR_PX)
     binned = min(max(by_blur, by_size, 1), most_binned)
     invalid = ~np.isfinite(points_m[..., 2])
     if binned > 1:
