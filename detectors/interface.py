@@ -133,8 +133,25 @@ class Measurement:
     """Shorter side of that rectangle."""
     along: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     """(3,): direction of the longer side."""
+    normal_share: float = np.nan
+    """Depth normal to the surface over depth along the viewing axis: a cosine."""
+    sight_share: float = np.nan
+    """Depth along the line of sight over depth along the viewing axis."""
+    shape: str = ""
+    """The shape that fits (`detectors.findings.shapes`), "ragged" if none does, or empty if the
+    blur hides it."""
     model_note: str = ""
     """Reason why an estimate is missing."""
+
+    @property
+    def normal_depth_m(self) -> float:
+        """Depth normal to the surface."""
+        return self.model_depth_m * self.normal_share
+
+    @property
+    def normal_depth_se_m(self) -> float:
+        """Standard error of the depth normal to the surface."""
+        return self.model_depth_se_m * self.normal_share
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numba
 import numpy as np
 
+from detectors.findings.shapes import DISC, SHAPES, SLOT, Shape, reliefs
 from detectors.findings.whitening import correlated_products, covariance_factor
 from detectors.pixels.clusters import PLAIN
 
@@ -48,15 +49,14 @@ TOLERANCE = 1e-5  # relative gain of a step below which the descent ends
 DAMPING = 1e-3  # of the first step
 SMALLEST = 1e-18  # square of a deviation that is only rounding error, square metres
 LEAST_M = 1e-9  # size of such a deviation
+LONGEST = 3.0  # largest logarithm of a slot's length over its width
 
 # --- what is known beforehand ---
 
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Prior mean and standard deviation of the wall, which is uniform from 0 to 1."""
-MODEL_ERROR = 0.02
+MODEL_ERROR = 0.05
 """Error by light between wall and floor, on simulated clouds, as a share of a pixel's depth."""
-RADIUS_ERROR_PX = 0.05  # the same of the fitted radius, in pixels
-DEPTH_ERROR = 0.05  # the same of the fitted depth, as a share of it
 MOST_MISFIT = 1.5
 """Largest misfit of a valid fit: simulations with the model's optics give 0.3 to 1.05, with others
 1.1 to 3."""
@@ -139,22 +139,43 @@ class HolePatch:
     """(n, n): lower triangular L of the covariance L L' of the n used pixels' errors, if known."""
     left_out: int = 0
     """Number of pixels beside the used ones that would add too little."""
+    soft: bool = False
+    """True if the blur falls off from its middle like a lens' or a beam's: two rectangles in turn,
+    of 1 / sqrt(2) of its sides; False if it ends sharply like a filter's window."""
+    shared_px: tuple[float, float] | None = None
+    """Sides of the rectangle over which the noise is averaged; None: those of the blur."""
+
+    @property
+    def noise_px(self) -> tuple[float, float]:
+        """Sides of the rectangle over which the noise is averaged."""
+        return self.blur_px if self.shared_px is None else self.shared_px
 
     @property
     def prior_weight(self) -> float:
         """Misfit in metres that corresponds to a deviation of the wall by 1."""
-        return self.noise_m * math.sqrt(self.blur_px[0] * self.blur_px[1]) / WALL_PRIOR[1]
+        return self.noise_m * math.sqrt(math.prod(self.noise_px)) / WALL_PRIOR[1]
 
 
-def pictures(patch: HolePatch, holes: np.ndarray) -> np.ndarray:
+def pictures(patch: HolePatch, holes: np.ndarray, shape: Shape = "disc") -> np.ndarray:
     """Return the residuals (m, h, w), without offset, of holes (m, 5): u, v, radius, depth along
-    the optical axis, and wall in 0..1; a disc if the depth is negative.
+    the optical axis, and wall in 0..1; a disc if the depth is negative. Other shapes have 7
+    numbers (`detectors.findings.shapes`).
 
     The mouth is cut into strips along u. Each viewpoint gives a hole three layers of wall and one
     of all that is deeper."""
     blur_u, blur_v = patch.blur_px
     height, width = patch.used.shape
-    return _painted(holes, patch.sights, patch.metric_m2, blur_u, blur_v, height, width)
+    return _drawn(
+        SHAPES.index(shape),
+        holes,
+        patch.sights,
+        patch.metric_m2,
+        blur_u,
+        blur_v,
+        patch.soft,
+        height,
+        width,
+    )
 
 
 @numba.njit(**PLAIN)
@@ -327,10 +348,26 @@ class HoleFit:
     wall: float
     """Length of the tube over the depth, 0 to 1."""
     covariance: np.ndarray
-    """(6, 6): of u, v, radius, depth, offset and wall, in px and metres."""
+    """(8, 8): of u, v, radius, depth, offset, wall, stretch and angle, in px, metres and radians;
+    0 for those that the shape lacks."""
     converged: bool
     misfit: float
     """Deviation of the residuals over that of noise and model error; 0 if unknown."""
+    shape: Shape = "disc"
+    stretch: float = 0.0
+    """Logarithm of a slot's length over its width."""
+    angle_rad: float = 0.0
+    """Angle of a slot's length on the surface, from the direction of the rows."""
+    chi_square: float = np.nan
+    """Sum of squared residuals over the noise's variance, by independent pixels."""
+    independent: float = np.nan
+    """Number of independent pixels: all that are whitened, or else one in each blur."""
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The damage (7,) as `pictures` draws it."""
+        place_and_size = [self.u_px, self.v_px, self.radius_m, self.depth_m]
+        return np.array([*place_and_size, self.wall, self.stretch, self.angle_rad])
 
 
 def whitened(
@@ -361,41 +398,55 @@ def fit_hole(
     radius_m: float,
     depth_m: float,
     offset_m: float,
+    *,
+    shape: Shape = "disc",
+    stretch: float = 0.0,
+    angle_rad: float = 0.0,
 ) -> HoleFit:
-    """Fit a hole to at least six used pixels by least squares (Levenberg and Marquardt) from start
-    values. With the covariance in the patch, the fit has maximum likelihood; else the covariance
-    is that of `sandwich_covariance`.
+    """Fit a damage of one shape to at least six used pixels by least squares (Levenberg and
+    Marquardt) from start values. With the covariance in the patch, the fit has maximum likelihood;
+    else the covariance is that of `sandwich_covariance`.
 
     Fitted are q = (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2),
-    which has `WALL_PRIOR`. The fourth is the hole's volume. The blur preserves it, so that only
-    the radius of a small hole is ill-determined."""
+    which has `WALL_PRIOR`; of a slot, its stretch and angle instead of the wall. The fourth is the
+    hole's volume. The blur preserves it, so that only the radius of a small hole is
+    ill-determined."""
     factor = patch.factor
     blur_u, blur_v = patch.blur_px
     height, width = patch.used.shape
+    volume = depth_m * radius_m**2
+    x = WALL_PRIOR[0]
     hole, offset, rows, converged = _descent(
         patch.residual_m[patch.used],
         np.flatnonzero(patch.used),
         np.zeros((0, 0)) if factor is None else factor,
         patch.prior_weight if factor is None else 1.0 / WALL_PRIOR[1],
-        np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]]),
+        np.array([u, v, math.log(radius_m), volume, offset_m, x, stretch, angle_rad]),
+        SHAPES.index(shape),
         patch.sights,
         patch.metric_m2,
         blur_u,
         blur_v,
+        patch.soft,
         height,
         width,
     )
-    derivatives = rows[:6]
-    left = rows[6]
+    derivatives = rows[:8]
+    left = rows[8]
     square = float(left @ left)
-    u, v, radius, depth, wall = hole.tolist()
+    u, v, radius, depth, wall, stretch, angle = hole.tolist()
+    # pixels that are left out have the noise that is known
+    pixels = len(left) + patch.left_out
     if factor is None:
         covariance = sandwich_covariance(patch, derivatives, square)
         misfit = 0.0
+        sharing = math.prod(patch.noise_px)
+        independent = pixels / sharing
+        chi_square = square / max(patch.noise_m, LEAST_M) ** 2 / sharing
     else:
-        # pixels that are left out have the noise that is known
-        pixels = len(left) + patch.left_out
-        variance = (square + patch.left_out) / max(pixels - 6, 1)
+        independent = float(pixels)
+        chi_square = square + patch.left_out
+        variance = chi_square / max(pixels - 6, 1)
         covariance = _likelihood_covariance(patch, derivatives, variance, depth)
         misfit = math.sqrt(variance)
     return HoleFit(
@@ -408,6 +459,11 @@ def fit_hole(
         covariance=covariance,
         converged=converged,
         misfit=misfit,
+        shape=shape,
+        stretch=stretch,
+        angle_rad=angle,
+        chi_square=chi_square,
+        independent=independent,
     )
 
 
@@ -417,15 +473,12 @@ def _likelihood_covariance(
     variance: float,
     depth_m: float,
 ) -> np.ndarray:
-    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) by whitened derivatives
-    (6, n): the inverse of the information times the residuals' ``variance``, and the model's
+    """Return the covariance (p, p) of (u, v, radius, depth, offset, wall ..) by whitened derivatives
+    (p, n): the inverse of the information times the residuals' ``variance``, and the model's
     errors of radius and depth."""
     information = derivatives @ derivatives.T
     information[5, 5] += WALL_PRIOR[1] ** -2
-    covariance = np.linalg.pinv(information, hermitian=True) * variance
-    covariance[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
-    covariance[3, 3] += (DEPTH_ERROR * depth_m) ** 2
-    return covariance
+    return np.linalg.pinv(information, hermitian=True) * variance
 
 
 def sandwich_covariance(
@@ -433,7 +486,7 @@ def sandwich_covariance(
     derivatives: np.ndarray,
     square_m2: float,
 ) -> np.ndarray:
-    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) if the square filter
+    """Return the covariance (p, p) of (u, v, radius, depth, offset, wall ..) if the square filter
     correlates the noise; NaN if it is singular.
 
     With A = J' J + W it is A^-1 (s^2 J' C J + p^2 W) A^-1. W is the prior's square weight on the
@@ -441,30 +494,84 @@ def sandwich_covariance(
 
     Args:
         patch: the pixels, their noise and blur.
-        derivatives: J' (6, n), of the used pixels.
+        derivatives: J' (p, n), of the used pixels; rows of 0 for parameters that are not fitted.
         square_m2: sum of their squared residuals."""
-    columns = np.zeros((*patch.used.shape, 6))
+    count = len(derivatives)
+    fitted = np.flatnonzero(derivatives.any(axis=1) | (np.arange(count) < 6))
+    derivatives = derivatives[fitted]
+    columns = np.zeros((*patch.used.shape, len(fitted)))
     columns[patch.used] = derivatives.T
-    blur_u, blur_v = patch.blur_px
+    blur_u, blur_v = patch.noise_px
     across = _nearest_odd(blur_u)
     down = _nearest_odd(blur_v)
-    prior = np.zeros((6, 6))
-    prior[5, 5] = patch.prior_weight**2
+    prior = np.diag(np.where(fitted == 5, patch.prior_weight**2, 0.0))
+    unknown = np.full((count, count), np.nan)
     try:
         bread = np.linalg.inv(derivatives @ derivatives.T + prior)
     except np.linalg.LinAlgError:
-        return np.full((6, 6), np.nan)
+        return unknown
     meat = correlated_products(columns, across, down) / (across * down)
     freedom = derivatives.shape[1] - float(np.vdot(bread, meat))
     if freedom <= 0:
-        return np.full((6, 6), np.nan)
+        return unknown
     prior_variance = patch.noise_m**2 * blur_u * blur_v
-    return bread @ (square_m2 / freedom * meat + prior_variance * prior) @ bread
+    covariance = np.zeros((count, count))
+    inner = square_m2 / freedom * meat + prior_variance * prior
+    covariance[np.ix_(fitted, fitted)] = bread @ inner @ bread
+    return covariance
 
 
 def _nearest_odd(blur: float) -> int:
     """Return the odd number of pixels nearest to a blur: pixels this far apart share no noise."""
     return 2 * max(round((blur - 1) / 2), 0) + 1
+
+
+@numba.njit(**PLAIN)
+def _drawn(  # type: ignore[no-untyped-def]
+    shape,
+    holes,
+    sights,
+    metric,
+    blur_u,
+    blur_v,
+    soft,
+    h,
+    w,
+):
+    """Return the `pictures` (m, h, w) of damages (m, 7) of a shape."""
+    if soft:
+        blur_u = math.sqrt(0.5) * blur_u
+        blur_v = math.sqrt(0.5) * blur_v
+    if shape == DISC:
+        images = _painted(holes, sights, metric, max(blur_u, 1.0), max(blur_v, 1.0), h, w)
+    else:
+        images = reliefs(shape, holes, sights, metric, max(blur_u, 1.0), max(blur_v, 1.0), h, w)
+    if soft:
+        for n in range(len(images)):
+            _smooth_rows(images[n], blur_u)
+            _smooth_rows(images[n].T, blur_v)
+    return images
+
+
+@numba.njit(**PLAIN)
+def _smooth_rows(image, side):  # type: ignore[no-untyped-def]
+    """Replace each row of an image (h, w) by its means over ``side`` pixels. Beyond its ends, the
+    image goes on as its last pixel."""
+    h, w = image.shape
+    margin = math.ceil(0.5 * side) + 1
+    sums = np.zeros(w + 2 * margin + 1)
+    for r in range(h):
+        for c in range(w + 2 * margin):
+            sums[c + 1] = sums[c] + image[r, min(max(c - margin, 0), w - 1)]
+        for c in range(w):
+            middle = c + 0.5 + margin
+            low = middle - 0.5 * side
+            high = middle + 0.5 * side
+            i = int(low)
+            j = int(high)
+            before = sums[i] + (low - i) * (sums[i + 1] - sums[i])
+            after = sums[j] + (high - j) * (sums[j + 1] - sums[j])
+            image[r, c] = (after - before) / side
 
 
 @numba.njit(**PLAIN)
@@ -474,47 +581,59 @@ def _descent(  # type: ignore[no-untyped-def]
     factor,
     weight,
     start,
+    shape,
     sights,
     metric,
     blur_u,
     blur_v,
+    soft,
     h,
     w,
 ):
-    """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start``
-    (6,) has converged.
+    """Return the best damage (7,) of a shape, its offset, rows (10, n) and whether the descent
+    from ``start`` (8,) has converged.
 
     The first rows are derivatives of the used pixels, at flat indices ``pixels`` (n,), by (u, v,
-    radius, depth, offset, wall); the seventh is the hole minus ``data`` (n,); the eighth is that
-    of the last trial. With a ``factor`` (n, n) that is not empty, they are whitened. ``weight``:
-    of the prior."""
+    radius, depth, offset, wall, stretch, angle), 0 for those that the shape lacks; the ninth is the
+    damage minus ``data`` (n,); the tenth is that of the last trial. With a ``factor`` (n, n) that
+    is not empty, they are whitened. ``weight``: of the prior."""
     n = len(data)
     q = start
-    step = np.zeros(6)
+    step = np.zeros(8)
     damping = 10.0 * DAMPING
     converged = False
     square = np.inf
     promised = np.inf
-    rows = np.ones((8, n))
-    products = np.eye(7)
-    best = np.zeros(5)
-    holes = np.zeros((6, 5))  # the hole, and five with one parameter changed
-    sizes = np.zeros(5)  # of these changes
-    left = rows[7:]
-    turn = np.eye(7)
+    rows = np.zeros((10, n))
+    rows[4] = 1.0
+    products = np.eye(9)
+    best = np.zeros(7)
+    holes = np.zeros((8, 7))  # the damage, and seven with one parameter changed
+    sizes = np.zeros(7)  # of these changes
+    left = rows[9:]
+    turn = np.eye(9)
+    # the parameters of the damage that vary, and their rows
+    if shape == SLOT:
+        changed = np.array([0, 1, 2, 3, 5, 6])
+    elif shape == DISC:
+        changed = np.array([0, 1, 2, 3, 4])
+    else:
+        changed = np.array([0, 1, 2, 3])
     _whiten(rows[4:5], factor)
     # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
         trial_q = q + step
         radius = math.exp(min(max(trial_q[2], -20.0), widest))
-        for k in range(6):
+        for k in range(8):
             holes[k, 0] = min(max(trial_q[0], -10.0 * w), 10.0 * w)
             holes[k, 1] = min(max(trial_q[1], -10.0 * h), 10.0 * h)
             holes[k, 2] = radius
             holes[k, 3] = trial_q[3] / radius**2
             holes[k, 4] = math.sin(0.5 * math.pi * trial_q[5]) ** 2
-        image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).ravel()
+            holes[k, 5] = min(max(trial_q[6], -LONGEST), LONGEST)
+            holes[k, 6] = trial_q[7]
+        image = _drawn(shape, holes[:1], sights, metric, blur_u, blur_v, soft, h, w).ravel()
         for i in range(n):
             left[0, i] = image[pixels[i]] + trial_q[4] - data[i]
         _whiten(left, factor)
@@ -528,7 +647,7 @@ def _descent(  # type: ignore[no-untyped-def]
             q = trial_q
             square = new_square
             damping = 0.1 * damping
-            for k in range(5):
+            for k in range(7):
                 best[k] = holes[0, k]
             depth = best[3]
             sizes[0] = STEP
@@ -536,27 +655,38 @@ def _descent(  # type: ignore[no-untyped-def]
             sizes[2] = STEP * radius
             sizes[3] = STEP * (depth if depth != 0.0 else STEP)
             sizes[4] = -STEP if best[4] >= 0.5 else STEP
-            for k in range(5):
-                holes[k + 1, k] += sizes[k]
-            images = _painted(holes[1:], sights, metric, blur_u, blur_v, h, w).ravel()
-            for k in range(5):
-                row = k if k < 4 else 5
-                per_step = 1.0 / sizes[k]
+            sizes[5] = STEP
+            sizes[6] = STEP
+            count = len(changed)
+            for k in range(count):
+                holes[k + 1, changed[k]] += sizes[changed[k]]
+            others = holes[1 : 1 + count]
+            drawn = _drawn(shape, others, sights, metric, blur_u, blur_v, soft, h, w)
+            images = drawn.ravel()
+            for k in range(count):
+                row = changed[k] if changed[k] < 4 else changed[k] + 1
+                per_step = 1.0 / sizes[changed[k]]
                 for i in range(n):
                     rows[row, i] = (images[k * h * w + pixels[i]] - image[pixels[i]]) * per_step
             for i in range(n):
-                rows[6, i] = left[0, i]
+                rows[8, i] = left[0, i]
             _whiten(rows[:4], factor)
-            _whiten(rows[5:6], factor)
+            if shape == DISC:
+                _whiten(rows[5:6], factor)
+            if shape == SLOT:
+                _whiten(rows[6:8], factor)
             # derivatives by q from those by the hole's parameters
             bend = 0.5 * math.pi * math.sin(math.pi * trial_q[5])
             turn[2, 2] = radius
             turn[2, 3] = -2.0 * depth
             turn[3, 3] = radius**-2.0
             turn[5, 5] = bend
-            products = np.dot(np.dot(turn, np.dot(rows[:7], rows[:7].T)), turn.T)
+            products = np.dot(np.dot(turn, np.dot(rows[:9], rows[:9].T)), turn.T)
             products[5, 5] += (weight * bend) ** 2
-            products[5, 6] += weight * bend * prior
+            products[5, 8] += weight * bend * prior
+            if shape != SLOT:
+                products[6, 6] = 1.0
+                products[7, 7] = 1.0
         else:
             damping = max(10.0 * damping, 10.0 * DAMPING)
         if converged:
@@ -586,23 +716,24 @@ def _whiten(rows: np.ndarray, factor: np.ndarray) -> None:
 
 @numba.njit(**PLAIN)
 def _damped(products, damping):  # type: ignore[no-untyped-def]
-    """Return the step (6,) of damped normal equations ``products`` (7, 7), right side last, and
+    """Return the step (p,) of damped normal equations ``products`` (p + 1, p + 1), right side last, and
     its predicted gain, by Cholesky's factor of the matrix with its diagonal times 1 +
     ``damping``."""
-    lower = np.zeros((7, 6))
-    step = np.zeros(6)
+    p = len(products) - 1
+    lower = np.zeros((p + 1, p))
+    step = np.zeros(p)
     promised = 0.0
-    for j in range(6):
-        for i in range(j, 7):
+    for j in range(p):
+        for i in range(j, p + 1):
             total = products[j, i] * (1.0 + damping if i == j else 1.0)
             least = max(1e-14 * total, SMALLEST)
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
             lower[i, j] = math.sqrt(max(total, least)) if i == j else total / lower[j, j]
-    for j in range(5, -1, -1):
-        total = -lower[6, j]
-        for k in range(j + 1, 6):
+    for j in range(p - 1, -1, -1):
+        total = -lower[p, j]
+        for k in range(j + 1, p):
             total -= lower[k, j] * step[k]
         step[j] = total / lower[j, j]
-        promised -= step[j] * products[j, 6]
+        promised -= step[j] * products[j, p]
     return step, promised

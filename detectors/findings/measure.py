@@ -1,7 +1,7 @@
 """Measures the size and the place of a detection: the thesis' extents, and a fitted model of a
-blurred hole. Where the model does not hold, the contour at half depth is measured instead. Depths
-are measured along the optical axis, positive behind the surface; sizes are measured on the
-surface."""
+damage, averaged over a family of shapes. Where the model does not hold, the contour at half depth
+is measured instead. Depths are fitted along the optical axis, positive behind the surface; a
+`Measurement` states them normal to the surface too. Sizes are measured on the surface."""
 
 from __future__ import annotations
 
@@ -13,17 +13,15 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
+from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
 from detectors.findings.hole_model import (
-    MOST_MISFIT,
-    HoleFit,
     HolePatch,
-    fit_hole,
     normal_of,
     pictures,
     sight,
     straight_sight,
-    whitened,
 )
+from detectors.findings.shapes import Shape
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN
 from detectors.pixels.masks import grown, parts_with
@@ -35,20 +33,20 @@ OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch with a larger residual that do not touch the detection belong to other
 damage."""
 FEWEST_AROUND = 12  # valid pixels around a detection
-NEAR_BLURS = 1.4
-"""Distance from a detection, in sides of the blur, up to which all pixels count if the noise's
-correlation is known. Leaving out 15 of 16 farther pixels raises the standard errors of diameter
-and depth by 0.5 to 1.5 %."""
-EXPLAINED = 0.5
-"""Least share of a detection's mean residual that its fit must explain: correlated noise may
-absorb a smooth dent."""
-SHARPER_PX = (1.0, 2.0, 3.0, 5.0)
-"""Blurs, smaller than the noise's, that are tried for a recording: noise may be blurred more than
-the scene."""
-SHARPER_GAIN = 9.0  # gain in chi square that accepts them
+EXPLAINED = 0.7
+"""Least share of a detection's squared residual that its fit must explain: correlated noise may
+absorb a smooth dent, and a ragged damage has no shape."""
+MARGIN_SHARE = 0.4
+"""Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
+FINE_BLUR_PX = 2.0  # a recording's blur is at least as wide as this in the pixels of the fit
+MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are fitted
+LONG = 0.5  # logarithm of length over width from which a slot is tried
+MOST_STRETCH = 2.5  # largest start value of it
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
 shows through."""
+FLANK = (0.35, 0.65)
+"""Shares of the depth between whose contours that at half depth lies within a standard error."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 
 MISFIT = "the model of a blurred hole does not fit"
@@ -186,10 +184,8 @@ def measure_detection(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
-    by_lag: np.ndarray | None = None,
 ) -> Measurement:
-    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag`` (odd,
-    odd): the noise's correlation."""
+    """Measure a detection both ways; failed measurements are NaN, with a note."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     measured = measure_extents(cloud, detection, "too few valid pixels around it for a model")
@@ -205,20 +201,43 @@ def measure_detection(
         width_m=width_m,
         along=along,
     )
-    fit, doubt = _modelled(around, config, by_lag)
-    if fit is None:
-        return _by_contour(measured, around, doubt)
-    errors = np.sqrt(np.diag(fit.covariance))
+    size, doubt = _modelled(around, config)
+    if size is None:
+        # a contour needs no fit, and so all pixels
+        fine = _surroundings(cloud, evidence, detection, config, most_binned=1)
+        return _by_contour(measured, fine or around, doubt)
+    fit = size.best
     spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
-    return replace(
+    measured = replace(
         around.positioned(measured, fit.u_px, fit.v_px),
-        model_diameter_m=2.0 * fit.radius_m,
-        model_diameter_se_m=2.0 * float(errors[2]),
-        model_depth_m=fit.depth_m,
-        model_depth_se_m=float(errors[3]),
+        model_diameter_m=size.diameter_m,
+        model_diameter_se_m=size.diameter_se_m,
+        model_depth_m=size.depth_m,
+        model_depth_se_m=size.depth_se_m,
+        normal_share=around.normal_share,
+        sight_share=around.sight_share,
         # standard error along one axis: the two axes on the surface share the trace
         model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
+        shape=size.shape or "",
         model_note="",
+    )
+    return _as_slot(measured, around, size) if size.shape == "slot" else measured
+
+
+def _as_slot(measured: Measurement, around: _Surroundings, size: Size) -> Measurement:
+    """Return a measurement with the sides and the direction of a fitted slot."""
+    fit = size.best
+    sides_m = 2.0 * fit.radius_m * np.array([math.exp(fit.stretch), 1.0])
+    angle_rad = fit.angle_rad
+    if fit.stretch < 0.0:
+        sides_m = sides_m[::-1]
+        angle_rad += 0.5 * math.pi
+    right, down = around.axes
+    return replace(
+        measured,
+        length_m=float(sides_m[0]),
+        width_m=float(sides_m[1]),
+        along=math.cos(angle_rad) * right + math.sin(angle_rad) * down,
     )
 
 
@@ -231,6 +250,8 @@ class _Surroundings:
     """(h, w) bool: the detection's pixels."""
     near: np.ndarray
     """(h, w) bool: these grown by one more than ``reach_px``."""
+    binned: int
+    """Side of the squares of the cloud's pixels whose means are the patch's pixels."""
     invalid: np.ndarray
     """(h, w) bool: pixels without a range."""
     offset_m: float
@@ -241,6 +262,10 @@ class _Surroundings:
     """Its largest residual (the 90th percentile) beyond the offset, above 0 on either side."""
     reach_px: int
     """Half of the blur."""
+    normal_share: float
+    """Depth normal to the surface over depth along the optical axis."""
+    sight_share: float
+    """Depth along the line of sight over depth along the optical axis."""
     u0: float
     """Centroid of the detection's pixels in the patch, along columns."""
     v0: float
@@ -249,13 +274,20 @@ class _Surroundings:
     """(3,): the surface's point at (u0, v0)."""
     per_px_m: np.ndarray
     """(2, 3): the surface's derivatives by u and v."""
-    sharper_px: tuple[float, ...]
-    """Smaller blurs to try."""
+    blurs: tuple[tuple[float, bool, float], ...]
+    """The `BLURS` to try."""
 
     @property
     def area_m2(self) -> float:
         """Area of one pixel on the surface."""
         return math.hypot(*normal_of(self.per_px_m))
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors (3,) on the surface along the rows, and across them towards larger v."""
+        right = self.per_px_m[0] / np.linalg.norm(self.per_px_m[0])
+        down = self.per_px_m[1] - (self.per_px_m[1] @ right) * right
+        return right, down / np.linalg.norm(down)
 
     def positioned(
         self,
@@ -268,8 +300,8 @@ class _Surroundings:
         dv = v - self.v0
         return replace(
             measured,
-            u_px=du + measured.u_px,
-            v_px=dv + measured.v_px,
+            u_px=self.binned * du + measured.u_px,
+            v_px=self.binned * dv + measured.v_px,
             model_centre_m=self.origin_m + du * self.per_px_m[0] + dv * self.per_px_m[1],
         )
 
@@ -279,9 +311,11 @@ def _surroundings(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
+    most_binned: int = 64,
 ) -> _Surroundings | None:
-    """Cut out the detection with a margin of twice the blur on each side; None with too few valid
-    pixels around."""
+    """Cut out the detection with a margin of twice the blur or `MARGIN_SHARE` of its size on each
+    side, in means over squares of pixels where these are small, of ``most_binned`` pixels a side;
+    None with too few valid pixels around."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
     blur_px = blur_in_cells(cloud, config)
@@ -291,12 +325,41 @@ def _surroundings(
         int(columns.min()),
         int(columns.max()) + 1,
     )
-    corner = tight.grown(math.ceil(2 * max(blur_px)) + 2, h, w)
+    widest = max(tight.row1 - tight.row0, tight.col1 - tight.col0)
+    margin_px = math.ceil(max(2 * max(blur_px) + 2, MARGIN_SHARE * widest))
+    corner = tight.grown(margin_px, h, w)
     cut = corner.within(Region(0, h, 0, w))
     residual_m = evidence.residual_m[cut]
     points_m = cloud.points_m[cut]
     own = np.zeros(residual_m.shape, dtype=bool)
     own[rows - corner.row0, columns - corner.col0] = True
+    plane = local_plane(
+        points_m,
+        evidence.surface_z_m[cut],
+        np.isfinite(residual_m),
+        own,
+        cloud.projection,
+    )
+    if plane is None:
+        return None
+    origin_m, per_px_m = plane
+    u0, v0 = _centroid(own)
+    by_blur = 1
+    by_size = max(residual_m.shape) // MOST_SIDE_PX
+    if cloud.noise_reach_px:  # its blurs are many fits
+        by_blur = int(min(blur_px) / FINE_BLUR_PX)
+    binned = min(max(by_blur, by_size, 1), most_binned)
+    invalid = ~np.isfinite(points_m[..., 2])
+    if binned > 1:
+        residual_m = _means(residual_m, binned)
+        coverage = _means(own.astype(float), binned)
+        own = coverage >= min(0.5, coverage.max())
+        invalid = _means(invalid.astype(float), binned) > 0.5
+        per_px_m = binned * per_px_m
+        u0 = (u0 + 0.5) / binned - 0.5
+        v0 = (v0 + 0.5) / binned - 0.5
+        blur_u, blur_v = blur_px
+        blur_px = (_binned_blur(blur_u, binned), _binned_blur(blur_v, binned))
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
     near = grown(own, reach_px + 1)
@@ -305,24 +368,13 @@ def _surroundings(
         return None
     offset_m = median_of(ring_m)
     noise_m = sigma_of(ring_m - offset_m)
-    plane = local_plane(
-        points_m,
-        evidence.surface_z_m[cut],
-        finite,
-        own,
-        cloud.projection,
-    )
-    if plane is None:
-        return None
-    origin_m, per_px_m = plane
     # large residuals that do not touch the detection are other damage; the blur spreads it
     limit_m = OTHER_DAMAGE_SIGMAS * max(noise_m, 1e-9)
     stands_out = (np.abs(residual_m - offset_m) > limit_m) | own
     other_damage = stands_out & ~parts_with(stands_out, own)
     used = finite & (own | ~grown(other_damage, reach_px))
-    deviations_m = residual_m[own] - offset_m
+    deviations_m = residual_m[own & finite] - offset_m
     sign = 1.0 if deviations_m.sum() >= 0 else -1.0
-    u0, v0 = _centroid(own)
     patch = HolePatch(
         residual_m=residual_m,
         used=used,
@@ -330,22 +382,47 @@ def _surroundings(
         blur_px=blur_px,
         noise_m=noise_m,
         sights=_sights(cloud, origin_m, per_px_m, config),
+        shared_px=blur_px,
     )
+    normal = normal_of(per_px_m)
+    ray = np.array([0.0, 0.0, 1.0])
+    if cloud.projection == "central":
+        ray = origin_m / origin_m[2]
     return _Surroundings(
         patch=patch,
         own=own,
         near=near,
-        invalid=~np.isfinite(points_m[..., 2]),
+        binned=binned,
+        invalid=invalid,
         offset_m=offset_m,
         sign=sign,
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
+        normal_share=float(abs(normal @ ray) / math.hypot(*normal)),
+        sight_share=float(np.linalg.norm(ray)),
         u0=u0,
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
-        sharper_px=tuple(side for side in SHARPER_PX if side < cloud.noise_reach_px),
+        # a simulated camera's blur is stated, a recording's is estimated
+        blurs=BLURS if cloud.noise_reach_px else BLURS[:1],
     )
+
+
+def _means(picture: np.ndarray, side: int) -> np.ndarray:
+    """Return the means (h // side, w // side) of a picture's known pixels over squares; NaN where
+    fewer than half are known."""
+    height, width = (length // side for length in picture.shape)
+    squares = picture[: height * side, : width * side].reshape(height, side, width, side)
+    known = np.isfinite(squares)
+    counts = known.sum(axis=(1, 3))
+    sums = np.where(known, squares, 0.0).sum(axis=(1, 3))
+    return np.where(2 * counts >= side**2, sums / np.maximum(counts, 1), np.nan)
+
+
+def _binned_blur(blur_px: float, binned: int) -> float:
+    """Return the side, in means over squares of pixels, of a blur: second moments add."""
+    return math.sqrt(blur_px**2 + binned**2 - 1.0) / binned
 
 
 def _centroid(mask: np.ndarray) -> tuple[float, float]:
@@ -453,8 +530,7 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 def _modelled(
     around: _Surroundings,
     config: HoleModelConfig,
-    by_lag: np.ndarray | None,
-) -> tuple[HoleFit | None, str]:
+) -> tuple[Size | None, str]:
     """Return the fitted hole, or None and the reason why the model does not hold."""
     own = around.own
     invalid = around.invalid
@@ -467,77 +543,75 @@ def _modelled(
         return None, DARK
     if around.peak_m > config.linear_depth_mm * MM:
         return None, too_deep
-    if around.patch.used.sum() < 6:
+    if around.patch.used.sum() < 8:
         return None, MISFIT
-    fit, patch = _fitted(around, by_lag)
-    if not _explains(around, fit, patch):
+    size = _sized(around)
+    if size is None:
+        return None, AMBIGUOUS
+    if not _explains(around, size):
         return None, MISFIT
-    if abs(fit.depth_m) > config.linear_depth_mm * MM:
+    if abs(size.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep
-    # the share of each pixel that the disc covers
-    flat = np.array([[fit.u_px, fit.v_px, fit.radius_m, -1.0, 0.0]])
-    disc = -pictures(replace(patch, blur_px=(1.0, 1.0)), flat)[0]
+    # the share of each pixel that the mouth covers
+    fit = size.best
+    flat = np.array([[fit.u_px, fit.v_px, fit.radius_m, -1.0, 0.0, fit.stretch, fit.angle_rad]])
+    sharp = replace(size.patch, blur_px=(1.0, 1.0))
+    mouth: Shape = "slot" if fit.shape == "slot" else "disc"
+    disc = -pictures(sharp, flat, mouth)[0]
     if float(disc[invalid].sum()) > config.largest_invalid * float(disc.sum()):
         return None, DARK
-    # rounding can make the variance of a singular fit negative
-    variance = float(fit.covariance[2, 2])
-    if not 0 < variance < (config.largest_relative_error * fit.radius_m) ** 2:
+    # a fit that leaves the radius open has a singular covariance
+    if not fit.covariance[2, 2] < (config.largest_relative_error * fit.radius_m) ** 2:
         return None, AMBIGUOUS
-    return fit, ""
+    return size, ""
 
 
-def _fitted(around: _Surroundings, by_lag: np.ndarray | None) -> tuple[HoleFit, HolePatch]:
-    """Return the fitted hole, and the patch with the blur with which it fits best."""
-    patch = around.patch
+def _sized(around: _Surroundings) -> Size | None:
+    """Return the averaged size by the family of shapes."""
     start = _start(around)
-    if by_lag is not None:
-        reach_px = round(NEAR_BLURS * max(patch.blur_px))
-        near = grown(around.own, reach_px, cv2.MORPH_ELLIPSE)
-        patch = whitened(patch, by_lag, around.offset_m, near)
-    fit = fit_hole(patch, *start)
-    if not fit.misfit:
-        return fit, patch
-    best_patch = patch
-    pixels = int(patch.used.sum()) + patch.left_out
-    for side in around.sharper_px:
-        sharper_patch = replace(patch, blur_px=(side, side))
-        sharper = fit_hole(sharper_patch, *start)
-        gain = pixels * (fit.misfit**2 - sharper.misfit**2)
-        least_gain = SHARPER_GAIN * sharper.misfit**2 if fit.converged else 0.0
-        if sharper.converged and gain > least_gain:
-            fit = sharper
-            best_patch = sharper_patch
-    return fit, best_patch
+    shapes: tuple[Shape, ...] = ("disc", "cap", "bowl")
+    if start.stretch > LONG:
+        shapes = (*shapes, "slot")
+    return sized(around.patch, start, shapes, around.blurs)
 
 
-def _start(around: _Surroundings) -> tuple[float, float, float, float, float]:
-    """Return start values of u, v, radius, depth and offset: the centroid of the deviation, the
-    radius that gives its volume, and its peak."""
+def _start(around: _Surroundings) -> Start:
+    """Return start values: the centroid of the deviation, the radius that gives its volume, its
+    peak, and the sides and the direction of its second moments."""
     near = grown(around.own, around.reach_px) & around.patch.used
     weight = np.maximum(around.sign * (around.patch.residual_m[near] - around.offset_m), 0.0)
     rows, columns = np.nonzero(near)
     total = max(float(weight.sum()), 1e-12)
-    u = float(weight @ columns) / total
-    v = float(weight @ rows) / total
-    radius_m = float(np.sqrt(total * around.area_m2 / (np.pi * around.peak_m)))
-    return u, v, radius_m, around.sign * around.peak_m, around.offset_m
+    length_m, width_m, along = _sides(around, around.near & around.patch.used)
+    stretch = 0.0
+    angle_rad = 0.0
+    if width_m > 0.0:
+        right, down = around.axes
+        stretch = min(math.log(length_m / width_m), MOST_STRETCH)
+        angle_rad = math.atan2(along @ down, along @ right)
+    return Start(
+        u_px=float(weight @ columns) / total,
+        v_px=float(weight @ rows) / total,
+        radius_m=float(np.sqrt(total * around.area_m2 / (np.pi * around.peak_m))),
+        depth_m=around.sign * around.peak_m,
+        offset_m=around.offset_m,
+        stretch=stretch,
+        angle_rad=angle_rad,
+    )
 
 
-def _explains(
-    around: _Surroundings,
-    fit: HoleFit,
-    patch: HolePatch,
-) -> bool:
-    """Return whether a fit has converged near the detection and explains its residual."""
+def _explains(around: _Surroundings, size: Size) -> bool:
+    """Return whether the best shape lies near the detection and explains its residual."""
+    fit = size.best
     h, w = around.own.shape
     row = round(fit.v_px)
     column = round(fit.u_px)
     if not (0 <= row < h and 0 <= column < w and around.near[row, column]):
         return False
-    hole = np.array([[fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.wall]])
-    fitted_m = pictures(patch, hole)[0][around.own].mean()
-    share = fitted_m / (patch.residual_m[around.own].mean() - fit.offset_m)
-    return bool(fit.converged and fit.misfit < MOST_MISFIT and share > EXPLAINED)
+    inside = around.near & around.patch.used
+    seen_m = around.patch.residual_m[inside] - fit.offset_m
+    left_m = seen_m - pictures(size.patch, fit.numbers[None], fit.shape)[0][inside]
+    return bool(left_m @ left_m < (1.0 - EXPLAINED) * (seen_m @ seen_m))
 
 
 # --- the contour at half depth, elsewhere ---
@@ -549,13 +623,60 @@ def _by_contour(
     doubt: str,
 ) -> Measurement:
     """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels
-    without a range that touch the detection count as inside."""
+    without a range that touch the detection count as inside.
+
+    The diameter's standard error is half of the difference to the contours at the shares `FLANK` of
+    the depth, and what the blur moves a round contour. If no shape fits, the damage is ragged, and
+    its depth is the mean one, volume over area; else it is the deepest."""
     residual_m = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
     hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
     top_m = min(around.peak_m, OPEN_M)
     residual_m = np.minimum(residual_m, top_m)
     residual_m[hollow] = top_m
     residual_m[~around.patch.used & ~hollow] = 0.0
+    inside = _contour(around, residual_m, 0.5 * top_m)
+    if not inside.any():
+        return replace(measured, model_note=doubt + "; no half-depth contour")
+    rows, columns = np.nonzero(inside)
+    u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    diameter_m = _diameter_m(around, inside)
+    low, high = (_contour(around, residual_m, share * top_m) for share in FLANK)
+    flank_m = 0.5 * (_diameter_m(around, low) - _diameter_m(around, high))
+    blur_m2 = math.prod(around.patch.blur_px) * around.area_m2
+    moved_m = min(blur_m2 / (6.0 * diameter_m), 0.5 * diameter_m)
+    if doubt == AMBIGUOUS:
+        moved_m = 0.5 * diameter_m
+    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
+        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
+    diameter_se_m = math.hypot(flank_m, moved_m)
+    depth_m, depth_se_m = _contour_depth(around, inside, residual_m)
+    is_ragged = doubt == MISFIT
+    if is_ragged:
+        # the volume is known: the area's error is twice that of the diameter
+        area_m2 = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
+        volume_m3 = measured.volume_m3 / around.normal_share
+        depth_m = volume_m3 / area_m2
+        depth_se_m = abs(depth_m) * 2.0 * diameter_se_m / diameter_m
+    if hollow.sum() > around.own.sum():
+        depth_m = np.nan
+        depth_se_m = np.nan
+    return replace(
+        around.positioned(measured, u, v),
+        model_diameter_m=diameter_m,
+        model_diameter_se_m=diameter_se_m,
+        model_depth_m=depth_m,
+        model_depth_se_m=math.hypot(depth_se_m, DEPTH_ERROR * depth_m),
+        normal_share=around.normal_share,
+        sight_share=around.sight_share,
+        shape="ragged" if is_ragged else "",
+        model_note=doubt + "; measured at the half-depth contour",
+    )
+
+
+def _contour(around: _Surroundings, residual_m: np.ndarray, level_m: float) -> np.ndarray:
+    """Return where a residual (h, w), drawn `CONTOUR_ZOOM` times as fine, exceeds a level in one
+    piece with the detection."""
     height, width = residual_m.shape
     size = (CONTOUR_ZOOM * width, CONTOUR_ZOOM * height)
     fine_m = cv2.resize(residual_m, size, interpolation=cv2.INTER_LINEAR)
@@ -564,20 +685,31 @@ def _by_contour(
         size,
         interpolation=cv2.INTER_NEAREST,
     )
-    inside = parts_with(fine_m > 0.5 * top_m, seeds > 0)
-    if not inside.any():
-        return replace(measured, model_note=doubt + "; no half-depth contour")
-    rows, columns = np.nonzero(inside)
-    u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
-    v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    return parts_with(fine_m > level_m, seeds > 0)
+
+
+def _diameter_m(around: _Surroundings, inside: np.ndarray) -> float:
+    """Return the diameter of the circle with the area of a `_contour`."""
     area_m2 = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
-    diameter_m = 2.0 * float(np.sqrt(area_m2 / np.pi))
-    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
-        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
-    depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
-    return replace(
-        around.positioned(measured, u, v),
-        model_diameter_m=diameter_m,
-        model_depth_m=depth_m,
-        model_note=doubt + "; measured at the half-depth contour, without standard errors",
+    return 2.0 * math.sqrt(area_m2 / math.pi)
+
+
+def _contour_depth(
+    around: _Surroundings,
+    inside: np.ndarray,
+    residual_m: np.ndarray,
+) -> tuple[float, float]:
+    """Return the deepest residual along the optical axis, and its standard error: half of its
+    difference from the median inside, and the noise."""
+    height, width = residual_m.shape
+    coarse = cv2.resize(
+        inside.astype(np.uint8),
+        (width, height),
+        interpolation=cv2.INTER_NEAREST,
     )
+    depths_m = around.sign * (around.patch.residual_m - around.offset_m)
+    depths_m = depths_m[(coarse > 0) & np.isfinite(depths_m)]
+    if not len(depths_m):
+        return around.sign * around.peak_m, np.nan
+    spread_m = 0.5 * (around.peak_m - median_of(depths_m))
+    return around.sign * around.peak_m, math.hypot(spread_m, around.patch.noise_m)

@@ -351,7 +351,8 @@ def _lower_covariance(  # type: ignore[no-untyped-def]
             row = rows[i] - rows[j] + middle_row
             column = columns[i] - columns[j] + middle_column
             if row < len(correlation) and 0 <= column < correlation.shape[1]:
-                covariance[i, j] = correlation[row, column] * (variance + error[i] * error[j])
+                covariance[i, j] = correlation[row, column] * variance
+        covariance[i, i] += error[i] ** 2
     return covariance
 
 
