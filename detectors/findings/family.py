@@ -19,19 +19,30 @@ import numpy as np
 from detectors.findings.hole_model import HoleFit, HolePatch, fit_hole
 from detectors.findings.shapes import Shape
 
-PRIOR: dict[Shape, float] = {"disc": 0.6, "cap": 0.2, "bowl": 0.2, "slot": 0.2}
+PRIOR: dict[Shape, float] = {"disc": 0.7, "cap": 0.15, "bowl": 0.15, "slot": 0.1}
 """Prior weights: more damage is drilled or punched than pressed. They decide only where the blur
 hides the shape."""
 WIDER: dict[Shape, float] = {"disc": 1.0, "cap": 1.25, "bowl": 1.6, "slot": 1.0}
 """Mouth of each shape, in mouths of a disc with the same volume and deepest residual."""
-SHARPER_LOSS = 9.0
-"""Penalty in the information criterion of another blur than the noise's."""
+BLURS = (
+    (1.0, False, 0.0),
+    (1.5, False, 4.0),
+    (1.0, True, 2.0),
+    (1.4, True, 4.0),
+    (0.7, True, 2.0),
+    (0.5, False, 9.0),
+    (0.25, False, 9.0),
+)
+"""Blurs that are tried for a recording, whose own is known by its noise alone: side over that of the
+noise, whether it is soft, and penalty in the information criterion. Rounded noise looks sharper
+than it is; a camera's maker may smooth the noise more than the scene."""
+MOST_OPEN = 0.3  # largest relative error of a radius that counts as measured
 RADIUS_ERROR_PX = 0.05
 """Error of the model's radius on simulated clouds, in pixels."""
-DIAMETER_ERROR: dict[Shape, float] = {"disc": 0.01, "cap": 0.035, "bowl": 0.035, "slot": 0.02}
+DIAMETER_ERROR: dict[Shape, float] = {"disc": 0.02, "cap": 0.035, "bowl": 0.035, "slot": 0.02}
 """Error of the model's diameter on simulated clouds, as a share of it: light between the slopes of
 a dent changes its profile."""
-DEPTH_ERROR = 0.06
+DEPTH_ERROR = 0.08
 """Error of the model's depth on simulated clouds, as a share of it: light between floor, slopes and
 walls lengthens its way."""
 
@@ -86,8 +97,8 @@ class Candidate:
     fit: HoleFit
     patch: HolePatch
     """The pixels, and the blur of this fit."""
-    sharper: bool = False
-    """True if the blur is smaller than that of the noise."""
+    loss: float = 0.0
+    """Penalty of its blur in the information criterion."""
 
     @property
     def criterion(self) -> float:
@@ -96,7 +107,7 @@ class Candidate:
         parameters = 7 if fit.shape == "slot" else 5
         independent = max(fit.independent, parameters + 1.0)
         per_pixel = max(fit.chi_square, 1e-12) / independent
-        penalty = parameters * math.log(independent) + SHARPER_LOSS * self.sharper
+        penalty = parameters * math.log(independent) + self.loss
         return independent * math.log(per_pixel) + penalty
 
     @property
@@ -133,25 +144,35 @@ def sized(
     patch: HolePatch,
     start: Start,
     shapes: Sequence[Shape],
-    sharper_px: Sequence[float],
+    blur_choices: Sequence[tuple[float, bool, float]],
 ) -> Size | None:
-    """Fit the shapes and average them; None if no fit has converged. ``sharper_px``: further sides
-    of the blur to try."""
-    patches = [patch]
-    for side in sharper_px:
-        patches.append(replace(patch, blur_px=(side, side)))
+    """Fit the shapes and average them; None if no fit has converged. ``blur_choices``: of `BLURS`,
+    those to try."""
+    blur_u, blur_v = patch.blur_px
+    blurs = []
+    for ratio, soft, loss in blur_choices:
+        blur_px = (max(ratio * blur_u, 1.0), max(ratio * blur_v, 1.0))
+        blurs.append((replace(patch, blur_px=blur_px, soft=soft), loss))
     candidates = []
     for shape in shapes:
         radius_m = start.radius_m * WIDER[shape]
         if shape == "slot":
             radius_m *= math.exp(-0.5 * start.stretch)
         first = replace(start, radius_m=radius_m)
-        for blurred in patches:
+        for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
-            if fit.converged and 0.0 < fit.covariance[2, 2] < np.inf:
-                candidates.append(Candidate(fit, blurred, blurred is not patch))
+            if fit.converged and _is_determined(fit):
+                candidates.append(Candidate(fit, blurred, loss))
                 first = _start_after(fit)
     return averaged(candidates) if candidates else None
+
+
+def _is_determined(fit: HoleFit) -> bool:
+    """Return whether radius and depth are known, so that errors to first order mean something."""
+    radius_m2 = fit.covariance[2, 2]
+    depth_m2 = fit.covariance[3, 3]
+    radius_is_known = 0.0 < radius_m2 < (MOST_OPEN * fit.radius_m) ** 2
+    return bool(radius_is_known and depth_m2 < fit.depth_m**2)
 
 
 def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:

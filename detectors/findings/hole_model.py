@@ -139,6 +139,9 @@ class HolePatch:
     """(n, n): lower triangular L of the covariance L L' of the n used pixels' errors, if known."""
     left_out: int = 0
     """Number of pixels beside the used ones that would add too little."""
+    soft: bool = False
+    """True if the blur falls off from its middle like a lens' or a beam's: two rectangles in turn,
+    of 1 / sqrt(2) of its sides; False if it ends sharply like a filter's window."""
     shared_px: tuple[float, float] | None = None
     """Sides of the rectangle over which the noise is averaged; None: those of the blur."""
 
@@ -162,8 +165,17 @@ def pictures(patch: HolePatch, holes: np.ndarray, shape: Shape = "disc") -> np.n
     of all that is deeper."""
     blur_u, blur_v = patch.blur_px
     height, width = patch.used.shape
-    numbers = (patch.sights, patch.metric_m2, blur_u, blur_v, height, width)
-    return _drawn(SHAPES.index(shape), holes, *numbers)
+    return _drawn(
+        SHAPES.index(shape),
+        holes,
+        patch.sights,
+        patch.metric_m2,
+        blur_u,
+        blur_v,
+        patch.soft,
+        height,
+        width,
+    )
 
 
 @numba.njit(**PLAIN)
@@ -415,6 +427,7 @@ def fit_hole(
         patch.metric_m2,
         blur_u,
         blur_v,
+        patch.soft,
         height,
         width,
     )
@@ -521,13 +534,44 @@ def _drawn(  # type: ignore[no-untyped-def]
     metric,
     blur_u,
     blur_v,
+    soft,
     h,
     w,
 ):
     """Return the `pictures` (m, h, w) of damages (m, 7) of a shape."""
+    if soft:
+        blur_u = math.sqrt(0.5) * blur_u
+        blur_v = math.sqrt(0.5) * blur_v
     if shape == DISC:
-        return _painted(holes, sights, metric, blur_u, blur_v, h, w)
-    return reliefs(shape, holes, sights, metric, blur_u, blur_v, h, w)
+        images = _painted(holes, sights, metric, max(blur_u, 1.0), max(blur_v, 1.0), h, w)
+    else:
+        images = reliefs(shape, holes, sights, metric, max(blur_u, 1.0), max(blur_v, 1.0), h, w)
+    if soft:
+        for n in range(len(images)):
+            _smooth_rows(images[n], blur_u)
+            _smooth_rows(images[n].T, blur_v)
+    return images
+
+
+@numba.njit(**PLAIN)
+def _smooth_rows(image, side):  # type: ignore[no-untyped-def]
+    """Replace each row of an image (h, w) by its means over ``side`` pixels. Beyond its ends, the
+    image goes on as its last pixel."""
+    h, w = image.shape
+    margin = math.ceil(0.5 * side) + 1
+    sums = np.zeros(w + 2 * margin + 1)
+    for r in range(h):
+        for c in range(w + 2 * margin):
+            sums[c + 1] = sums[c] + image[r, min(max(c - margin, 0), w - 1)]
+        for c in range(w):
+            middle = c + 0.5 + margin
+            low = middle - 0.5 * side
+            high = middle + 0.5 * side
+            i = int(low)
+            j = int(high)
+            before = sums[i] + (low - i) * (sums[i + 1] - sums[i])
+            after = sums[j] + (high - j) * (sums[j + 1] - sums[j])
+            image[r, c] = (after - before) / side
 
 
 @numba.njit(**PLAIN)
@@ -542,6 +586,7 @@ def _descent(  # type: ignore[no-untyped-def]
     metric,
     blur_u,
     blur_v,
+    soft,
     h,
     w,
 ):
@@ -588,7 +633,7 @@ def _descent(  # type: ignore[no-untyped-def]
             holes[k, 4] = math.sin(0.5 * math.pi * trial_q[5]) ** 2
             holes[k, 5] = min(max(trial_q[6], -LONGEST), LONGEST)
             holes[k, 6] = trial_q[7]
-        image = _drawn(shape, holes[:1], sights, metric, blur_u, blur_v, h, w).ravel()
+        image = _drawn(shape, holes[:1], sights, metric, blur_u, blur_v, soft, h, w).ravel()
         for i in range(n):
             left[0, i] = image[pixels[i]] + trial_q[4] - data[i]
         _whiten(left, factor)
@@ -615,7 +660,8 @@ def _descent(  # type: ignore[no-untyped-def]
             count = len(changed)
             for k in range(count):
                 holes[k + 1, changed[k]] += sizes[changed[k]]
-            drawn = _drawn(shape, holes[1 : 1 + count], sights, metric, blur_u, blur_v, h, w)
+            others = holes[1 : 1 + count]
+            drawn = _drawn(shape, others, sights, metric, blur_u, blur_v, soft, h, w)
             images = drawn.ravel()
             for k in range(count):
                 row = changed[k] if changed[k] < 4 else changed[k] + 1

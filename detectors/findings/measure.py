@@ -1,7 +1,7 @@
 """Measures the size and the place of a detection: the thesis' extents, and a fitted model of a
-blurred hole. Where the model does not hold, the contour at half depth is measured instead. Depths
-are measured along the optical axis, positive behind the surface; sizes are measured on the
-surface."""
+damage, averaged over a family of shapes. Where the model does not hold, the contour at half depth
+is measured instead. Depths are fitted along the optical axis, positive behind the surface; a
+`Measurement` states them normal to the surface too. Sizes are measured on the surface."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import Size, Start, sized
+from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
     normal_of,
     pictures,
     sight,
     straight_sight,
-    whitened,
 )
 from detectors.findings.shapes import Shape
 from detectors.interface import Detection, Evidence, Measurement
@@ -34,25 +33,20 @@ OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch with a larger residual that do not touch the detection belong to other
 damage."""
 FEWEST_AROUND = 12  # valid pixels around a detection
-NEAR_BLURS = 1.4
-"""Distance from a detection, in sides of the blur, up to which all pixels count if the noise's
-correlation is known. Leaving out 15 of 16 farther pixels raises the standard errors of diameter
-and depth by 0.5 to 1.5 %."""
 EXPLAINED = 0.7
 """Least share of a detection's squared residual that its fit must explain: correlated noise may
 absorb a smooth dent, and a ragged damage has no shape."""
 MARGIN_SHARE = 0.4
 """Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
-FINE_BLUR_PX = 3.0  # a blur is at least as wide as this in the pixels of the fit
-MOST_SIDE_PX = 36  # side of a patch from which means over squares of pixels are fitted
-LONG = 0.35  # logarithm of length over width from which a slot is tried
+FINE_BLUR_PX = 2.0  # a recording's blur is at least as wide as this in the pixels of the fit
+MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are fitted
+LONG = 0.5  # logarithm of length over width from which a slot is tried
 MOST_STRETCH = 2.5  # largest start value of it
-SHARPER_PX = (1.0, 2.0, 3.0, 5.0)
-"""Blurs, smaller than the noise's, that are tried for a recording: noise may be blurred more than
-the scene."""
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
 shows through."""
+FLANK = (0.35, 0.65)
+"""Shares of the depth between whose contours that at half depth lies within a standard error."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 
 MISFIT = "the model of a blurred hole does not fit"
@@ -190,10 +184,8 @@ def measure_detection(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
-    by_lag: np.ndarray | None = None,
 ) -> Measurement:
-    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag`` (odd,
-    odd): the noise's correlation."""
+    """Measure a detection both ways; failed measurements are NaN, with a note."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     measured = measure_extents(cloud, detection, "too few valid pixels around it for a model")
@@ -209,9 +201,11 @@ def measure_detection(
         width_m=width_m,
         along=along,
     )
-    size, doubt = _modelled(around, config, by_lag)
+    size, doubt = _modelled(around, config)
     if size is None:
-        return _by_contour(measured, around, doubt)
+        # a contour needs no fit, and so all pixels
+        fine = _surroundings(cloud, evidence, detection, config, most_binned=1)
+        return _by_contour(measured, fine or around, doubt)
     fit = size.best
     spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
     measured = replace(
@@ -280,8 +274,8 @@ class _Surroundings:
     """(3,): the surface's point at (u0, v0)."""
     per_px_m: np.ndarray
     """(2, 3): the surface's derivatives by u and v."""
-    sharper_px: tuple[float, ...]
-    """Smaller blurs to try."""
+    blurs: tuple[tuple[float, bool, float], ...]
+    """The `BLURS` to try."""
 
     @property
     def area_m2(self) -> float:
@@ -317,10 +311,11 @@ def _surroundings(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
+    most_binned: int = 64,
 ) -> _Surroundings | None:
     """Cut out the detection with a margin of twice the blur or `MARGIN_SHARE` of its size on each
-    side, in means over squares of pixels where these are small; None with too few valid pixels
-    around."""
+    side, in means over squares of pixels where these are small, of ``most_binned`` pixels a side;
+    None with too few valid pixels around."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
     blur_px = blur_in_cells(cloud, config)
@@ -349,9 +344,11 @@ def _surroundings(
         return None
     origin_m, per_px_m = plane
     u0, v0 = _centroid(own)
-    by_blur = int(min(blur_px) / FINE_BLUR_PX)
+    by_blur = 1
     by_size = max(residual_m.shape) // MOST_SIDE_PX
-    binned = max(by_blur, by_size, 1)
+    if cloud.noise_reach_px:  # its blurs are many fits
+        by_blur = int(min(blur_px) / FINE_BLUR_PX)
+    binned = min(max(by_blur, by_size, 1), most_binned)
     invalid = ~np.isfinite(points_m[..., 2])
     if binned > 1:
         residual_m = _means(residual_m, binned)
@@ -391,7 +388,6 @@ def _surroundings(
     ray = np.array([0.0, 0.0, 1.0])
     if cloud.projection == "central":
         ray = origin_m / origin_m[2]
-    sharper_px = [side for side in SHARPER_PX if side < cloud.noise_reach_px]
     return _Surroundings(
         patch=patch,
         own=own,
@@ -408,7 +404,8 @@ def _surroundings(
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
-        sharper_px=tuple(_binned_blur(side, binned) for side in sharper_px),
+        # a simulated camera's blur is stated, a recording's is estimated
+        blurs=BLURS if cloud.noise_reach_px else BLURS[:1],
     )
 
 
@@ -426,18 +423,6 @@ def _means(picture: np.ndarray, side: int) -> np.ndarray:
 def _binned_blur(blur_px: float, binned: int) -> float:
     """Return the side, in means over squares of pixels, of a blur: second moments add."""
     return math.sqrt(blur_px**2 + binned**2 - 1.0) / binned
-
-
-def _binned_correlation(by_lag: np.ndarray, binned: int) -> np.ndarray:
-    """Return the correlation (odd, odd) by lag of means over squares of pixels."""
-    if binned == 1:
-        return by_lag
-    shared = np.convolve(np.ones(binned), np.ones(binned))  # pairs of pixels by lag
-    summed = cv2.sepFilter2D(by_lag, -1, shared, shared, borderType=cv2.BORDER_CONSTANT)
-    middle_row = len(summed) // 2
-    middle_column = summed.shape[1] // 2
-    covariance = summed[middle_row % binned :: binned, middle_column % binned :: binned]
-    return covariance / summed[middle_row, middle_column]
 
 
 def _centroid(mask: np.ndarray) -> tuple[float, float]:
@@ -545,8 +530,7 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 def _modelled(
     around: _Surroundings,
     config: HoleModelConfig,
-    by_lag: np.ndarray | None,
-) -> tuple[HoleFit | None, str]:
+) -> tuple[Size | None, str]:
     """Return the fitted hole, or None and the reason why the model does not hold."""
     own = around.own
     invalid = around.invalid
@@ -561,8 +545,10 @@ def _modelled(
         return None, too_deep
     if around.patch.used.sum() < 8:
         return None, MISFIT
-    size = _sized(around, by_lag)
-    if size is None or not _explains(around, size):
+    size = _sized(around)
+    if size is None:
+        return None, AMBIGUOUS
+    if not _explains(around, size):
         return None, MISFIT
     if abs(size.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep
@@ -580,19 +566,13 @@ def _modelled(
     return size, ""
 
 
-def _sized(around: _Surroundings, by_lag: np.ndarray | None) -> Size | None:
+def _sized(around: _Surroundings) -> Size | None:
     """Return the averaged size by the family of shapes."""
-    patch = around.patch
-    if by_lag is not None:
-        reach_px = round(NEAR_BLURS * max(patch.blur_px))
-        near = grown(around.own, reach_px, cv2.MORPH_ELLIPSE)
-        by_binned_lag = _binned_correlation(by_lag, around.binned)
-        patch = whitened(patch, by_binned_lag, around.offset_m, near)
     start = _start(around)
     shapes: tuple[Shape, ...] = ("disc", "cap", "bowl")
     if start.stretch > LONG:
         shapes = (*shapes, "slot")
-    return sized(patch, start, shapes, around.sharper_px)
+    return sized(around.patch, start, shapes, around.blurs)
 
 
 def _start(around: _Surroundings) -> Start:
@@ -643,13 +623,60 @@ def _by_contour(
     doubt: str,
 ) -> Measurement:
     """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels
-    without a range that touch the detection count as inside."""
+    without a range that touch the detection count as inside.
+
+    The diameter's standard error is half of the difference to the contours at the shares `FLANK` of
+    the depth, and what the blur moves a round contour. If no shape fits, the damage is ragged, and
+    its depth is the mean one, volume over area; else it is the deepest."""
     residual_m = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
     hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
     top_m = min(around.peak_m, OPEN_M)
     residual_m = np.minimum(residual_m, top_m)
     residual_m[hollow] = top_m
     residual_m[~around.patch.used & ~hollow] = 0.0
+    inside = _contour(around, residual_m, 0.5 * top_m)
+    if not inside.any():
+        return replace(measured, model_note=doubt + "; no half-depth contour")
+    rows, columns = np.nonzero(inside)
+    u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    diameter_m = _diameter_m(around, inside)
+    low, high = (_contour(around, residual_m, share * top_m) for share in FLANK)
+    flank_m = 0.5 * (_diameter_m(around, low) - _diameter_m(around, high))
+    blur_m2 = math.prod(around.patch.blur_px) * around.area_m2
+    moved_m = min(blur_m2 / (6.0 * diameter_m), 0.5 * diameter_m)
+    if doubt == AMBIGUOUS:
+        moved_m = 0.5 * diameter_m
+    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
+        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
+    diameter_se_m = math.hypot(flank_m, moved_m)
+    depth_m, depth_se_m = _contour_depth(around, inside, residual_m)
+    is_ragged = doubt == MISFIT
+    if is_ragged:
+        # the volume is known: the area's error is twice that of the diameter
+        area_m2 = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
+        volume_m3 = measured.volume_m3 / around.normal_share
+        depth_m = volume_m3 / area_m2
+        depth_se_m = abs(depth_m) * 2.0 * diameter_se_m / diameter_m
+    if hollow.sum() > around.own.sum():
+        depth_m = np.nan
+        depth_se_m = np.nan
+    return replace(
+        around.positioned(measured, u, v),
+        model_diameter_m=diameter_m,
+        model_diameter_se_m=diameter_se_m,
+        model_depth_m=depth_m,
+        model_depth_se_m=math.hypot(depth_se_m, DEPTH_ERROR * depth_m),
+        normal_share=around.normal_share,
+        sight_share=around.sight_share,
+        shape="ragged" if is_ragged else "",
+        model_note=doubt + "; measured at the half-depth contour",
+    )
+
+
+def _contour(around: _Surroundings, residual_m: np.ndarray, level_m: float) -> np.ndarray:
+    """Return where a residual (h, w), drawn `CONTOUR_ZOOM` times as fine, exceeds a level in one
+    piece with the detection."""
     height, width = residual_m.shape
     size = (CONTOUR_ZOOM * width, CONTOUR_ZOOM * height)
     fine_m = cv2.resize(residual_m, size, interpolation=cv2.INTER_LINEAR)
@@ -658,20 +685,31 @@ def _by_contour(
         size,
         interpolation=cv2.INTER_NEAREST,
     )
-    inside = parts_with(fine_m > 0.5 * top_m, seeds > 0)
-    if not inside.any():
-        return replace(measured, model_note=doubt + "; no half-depth contour")
-    rows, columns = np.nonzero(inside)
-    u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
-    v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
+    return parts_with(fine_m > level_m, seeds > 0)
+
+
+def _diameter_m(around: _Surroundings, inside: np.ndarray) -> float:
+    """Return the diameter of the circle with the area of a `_contour`."""
     area_m2 = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
-    diameter_m = 2.0 * float(np.sqrt(area_m2 / np.pi))
-    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
-        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
-    depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
-    return replace(
-        around.positioned(measured, u, v),
-        model_diameter_m=diameter_m,
-        model_depth_m=depth_m,
-        model_note=doubt + "; measured at the half-depth contour, without standard errors",
+    return 2.0 * math.sqrt(area_m2 / math.pi)
+
+
+def _contour_depth(
+    around: _Surroundings,
+    inside: np.ndarray,
+    residual_m: np.ndarray,
+) -> tuple[float, float]:
+    """Return the deepest residual along the optical axis, and its standard error: half of its
+    difference from the median inside, and the noise."""
+    height, width = residual_m.shape
+    coarse = cv2.resize(
+        inside.astype(np.uint8),
+        (width, height),
+        interpolation=cv2.INTER_NEAREST,
     )
+    depths_m = around.sign * (around.patch.residual_m - around.offset_m)
+    depths_m = depths_m[(coarse > 0) & np.isfinite(depths_m)]
+    if not len(depths_m):
+        return around.sign * around.peak_m, np.nan
+    spread_m = 0.5 * (around.peak_m - median_of(depths_m))
+    return around.sign * around.peak_m, math.hypot(spread_m, around.patch.noise_m)

@@ -9,13 +9,23 @@ together. The tail is exponential in (s^q - 1) / q of the score s, minus the log
 maxima of normal noise in two dimensions are more frequent. The data weigh the exponents q,
 starting from `PRIOR`; rates and scales are integrated out.
 
+Beside objects, print and edges false calls are more frequent, on both sides of the surface. The
+peaks in front of it there have a tail of their own, which predicts how many more calls that
+threshold lets pass. A small mark in the picture that lies within a finding is the finding itself.
+
+Where light from the target's edge mixes in, peaks along its rim are higher. If the peaks elsewhere
+do not explain those at the rim, these have a law of their own too, and scores at the rim are
+scaled down so that one threshold holds for both.
+
 Not modelled: noise that is asymmetric beyond what `skew_of` sees in the core; damage towards the
 camera that is no larger than the noise; objects on clouds without a grid, or that neither stand
 out nor are visible in a picture."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,6 +46,8 @@ NORMAL_PEAKS = 10.0
 """Weight of the theory, in peaks: maxima of normal noise with the deviation that a unit of score
 is meant to be. Ten peaks show that deviation to 16 %; robust scales of heavy-tailed noise err by
 as much."""
+THEORY_AT_MARKS = 1.0
+"""The same at marks: what print and edges make of the distance is no normal noise."""
 DRAWS = 4000  # of the interval
 CONTRADICTED = 0.1
 """A tail is rejected if the probability of the number of peaks above the threshold is lower."""
@@ -73,7 +85,21 @@ MARKED = 8.0
 material."""
 MOST_MASKED = 0.5
 """Largest share of the judged area under objects: the rest must represent the whole."""
+LONGEST_HOLE_PX = 35
+"""A longer mark is more than a hole as the picture shows it: the widest filters judge 25 pixels,
+and the squares that smooth the picture twice widen its edges by 10."""
+OWN_SHARE = 0.5
+"""A longer mark is still the finding itself if this share of it lies within the finding and its
+margin."""
+PLAIN = "plain"
+"""Name of the law of noise away from long marks."""
+MARKS = "at marks"
+"""Name of the law at objects, print and edges."""
+RIM = "at the rim"
+"""Name of the law along the target's rim."""
 RIM_PX = 10  # depth of the target's rim
+RIM_CHANCE = 0.01
+"""Peaks at the rim have a law of their own if chance makes as many high ones more seldom."""
 RIM_CALLS = 2  # calls behind the surface along the rim that chance does not explain
 
 
@@ -84,7 +110,10 @@ class OwnThreshold:
     threshold: float
     """Units of score."""
     expected: float
-    """False calls expected at the threshold, in front of and behind the surface."""
+    """False calls expected at the threshold, in front of and behind the surface, with those at
+    marks."""
+    at_marks: float
+    """False calls of these that are expected at objects, print and edges in the picture."""
     low: float
     """Lower end of the 95 % interval of that expectation."""
     high: float
@@ -97,10 +126,15 @@ class OwnThreshold:
     """Number of regions that are excluded as objects."""
     rim_pixels: int
     """Number of pixels along the rim that mix in what lies behind the target."""
+    rim_scale: float
+    """Factor of scores at the rim in ``evidence``; 1 if one law explains all peaks."""
     evidence: Evidence
-    """Evidence to search: without the rim pixels."""
+    """Evidence to search: without the rim pixels, and with scores at the rim scaled."""
     doubts: tuple[str, ...]
     """Full sentences on why the numbers cannot be trusted."""
+    tails: dict[str, Tail]
+    """Laws of the false calls on one side of the surface, by `PLAIN`, `RIM` and `MARKS`; empty
+    with too few peaks."""
 
 
 def own_threshold(
@@ -113,34 +147,39 @@ def own_threshold(
     peaks towards the camera; at least `LEAST`. With too few peaks the numbers are NaN, and
     ``doubts`` says so."""
     judged = np.isfinite(evidence.score)
-    covered = np.zeros(judged.shape, bool)
-    if cloud.organised:
-        objects = _proud(cloud, evidence) | _marked(cloud, evidence)
-        covered = grown(objects, _margin(cloud), cv2.MORPH_ELLIPSE)
+    marks = marks_of(cloud, evidence)
+    covered = marks.covered
     n_objects = int(ndimage.label(covered)[1])
-    floor, peaks = _peaks(detector, cloud, _only(evidence, ~behind(evidence)), covered)
+    before = _only(evidence, ~behind(evidence))
+    peaks = _peaks(detector, cloud, before, marks)
     doubts = _doubts_about_symmetry(evidence)
-    if len(peaks) < FEWEST_PEAKS:
+    if len(peaks.scores) < FEWEST_PEAKS:
         doubts.append(
-            f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a"
-            f" threshold (at least {FEWEST_PEAKS} are needed)"
+            f"only {len(peaks.scores)} peaks of noise stand out towards the camera, too few to set"
+            f" a threshold (at least {FEWEST_PEAKS} are needed)"
         )
         return OwnThreshold(
             threshold=float("nan"),
             expected=float("nan"),
+            at_marks=float("nan"),
             low=float("nan"),
             high=float("nan"),
-            peaks=len(peaks),
-            floor=floor,
+            peaks=len(peaks.scores),
+            floor=peaks.floor,
             objects=n_objects,
             rim_pixels=0,
+            rim_scale=1.0,
             evidence=evidence,
             doubts=tuple(doubts),
+            tails={},
         )
     # half of the false calls lie in front of the surface, where the peaks are
-    tail = _fitting_tail(peaks, floor, false_calls / 2.0)
-    threshold = max(tail.threshold(false_calls / 2.0), LEAST)
-    low, high = tail.interval(threshold)
+    threshold, tails = _laws(peaks, judged, marks, false_calls / 2.0)
+    tail = tails[PLAIN]
+    rim_scale = tails[RIM].scale if RIM in tails else 1.0
+    evidence = with_rim_scaled(evidence, rim_scale)
+    expected = {name: 2.0 * tail.expected(threshold) for name, tail in tails.items()}
+    low, high = interval_of(tails, threshold)
     rim = np.zeros(judged.shape, bool)
     if cloud.organised:
         rim = _mixed_rim(detector, cloud, evidence, threshold)
@@ -158,21 +197,117 @@ def own_threshold(
         )
     return OwnThreshold(
         threshold=threshold,
-        expected=2.0 * tail.expected(threshold),
-        low=2.0 * low,
-        high=2.0 * high,
+        expected=sum(expected.values()),
+        at_marks=expected.get(MARKS, 0.0),
+        low=low,
+        high=high,
         peaks=tail.peaks,
         floor=tail.floor,
         objects=n_objects,
         rim_pixels=int(rim.sum()),
+        rim_scale=rim_scale,
         evidence=_only(evidence, ~rim),
         doubts=tuple(doubts),
+        tails=tails,
     )
 
 
-def _fitting_tail(peaks: np.ndarray, floor: float, number: float) -> Tail:
+def interval_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
+    """Return the central 95 % of the expected number of false calls above a threshold, on both
+    sides of the surface and by all laws together."""
+    drawn = np.zeros(DRAWS)
+    for tail in tails.values():
+        drawn += 2.0 * tail.laws(DRAWS).expected(threshold)
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def _laws(
+    peaks: _Peaks,
+    judged: np.ndarray,
+    marks: Marks,
+    number: float,
+) -> tuple[float, dict[str, Tail]]:
+    """Return the threshold at which ``number`` are expected on one side away from marks, and the
+    laws. ``judged`` (h, w) bool.
+
+    The rim has a law of its own if the peaks elsewhere do not explain as many high ones there, at
+    least `FEWEST_PEAKS`; it then gets its share of the number by area."""
+    tails = {PLAIN: _fitting_tail(peaks.scores, peaks.floor, number, _area_ratio(judged, marks))}
+    threshold = max(tails[PLAIN].threshold(number), LEAST)
+    if marks.count:
+        tails[MARKS] = Tail.of(peaks.at_marks, peaks.floor, THEORY_AT_MARKS)
+
+    rim = judged & _rim_of(judged)
+    share = float(rim.sum()) / float(judged.sum())
+    inner = peaks.scores[~peaks.is_at_rim]
+    outer = peaks.scores[peaks.is_at_rim]
+    if len(inner) < FEWEST_PEAKS or not 0.0 < share < 0.5:
+        return threshold, tails
+    inner_number = (1.0 - share) * number
+    inner_ratio = _area_ratio(judged & ~rim, marks)
+    inner_tail = _fitting_tail(inner, peaks.floor, inner_number, inner_ratio)
+    inner_threshold = max(inner_tail.threshold(inner_number), LEAST)
+    exceeding = int((outer > inner_threshold).sum())
+    # fewer than so many may be bumps
+    if exceeding < FEWEST_PEAKS or special.gammainc(exceeding, share * number) > RIM_CHANCE:
+        return threshold, tails
+    rim_tail = replace(
+        Tail.of(outer, peaks.floor, THEORY_AT_MARKS), area_ratio=_area_ratio(rim, marks)
+    )
+    rim_threshold = rim_tail.threshold(share * number)
+    if rim_threshold <= inner_threshold:
+        return threshold, tails
+    tails[PLAIN] = inner_tail
+    tails[RIM] = replace(rim_tail, scale=inner_threshold / rim_threshold)
+    return inner_threshold, tails
+
+
+def _rim_of(judged: np.ndarray) -> np.ndarray:
+    """Return (h, w) bool: the pixels along the rim of the judged ones, (h, w) bool."""
+    return _depth_px(holes_filled(judged)) <= RIM_PX
+
+
+def is_at_rim(evidence: Evidence, detection: Detection) -> bool:
+    """Return whether a finding's highest score lies along the rim of the judged area."""
+    return bool(
+        _rim_of(np.isfinite(evidence.residual_m)).reshape(-1)[_peak_of(evidence, detection)]
+    )
+
+
+def _peak_of(evidence: Evidence, detection: Detection) -> int:
+    """Return the flat index of a finding's highest score."""
+    scores = np.nan_to_num(evidence.score.reshape(-1)[detection.pixels])
+    return int(detection.pixels[np.argmax(scores)])
+
+
+def with_rim_scaled(evidence: Evidence, scale: float) -> Evidence:
+    """Return the evidence with scores along the rim multiplied by a scale, and by less up to twice
+    as far from it: a finding at the rim, as wide as the widest filters, is not cut in two."""
+    if scale == 1.0:
+        return evidence
+    depth_px = _depth_px(holes_filled(np.isfinite(evidence.residual_m)))
+    nearness = np.clip(2.0 - depth_px / RIM_PX, 0.0, 1.0)
+    return replace(evidence, score=evidence.score * scale**nearness)
+
+
+def _area_ratio(judged: np.ndarray, marks: Marks) -> float:
+    """Return the judged area away from long marks over the area where peaks count as noise.
+
+    ``judged`` (h, w) bool. Peaks at small marks do not count, but noise is as frequent there."""
+    near_long = grown(marks.labels > 0, marks.margin_px, cv2.MORPH_ELLIPSE)
+    counted = int((judged & ~marks.covered).sum())
+    return float((judged & ~near_long).sum()) / max(counted, 1)
+
+
+def _fitting_tail(
+    peaks: np.ndarray,
+    floor: float,
+    number: float,
+    area_ratio: float = 1.0,
+) -> Tail:
     """Return a tail that the highest peaks (n,) do not contradict at the threshold at which
-    ``number`` are expected.
+    ``number`` are expected, in ``area_ratio`` times the area of the peaks.
 
     It takes all peaks, then the higher half, and so on while too many exceed the threshold: a few
     wide waves of a fixed pattern are then higher than the noise of many pixels, and one tail does
@@ -181,9 +316,10 @@ def _fitting_tail(peaks: np.ndarray, floor: float, number: float) -> Tail:
     while True:
         tail = Tail.of(falling, floor)
         half = len(falling) // 2
-        exceeding = int((falling > tail.threshold(number)).sum())
-        if half < FEWEST_PEAKS or special.gammainc(exceeding, number) > CONTRADICTED:
-            return tail
+        exceeding = int((falling > tail.threshold(number / area_ratio)).sum())
+        likely = special.gammainc(exceeding, number / area_ratio) > CONTRADICTED
+        if half < FEWEST_PEAKS or likely:
+            return replace(tail, area_ratio=area_ratio)
         floor = float(falling[half])
         falling = falling[:half]
 
@@ -225,6 +361,44 @@ def _doubts_about_symmetry(evidence: Evidence) -> list[str]:
 
 
 @dataclass(frozen=True)
+class Laws:
+    """Laws that the peaks allow, drawn at random, each with one exponent."""
+
+    floor: float
+    """Units of score."""
+    exponents: np.ndarray
+    """(k,)."""
+    numbers: np.ndarray
+    """(k,): expected number of calls above the floor."""
+    rates: np.ndarray
+    """(k,): by which the logarithm of the number falls with the excess."""
+    scale: float
+    """Scores in the evidence over those of the law."""
+
+    def expected(self, threshold: float) -> np.ndarray:
+        """Return the expected number (k,) of calls above a threshold."""
+        ratio = np.array([threshold / (self.scale * self.floor)])
+        excesses = np.zeros(len(self.numbers))
+        for exponent in EXPONENTS:
+            excesses[self.exponents == exponent] = _excess(ratio, exponent, self.floor)[0]
+        return self.numbers * np.exp(-self.rates * excesses)
+
+    def densities(self, scores: np.ndarray) -> np.ndarray:
+        """Return the expected number (k, n) of calls per unit of score, at scores (n,) above the
+        floor."""
+        floor = self.scale * self.floor
+        ratios = scores / floor
+        falls = np.zeros((len(self.numbers), len(scores)))
+        for exponent in EXPONENTS:
+            excess = _excess(ratios, exponent, self.floor)
+            slope = self.floor * (ratios ** (exponent - 1.0) - _crowd(self.floor) / ratios)
+            chosen = self.exponents == exponent
+            rates = self.rates[chosen, None]
+            falls[chosen] = rates * slope / self.scale * np.exp(-rates * excess)
+        return self.numbers[:, None] * falls
+
+
+@dataclass(frozen=True)
 class Tail:
     """The law by which noise exceeds a threshold, from its peaks above a floor."""
 
@@ -236,58 +410,104 @@ class Tail:
     """(e,): for each exponent, the sum of the peaks' transformed excesses, and the theory's."""
     weights: np.ndarray
     """(e,): of the exponents, which sum to 1."""
+    theory: float = NORMAL_PEAKS
+    """Weight of the theory of normal noise, in peaks."""
+    area_ratio: float = 1.0
+    """Area where calls are expected, over the area of the peaks."""
+    scale: float = 1.0
+    """Scores in the evidence over those of the peaks."""
+
+    @property
+    def number(self) -> float:
+        """Expected number of calls above the floor; that of half a peak if there is none."""
+        return max(self.peaks, 0.5) * self.area_ratio
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {
+            "floor": self.floor,
+            "peaks": self.peaks,
+            "sums": self.sums.tolist(),
+            "weights": self.weights.tolist(),
+            "theory": self.theory,
+            "area_ratio": self.area_ratio,
+            "scale": self.scale,
+        }
 
     @classmethod
-    def of(cls, peaks: np.ndarray, floor: float) -> Tail:
+    def from_facts(cls, facts: Mapping[str, Any]) -> Tail:
+        """Return the tail with these `facts`."""
+        return cls(
+            floor=facts["floor"],
+            peaks=facts["peaks"],
+            sums=np.array(facts["sums"]),
+            weights=np.array(facts["weights"]),
+            theory=facts["theory"],
+            area_ratio=facts["area_ratio"],
+            scale=facts["scale"],
+        )
+
+    @classmethod
+    def of(cls, peaks: np.ndarray, floor: float, theory: float = NORMAL_PEAKS) -> Tail:
         """Weigh the exponents by the scores (n,) of the peaks above a floor, which is positive."""
         ratios = np.maximum(np.asarray(peaks, float) / floor, 1.0 + 1e-9)
         excesses = [_excess(ratios, exponent, floor) for exponent in EXPONENTS]
-        sums = NORMAL_PEAKS + np.array([excess.sum() for excess in excesses])
+        sums = theory + np.array([excess.sum() for excess in excesses])
         # the likelihood with the scale integrated out under its prior, a Gamma distribution
         slopes = ratios[:, None] ** (EXPONENTS - 1.0) - _crowd(floor) / ratios[:, None]
         logs = np.log(slopes).sum(axis=0)
-        logs = logs - (len(ratios) + NORMAL_PEAKS) * np.log(sums) + np.log(PRIOR)
+        logs = logs - (len(ratios) + theory) * np.log(sums) + np.log(PRIOR)
         weights = np.exp(logs - logs.max())
-        return cls(floor, len(ratios), sums, weights / weights.sum())
+        return cls(floor, len(ratios), sums, weights / weights.sum(), theory)
 
     def _excesses(self, threshold: float) -> np.ndarray:
         """Return the excess (e,) of a threshold by each exponent."""
-        ratio = np.array([threshold / self.floor])
+        ratio = np.array([threshold / (self.scale * self.floor)])
         return np.array([float(_excess(ratio, exponent, self.floor)[0]) for exponent in EXPONENTS])
 
     def expected(self, threshold: float) -> float:
         """Return the mean number of peaks above a threshold, over all rates and scales that the
         peaks allow."""
         beyond = 1.0 + self._excesses(threshold) / self.sums
-        shares = beyond ** -(self.peaks + NORMAL_PEAKS)
-        return float((self.weights * self.peaks * shares).sum())
+        shares = beyond ** -(self.peaks + self.theory)
+        return float((self.weights * self.number * shares).sum())
 
     def threshold(self, number: float) -> float:
         """Return the threshold at which this number of peaks is expected; the floor if fewer are
         expected there."""
-        if number >= self.peaks:
-            return self.floor
+        floor = self.scale * self.floor
+        if number >= self.number:
+            return floor
 
         def surplus(log_ratio: float) -> float:
-            threshold = float(np.exp(log_ratio)) * self.floor
+            threshold = float(np.exp(log_ratio)) * floor
             return float(np.log(self.expected(threshold) / number))
 
         high = 2.0
-        while self.expected(high * self.floor) > number:
+        while self.expected(high * floor) > number:
             high *= 2.0
         log_ratio = optimize.brentq(surplus, 0.0, np.log(high))
-        return float(np.exp(log_ratio)) * self.floor
+        return float(np.exp(log_ratio)) * floor
 
     def interval(self, threshold: float) -> tuple[float, float]:
         """Return the central 95 % of the expected number of peaks above a threshold."""
-        random = np.random.default_rng(20201102)
-        chosen = random.choice(len(EXPONENTS), DRAWS, p=self.weights)
-        steepness = random.gamma(self.peaks + NORMAL_PEAKS, 1.0, DRAWS)
-        excesses = self._excesses(threshold)
-        exponents = steepness * excesses[chosen] / self.sums[chosen]
-        drawn = random.gamma(self.peaks, 1.0, DRAWS) * np.exp(-exponents)
-        low, high = np.quantile(drawn, (0.025, 0.975))
+        low, high = np.quantile(self.laws(DRAWS).expected(threshold), (0.025, 0.975))
         return float(low), float(high)
+
+    def laws(self, count: int) -> Laws:
+        """Draw ``count`` laws that the peaks allow, the same ones every time."""
+        random = np.random.default_rng(20201102)
+        chosen = random.choice(len(EXPONENTS), count, p=self.weights)
+        steepness = random.gamma(self.peaks + self.theory, 1.0, count)
+        numbers = self.area_ratio * random.gamma(max(self.peaks, 0.5), 1.0, count)
+        return Laws(
+            floor=self.floor,
+            exponents=EXPONENTS[chosen],
+            numbers=numbers,
+            rates=steepness / self.sums[chosen],
+            scale=self.scale,
+        )
 
 
 def _excess(
@@ -310,32 +530,59 @@ def _crowd(floor: float) -> float:
     return min(floor**-2.0, 0.5)
 
 
+@dataclass(frozen=True)
+class _Peaks:
+    """Findings in front of the surface, which are false calls."""
+
+    floor: float
+    """Units of score; about `WANTED_PEAKS` of them away from marks exceed it."""
+    scores: np.ndarray
+    """(n,): of the findings above the floor away from marks."""
+    is_at_rim: np.ndarray
+    """(n,) bool: those along the rim."""
+    at_marks: np.ndarray
+    """(m,): scores of the findings at long marks."""
+
+
 def _peaks(
     detector: Detector,
     cloud: Cloud,
     before: Evidence,
-    covered: np.ndarray,
-) -> tuple[float, np.ndarray]:
-    """Return a floor with about `WANTED_PEAKS` findings above it, and their scores (n,).
+    marks: Marks,
+) -> _Peaks:
+    """Return the peaks in front of the surface.
 
-    ``before``: evidence with scores in front of the surface only. ``covered`` (h, w) bool: pixels
-    at objects, where findings do not count."""
-    evidence = _only(before, ~covered)
+    ``before``: evidence with scores in front of the surface only. Findings at small marks, and
+    those on objects, which are no false calls, do not count."""
+    evidence = _only(before, ~marks.covered)
     judged = evidence.score[np.isfinite(evidence.score)]
     if not (len(judged) and judged.max() > 0):
-        return 1.0, np.zeros(0)
+        return _Peaks(1.0, np.zeros(0), np.zeros(0, bool), np.zeros(0))
     least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
     steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
     counts = [len(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
     floor = thresholds[_floor_among(counts)]
-    hidden = covered.reshape(-1)
-    scores = [
-        detection.score
-        for detection in detector.find(cloud, before, floor)
-        if not hidden[detection.pixels].any()
-    ]
-    return floor, np.array(scores)
+    hidden = marks.covered.reshape(-1)
+    proud = marks.proud.reshape(-1)
+    rim = np.zeros(hidden.shape, bool)
+    if cloud.organised:
+        rim = _rim_of(np.isfinite(before.residual_m)).reshape(-1)
+    scores = []
+    at_rim = []
+    scores_at_marks = []
+    for detection in detector.find(cloud, before, floor):
+        if not hidden[detection.pixels].any():
+            scores.append(detection.score)
+            at_rim.append(rim[_peak_of(before, detection)])
+        elif not proud[detection.pixels].any() and marks.hold(detection):
+            scores_at_marks.append(detection.score)
+    return _Peaks(
+        floor=floor,
+        scores=np.array(scores),
+        is_at_rim=np.array(at_rim, bool),
+        at_marks=np.array(scores_at_marks),
+    )
 
 
 def _floor_among(counts: list[int]) -> int:
@@ -349,7 +596,67 @@ def _floor_among(counts: list[int]) -> int:
     return free[0] if free else crowd
 
 
-# --- objects on the target ---
+# --- objects on the target, print and edges ---
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Objects, print and edges in the picture, where false calls are more frequent."""
+
+    proud: np.ndarray
+    """(h, w) bool: objects that stand before the surface."""
+    covered: np.ndarray
+    """(h, w) bool: objects and edges of the picture, with their margin."""
+    labels: np.ndarray
+    """(h, w): number of the object or edge that is longer than a hole, without margin; 0 elsewhere.
+    """
+    areas: np.ndarray
+    """(n + 1,): number of pixels with each number."""
+    margin_px: int
+    """Distance in pixels up to which a finding is at a mark."""
+
+    @property
+    def count(self) -> int:
+        """Number of long marks."""
+        return len(self.areas) - 1
+
+    def hold(self, detection: Detection) -> bool:
+        """Return whether a finding is at a long mark, most of which lies beyond the finding."""
+        if not self.count:
+            return False
+        height, width = self.labels.shape
+        rows, columns = np.unravel_index(detection.pixels, self.labels.shape)
+        margin = self.margin_px
+        top = max(int(rows.min()) - margin, 0)
+        left = max(int(columns.min()) - margin, 0)
+        bottom = min(int(rows.max()) + margin + 1, height)
+        right = min(int(columns.max()) + margin + 1, width)
+        inside = np.zeros((bottom - top, right - left), bool)
+        inside[rows - top, columns - left] = True
+        near = self.labels[top:bottom, left:right][grown(inside, margin, cv2.MORPH_ELLIPSE)]
+        counts = np.bincount(near, minlength=len(self.areas))[1:]
+        return bool(((counts > 0) & (counts < OWN_SHARE * self.areas[1:])).any())
+
+
+def marks_of(cloud: Cloud, evidence: Evidence) -> Marks:
+    """Return the objects, print and edges of a cloud; none without a pixel grid."""
+    shape = evidence.score.shape
+    nowhere = np.zeros(shape, bool)
+    margin_px = _margin(cloud)
+    if not cloud.organised:
+        labels = np.zeros(shape, np.int32)
+        return Marks(nowhere, nowhere, labels, np.array([nowhere.size]), margin_px)
+    proud = _proud(cloud, evidence)
+    objects = proud | _marked(cloud, evidence)
+    covered = grown(objects, margin_px, cv2.MORPH_ELLIPSE)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(objects.astype(np.uint8))
+    longer = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
+    is_long = longer > LONGEST_HOLE_PX
+    is_long[0] = False
+    number = np.cumsum(is_long) * is_long
+    labels = number[labels]
+    areas = np.bincount(labels.ravel(), minlength=int(is_long.sum()) + 1)
+    return Marks(proud, covered, labels, areas, margin_px)
 
 
 def each_object_once(

@@ -116,7 +116,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 3
+    version = 4
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings
@@ -257,12 +257,7 @@ class LocalDetector:
         """Measure the thesis' extents and the model of a blurred hole on the finding's core."""
         scores = evidence.score.reshape(-1)[detection.pixels]
         core = replace(detection, pixels=detection.pixels[scores >= CORE * detection.score])
-        by_lag = self.correlation(evidence)
-        return measure_detection(cloud, evidence, core, self.settings.hole_model, by_lag)
-
-    def correlation(self, evidence: Evidence) -> np.ndarray | None:
-        """Return the noise's correlation (odd, odd) by lag, which weighs sizes; None if unknown."""
-        return None
+        return measure_detection(cloud, evidence, core, self.settings.hole_model)
 
 
 def _shares(

@@ -9,7 +9,8 @@ from typing import Any
 
 from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
-from detectors.findings.null import OwnThreshold, each_object_once, own_threshold
+from detectors.findings.null import RIM_PX, OwnThreshold, each_object_once, own_threshold
+from detectors.findings.odds import noise_probabilities
 from detectors.interface import Detection, Detector, Evidence, Measurement
 from detectors.surfaces.background import misfit
 from harness.inspection import arguments as cli
@@ -23,8 +24,12 @@ DEFAULT_K = 5.0
 """
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
-NULL_FACTS = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
-"""Facts of a capture's own threshold that are stored with the findings."""
+NULL_FACTS = ("threshold", "expected", "at_marks", "low", "high")
+"""Facts of a capture's own threshold that are stored with the findings if it can be trusted."""
+PEAK_FACTS = ("peaks", "floor", "objects", "rim_pixels", "rim_scale")
+"""Facts that are stored in any case."""
+LEAST_AT_MARKS = 0.05
+"""Fewest expected calls at marks that the output states: 0.1 when rounded."""
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
@@ -38,7 +43,8 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     measurements = tuple(
         _measured(detector, cloud, evidence, detection) for detection in detections
     )
-    result = Judged(cloud, evidence, detections, measurements, missing)
+    probabilities = noise_probabilities(cloud, evidence, detections, missing)
+    result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)
 
 
@@ -105,8 +111,7 @@ def threshold_of(
 
     wanted_calls = arguments.false_calls or cli.DEFAULT_FALSE_CALLS
     own = own_threshold(detector, cloud, evidence, wanted_calls)
-    own_null = {name: getattr(own, name) for name in NULL_FACTS}
-    notes: dict[str, Any] = {**evidence.notes, "own_null": own_null}
+    notes: dict[str, Any] = {**evidence.notes, "own_null": null_facts(own)}
     searched = replace(own.evidence, notes=notes)
     peaks = _peaks_text(own, cloud)
     if own.doubts:
@@ -120,18 +125,34 @@ def threshold_of(
         return k, origin, replace(searched, warnings=(*evidence.warnings, *warnings))
     expected = f"{calls_text(own.expected)} false calls expected"
     interval = f"95 % interval {calls_text(own.low)} to {calls_text(own.high)}"
-    origin = f"from this capture's own null: {expected}, {interval}, from {peaks}"
+    at_marks = ""
+    if own.at_marks >= LEAST_AT_MARKS:
+        at_marks = f", {calls_text(own.at_marks)} of them at objects, print and edges"
+    origin = f"from this capture's own null: {expected}{at_marks}, {interval}, from {peaks}"
     return own.threshold, origin, searched
+
+
+def null_facts(own: OwnThreshold) -> dict[str, Any]:
+    """Return the facts of a capture's own threshold as plain data; the expected numbers are NaN
+    and the laws are missing if they cannot be trusted."""
+    facts: dict[str, Any] = {name: getattr(own, name) for name in PEAK_FACTS}
+    if own.doubts:
+        facts.update(dict.fromkeys(NULL_FACTS, math.nan))
+        facts["tails"] = {}
+    else:
+        facts.update({name: getattr(own, name) for name in NULL_FACTS})
+        facts["tails"] = {name: tail.facts for name, tail in own.tails.items()}
+    return facts
 
 
 def _peaks_text(own: OwnThreshold, cloud: Cloud) -> str:
     """Say from how many peaks a capture's own threshold comes, and what limits them."""
     text = f"{own.peaks} peaks towards the camera"
-    if own.objects:
-        beside = "expect more beside objects, tags and edges in the picture"
-        text += f"; {beside} ({own.objects} places)"
     if not cloud.organised:
         text += "; objects on the target were not sought"
+    if own.rim_scale < 1.0:
+        rim = f"scores within {RIM_PX} pixels of the rim count {own.rim_scale:.2g} times"
+        text += f"; {rim}, because noise is higher there"
     if own.rim_pixels:
         rim = f"{own.rim_pixels} pixels along the rim"
         text += f"; {rim} are mixed with the background and are not judged"

@@ -94,7 +94,7 @@ def limit_of(
             "--limit presses damage into a grid of pixels, and these points have none",
             fix="leave out --limit, or give depth images",
         )
-    free = _free(result)
+    free = free_area(result)
     counts: dict[int, SizeCount] = {}
     step = 0
     while len(counts) < MOST_SIZES:
@@ -102,7 +102,7 @@ def limit_of(
         if count is None:
             break
         counts[step] = count
-        following = _following(counts)
+        following = next_step(counts)
         if following is None:
             break
         step = following
@@ -112,7 +112,7 @@ def limit_of(
             fix="leave out --limit, or judge a larger area",
         )
     sizes = tuple(counts[number] for number in sorted(counts))
-    return _fitted(sizes, depth_m)
+    return fitted(sizes, depth_m)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _pitch_m(result: Judged) -> float:
     return pitch_mm(result.cloud, result.evidence) * MM
 
 
-def _following(counts: dict[int, SizeCount]) -> int | None:
+def next_step(counts: dict[int, SizeCount]) -> int | None:
     """Return the step of the next size: smaller ones until few are found, then larger ones until
     nearly all are; None at the end."""
     smallest = min(counts)
@@ -154,7 +154,7 @@ def _counted(
     detector: Detector, result: Judged, threshold: float, free: np.ndarray, disc: Disc
 ) -> SizeCount | None:
     """Press discs of one size into the cloud and count those that are found; None without room."""
-    centres = _centres(result, free, disc)
+    centres = places_for(result, free, disc)
     if not len(centres):
         return None
     pressed, floors = pressed_in(result, centres, disc)
@@ -214,7 +214,7 @@ def _along_ray(cloud: Cloud, surface_m: np.ndarray) -> np.ndarray:
     return np.asarray(np.nan_to_num(rays / cosines))
 
 
-def _free(result: Judged) -> np.ndarray:
+def free_area(result: Judged) -> np.ndarray:
     """Return (h, w) bool: judged pixels away from findings."""
     occupied = np.zeros(result.cloud.valid.size, bool)
     for detection in result.detections:
@@ -223,7 +223,7 @@ def _free(result: Judged) -> np.ndarray:
     return np.isfinite(result.evidence.score) & result.cloud.valid & ~near
 
 
-def _centres(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
+def places_for(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
     """Return the flat indices (n,) of random centres with room for a disc and apart from one
     another; the same at each call."""
     radius_px = 0.5 * disc.diameter_m / _pitch_m(result)
@@ -231,7 +231,7 @@ def _centres(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
     room_px = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     margin_px = radius_px + max(1.0, 0.5 * result.cloud.noise_reach_px)
     candidates = np.flatnonzero(room_px.ravel() > margin_px)
-    shuffled = random_stream(0, "limit", round(disc.diameter_m / MM, 6)).permutation(candidates)
+    shuffled = random_stream(0, "limit", f"{disc.diameter_m / MM:.6f} mm").permutation(candidates)
     area_px = math.pi * max(radius_px, 0.5) ** 2
     most = min(MOST_PLACES, max(1, int(MOST_SHARE * free.sum() / area_px)))
     apart_px = 2 * radius_px + APART_PX
@@ -247,7 +247,7 @@ def _centres(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
     return np.array(chosen, int)
 
 
-def _fitted(sizes: Sequence[SizeCount], depth_m: float | None) -> Limit:
+def fitted(sizes: Sequence[SizeCount], depth_m: float | None) -> Limit:
     """Fit the share that is found as a function of size."""
     diameters = np.concatenate([np.full(size.places, size.diameter_mm) for size in sizes])
     hits = np.concatenate([np.arange(size.places) < size.hits for size in sizes])

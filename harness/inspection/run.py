@@ -297,10 +297,11 @@ def write_inspection(
     command: str,
     further_inputs: Sequence[Path] = (),
     further_files: Mapping[str, FileWriter] | None = None,
+    further_warnings: Sequence[str] = (),
 ) -> None:
     """Write the findings, their facts and pictures into the folder of ``--out``, and print the
     paths. ``further_inputs``: other files that were read; ``further_files``: how to write other
-    files, by name."""
+    files, by name; ``further_warnings``: last on the page."""
     mapped = run.mapped
     limit = output.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
@@ -320,7 +321,7 @@ def write_inspection(
         files["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
             files |= output.pictures(choice, f"targets-{number}.png")
-    page = partial(_page_html, run, subject, scene, facts["provenance"])
+    page = partial(_page_html, run, subject, scene, facts["provenance"], further_warnings)
     files[outputs.INSPECTION_PAGE.name] = lambda path: path.write_text(page(), encoding="utf-8")
     written = write_findings(
         run.arguments.out, run.result, facts, title, cloud_name=cloud_name, beside=files
@@ -407,7 +408,13 @@ def _file_facts(path: Path) -> dict[str, str]:
 # ---------------------------------------------------------------- the page
 
 
-def _page_html(run: Inspection, subject: str, scene: Scene3d, provenance: Mapping[str, Any]) -> str:
+def _page_html(
+    run: Inspection,
+    subject: str,
+    scene: Scene3d,
+    provenance: Mapping[str, Any],
+    further_warnings: Sequence[str],
+) -> str:
     """Return report.html as text."""
     from harness.report.inspection_page import PageText, inspection_html
 
@@ -415,7 +422,7 @@ def _page_html(run: Inspection, subject: str, scene: Scene3d, provenance: Mappin
         title=subject,
         sentence=run.verdict.sentence,
         conditions=_conditions(run),
-        warnings=warnings_of(run),
+        warnings=(*warnings_of(run), *further_warnings),
         classes=CLASSES,
         flags=FLAGS,
         summary=tuple(_summary_rows(run.verdict)),
@@ -453,9 +460,11 @@ def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
         rows.append(("share of the part", f"{100 * extent.judged_share:.0f} %"))
     if np.isfinite(extent.blind_m2):
         rows.append(("blind", f"{1e4 * extent.blind_m2:.3g} cm2"))
-    expected = verdict.expected_false_calls
-    text = "unknown" if np.isnan(expected) else calls_text(expected)
-    rows.append(("expected false calls", text))
+    for name, expected in (
+        ("expected false calls", verdict.expected_false_calls),
+        ("of them among the sure", verdict.expected_false_sure),
+    ):
+        rows.append((name, "unknown" if np.isnan(expected) else calls_text(expected)))
     return rows
 
 
@@ -476,7 +485,9 @@ def _judged_rows(run: Inspection) -> list[tuple[str, str]]:
     if null is not None:
         rim = f"{null['rim_pixels']} pixels, not judged"
         rows.append(("rim mixed with what lies behind", rim))
-        objects = f"{null['objects']} places, whose bumps are not taken as noise"
+        objects = f"{null['objects']} places"
+        if np.isfinite(null["at_marks"]):
+            objects += f", {calls_text(null['at_marks'])} false calls expected there"
         rows.append(("objects, printed marks and edges in the picture", objects))
     choice = run.choices[0]
     if run.mapped is None and choice is not None:
@@ -536,10 +547,16 @@ def _registration_text(registration: Mapping[str, Any]) -> str:
 
 def _files_text(run: Inspection) -> dict[str, str]:
     """Return the files beside the page, with their content."""
-    files = {
-        output_file.name: output_file.note
-        for output_file in (outputs.FINDINGS, outputs.FINDINGS_DATA, outputs.ANNOTATED)
-    }
-    cloud_name = outputs.CLOUD.name if run.mapped is None else "merged.ply"
-    files[cloud_name] = outputs.CLOUD.note
+    shown = [outputs.FINDINGS, outputs.FINDINGS_DATA, outputs.ANNOTATED]
+    if run.result.missing is not None:
+        shown.append(outputs.BLIND)
+    if run.mapped is None and run.choices[0] is not None:
+        shown.append(outputs.TARGETS)
+    files = {shown_file.name: shown_file.note for shown_file in shown}
+    if run.mapped is None:
+        files[outputs.CLOUD.name] = outputs.CLOUD.note
+    else:
+        files["merged.ply"] = "the merged cloud, with findings in magenta"
+        files["registrations.json"] = "the pose of each view, with its covariance and checks"
+        files["view3d.html"] = "the merged cloud that can be turned, as a page of its own"
     return files

@@ -19,14 +19,14 @@ SURE = "sure"
 DOUBTFUL = "doubtful"
 RIM_OR_BLIND = "rim or blind"
 CLASSES = {
-    SURE: "noise explains each with a probability below 0.05; where this is unknown, the score is"
-    " well above the threshold",
-    DOUBTFUL: "noise may explain them",
+    SURE: "each is a false call with a probability below 0.05; where this is unknown, its score is"
+    " at least 1.5 times the threshold",
+    DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them",
     RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
 }
 """The classes of findings, with their meaning."""
 FLAGS = {
-    "faint": "noise may explain it",
+    "faint": "noise, or what an object or print makes of the distance, may explain it",
     "at_rim": "reaches the rim of the judged area: may be larger than stated",
     "open_behind": "shows what lies far behind, or nothing: may be wider than stated by up to the"
     " noise's reach, where the camera's filter mixes the rim with what is behind",
@@ -37,14 +37,13 @@ FLAGS = {
 }
 """The flags of findings, with their meaning."""
 MOST_NOISE = 0.05
-"""Probability of noise from which a finding is doubtful. Each sure finding is real with at least
-95 %, so that fewer than one in 20 of them are expected to be false, however many there are."""
+"""Probability of a false call from which a finding is doubtful. Each sure finding is real with at
+least 95 %, so that fewer than one in 20 of them are expected to be false, however many there are.
+"""
 CLEAR_RATIO = 1.5
 """Ratio of score to threshold from which a finding with unknown odds is not faint. At 1.5 times a
 threshold of 5, normal noise is rarer by a factor of exp(15.6), and noise that falls like
 exp(-score) by exp(2.5)."""
-FAINT_CALLS = 0.05
-"""Noise explains a finding if at least this many false calls of its score are expected."""
 OPEN_MM = 75.0
 """Depth beyond which a hole shows objects far behind it."""
 DENT_RATIO = 0.25
@@ -65,7 +64,7 @@ random cloud leaves exp(-6) of them empty."""
 def with_remarks(result: Judged, threshold: float) -> Judged:
     """Give each finding its class, its flags and its term. ``threshold``: units of score."""
     bare = replace(result, remarks=())
-    least_score = clear_score(result.evidence, threshold)
+    least_score = CLEAR_RATIO * threshold
     cut = _cut_by_the_rim(result.cloud, result.evidence, result.detections)
     floor_mm = least_floor_mm(result.cloud, result.evidence)
     remarks = []
@@ -98,21 +97,6 @@ def is_faint(finding: Finding, least_score: float) -> bool:
     if math.isnan(finding.noise_probability):
         return finding.score < least_score
     return finding.noise_probability >= MOST_NOISE
-
-
-def clear_score(evidence: Evidence, threshold: float) -> float:
-    """Return the score from which a finding with unknown odds is not faint.
-
-    Where the capture set its own threshold, it is the score at which `FAINT_CALLS` are expected.
-    The logarithm of the number of false calls is assumed to fall with the square of the score, as
-    for normal noise, through the peaks above the floor and the upper 95 % bound of the number
-    expected at the threshold. Otherwise it is `CLEAR_RATIO` times the threshold."""
-    null = evidence.notes.get("own_null", {"threshold": None})
-    if threshold != null["threshold"] or not 0 < null["high"] < null["peaks"]:
-        return CLEAR_RATIO * threshold
-    rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
-    further = math.log(max(null["high"] / FAINT_CALLS, 1.0)) / rate
-    return math.sqrt(threshold**2 + further)
 
 
 def class_of(finding: Finding, flags: Sequence[str]) -> str:
@@ -300,6 +284,9 @@ class InspectionVerdict:
     extent: Extent
     expected_false_calls: float
     """False calls expected in the capture; NaN where unknown."""
+    expected_false_sure: float
+    """Number of sure findings that are expected to be false, the sum of their probabilities; NaN
+    where these are unknown."""
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -312,6 +299,7 @@ class InspectionVerdict:
             "judged_share_of_outline": self.extent.judged_share,
             "blind_area_m2": self.extent.blind_m2,
             "expected_false_calls": self.expected_false_calls,
+            "expected_false_sure": self.expected_false_sure,
         }
 
 
@@ -322,16 +310,25 @@ def verdict_of(
     findings = result.findings
     counts = {name: 0 for name in CLASSES}
     terms: dict[str, int] = {}
+    false_sure = 0.0
     for finding in findings:
         counts[finding.certainty] += 1
         if finding.certainty == SURE:
             terms[finding.term] = terms.get(finding.term, 0) + 1
+            false_sure += finding.noise_probability
     extent = extent_of(result, outline)
     expected = expected_calls(result.evidence, threshold)
     clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not findings)]
     clauses += _other_clauses(findings, is_further=bool(terms))
-    clauses.append(_calls_clause(expected))
-    return InspectionVerdict("; ".join(clauses) + ".", counts, terms, extent, expected)
+    clauses.append(_calls_clause(expected, false_sure if terms else math.nan))
+    return InspectionVerdict(
+        sentence="; ".join(clauses) + ".",
+        counts=counts,
+        sure_terms=terms,
+        extent=extent,
+        expected_false_calls=expected,
+        expected_false_sure=false_sure,
+    )
 
 
 def expected_calls(evidence: Evidence, threshold: float) -> float:
@@ -390,7 +387,7 @@ def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str
         if finding.certainty == RIM_OR_BLIND:
             blind += finding.kind == "no return"
             cut += finding.kind != "no return"
-    clauses = []
+    clauses: list[str] = []
     for count, one, several in (
         (doubtful, "is doubtful", "are doubtful"),
         (cut, "is cut by the rim", "are cut by the rim"),
@@ -404,7 +401,10 @@ def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str
     return clauses
 
 
-def _calls_clause(expected: float) -> str:
+def _calls_clause(expected: float, false_sure: float) -> str:
+    """Return the clause on false calls: those among the sure findings, or else all of them."""
+    if not math.isnan(false_sure):
+        return f"{calls_text(false_sure)} false calls expected among the sure ones"
     if math.isnan(expected):
         return "the number of false calls is unknown"
     return f"{calls_text(expected)} false calls expected"

@@ -590,7 +590,7 @@ class ResultTables:
 
 # ---------------------------------------------------------------- real captures
 
-FINDINGS_VERSION = 3
+FINDINGS_VERSION = 4
 """The version is increased when the meaning of a column or key changes; the last column of the CSV
 states it."""
 FINDINGS_OF_CAPTURE = Table(
@@ -604,8 +604,22 @@ FINDINGS_OF_CAPTURE = Table(
         Column("x_mm", "", "x_mm", "x of its centre in the camera's frame (to the right)"),
         Column("y_mm", "", "y_mm", "y of its centre in the camera's frame (down)"),
         Column("z_mm", "", "z_mm", "z of its centre in the camera's frame (away from the camera)"),
-        Column("diameter_mm", "", "diameter_mm", "diameter, from the model if the model fits"),
-        Column("depth_mm", "", "depth_mm", "depth; negative for a bump"),
+        Column("diameter_mm", "", "diameter_mm", "diameter of the mouth, averaged over shapes"),
+        Column("diameter_se_mm", "", "diameter_se_mm", "its standard error"),
+        Column("depth_mm", "", "depth_mm", "depth normal to the surface; negative for a bump"),
+        Column("depth_se_mm", "", "depth_se_mm", "its standard error"),
+        Column(
+            "sight_depth_mm",
+            "",
+            "sight_depth_mm",
+            "depth along the line of sight; negative for a bump",
+        ),
+        Column(
+            "shape",
+            "",
+            "shape",
+            "disc, cap, bowl, slot, ragged (no shape fits), or empty if the blur hides it",
+        ),
         Column(
             "volume_mm3", "", "volume_mm3", "volume between the surface and the points behind it"
         ),
@@ -628,7 +642,7 @@ FINDINGS_OF_CAPTURE = Table(
             "noise_probability",
             "",
             "noise_probability",
-            "probability that noise alone made it; empty where unknown",
+            "probability that it is a false call; empty if the capture sets no threshold itself",
         ),
         Column(
             "certainty",

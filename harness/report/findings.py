@@ -58,9 +58,15 @@ class Finding:
     z_mm: float
     """z of its centre (away from the camera)."""
     diameter_mm: float
-    """Diameter, see ``size_from``."""
+    """Diameter of the mouth, see ``size_from``; of a slot, that of the circle with its area."""
+    diameter_se_mm: float
+    """Standard error of the diameter, with what the shape does not explain; NaN if unknown."""
     depth_mm: float
-    """Depth, negative for a bump, see ``depth_from``."""
+    """Depth normal to the fitted surface, negative for a bump, see ``depth_from``."""
+    depth_se_mm: float
+    """Standard error of the depth; NaN if unknown."""
+    sight_depth_mm: float
+    """Depth along the line of sight, negative for a bump."""
     volume_mm3: float
     """Volume between the surface and the points behind it."""
     points: int
@@ -73,13 +79,17 @@ class Finding:
     """Shorter side of that rectangle."""
     angle_deg: float
     """Angle of the longer side from x towards y, -90 to 90, across the line of sight."""
+    shape: str
+    """``disc``, ``cap``, ``bowl`` or ``slot``, ``ragged`` if no shape fits, or empty if the blur
+    hides it."""
     size_from: str
-    """``model`` (blurred hole, standard errors), ``contour`` (half depth), ``extent`` (extreme
-    points) or ``area`` (no return)."""
+    """``model`` (a family of shapes), ``contour`` (half depth), ``extent`` (extreme points) or
+    ``area`` (no return)."""
     depth_from: str
     """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
     noise_probability: float = math.nan
-    """Probability that noise alone made it; NaN where unknown."""
+    """Probability that it is a false call: noise, or what an object or print makes of the measured
+    distance. NaN if the capture does not set its own threshold."""
     certainty: str = ""
     """``sure``, ``doubtful`` or ``rim or blind``; empty where nobody has judged it."""
     flags: str = ""
@@ -130,19 +140,23 @@ class Judged:
     """The size and place of each cluster."""
     missing: MissingReturns | None = None
     """Missing returns; None without a pixel grid."""
+    noise_probabilities: tuple[float, ...] = ()
+    """Each finding's probability of being a false call, NaN if unknown; empty if all are."""
     remarks: tuple[Remark, ...] = ()
     """One for each finding, or none at all."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The findings, numbered from 1, strongest first."""
-        pairs = zip(self.detections, self.measurements, strict=True)
-        measured_only = [
-            finding_of(number, self.evidence, detection, measured)
-            for number, (detection, measured) in enumerate(pairs, start=1)
-        ]
+        unknown = (math.nan,) * len(self.detections)
+        probabilities = self.noise_probabilities or unknown
+        triples = zip(self.detections, self.measurements, probabilities, strict=True)
+        measured_only = tuple(
+            finding_of(number, self.evidence, detection, measured, probability)
+            for number, (detection, measured, probability) in enumerate(triples, start=1)
+        )
         if not self.remarks:
-            return tuple(measured_only)
+            return measured_only
         remarked = []
         for finding, remark in zip(measured_only, self.remarks, strict=True):
             remarked.append(replace(finding, **vars(remark)))
@@ -150,7 +164,11 @@ class Judged:
 
 
 def finding_of(
-    number: int, evidence: Evidence, detection: Detection, measured: Measurement
+    number: int,
+    evidence: Evidence,
+    detection: Detection,
+    measured: Measurement,
+    noise_probability: float = math.nan,
 ) -> Finding:
     """Return the row of a detection: the model's numbers if they exist, or else those of the
     extents."""
@@ -160,7 +178,11 @@ def finding_of(
     is_modelled = math.isfinite(measured.model_diameter_m)
     diameter_m = measured.model_diameter_m if is_modelled else measured.extent_diameter_m
     size_from = _size_from(detection, measured)
-    depth_m, depth_from = _depth_of(evidence, detection, measured)
+    axial_depth_m, depth_from = _depth_of(evidence, detection, measured)
+    # a measurement without a surface around it has no cosine: the depth is that along the axis
+    normal_share = measured.normal_share if math.isfinite(measured.normal_share) else 1.0
+    sight_share = measured.sight_share if math.isfinite(measured.sight_share) else 1.0
+    depth_m = axial_depth_m * normal_share
     kind: str = detection.kind
     if kind != "no return":
         kind = "bump" if depth_m < 0 else "hole"
@@ -176,15 +198,20 @@ def finding_of(
         y_mm=float(centre_m[1]) / MM,
         z_mm=float(centre_m[2]) / MM,
         diameter_mm=diameter_m / MM,
+        diameter_se_mm=measured.model_diameter_se_m / MM,
         depth_mm=depth_m / MM,
+        depth_se_mm=measured.model_depth_se_m * normal_share / MM,
+        sight_depth_mm=axial_depth_m * sight_share / MM,
         volume_mm3=measured.volume_m3 / MM**3,
         points=measured.points,
         score=measured.score,
         length_mm=measured.length_m / MM,
         width_mm=measured.width_m / MM,
         angle_deg=angle_deg,
+        shape=measured.shape,
         size_from=size_from,
         depth_from=depth_from,
+        noise_probability=noise_probability,
     )
 
 
@@ -194,7 +221,7 @@ def _size_from(detection: Detection, measured: Measurement) -> str:
         return "area"
     if not math.isfinite(measured.model_diameter_m):
         return "extent"
-    return "contour" if math.isnan(measured.model_diameter_se_m) else "model"
+    return "contour" if measured.model_note else "model"
 
 
 def _depth_of(evidence: Evidence, detection: Detection, measured: Measurement) -> tuple[float, str]:

@@ -39,6 +39,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
             further_files={
                 GAUGE_ROWS.name: lambda path: path.write_text(table, encoding="utf-8"),
             },
+            further_warnings=reading.warnings,
         )
     return 0
 

@@ -321,15 +321,14 @@ def test_a_centre_s_error_is_that_along_one_axis() -> None:
     detection = strongest(cloud, evidence, 5.0)
     around = _surroundings(cloud, evidence, detection, HoleModelConfig())
     assert around is not None
-    fit, _ = _modelled(around, HoleModelConfig(), None)
-    assert fit is not None
+    size, _ = _modelled(around, HoleModelConfig())
+    assert size is not None
+    fit = size.best
     u_m, v_m = np.linalg.norm(around.per_px_m, axis=1)
     m = measure_detection(cloud, evidence, detection, HoleModelConfig())
     # the derivatives by u and v are nearly at right angles
     square_m2 = fit.covariance[0, 0] * u_m**2 + fit.covariance[1, 1] * v_m**2
     assert m.model_centre_se_m == pytest.approx(np.sqrt(square_m2 / 2), rel=0.02)
-    assert m.model_depth_se_m == np.sqrt(fit.covariance[3, 3])
-    assert m.model_diameter_se_m == 2.0 * np.sqrt(fit.covariance[2, 2])
 
 
 @pytest.mark.parametrize(
@@ -340,10 +339,9 @@ def test_a_centre_s_error_is_that_along_one_axis() -> None:
     ],
 )
 def test_standard_errors_cover_the_truth(count: int) -> None:
-    """Draws of correlated noise, over walls of every length as the prior has it. The deviation of
-    200 standard scores with some 20 degrees of freedom each has a standard error of 0.055, so 1 -+
-    0.2 holds with a risk below 0.1 % for each of the three; means within 0.25 (3.5 standard
-    errors). Of fewer draws the bounds are wider."""
+    """Draws of correlated noise, over walls of every length as the prior has it. The blur hides
+    whether the hole is a disc or a cap, so that the errors contain the difference: they cover
+    more often than a normal error's 95 %, and sizes lie on one side of the truth."""
     boards = [Board(12.7, 5.0, wall=wall) for wall in (0.1, 0.3, 0.5, 0.7, 0.9)]
     draws = [(boards[seed % 5], measured(boards[seed % 5], 0.25, seed)) for seed in range(count)]
     assert all(m.model_note == "" for _, m in draws)
@@ -357,63 +355,47 @@ def test_standard_errors_cover_the_truth(count: int) -> None:
             for board, m in draws
         ]
     )
-    wider = np.sqrt(200 / count)
-    assert np.all(np.abs(scores.mean(axis=0)) < 0.25 * wider)
-    assert np.all(np.abs(scores.std(axis=0) - 1.02) < 0.2 * wider)
+    covered = (np.abs(scores) < 2.0).mean(axis=0)
+    assert (covered >= 0.9).all()
+    assert (np.abs(scores.mean(axis=0)) < 0.7).all()
+    widths = np.array([m.model_diameter_se_m for _, m in draws])
+    assert np.median(widths) < 0.16 * 12.7e-3
 
 
-@pytest.mark.parametrize(
-    ("reach_px", "low_mm", "high_mm"),
-    [
-        (5.0, 8.0, 10.5),
-        (0.0, 0.0, 7.5),
-    ],
-)
-def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise(
-    reach_px,
-    low_mm,
-    high_mm,
-) -> None:
+def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise() -> None:
     board = Board(9.0, 9.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
-    cloud, evidence = board.seen(0.5, 3)
-    cloud = replace(
-        cloud, noise_reach_px=reach_px
-    )  # 0: no recording, so that the model's own blur of 5 pixels is taken
-    white = np.pad([[1.0]], 10)
-    m = measure_detection(
-        cloud,
-        evidence,
-        strongest(cloud, evidence, 5.0),
-        HoleModelConfig(),
-        white,
-    )
-    assert low_mm * 1e-3 < m.model_diameter_m < high_mm * 1e-3
+    board.blur = 5  # of the noise alone
+    cloud, evidence = board.seen(0.2, 3)
+    detection = strongest(cloud, evidence, 5.0)
+    recording = replace(cloud, noise_reach_px=5.0)
+    m = measure_detection(recording, evidence, detection, HoleModelConfig())
+    assert 8.5e-3 < m.model_diameter_m < 10.0e-3
+    # no recording: the model's own blur of 5 pixels is taken, and the hole is too narrow and deep
+    m = measure_detection(cloud, evidence, detection, HoleModelConfig())
+    assert "deeper than 75 mm" in m.model_note
 
 
 def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
     board = Board(9.0, 9.0, wall=0.0)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    # a cap 48 mm wide; half of its depth lies within 34 mm
+    # a paraboloid 48 mm wide; half of its depth lies within 34 mm
     board.image = 7e-3 * np.clip(
         1 - ((u - WIDTH / 2) ** 2 + (v - HEIGHT / 2) ** 2) / 16.0**2,
         0,
         None,
     )
     cloud, evidence = board.seen(0.05, 3)
-    lag = np.abs(np.arange(-28, 29))
-    triangle = np.clip(1 - lag / 4, 0, None)
-    wave = np.exp(-(lag**2) / (2 * 6.3**2))
-    by_lag = 0.3 * np.outer(triangle, triangle) + 0.7 * np.outer(wave, wave)
     core = detection_of(cloud, 9.0, np.flatnonzero(board.image > 6.3e-3))
     m = measure_detection(
         cloud,
         evidence,
         core,
         HoleModelConfig(),
-        by_lag,
     )
-    assert m.model_depth_m == pytest.approx(7e-3, abs=1.5e-3)
-    assert m.model_diameter_m == pytest.approx(34e-3, abs=5e-3)
+    assert m.shape == "cap"
+    assert m.model_depth_m == pytest.approx(7e-3, abs=0.3e-3)
+    assert m.model_diameter_m == pytest.approx(48e-3, abs=1.5e-3)
+    assert abs(m.model_diameter_m - 48e-3) < 2 * m.model_diameter_se_m
 
 
 def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
@@ -421,7 +403,8 @@ def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
     assert m.model_note.startswith("the blur hides the difference")
     assert "half-depth contour" in m.model_note
     assert m.model_diameter_m > 2.0e-3
-    assert np.isnan(m.model_diameter_se_m)
+    # an upper limit: two standard errors reach down to 0
+    assert 2 * m.model_diameter_se_m > 0.95 * m.model_diameter_m
 
 
 def test_a_deep_hole_falls_back_to_its_contour() -> None:
@@ -468,7 +451,8 @@ def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
     assert "no range" in m.model_note
     assert m.model_diameter_m == pytest.approx(19.0e-3, abs=1.0e-3)
     assert np.isnan(m.model_depth_m)
-    assert np.isnan(m.model_diameter_se_m)
+    assert np.isnan(m.model_depth_se_m)
+    assert abs(m.model_diameter_m - 19.0e-3) < 2 * m.model_diameter_se_m < 4e-3
 
 
 def test_a_neighbour_is_masked() -> None:
@@ -577,7 +561,7 @@ def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
     )
     assert m.points == 1
     assert m.extent_diameter_m == 0.0
-    assert m.model_note != ""
+    assert m.model_note != "" or m.model_diameter_se_m > 0.15 * m.model_diameter_m
 
 
 def test_an_even_blur_is_refused() -> None:

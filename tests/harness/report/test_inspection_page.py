@@ -67,17 +67,19 @@ def image_in(markup: str) -> np.ndarray:
     encoded = re.search(r'href="data:image/(?:png|jpeg);base64,([^"]+)"', markup)
     assert encoded
     data = np.frombuffer(base64.b64decode(encoded[1]), np.uint8)
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert image is not None
+    return image[..., ::-1]
 
 
-def test_the_picture_is_colour_else_infrared_else_the_deviation():
+def test_the_picture_is_colour_else_infrared_else_the_deviation() -> None:
     assert best_view(judged_of(rgb=True, amplitude=True))[0] == "colour picture"
     assert best_view(judged_of(amplitude=True))[0] == "infrared picture"
     assert best_view(judged_of())[0] == "distance from the surface"
     assert best_view(judged_of(organised=False))[0] == "distance from the surface"
 
 
-def test_a_mark_lies_on_its_finding_in_the_cropped_picture():
+def test_a_mark_lies_on_its_finding_in_the_cropped_picture() -> None:
     """The crop leaves a twelfth of the 30 judged columns about them: 2.5 pixels, from 7.5, so that
     pixel 7 is the first; the rows begin at pixel 5. The square's middle is then 21.5 - 7 + .5."""
     judged = judged_of()
@@ -94,7 +96,7 @@ def test_a_mark_lies_on_its_finding_in_the_cropped_picture():
     assert "<title>1: hole, 8.0 mm wide, 5.00 mm deep, doubtful</title>" in text
 
 
-def test_a_cloud_without_a_grid_is_drawn_in_its_plan_view():
+def test_a_cloud_without_a_grid_is_drawn_in_its_plan_view() -> None:
     judged = judged_of(organised=False)
     picture = deviation_view(judged)
     text = str(numbered_picture(judged, picture, "picture"))
@@ -106,7 +108,7 @@ def test_a_cloud_without_a_grid_is_drawn_in_its_plan_view():
     assert red[0].min() - 1 <= y <= red[0].max() + 1
 
 
-def test_red_is_behind_blue_before_and_grey_was_not_judged():
+def test_red_is_behind_blue_before_and_grey_was_not_judged() -> None:
     behind, before, nothing = residual_rgb(np.array([[5.0, -5.0, np.nan]]))[0]
     assert behind[0] > 2 * behind[2] and before[2] > 2 * before[0]
     assert tuple(nothing) == (185, 190, 196)
@@ -114,7 +116,7 @@ def test_red_is_behind_blue_before_and_grey_was_not_judged():
     assert '<span style="left:50.0%">0</span>' in key and "−10" in key
 
 
-def test_each_class_has_its_own_table():
+def test_each_class_has_its_own_table() -> None:
     finding = judged_of().findings[0]
     long = replace(finding, id=2, certainty="sure", length_mm=20.0, width_mm=3.0)
     text = "".join(map(str, class_sections([finding, long], {"sure": "real", "doubtful": "noise"})))
@@ -126,7 +128,7 @@ def test_each_class_has_its_own_table():
 
 
 @pytest.mark.usefixtures("unpictured")
-def test_every_number_of_the_page_stands_in_a_data_file(tmp_path: Path):
+def test_every_number_of_the_page_stands_in_a_data_file(tmp_path: Path) -> None:
     capture = plane.write_open3d_folder(tmp_path / "<b>plate", 4, noise_mm=0.6)
     out = tmp_path / "out"
     arguments = [str(capture), "--out", str(out), "--false-calls", "0.1"]
@@ -151,7 +153,7 @@ def test_every_number_of_the_page_stands_in_a_data_file(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("unpictured")
-def test_warnings_stand_first_and_nothing_found_is_said(tmp_path: Path):
+def test_warnings_stand_first_and_nothing_found_is_said(tmp_path: Path) -> None:
     capture = plane.write_open3d_folder(tmp_path / "plain", 4, noise_mm=0.6, hole=False)
     out = tmp_path / "out"
     assert detect.main([str(capture), "--out", str(out), "--threshold", "20"]) == 0

@@ -1,0 +1,80 @@
+"""What a judged cloud says of noise: the law of its own null, and what stays unknown."""
+
+import argparse
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from detectors import load_detector
+from detectors.findings.null import OwnThreshold, own_threshold
+from harness.inspection.judging import judged, null_facts, threshold_of
+from harness.vocabulary.files import plain_json
+from tests.validation.odds import Case, capture
+
+DETECTOR = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
+CLOUD, _ = capture(Case("normal", 3, 1), 11)
+EVIDENCE = DETECTOR.analyse(CLOUD)
+
+
+def arguments(**changed: float | None) -> argparse.Namespace:
+    plain = {"threshold": None, "quiet_capture": None, "false_calls": None}
+    return argparse.Namespace(**{**plain, **changed})
+
+
+def never() -> tuple[float, str]:
+    raise AssertionError("no quiet capture was given")
+
+
+def own(false_calls: float) -> OwnThreshold:
+    return own_threshold(DETECTOR, CLOUD, EVIDENCE, false_calls)
+
+
+def test_findings_carry_the_odds_of_the_captures_own_null() -> None:
+    threshold, origin, evidence = threshold_of(
+        arguments(false_calls=3.0), DETECTOR, CLOUD, EVIDENCE, never
+    )
+    result = judged(DETECTOR, CLOUD, evidence, threshold)
+    assert "own null: 3.0 false calls expected, 95 % interval" in origin
+    assert evidence.warnings == ()
+    assert len(result.findings) >= 2
+    stated = [finding.noise_probability for finding in result.findings]
+    assert stated == list(result.noise_probabilities)
+    assert min(stated) < 0.05
+    assert max(stated) > 0.5
+    assert stated == sorted(stated)
+
+
+def test_odds_are_unknown_where_the_threshold_is_given() -> None:
+    threshold, _, evidence = threshold_of(
+        arguments(threshold=4.5), DETECTOR, CLOUD, EVIDENCE, never
+    )
+    result = judged(DETECTOR, CLOUD, evidence, threshold)
+    assert result.findings
+    assert all(math.isnan(finding.noise_probability) for finding in result.findings)
+    bare = replace(result, noise_probabilities=())
+    assert all(math.isnan(finding.noise_probability) for finding in bare.findings)
+
+
+def test_a_null_in_doubt_states_neither_calls_nor_odds() -> None:
+    trusted = own(3.0)
+    facts = null_facts(trusted)
+    assert facts["expected"] == trusted.expected == pytest.approx(3.0)
+    assert facts["tails"]["plain"]["peaks"] == facts["peaks"] == trusted.peaks
+    in_doubt = null_facts(replace(trusted, doubts=("the residual is not symmetric",)))
+    assert in_doubt["tails"] == {}
+    for name in ("threshold", "expected", "at_marks", "low", "high"):
+        assert math.isnan(in_doubt[name])
+    assert in_doubt["peaks"] == trusted.peaks
+    assert '"expected": null' in plain_json(in_doubt)
+
+
+def test_calls_at_marks_are_stated_apart() -> None:
+    noisy = replace(CLOUD, rgb=np.full((*CLOUD.valid.shape, 3), 200.0))
+    noisy.rgb[30:90, 30:100] = 20.0
+    _, origin, evidence = threshold_of(arguments(), DETECTOR, noisy, EVIDENCE, never)
+    null = evidence.notes["own_null"]
+    assert null["at_marks"] > 0.05
+    assert null["expected"] == pytest.approx(1.0 + null["at_marks"], rel=1e-6)
+    assert "of them at objects, print and edges, 95 % interval" in origin
