@@ -33,6 +33,7 @@ LEAST_LENGTH_M = 0.04
 """Least visible length along the direction from which a place of the profile is known."""
 LEAST_POINTS = 12
 STEEP = 3.7  # tan(75 degrees): a steeper place is a step, beside which pixels mix both of its sides
+RIM_PX = 3  # knots on either side of a step that mix both of its sides, as at a target's rim
 SEEN = 0.5  # least departure from a smooth surface, as a share of a pixel's noise
 GAIN_SIGMAS = 4.0
 """Least significance of a profile's gain over a smooth surface."""
@@ -138,7 +139,7 @@ class Profile:
         steps = np.abs(np.diff(1.0 / self.curve if self.central else self.curve))
         width_m = self.step * (distance_m[1:] if self.central else 1.0)
         is_step = steps > STEEP * width_m
-        for shift in (-1, 0, 1, 2):
+        for shift in range(1 - RIM_PX, RIM_PX + 1):
             index = np.flatnonzero(is_step) + shift
             unknown[index[(index >= 0) & (index < count)]] = True
         return replace(self, curve=np.where(unknown, np.nan, self.curve))

@@ -16,7 +16,6 @@ from detectors.surfaces.surface import Fit, polynomial
 
 SEARCHED = 40_000  # points of the area that are fitted
 CHORD_KNOTS = 6  # distance of the knots between which the profile's direction is taken
-TURNED = math.radians(12.0)  # a profile has left a direction when it has turned by this much
 HELD_OF_STRIP = 0.85  # share of a strip's points within the limit of a profile that holds it
 HELD_STRIPS = 0.9  # share of strips that a profile holds
 
@@ -26,6 +25,7 @@ def extruded_faces(
     surface: np.ndarray,
     points_m: np.ndarray,
     apart_m: float,
+    crease_deg: float,
     central: bool,
 ) -> np.ndarray | None:
     """Return (h, w) bool: the pixels of the extruded part that includes a surface.
@@ -35,6 +35,7 @@ def extruded_faces(
         surface: (h, w) bool.
         points_m: (h, w, 3), metres, NaN where nothing returned.
         apart_m: distance from the profile within which a point belongs to it.
+        crease_deg: bend that separates two faces.
         central: whether rays leave the origin.
 
     Returns:
@@ -48,7 +49,9 @@ def extruded_faces(
         return None
     profile = with_twist(directed, sample)
     off_m = np.abs(sample[:, 2] - profile(sample))
-    if not _held(profile, sample, off_m <= apart_m) or not turns_back(profile):
+    # the twist may hold a bend across the direction, so the curve is taken without it
+    curve = directed.fitted(sample)
+    if not _held(profile, sample, off_m <= apart_m) or not turns_back(curve, crease_deg):
         return None
     on_profile = np.zeros(area.shape, bool)
     on_profile[area] = np.abs(points_m[area][:, 2] - profile(points_m[area])) <= 2.0 * apart_m
@@ -77,8 +80,8 @@ def _held(profile: Profile, points: np.ndarray, near: np.ndarray) -> bool:
     return bool((shares >= HELD_OF_STRIP).mean() >= HELD_STRIPS)
 
 
-def turns_back(profile: Profile) -> bool:
-    """Return whether the profile returns to a direction that it has left."""
+def turns_back(profile: Profile, crease_deg: float) -> bool:
+    """Return whether the profile turns by the angle of a crease, and later back by as much."""
     place = profile.first + profile.step * np.arange(len(profile.curve))
     ahead = profile.curve
     if profile.central:
@@ -87,11 +90,11 @@ def turns_back(profile: Profile) -> bool:
     across_m = place[CHORD_KNOTS:] - place[:-CHORD_KNOTS]
     ahead_m = ahead[CHORD_KNOTS:] - ahead[:-CHORD_KNOTS]
     angle = np.unwrap(np.arctan2(ahead_m, across_m))
-    # the largest turn from a direction, and the largest turn back afterwards
+    # the largest turn from a direction before a place, and the largest turn back behind it
     for sign in (1.0, -1.0):
         turned = sign * angle
         risen = turned - np.minimum.accumulate(turned)
         falls = turned - np.minimum.accumulate(turned[::-1])[::-1]
-        if (np.minimum(risen, falls) >= TURNED).any():
+        if (np.minimum(risen, falls) >= math.radians(crease_deg)).any():
             return True
     return False

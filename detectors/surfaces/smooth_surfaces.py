@@ -124,7 +124,7 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     seen_m = np.where(valid[..., None], points, np.nan)
     masks = _with_pieces(masks, small, seen_m, contact_m, reach)
     unbroken = components(valid, right, down)[0]
-    masks = _with_faces(masks, unbroken, seen_m, contact_m, central)
+    masks = _with_faces(masks, unbroken, seen_m, contact_m, crease_deg, central)
     filled = masks.copy()
     for number, mask in enumerate(masks):
         filled[number] = holes_filled(mask)
@@ -164,6 +164,7 @@ def _with_faces(
     unbroken: np.ndarray,
     points_m: np.ndarray,
     apart_m: float,
+    crease_deg: float,
     central: bool,
 ) -> np.ndarray:
     """Return the surfaces, each with all faces of the extruded part of which it is one: a sheet's
@@ -172,11 +173,11 @@ def _with_faces(
     surfaces = list(masks)
     for number in _areas_of(masks, unbroken):
         area = unbroken == number
-        inside = [surface for surface in surfaces if _lies_in(surface, area)]
-        largest = max(inside, key=np.count_nonzero)
-        if np.count_nonzero(area) <= FACES_FROM * np.count_nonzero(largest):
+        shared = [np.count_nonzero(surface & area) for surface in surfaces]
+        largest = surfaces[int(np.argmax(shared))]
+        if np.count_nonzero(area) <= FACES_FROM * max(shared):
             continue
-        part = extruded_faces(area, largest, points_m, apart_m, central)
+        part = extruded_faces(area, largest, points_m, apart_m, crease_deg, central)
         if part is not None:
             part = part | largest
             surfaces = [part, *[surface for surface in surfaces if not _lies_in(surface, part)]]

@@ -312,15 +312,18 @@ def test_a_deep_hole_at_the_edge_stays_in_the_outline() -> None:
     assert not mask[~board].any()
 
 
-@pytest.mark.parametrize("strip", [True, False])
-def test_a_part_behind_a_strip_is_told(strip: bool) -> None:
+@pytest.mark.parametrize("between_m", [0.4, 1.2])
+def test_pieces_behind_a_strip_are_one_target_and_beside_a_gap_are_two(between_m: float) -> None:
     z = np.full((150, 200), 1.2)
     z[30:120, 20:180] = 0.7
-    if strip:
-        z[:, 120:128] = 0.4
+    z[:, 120:128] = between_m
     z += 5e-4 * np.random.default_rng(0).standard_normal(z.shape)
-    warnings = choice_of(cloud_of(z), AutoCrop()).warnings
-    assert any("lies in the plane of target 1" in warning for warning in warnings) == strip
+    choice = choice_of(cloud_of(z), AutoCrop(inset_px=0))
+    assert choice.mask[34:116, 24:116].all()
+    assert choice.mask[34:116, 132:176].all() == (between_m < 0.7)
+    assert not choice.mask[:, 121:127].any()
+    in_plane = any("lies in the plane of target 1" in warning for warning in choice.warnings)
+    assert in_plane == (between_m > 0.7)
 
 
 def test_a_crease_ends_the_surface() -> None:
