@@ -130,5 +130,5 @@ def _decoded(content: bytes) -> np.ndarray:
         raise ValueError("it holds no grey picture in floating point")
     picture = pictures[0]
     (plane,) = picture.planes
-    rows = np.frombuffer(plane, NUMBERS[picture.format.name]).reshape(plane.height, -1)
+    rows = np.frombuffer(bytes(plane), NUMBERS[picture.format.name]).reshape(plane.height, -1)
     return rows[:, : picture.width].astype(np.float32)
