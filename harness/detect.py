@@ -12,8 +12,8 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `tofpod detect`, which other programs that inspect a capture have too."""
     add = parser.add_argument
     formats = (
-        "folder or list of depth .png, .ply, .pcd, .xyz; folder of .npy, .tiff; one .npy "
-        ".npz .mat .tiff .pfm .mkv .r3d"
+        "folder or list of depth .png, .ply, .pcd, .xyz; folder of .npy, .tiff, .exr; one .npy "
+        ".npz .mat .tiff .exr .pfm .mkv .r3d"
         " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch "
         "a height map"
     )

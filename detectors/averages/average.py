@@ -64,6 +64,17 @@ RECORDED = AverageConfig(disturbed_fraction=0.01)
 """Settings for recordings, in which a camera may be knocked: a shift by 2 % of the picture's width
 changes some 2 % of the pixels; frames of static real cameras differ from the first by 0.3 % beyond
 what the reference frames show."""
+MOST_NAMED = 6  # frames named in a warning
+SCENE_BLOCKS = 24
+"""Blocks along the shorter side of a picture, in which two frames are compared as scenes; blocks of
+some 24 pixels average what depth engines filter."""
+LEAST_BLOCK_PX = 8
+BLOCK_SAMPLES = 5
+"""Pixels along the side of a block that are looked at."""
+FEWEST_BLOCKS = 16
+OTHER_SCENE = 0.25
+"""Share of the blocks that have changed, from which a frame shows another scene. Fewer are a person
+who passes by, and are judged pixel by pixel."""
 MOST_LEFT_OUT = 0.25  # largest share of frames left out that an accident explains
 
 
@@ -73,10 +84,17 @@ def unsteadiness(cloud: Cloud) -> str:
     frames = cloud.n_frames + out
     if out <= MOST_LEFT_OUT * frames:
         return ""
+    names = ", ".join(frame.name for frame in cloud.left_out[:MOST_NAMED])
+    more = ", .." if out > MOST_NAMED else ""
+    if out >= cloud.n_frames:
+        used = "only one frame is" if cloud.n_frames == 1 else f"only {cloud.n_frames} are"
+        return (
+            f"the {frames} frames do not show the same scene: {used} used, and {names}{more} left"
+            " out; name the frames of one scene only"
+        )
     return (
-        f"{out} of {frames} frames differ from the others and are left out: the camera or "
-        "the scene"
-        " moved"
+        f"{out} of {frames} frames differ from the others and are left out ({names}{more}): the"
+        " camera or the scene moved"
     )
 
 
@@ -201,6 +219,9 @@ class FrameSums:
     def _refer(self, stack: np.ndarray) -> None:
         """Define a good frame from the z of the first frames (r, n)."""
         config = self.config
+        if config.judge_frames:
+            # frames of other scenes would pass for noise, and the limits would let all pass
+            stack = stack[_one_scene(stack.reshape(-1, *self.shape), config.changed_mm * MM)]
         finite = np.isfinite(stack)
         usable = np.flatnonzero(2 * finite.sum(axis=0) > finite.any(axis=1).sum())
         # flat indices of the judged pixels, all valid in the good frame
@@ -390,6 +411,41 @@ class FrameSums:
 
 
 # --- what a good frame is ---
+
+
+def _one_scene(stack: np.ndarray, change_m: float) -> np.ndarray:
+    """Return which of the frames (r, h, w) show the scene that most of them show, (r,) bool; the
+    first of equally frequent ones. All frames without a pixel grid do."""
+    height, width = stack.shape[1:]
+    block_px = max(LEAST_BLOCK_PX, min(height, width) // SCENE_BLOCKS)
+    rows = height // block_px
+    columns = width // block_px
+    if rows * columns < FEWEST_BLOCKS:
+        return np.ones(len(stack), bool)
+    step = max(1, block_px // BLOCK_SAMPLES)
+    whole = stack[:, : rows * block_px, : columns * block_px]
+    blocks = whole.reshape(-1, rows, block_px, columns, block_px)[:, :, ::step, :, ::step]
+    samples = blocks.transpose(0, 1, 3, 2, 4).reshape(len(stack), rows * columns, -1)
+    is_same = np.eye(len(stack), dtype=bool)
+    for i, j in combinations(range(len(stack)), 2):
+        is_same[i, j] = _changed_share(samples[i], samples[j], change_m) < OTHER_SCENE
+        is_same[j, i] = is_same[i, j]
+    return is_same[int(np.argmax(is_same.sum(axis=1)))]
+
+
+def _changed_share(first: np.ndarray, second: np.ndarray, change_m: float) -> float:
+    """Return the share of blocks (b, s) whose median difference is off the common one by more than
+    ``change_m``, and by more than pixels scatter within blocks, as noise that neighbours share may
+    be; 0 if too few blocks have distances in both frames."""
+    differences = first - second
+    counts = np.isfinite(differences).sum(axis=1)
+    known = differences[2 * counts > differences.shape[1]]
+    if len(known) < FEWEST_BLOCKS:
+        return 0.0
+    of_blocks = np.nanmedian(known, axis=1)
+    scatter_m = _median_finite(np.abs(known - of_blocks[:, None])) / 0.6745
+    limit_m = max(change_m, scatter_m)
+    return float(np.mean(np.abs(of_blocks - np.median(of_blocks)) > limit_m))
 
 
 def _shifts(sampled: np.ndarray) -> np.ndarray:

@@ -366,7 +366,8 @@ def _with_doubts(result: Separated) -> Separated:
     stable."""
     notes = []
     field = result.field
-    if not _moved(result.captures):
+    moved = _moved(result.captures)
+    if not moved:
         why = "nothing shows that the camera moved between the captures"
         if len(result.captures) == 1:
             why = "one capture"
@@ -398,7 +399,9 @@ def _with_doubts(result: Separated) -> Separated:
     # of two parts that scatter by t each, the mean is off a third part by 3/2 t^2, and their
     # difference is 2 t^2
     variance_m2 = field.variance_m2 + 0.75 * largest_m**2
-    return replace(result, field=replace(field, variance_m2=variance_m2, warnings=tuple(notes)))
+    return replace(
+        result, field=replace(field, variance_m2=variance_m2, warnings=tuple(notes), moved=moved)
+    )
 
 
 def _moved(captures: Sequence[FlatCapture]) -> bool:

@@ -52,6 +52,10 @@ class FlatField:
     """The nearest and the farthest at which it was measured."""
     warnings: tuple[str, ...] = ()
     """Full sentences on doubts about it."""
+    frames: frozenset[str] = frozenset()
+    """Digests of the frames that it was made of; empty if unknown."""
+    moved: bool = False
+    """Whether the camera moved between the captures, so that the surface's shape is not in it."""
 
     @property
     def rms_m(self) -> float:
@@ -160,6 +164,8 @@ def save_flat_field(path: Path, field: FlatField) -> None:
             lens=np.array(numbers, float),
             distances_m=np.array(field.distances_m),
             warnings=np.array(json.dumps(field.warnings)),
+            frames=np.array(json.dumps(sorted(field.frames))),
+            moved=np.array(field.moved),
         )
 
 
@@ -196,6 +202,9 @@ def _field_of(arrays: Mapping[str, np.ndarray], path: Path) -> FlatField:
     variance_m2 = arrays["variance_m2"].astype(np.float32)
     nearest_m, farthest_m = arrays["distances_m"].astype(float).tolist()
     warnings = json.loads(str(arrays["warnings"]))
+    # files of earlier versions do not name their frames
+    frames = json.loads(str(arrays.get("frames", "[]")))
+    moved = bool(arrays.get("moved", np.array(False)).item())
     is_known = np.isfinite(error_m)
     is_sound = (
         error_m.shape == variance_m2.shape == (lens.height, lens.width)
@@ -203,7 +212,7 @@ def _field_of(arrays: Mapping[str, np.ndarray], path: Path) -> FlatField:
         and is_known.any()
         and bool((variance_m2[is_known] >= 0).all())
         and 0 < nearest_m <= farthest_m < np.inf
-        and all(isinstance(warning, str) for warning in warnings)
+        and all(isinstance(text, str) for text in (*warnings, *frames))
     )
     if not is_sound:
         raise ValueError("its arrays do not belong together")
@@ -213,4 +222,6 @@ def _field_of(arrays: Mapping[str, np.ndarray], path: Path) -> FlatField:
         lens,
         (nearest_m, farthest_m),
         tuple(warnings),
+        frames=frozenset(frames),
+        moved=moved,
     )

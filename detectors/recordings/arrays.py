@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
+from detectors.recordings.exr import load_exr
 from detectors.recordings.intrinsics import lens_for
 from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary import files
@@ -255,6 +256,7 @@ LOADERS: dict[str, ArraysLoader] = {
     ".tif": load_picture,
     ".tiff": load_picture,
     ".pfm": load_picture,
+    ".exr": load_exr,
 }
 DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")

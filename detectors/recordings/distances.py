@@ -196,6 +196,7 @@ UNIT_KEYS = (
     "depthunits",
     "depthunit",
     "depthfactor",
+    "factordepth",
     "depthmapfactor",
     "pngdepthscale",
     "zunits",

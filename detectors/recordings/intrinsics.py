@@ -1,5 +1,5 @@
-"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure
-Kinect's calibration."""
+"""The lens of a capture from a file: JSON or YAML of many programs, bare matrices, GraspNet's
+meta.mat, an Azure Kinect's calibration."""
 
 import json
 import re
@@ -140,7 +140,8 @@ LEGAL_LENS = (
     "JSON or YAML with fx, fy, cx, cy (RealSense: ppx, ppy) in pixels "
     "[distortion: k1 k2 p1 p2 k3 k4 k5 k6]; Open3D's intrinsic.json; "
     "OpenCV's or ROS' camera_info YAML; BOP's scene_camera.json; "
-    "a matrix of 3 x 3 or 4 x 4 numbers; an Azure Kinect's calibration.json"
+    "a matrix of 3 x 3 or 4 x 4 numbers; GraspNet's meta.mat; Berkeley's .intr; "
+    "an Azure Kinect's calibration.json"
 )
 FOUND_BESIDE = (
     "intrinsic",
@@ -169,20 +170,30 @@ BARE_MATRICES = (
     "depth_intrinsics.txt",
 )
 """The same for text files: other text beside frames is mostly something different."""
+GRASPNET = ("meta.mat", "meta/*.mat")
+"""The same for GraspNet, whose scenes have one such file for each picture, with equal lenses."""
+BERKELEY = "*.intr"
+"""The same for the perception library of Berkeley, which GQ-CNN uses; a folder with several such
+files does not tell which of them is meant."""
+MAT = ".mat"
 SPELLINGS = {
-    "fx": ("fx", "fl_x", "focal_x"),
-    "fy": ("fy", "fl_y", "focal_y"),
-    "cx": ("cx", "ppx", "c_x"),
-    "cy": ("cy", "ppy", "c_y"),
+    "fx": ("fx", "fl_x", "focal_x", "_fx"),
+    "fy": ("fy", "fl_y", "focal_y", "_fy"),
+    "cx": ("cx", "ppx", "c_x", "_cx"),
+    "cy": ("cy", "ppy", "c_y", "_cy"),
 }
+SKEW = "_skew"
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 SIZES = (
     ("width", "height"),
     ("image_width", "image_height"),
     ("width_px", "height_px"),
     ("w", "h"),
+    ("_width", "_height"),
 )
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
+UNIT_NAMES_OF_MAT = ("factor_depth", "depth_factor", "depth_scale")
+"""Names by which MATLAB files state how many stored numbers make a metre."""
 MODELS = ("distortion_model", "model", "camera_model")
 """Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion.
 """
@@ -259,6 +270,12 @@ def _lens_file_in(folders: Sequence[Path]) -> Path | None:
         for name in names:
             if (folder / name).is_file():
                 return folder / name
+        for pattern in GRASPNET:
+            for path in sorted(folder.glob(pattern)):
+                return path
+        lenses = sorted(folder.glob(BERKELEY))
+        if len(lenses) == 1:
+            return lenses[0]
     return None
 
 
@@ -335,6 +352,8 @@ def parsed_lens(path: Path) -> dict[str, Any]:
     nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
+    if path.suffix.lower() == MAT:
+        return _mat_lens(path)
     with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
         lens = _bare_lens(text)
@@ -357,6 +376,23 @@ def parsed_lens(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise UserError(f"{path}: contains no keys with values", legal=LEGAL_LENS)
     return data
+
+
+def _mat_lens(path: Path) -> dict[str, Any]:
+    """Return the lens matrix and the depth factor of a MATLAB file. Raises UserError if it cannot
+    be read."""
+    import scipy.io
+
+    wanted = (*MATRICES, *UNIT_NAMES_OF_MAT)
+    with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
+        refuse_bytes(str(path), path.stat().st_size, TEXT_BYTES)
+        loaded = scipy.io.loadmat(path, variable_names=wanted)
+    lens: dict[str, Any] = {}
+    for name, value in loaded.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size:
+            # MATLAB's scalars are 1 x 1 arrays
+            lens[name] = value.item() if value.size == 1 else value.tolist()
+    return lens
 
 
 def _bare_lens(text: str) -> dict[str, Any] | None:
@@ -449,6 +485,10 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     """Return fx, fy, cx, cy from any of the known forms of a mapping."""
     keys = [_named(data, quantity) for quantity in SPELLINGS]
     if all(keys):
+        skew = _number(path, SKEW, data.get(SKEW, 0.0))
+        if skew:
+            problem = f"{path}: {SKEW} is {skew:g}, and skewed pixels are not modelled"
+            raise UserError(problem, legal=f"{SKEW} 0")
         return tuple(_number(path, key, data[key]) for key in keys if key)
     key = _matrix_key(data)
     assert key is not None

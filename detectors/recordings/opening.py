@@ -27,15 +27,15 @@ from detectors.recordings.distances import (
     ray_lengths_doubt,
     scale_in,
 )
-from detectors.recordings.intrinsics import mappings, parsed_lens
+from detectors.recordings.intrinsics import GRASPNET, mappings, parsed_lens
 from detectors.recordings.recording import CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import OtherLens
 
 LEGAL_FORMATS = (
     "a folder or list of 16-bit depth .png, of .ply or .pcd, or of .xyz .txt .csv points; "
-    "a folder of .npy or .tiff; a ROS bag (folder, .mcap, .db3, .bag); "
-    "one .npy, .npz, .mat, .tiff, .pfm, .mkv or .r3d file; a Stray Scanner folder; "
+    "a folder of .npy, .tiff or .exr; a ROS bag (folder, .mcap, .db3, .bag); "
+    "one .npy, .npz, .mat, .tiff, .exr, .pfm, .mkv or .r3d file; a Stray Scanner folder; "
     "with --pitch a height map; with --raw a file of bare numbers"
 )
 Opener = Callable[[Path, CaptureOptions], Recording]
@@ -56,7 +56,6 @@ SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name d
 PICTURE = SAVE.format("cv2", "cv2.imread('FILE', -1)")
 HDF5 = SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
-    ".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}",
     ".pgm": PICTURE,
     ".h5": HDF5,
     ".hdf5": HDF5,
@@ -141,13 +140,15 @@ def _unit_not_stated(recording: Recording) -> Unit:
 
 
 def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the names and values in the JSON and YAML files in and above the folder of a capture's
-    first file."""
+    """Yield the names and values in the JSON, YAML and lens files in and above the folder of a
+    capture's first file."""
     folders = (files[0].parent, files[0].parent.parent) if files else ()
     for folder in dict.fromkeys(folders):
         beside: list[Path] = []
         for ending in ("json", "yaml", "yml"):
             beside += sorted(folder.glob(f"*.{ending}"))
+        for pattern in GRASPNET:
+            beside += sorted(folder.glob(pattern))[:1]
         for path in beside[:20]:
             try:
                 for _, mapping in mappings(parsed_lens(path)):

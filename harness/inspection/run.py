@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.averages.average import RECORDED, average, unsteadiness
+from detectors.averages.flat_agreement import places_doubt, refuse_unfit
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
 from detectors.crop import Choice, described_text
 from detectors.interface import Detector
@@ -203,7 +204,11 @@ def _averaged(
     first_frames = list(islice(recording.frames(), REACH_FRAMES)) if cloud.organised else []
     reach_px = noise_reach_px(first_frames, recording.z_step_m) if first_frames else 0.0
     cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
-    return cloud if flat_field is None else corrected(cloud, flat_field)
+    if flat_field is None:
+        return cloud
+    corrected_cloud = corrected(cloud, flat_field)
+    refuse_unfit(cloud, recording.selected(), flat_field, arguments.flat_field)
+    return corrected_cloud
 
 
 def _capture_doubts(
@@ -218,7 +223,8 @@ def _capture_doubts(
     if flat_field is not None:
         for view in views:
             found += doubts(view.cloud, flat_field, arguments.flat_field)
-    return list(dict.fromkeys(found))
+            found.append(places_doubt(view.cloud, flat_field, arguments.flat_field))
+    return list(filter(None, dict.fromkeys(found)))
 
 
 def warnings_of(run: Inspection) -> tuple[str, ...]:

@@ -817,6 +817,29 @@ def passer_by(rng: Rng) -> Stranger:
     return replace(created, frames=10, per_frame=walks)
 
 
+@kind
+def three_heaps(rng: Rng) -> Stranger:
+    """Heaps of parts on a table, another heap in each of three frames: nothing to average."""
+    created = plate(rng)
+    height = created.camera.height
+    width = created.camera.width
+    seed = int(rng.integers(1 << 30))
+
+    def heap(k: int, depth: np.ndarray) -> np.ndarray:
+        of_frame = np.random.default_rng([seed, k])
+        v, u = np.mgrid[:height, :width]
+        heaped = depth.copy()
+        for _ in range(40):
+            centre_u = of_frame.uniform(0.15, 0.85) * width
+            centre_v = of_frame.uniform(0.15, 0.85) * height
+            radius_px = of_frame.uniform(0.04, 0.1) * height
+            is_part = np.hypot(u - centre_u, v - centre_v) < radius_px
+            heaped[is_part] -= of_frame.uniform(0.015, 0.04)
+        return heaped
+
+    return replace(created, frames=3, per_frame=heap, doubtful=True)
+
+
 # ---- cameras and files
 # -----------------------------------------------------------------------------------------------
 

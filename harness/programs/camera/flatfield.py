@@ -78,9 +78,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(
             f"--out {options.out}: is not a name for a flat field", legal="a name that ends in .npz"
         )
-    lens, captures, doubted = _captures(options)
+    lens, captures, doubted, frames = _captures(options)
     separated_field = separated(captures, lens)
-    field = replace(separated_field.field, warnings=(*doubted, *separated_field.field.warnings))
+    warnings = (*doubted, *separated_field.field.warnings)
+    field = replace(separated_field.field, warnings=warnings, frames=frames)
     nearest_m, farthest_m = field.distances_m
     distance = f"{nearest_m:.2f} to {farthest_m:.2f} m"
     if farthest_m < nearest_m * 1.01:
@@ -121,11 +122,14 @@ def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
     figure.suptitle(title, fontsize=10, parse_math=False)
 
 
-def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], list[str]]:
+def _captures(
+    options: argparse.Namespace,
+) -> tuple[Lens, list[FlatCapture], list[str], frozenset[str]]:
     """Return the lens, the captures minus their smooth fits (a single capture as two halves, which
-    show whether the pattern is stable), and warnings about the recordings. Raises UserError for
-    faulty files or different cameras."""
+    show whether the pattern is stable), warnings about the recordings, and the digests of all
+    frames. Raises UserError for faulty files or different cameras."""
     from detectors.averages.average import RECORDED, average
+    from detectors.averages.flat_agreement import frame_digests
     from detectors.averages.flat_captures import flattened
     from detectors.crop import crop
     from detectors.methods.local import LocalConfig
@@ -159,7 +163,8 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
             captures.append(flattened(cloud, crop(cloud, config), part.name, pose))
     assert first.lens is not None
     doubts = [doubt for recording in recordings for doubt in recording.warnings]
-    return first.lens, captures, doubts
+    frames = frame_digests(frame for recording in recordings for frame in recording.selected())
+    return first.lens, captures, doubts, frames
 
 
 def _halves(recording: Recording) -> Iterator[Recording]:

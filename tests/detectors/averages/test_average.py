@@ -277,6 +277,68 @@ def test_a_knocked_camera_is_told() -> None:
     assert unsteadiness(average(stack, RECORDED)) == ""
 
 
+HEIGHT = 96
+WIDTH = 128
+
+
+def heap(number: int, depth_m: float = 0.03) -> np.ndarray:
+    """(h, w): parts of ``depth_m`` at random on a table at 0.8 m, another heap for each number."""
+    rng = np.random.default_rng([8, number])
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    z_m = np.full((HEIGHT, WIDTH), 0.8, np.float32)
+    for _ in range(40):
+        centre_u = rng.uniform(0, WIDTH)
+        centre_v = rng.uniform(0, HEIGHT)
+        z_m[np.hypot(u - centre_u, v - centre_v) < 8] -= depth_m * rng.uniform(0.5, 1.5)
+    return z_m
+
+
+def heaps(numbers: list[int], noise_m: float = 1e-3, blur_px: int = 1) -> Stack:
+    """A frame of each heap, with noise that ``blur_px`` pixels share, or 1 for none."""
+    rng = np.random.default_rng(9)
+    frames = []
+    for number in numbers:
+        noise = rng.normal(0, noise_m * blur_px, (HEIGHT, WIDTH))
+        frames.append(heap(number) + cv2.blur(noise, (blur_px, blur_px)))
+    z_m = np.stack(frames).astype(np.float32)
+    return Stack(z_m, np.zeros((HEIGHT, WIDTH, 2)))
+
+
+def test_frames_of_three_scenes_are_told_by_name() -> None:
+    """Their differences are no noise, which would let all of them pass."""
+    cloud = average(heaps([0, 1, 2]), RECORDED)
+    assert cloud.n_frames == 1
+    assert [frame.name for frame in cloud.left_out] == ["frame 1", "frame 2"]
+    assert unsteadiness(cloud) == (
+        "the 3 frames do not show the same scene: only one frame is used, and frame 1, frame 2"
+        " left out; name the frames of one scene only"
+    )
+
+
+def test_the_scene_of_most_frames_counts() -> None:
+    cloud = average(heaps([1, 0, 0, 2, 0, 0]), RECORDED)
+    assert [frame.name for frame in cloud.left_out] == ["frame 0", "frame 3"]
+    text = unsteadiness(cloud)
+    assert text.startswith("2 of 6 frames differ from the others and are left out (frame 0, frame")
+    many = average(heaps([0, *range(1, 9)]), RECORDED)
+    assert "frame 5, frame 6, .. left out" in unsteadiness(many)
+
+
+@pytest.mark.parametrize(("noise_m", "blur_px"), [(1e-3, 1), (8e-3, 5), (30e-3, 1), (4e-3, 9)])
+def test_noise_is_no_other_scene(noise_m: float, blur_px: int) -> None:
+    """Also far noisier than the least change, or shared by the pixels of a depth engine's filter."""
+    cloud = average(heaps([0] * 6, noise_m, blur_px), RECORDED)
+    assert cloud.n_frames == 6 and unsteadiness(cloud) == ""
+
+
+def test_a_jump_of_the_range_is_no_other_scene() -> None:
+    """One of three frames lies 20 mm farther: it jumps, and the two others are averaged."""
+    stack = heaps([0, 0, 0])
+    stack.z_m[1] += 0.02
+    cloud = average(stack, RECORDED)
+    assert cloud.n_frames == 2 and cloud.left_out[0].why.startswith("the whole range jumps")
+
+
 def test_judging_can_be_switched_off() -> None:
     stack = noisy()
     stack.z_m[3] += np.float32(0.018)

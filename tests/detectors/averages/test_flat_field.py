@@ -586,12 +586,13 @@ def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three captures of 8 frames each as .npy in metres, with a lens."""
+    """Three captures of 8 frames each as .npy in metres, and one more to judge, with a lens."""
     folder = tmp_path_factory.mktemp("walls")
-    for number, pose_m in enumerate(SHIFTS[:3]):
+    for number, pose_m in enumerate((*SHIFTS[:3], SHIFTS[0])):
         z_m = capture(number, wall(0.0), pose_m, noise_m=0.0).points_m[..., 2]
         noise = np.random.default_rng([4, number]).standard_normal((8, *z_m.shape)) * NOISE_M
-        np.save(folder / f"wall{number}.npy", (z_m + noise).astype(np.float32))
+        name = "judged" if number == 3 else f"wall{number}"
+        np.save(folder / f"{name}.npy", (z_m + noise).astype(np.float32))
     stated = {name: getattr(LENS, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     (folder / "lens.json").write_text(json.dumps(stated))
     return folder
@@ -599,7 +600,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.usefixtures("unpictured")
 def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_path, capsys, truth_m):
-    walls = [str(path) for path in sorted(recorded.glob("*.npy"))]
+    walls = [str(path) for path in sorted(recorded.glob("wall*.npy"))]
     options = ["--unit", "m"]
     options += ["--intrinsics", str(recorded / "lens.json"), "--crop", "none"]
     unit = tmp_path / "unit.npz"
@@ -616,7 +617,10 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
     assert len(facts["captures"]) == 3
     assert unit.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 
-    judged = [walls[0], *options, "--threshold", "5"]
+    own = [walls[0], *options, "--threshold", "5", "--flat-field", str(unit)]
+    assert detect.main(own) == 2
+    assert "was made from this capture: 8 of its frames are in both" in capsys.readouterr().err
+    judged = [str(recorded / "judged.npy"), *options, "--threshold", "5"]
     assert detect.main([*judged, "--flat-field", str(unit), "--out", str(tmp_path / "with")]) == 0
     assert capsys.readouterr().out.startswith(f"warning: the flat field {unit}: nothing shows that")
     assert detect.main(judged) == 0

@@ -295,7 +295,7 @@ def test_a_folder_whose_depth_lies_in_arrays_beside_pictures_names_them(tmp_path
 
 
 def test_files_that_are_not_read_are_told_how_to_be_converted(tmp_path: Path) -> None:
-    for name, message in (("a.exr", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
+    for name, message in (("a.pgm", "cv2.imread("), ("a.h5", "h5py.File("), ("a.e57", "as PLY")):
         (tmp_path / name).write_bytes(b"abc")
         assert message in refusal(tmp_path / name)
 
