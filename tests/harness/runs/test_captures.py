@@ -15,7 +15,7 @@ from harness.runs.captures import judge_captures
 
 CAPTURE = """\
 name: real
-source: {kind: capture, paths: [frames], intrinsics: azure_kinect_nfov}
+source: {kind: capture, paths: [frames], intrinsics: azure_kinect_nfov_binned}
 capture: {frames: 4}
 detector: {name: thesis, settings: {crop: {kind: none}}}
 threshold: {k: 6.0}
@@ -32,8 +32,8 @@ def test_each_point_is_judged_into_its_folder(
     frames.mkdir()
     rng = np.random.default_rng(1)
     for index in range(5):
-        z_mm = 700.0 + rng.normal(0.0, 1.0, (576, 640))
-        z_mm[280:296, 310:326] += 20.0
+        z_mm = 700.0 + rng.normal(0.0, 1.0, (288, 320))
+        z_mm[140:150, 155:165] += 20.0
         z_mm += 40.0 * (index == 1)
         cv2.imwrite(str(frames / f"{index}.png"), np.rint(z_mm).astype(np.uint16))
     (tmp_path / "real.yaml").write_text(CAPTURE)
