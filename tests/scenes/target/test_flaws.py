@@ -23,7 +23,7 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.flaws import CorrosionConfig
 from scenes.target.mesh import Target, board_solid, build_target
-from scenes.target.part import crossing
+from scenes.target.part import crossing, part_of
 from scenes.target.truth import face_of, outline_board_m, truth_of
 from tests.support.declared_targets import target_from_data
 
@@ -444,6 +444,17 @@ def part_file(
     faces = np.asarray(mesh.faces)[keep]
     trimesh.Trimesh(mesh.vertices, faces, process=False).export(folder / name)
     return folder / name
+
+
+def test_the_front_of_a_part_lies_about_the_middle_of_its_bounds(tmp_path: Path) -> None:
+    """A box from (10, 20, 30) to (50, 100, 60) mm, whose file has its origin elsewhere."""
+    box = trimesh.creation.box(bounds=[[10.0, 20.0, 30.0], [50.0, 100.0, 60.0]])
+    box.export(tmp_path / "box.stl")
+    config = target_from_data({"name": "mesh", "file": str(tmp_path / "box.stl")}).declare()
+    points, triangles = part_of(config.board.shape)
+    assert points.min(axis=0) == pytest.approx([-0.02, -0.04, -0.03])
+    assert points.max(axis=0) == pytest.approx([0.02, 0.04, 0.0], abs=1e-9)
+    assert len(triangles) == 12
 
 
 def test_damage_lies_on_the_front_of_a_mesh(tmp_path: Path) -> None:

@@ -21,9 +21,9 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import invert, transform_points
 from scenes.perspectives import check_in_view
 from scenes.sensor.camera import load_camera
-from scenes.target.checks import check_target
+from scenes.target.checks import SHALLOWEST_BEND, check_target
 from scenes.target.custom import TargetConfig
-from scenes.target.drawn import DrawnTargetConfig, Purpose
+from scenes.target.drawn import DrawnTargetConfig, Purpose, _backing_size_mm, _dent_depths_mm
 from scenes.target.truth import backing_corners_board_m, outline_board_m
 from tests.support.declared_targets import target_from_data
 
@@ -298,6 +298,35 @@ def test_a_dent_is_as_deep_as_its_radius_allows() -> None:
     narrow = family(damage={**DENT, "per_board": 1, "diameter_mm": [2.0, 2.0]})
     depths = [narrow.drawn("damaged", n).dents[0].depth_mm for n in range(200)]
     assert stats.kstest(depths, stats.uniform(0.5, 0.5).cdf).pvalue > ALPHA
+
+
+@pytest.mark.parametrize(
+    ("reach", "least"),
+    [(0.0, 0.0), (0.6, (1 - 0.8) / 0.6), (0.8, (1 - 0.6) / 0.8), (1.0, 1.0), (1.5, 1.0)],
+)
+def test_a_dent_is_at_least_as_deep_as_its_ball_on_a_bent_face(reach: float, least: float) -> None:
+    """A cap of a ball of half the radius of curvature R, with a chord of reach x R: its depth is
+    R / 2 (1 - sqrt(1 - reach^2)), at most the hemisphere's."""
+    ball_mm = SHALLOWEST_BEND * 200.0
+    radius_mm = reach * ball_mm
+    least_mm, most_mm = _dent_depths_mm(2 * max(radius_mm, 1e-9), 1 / 200.0)
+    assert most_mm == pytest.approx(radius_mm, abs=1e-8)
+    assert least_mm == pytest.approx(radius_mm * least, rel=1e-4, abs=1e-8)
+
+
+def test_a_backing_is_as_wide_as_the_shadows_up_to_ten_metres() -> None:
+    """From the lens at 0.5 m, straight in front, the shadow of a face grows with the distance."""
+    straight = family(
+        board={"width_mm": 300.0, "height_mm": 200.0, "thickness_mm": 5.0},
+        distance_m=0.5,
+        offset_mm=0.0,
+        tilt_deg=0.0,
+        roll_deg=0.0,
+        distance_jitter_mm=0.0,
+    )
+    assert _backing_size_mm(straight, 0.0) == pytest.approx((300.0, 200.0))
+    assert _backing_size_mm(straight, -0.25) == pytest.approx((450.0, 300.0))
+    assert _backing_size_mm(straight, -20.0) == pytest.approx((10_000.0, 8200.0))
 
 
 def test_backing_fills_every_hole_in_every_pose() -> None:

@@ -350,6 +350,8 @@ def test_a_broken_assumption_is_seen(assumption: str) -> None:
     ("change", "message"),
     [
         ({"decision": 1.0}, "outside the signals"),
+        ({"decision": 50.1}, "outside the signals"),
+        ({"left": 50.0}, "not below saturation"),
         ({"left": 4.0, "right": 3.0}, "not below saturation"),
         ({"size": [0.0, *range(1, 12)], "log_size": True}, "no logarithm"),
         ({"signal": -np.arange(12.0), "left": None, "log_signal": True}, "no logarithm"),
@@ -371,5 +373,7 @@ def test_mistakes_of_the_user(change: dict[str, object], message: str) -> None:
         "right": 50.0,
     }
     fit_ahat(**sound)  # type: ignore[arg-type]
+    for decision in (1.5, 50.0):  # the limits themselves can be distinguished
+        fit_ahat(**{**sound, "decision": decision})  # type: ignore[arg-type]
     with pytest.raises(UserError, match=message):
         fit_ahat(**{**sound, **change})  # type: ignore[arg-type]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import optimize, stats
 
+from harness.evaluation.pod import curve as curves
 from harness.evaluation.pod.curve import (
     LARGEST_PREDICTOR,
     LINKS,
@@ -173,6 +175,30 @@ def test_maxima_have_no_slope_whatever_the_start(link: str) -> None:
     assert numeric_gradient(data, b[0]) == pytest.approx([0.0, 0.0], abs=1e-6)
     again = maxima(studies, np.array([6.0, 9.0]))
     assert again == pytest.approx(b, rel=1e-5)
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_plain_steps_reach_the_maximum_of_data_that_overlap(
+    link: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only studies without overlap are searched again, from the start."""
+    searched = []
+
+    def search(climb: Any, start: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        searched.append(start.tolist())
+        return ascend(climb, start, tolerance)
+
+    monkeypatch.setattr(curves, "ascend", search)
+    maxima(studies_of(data_of(link)), np.array([0.0, 0.5]))
+    assert searched == [[]]
+    both = replace(
+        studies_of(data_of(link)),
+        hits=np.stack([HITS, (SIZES > 0.1).astype(float)]),
+        misses=np.stack([MISSES, (SIZES <= 0.1).astype(float)]),
+    )
+    b = maxima(both, np.array([0.0, 0.5]))
+    assert searched[1] in ([], [[0.0, 0.5]])
+    assert b[0] == pytest.approx(maxima(studies_of(data_of(link)), np.array([0.0, 0.5]))[0])
 
 
 @pytest.mark.parametrize("link", LINKS)

@@ -20,6 +20,7 @@ from harness.programs.coverage.jobs import (
     _part_seen,
     _unit_m,
     _widened,
+    declared,
     patches_of,
     refuse_size,
 )
@@ -27,6 +28,7 @@ from harness.programs.coverage.statistics import Patches
 from harness.runs.plan import Group, plan_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens, Region
+from scenes.perspectives import ArcViews
 from scenes.target.custom import BoardConfig
 from scenes.target.truth import Damage
 
@@ -86,6 +88,20 @@ def test_sizes_outside_the_declared_range_are_refused() -> None:
         with pytest.raises(UserError, match="inspects no damage of that size") as error:
             refuse_size(config, size_mm)
         assert "0.5 to 7 mm (depth)" in str(error.value)
+
+
+def test_only_studies_of_drawn_damage_in_single_views_are_declared() -> None:
+    config = load_experiment("pipe").points[0].config
+    source = config.simulated
+    assert declared(config) == (source, source.target)
+    views = ArcViews(kind="arc", count=3, spread_deg=20.0)
+    for wrong in (
+        config.model_copy(update={"study": None}),
+        config.model_copy(update={"source": source.model_copy(update={"views": views})}),
+        load_experiment("plate").points[0].config,
+    ):
+        with pytest.raises(UserError, match="is not a study of drawn damage in single views"):
+            declared(wrong)
 
 
 def test_sizes_in_plan_count_if_they_differ() -> None:

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import special
 
-from harness.evaluation.pod.curve import PodCurve
+from harness.evaluation.pod.curve import PodCurve, link_ppf
 from harness.evaluation.study.record import record_text
 from harness.programs.inspections import pod
 from harness.programs.inspections.design_statistics import curve_through, even_sizes
-from harness.programs.inspections.mapod import Transfer
+from harness.programs.inspections.mapod import LIMIT_AT, Transfer, quantile
 from tests.support.synthetic_study import SetUp, Study, study_record
 from tests.validation.mapod_coverage import coverage, wrong_by
 
@@ -49,6 +50,133 @@ def test_without_real_targets_the_prior_remains():
     assert before.targets == 0
     assert before.a50 == pytest.approx(5.0, rel=0.05)
     assert before.a90_95 > 1.5 * before.a90
+
+
+def uncertain(log_size: bool, link: str = "cloglog") -> PodCurve:
+    """A skewed curve, whose mu is not its a50, with correlated errors."""
+    curve = curve_through(5.0, 7.0, link, log_size=log_size)
+    scale = np.diag([0.03 * curve.mu, 0.1 * curve.sigma])
+    return replace(curve, covariance=scale @ np.array([[1.0, 0.4], [0.4, 1.0]]) @ scale)
+
+
+@pytest.mark.parametrize("log_size", [False, True])
+def test_the_studys_own_covariance_is_by_the_delta_method(log_size: bool) -> None:
+    """Numeric slopes of ln a50 and of ln w by mu and sigma: the width counts relative to a50 if
+    sizes are no logarithms, as a size that is scaled by k scales the rise as well."""
+    curve = uncertain(log_size)
+
+    def of_curve(mu: float, sigma: float) -> np.ndarray:
+        moved = replace(curve, mu=mu, sigma=sigma)
+        width = sigma if log_size else sigma / moved.size_at(0.5)
+        return np.log([moved.size_at(0.5), width])
+
+    step = 1e-6
+    by_mu = of_curve(curve.mu + step, curve.sigma) - of_curve(curve.mu - step, curve.sigma)
+    by_sigma = of_curve(curve.mu, curve.sigma + step) - of_curve(curve.mu, curve.sigma - step)
+    slopes = np.stack([by_mu, by_sigma], axis=1) / (2 * step)
+    transfer = campaign(np.array([5.0]), np.array([True]), curve)
+    expected = slopes @ curve.covariance @ slopes.T
+    assert transfer.own_covariance == pytest.approx(expected, rel=1e-5)
+    prior = np.diag([np.log(1.5) ** 2, np.log(2.0) ** 2])
+    assert transfer.scale == pytest.approx(prior + expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("log_size", [False, True])
+def test_each_node_is_the_curve_scaled_in_size_and_width(log_size: bool) -> None:
+    """Damage of size a is found as simulated damage of a / k, with a rise w times as wide about
+    a50."""
+    curve = uncertain(log_size)
+    sizes = np.array([2.0, 5.0, 6.0, 9.0])
+    transfer = campaign(sizes, np.array([False, True, False, True]), curve)
+    deviations = np.sqrt(np.diag(transfer.scale))
+    assert np.abs(transfer.grid).max(axis=0) == pytest.approx(8.0 * deviations)
+    assert len(transfer.grid) == 241 * 61
+    assert len(np.unique(transfer.grid[:, 0])) == 241
+    log_hit, log_miss = transfer.logs
+    a90_mm = transfer.sizes_at(0.9)
+    for node in (5000, 6200, 7350, 8000, 9400):
+        k, w = np.exp(transfer.grid[node])
+        middle = curve.size_at(0.5)
+        half = curve.mu + curve.sigma * float(link_ppf("cloglog", np.array(0.5)))
+        wider = replace(curve, mu=half - (half - curve.mu) * w, sigma=curve.sigma * w)
+        assert wider.size_at(0.5) == pytest.approx(middle)
+        pod = wider.pod(sizes / k)
+        assert np.exp(log_hit[node]) == pytest.approx(pod, rel=1e-9)
+        assert np.exp(log_miss[node]) == pytest.approx(1 - pod, rel=1e-9, abs=1e-12)
+        assert a90_mm[node] == pytest.approx(k * wider.size_at(0.9))
+    assert (transfer.sizes_at(0.01) >= 0.0).all()
+
+
+def test_the_prior_is_students_without_steep_rises() -> None:
+    """Three degrees of freedom; w < 1 only within the study's own uncertainty and the distance of
+    the nodes."""
+    transfer = campaign(np.array([5.0]), np.array([True]), uncertain(False))
+    grid = transfer.grid
+    spacing = np.array([2 * grid[-1, 0] / 240, 2 * grid[-1, 1] / 60])
+    own = transfer.own_covariance + np.diag(spacing**2 / 12)
+    assert transfer.own_spread == pytest.approx(own)
+    inverse = np.linalg.inv(transfer.scale)
+    square = np.einsum("gi,ij,gj->g", grid, inverse, grid)
+    student = -(3 + 2) / 2 * np.log1p(square / 3)
+    steep = special.log_ndtr(grid[:, 1] / np.sqrt(own[1, 1]))
+    difference = transfer.log_prior - (student + steep)
+    assert np.ptp(difference) < 1e-9
+
+
+def test_the_posterior_is_prior_times_likelihood() -> None:
+    sizes = np.array([3.0, 5.0, 6.0, 9.0])
+    hit = np.array([False, True, False, True])
+    transfer = Transfer(uncertain(True), sizes, hit, np.array(["b", "a", "a", "b"]))
+    used = np.array([True, True, True, False])
+    log_hit, log_miss = transfer.logs
+    value = transfer.log_prior + log_miss[:, 0] + log_hit[:, 1] + log_miss[:, 2]
+    expected = np.exp(value - value.max())
+    assert transfer.posterior(used) == pytest.approx(expected / expected.sum(), abs=1e-15)
+    steps = transfer.steps()
+    assert [step.board for step in steps] == ["none", "b", "a"]
+    assert [step.targets for step in steps] == [0, 2, 4]
+    assert [step.hits for step in steps] == [0, 1, 2]
+    weight = transfer.posterior(np.ones(4, bool))
+    a90_mm = transfer.sizes_at(0.9)
+    order = np.argsort(a90_mm)
+    cumulated = np.cumsum(weight[order])
+    for share, value_mm in ((0.5, steps[-1].a90), (LIMIT_AT, steps[-1].a90_95)):
+        below = a90_mm[order][np.searchsorted(cumulated, share)]
+        assert value_mm == pytest.approx(below, rel=0.01)
+    # the quantile of the handbook's likelihood ratio: the normal's at the root of 3.841
+    assert pytest.approx(0.975, abs=1e-4) == LIMIT_AT
+    middle, low, high = transfer.band(np.array([4.0, 8.0]))
+    assert (low < middle).all() and (middle < high).all()
+    at_8 = np.exp(transfer._logs(transfer.grid, np.array([8.0]))[0][:, 0])
+    order = np.argsort(at_8)
+    cumulated = np.cumsum(weight[order])
+    for share, level in ((0.5, middle[1]), (1 - LIMIT_AT, low[1]), (LIMIT_AT, high[1])):
+        assert level == pytest.approx(at_8[order][np.searchsorted(cumulated, share)], abs=5e-3)
+
+
+def test_a_weighted_quantile_by_hand() -> None:
+    """Weights of 1, 2 and 1 lie about 0.5, 2 and 3.5 of 4."""
+    values = np.array([30.0, 10.0, 20.0])
+    weights = np.array([1.0, 1.0, 2.0])
+    assert quantile(values, weights, 0.5) == 20.0
+    assert quantile(values, weights, 0.125) == 10.0
+    assert quantile(values, weights, 0.0) == 10.0
+    assert quantile(values, weights, 0.6875) == pytest.approx(25.0)
+
+
+def test_a_step_is_enough_if_the_limit_is_near_the_estimate() -> None:
+    step = campaign(np.array([5.0]), np.array([True]), simulated()).steps()[0]
+    assert replace(step, a90=10.0, a90_95=12.0).enough
+    assert not replace(step, a90=10.0, a90_95=12.1).enough
+
+
+def test_agreement_counts_simulated_campaigns_that_are_as_far() -> None:
+    """Everything found at sizes that the curve misses, and the other way round, is as far as can
+    be: 1 of 1000. Hits as expected are no evidence."""
+    curve = uncertain(False)
+    size = np.array([1.0, 2.0, 3.0, 8.0, 9.0, 10.0])
+    assert campaign(size, size < 5.0, curve).agreement() < 0.01
+    assert campaign(size, size > 5.0, curve).agreement() > 0.2
 
 
 @pytest.mark.slow  # a Monte Carlo campaign

@@ -104,6 +104,30 @@ def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(results):
 
 
 @pytest.mark.usefixtures("unsaved")
+def test_a_posterior_takes_twenty_complete_set_ups(results):
+    """Of 22, one lacks a hole, and is none."""
+    summary = summarise_holes(results.holes, PATHS)
+    names = list(dict.fromkeys(summary["variant"]))
+    incomplete = summary[(summary["variant"] != names[5]) | (summary["hole"] != "7")]
+    for left_out, known in ((1, True), (2, False)):
+        part = incomplete[~incomplete["variant"].isin(names[:left_out])]
+        table = posterior_of(part, PATHS)
+        assert (table is not None) == known
+        if table is not None:
+            assert (table["axis"] == SET_UP).sum() == 20
+            assert names[5] not in set(table["value"])
+
+
+@pytest.mark.parametrize(("ratio", "doubted"), [(0.49, True), (0.51, False)])
+def test_a_value_is_doubted_below_half_of_its_prior(results, ratio, doubted):
+    table = posterior_of(summarise_holes(results.holes, PATHS), PATHS)
+    shares = table["prior_share"].copy()
+    is_deep = table["value"].str.startswith("4 mm")
+    shares[is_deep] *= ratio
+    sentence = borne_out_if(table.assign(posterior_share=shares))
+    assert ("blind depth is 2 mm" in sentence) == doubted
+
+
 def test_the_page_begins_with_the_sentence(results):
     page = set_ups_html(results, [], About(provenance(), "", "Inference", THESIS))
     answer = page.split('<p class="answer">')[1]
