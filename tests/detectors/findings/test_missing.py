@@ -559,13 +559,22 @@ def test_scattered_dropouts_alone_have_their_share_as_rate() -> None:
     assert missing.facts["expected_by_chance"] == 0.0
     assert missing.least_points == LEAST_POINTS
     assert not missing.detections
-    # beside a hole, the hole's pixels count neither as dropouts nor as known
+
+
+def test_the_rate_is_that_of_the_pixels_that_are_no_finding() -> None:
+    """A hole's pixels count neither as dropouts nor as known; dropouts at all four edges count."""
+    single = np.zeros(SHAPE, bool)
+    single[0:90:89, 10:110:9] = True
+    single[5:85:7, 0:120:119] = True
+    single[10:80:7, 5:115:10] = True
     hole = disc(60.4, 45.2, 14)
-    missing = missing_returns(*looked(gone | hole))
-    assert missing is not None
     around = cv2.dilate(hole.astype(np.uint8), np.ones((3, 3))) > 0
-    rest = (gone & ~around).sum()
-    assert missing.dropouts == pytest.approx(rest / (gone.size - hole.sum()), rel=0.03)
+    single &= ~around
+    missing = missing_returns(*looked(single | hole))
+    assert missing is not None
+    assert len(missing.detections) == 1
+    assert missing.outline.all()
+    assert missing.dropouts == pytest.approx(single.sum() / (single.size - hole.sum()), rel=1e-9)
 
 
 @pytest.mark.parametrize(
