@@ -7,18 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from detectors.rigid_motion import moved_by
-from detectors.views.marks.mark import MarkSet
+from detectors.views.marks.mark import Mark, MarkSet, off_line_problem
 from detectors.views.registration import register, registered
 from detectors.views.registration.by_points import (
     LEAST_VARIANCE,
     _covariance,
     coherent_point_drift,
 )
+from detectors.views.registration.pairing import FIT_CHI2, pair_marks
 from detectors.views.registration.settings import CpdRegistration
 from detectors.views.view import PreparedView, View
 from harness.vocabulary.geometry import Cloud, Lens, transform_points
@@ -358,3 +360,73 @@ def test_agreement_of_marks_leaves_the_farthest_tenth_out() -> None:
     result = register._agreement(reference, sampling, view, np.eye(4))
     assert result.marks_m == pytest.approx(2e-4, rel=1e-6)
     assert result.marks_scatter == pytest.approx(3.09 / np.sqrt(2 * 100 / 25))
+
+
+# --- pairs of marks ---
+
+
+def mark_at(place: np.ndarray, sigma_m: float = 1e-4) -> Mark:
+    return Mark(
+        centre_m=place,
+        covariance_m2=sigma_m**2 * np.eye(3),
+        normal=np.array([0.0, 0.0, -1.0]),
+        pixels=np.arange(20),
+        area_m2=1e-4,
+    )
+
+
+RECTANGLE_M = 0.1 * np.array([[0.8, 0.6], [-0.8, 0.6], [-0.8, -0.6], [0.8, -0.6]])
+"""Four marks, each 0.1 m from the middle."""
+
+
+@pytest.mark.parametrize(("guess_deg", "is_clear"), [(0.0, True), (54.5, True), (57.5, False)])
+def test_twin_placements_need_odds_of_90_to_1(guess_deg: float, is_clear: bool) -> None:
+    """A rectangle and its half turn: with the guess turned by an angle from the first, the root
+    mean squares from it are 0.2 m sin and cos of half of the angle, so that over 50 mm the odds
+    are 8 times its cosine: 4.5 at 55.8 degrees."""
+    places = np.column_stack([RECTANGLE_M, np.full(4, 0.7)])
+    marks = [mark_at(place) for place in places]
+    turn = np.array([0.0, 0.0, np.deg2rad(guess_deg), 0.0, 0.0, 0.0])
+    guess = moved_by(turn, np.array([0.0, 0.0, 0.7]))
+    pairing = pair_marks(marks, marks, guess)
+    np.testing.assert_array_equal(pairing.pairs, np.repeat(np.arange(4)[:, None], 2, axis=1))
+    assert (pairing.problem == "") == is_clear
+    if not is_clear:
+        near_mm = 200 * np.sin(np.deg2rad(guess_deg / 2))
+        far_mm = 200 * np.cos(np.deg2rad(guess_deg / 2))
+        assert f"{near_mm:.0f} mm from one, {far_mm:.0f} mm from the other" in pairing.problem
+    blind = pair_marks(marks, marks, None)
+    assert "there is no guess to choose by" in blind.problem
+
+
+def test_a_mark_is_matched_within_the_limit_of_chi_square() -> None:
+    """One of six marks is moved across its plane; both have 0.1 mm of noise and 1 mm that views do
+    not share."""
+    random = np.random.default_rng(12)
+    places = np.column_stack([random.uniform(-0.2, 0.2, (6, 2)), np.full(6, 0.8)])
+    marks = [mark_at(place) for place in places]
+    deviation = np.sqrt(2 * (1e-3**2 + 1e-4**2))
+    for sigmas, is_matched in ((0.5, True), (12.0, False)):
+        moved = places.copy()
+        moved[2, 2] += sigmas * deviation
+        pairing = pair_marks(marks, [mark_at(place) for place in moved], None)
+        assert pairing.problem == ""
+        assert (2 in pairing.pairs[:, 0]) == is_matched
+        np.testing.assert_array_equal(pairing.pairs[:, 0], pairing.pairs[:, 1])
+    # three degrees of freedom: a true match is lost once in 10,000
+    assert stats.chi2.sf(FIT_CHI2, 3) == pytest.approx(1e-4, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("off_mm", "sigma_mm", "is_line"),
+    [(4.1, 0.01, False), (3.9, 0.01, True), (10.1, 2.0, False), (9.9, 2.0, True)],
+)
+def test_marks_on_a_line_are_told(off_mm, sigma_mm, is_line) -> None:
+    """Four marks whose distance from their line is a root mean square of 2 % of that along it, or
+    five deviations of a mark, whichever is more."""
+    places = np.array([[-0.2, 0.0, 0.7], [0.2, 0.0, 0.7], [-0.2, 0.0, 0.7], [0.2, 0.0, 0.7]])
+    places[:, 1] = np.array([1.0, 1.0, -1.0, -1.0]) * off_mm * 1e-3
+    text = off_line_problem([mark_at(place, sigma_mm * 1e-3) for place in places])
+    assert bool(text) == is_line
+    if is_line:
+        assert f"{off_mm:.1f} mm off it" in text
