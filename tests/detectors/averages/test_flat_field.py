@@ -727,3 +727,99 @@ def test_an_impossible_flat_field_is_refused(tmp_path, change, message):
     (tmp_path / "tiny.yaml").write_text(STUDY)
     with pytest.raises(DeclarationError, match=message):
         load_experiment(tmp_path / "tiny.yaml", [change])
+
+
+# ---- numbers of a field by hand
+
+
+def plain_field(error_m: np.ndarray, **values: object) -> FlatField:
+    """A field of the camera above, known to 0.01 mm, measured at 0.5 to 1.0 m."""
+    variance_m2 = np.full(error_m.shape, (0.01 * MM) ** 2)
+    return replace(FlatField(error_m, variance_m2, LENS, (0.5, 1.0)), **values)
+
+
+def test_the_rms_of_a_pattern_is_that_without_the_map_s_noise() -> None:
+    error_m = np.full((128, 160), 5e-4)
+    error_m[::2] = -7e-4
+    error_m[5, 5] = np.nan
+    noisy = plain_field(error_m, variance_m2=np.full(error_m.shape, 1.3e-7))
+    squares = (64 * 160 * 4.9e-7 + (64 * 160 - 1) * 2.5e-7) / (128 * 160 - 1)
+    assert noisy.rms_m == pytest.approx(np.sqrt(squares - 1.3e-7))
+    assert plain_field(0.0 * error_m).rms_m == 0.0
+
+
+def test_a_correction_moves_points_along_their_rays_by_the_error() -> None:
+    random = np.random.default_rng(9)
+    error_m = 1e-3 * random.standard_normal((128, 160))
+    error_m[:3] = np.nan
+    field = plain_field(error_m, variance_m2=random.uniform(1e-9, 5e-9, error_m.shape))
+    cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
+    moved = corrected(cloud, field)
+    before_m = np.linalg.norm(cloud.points_m, axis=-1)
+    after_m = np.linalg.norm(moved.points_m, axis=-1)
+    known = np.isfinite(error_m)
+    np.testing.assert_allclose((before_m - after_m)[known], error_m[known], atol=1e-15)
+    np.testing.assert_array_equal(moved.points_m[~known], cloud.points_m[~known])
+    rays = cloud.points_m / before_m[..., None]
+    np.testing.assert_allclose(moved.points_m / after_m[..., None], rays, atol=1e-12)
+    # along the axis: the frames' noise and the map's, or the pattern where that is unknown
+    cosine2 = rays[..., 2] ** 2
+    assert moved.mean_variance_m2 is not None
+    frames_m2 = moved.mean_variance_m2 - cosine2 * np.where(known, field.variance_m2, 0.0)
+    unknown_m2 = frames_m2[~known] - (cosine2 * field.rms_m**2)[~known]
+    scatter_m2 = NOISE_M**2 / FRAMES
+    assert np.median(frames_m2[known]) == pytest.approx(scatter_m2, rel=0.02)
+    assert np.median(unknown_m2) == pytest.approx(scatter_m2, rel=0.05)
+    # a part of the sensor takes its part of the map
+    part = replace(
+        cloud,
+        points_m=cloud.points_m[20:60, 30:90],
+        reason=cloud.reason[20:60, 30:90],
+        count=cloud.count[20:60, 30:90],
+        variance_m2=cloud.variance_m2[20:60, 30:90],
+        region=Region(20, 60, 30, 90),
+    )
+    np.testing.assert_array_equal(corrected(part, field).points_m, moved.points_m[20:60, 30:90])
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "text"),
+    [
+        (0.42, ""),
+        (0.41, "was measured at 0.50 to 1.00 m, this capture is at 0.41 m"),
+        (1.19, ""),
+        (1.21, "was measured at 0.50 to 1.00 m, this capture is at 1.21 m"),
+    ],
+)
+def test_a_capture_a_fifth_nearer_or_farther_is_doubted(distance_m, text) -> None:
+    field = plain_field(np.zeros((128, 160)))
+    cloud = capture(9, wall(0.0), (distance_m, 0.0, 0.0), noise_m=1e-6)
+    notes = doubts(cloud, field, "f.npz")
+    assert [text in note for note in notes] == ([True] if text else [])
+    lone_distance = replace(field, distances_m=(1.0, 1.009))
+    if distance_m < 0.5:
+        assert "measured at 1.00 m, this" in doubts(cloud, lone_distance, "f.npz")[0]
+
+
+@pytest.mark.parametrize(("rows", "is_doubted"), [(12, False), (13, True)])
+def test_a_map_that_covers_less_than_nine_tenths_is_doubted(rows, is_doubted) -> None:
+    error_m = np.zeros((128, 160))
+    error_m[:rows] = np.nan
+    cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0), noise_m=1e-6)
+    notes = doubts(cloud, plain_field(error_m), "f.npz")
+    covers = f"covers {100 * (1 - rows / 128):.0f} % of the valid pixels"
+    assert [covers in note for note in notes] == ([True] if is_doubted else [])
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy"])
+@pytest.mark.parametrize("share", [0.0199, 0.0201, -0.0199, -0.0201])
+def test_a_lens_two_per_cent_off_is_another_one(name: str, share: float) -> None:
+    """Of the focal length, which is more than the width."""
+    field = plain_field(np.zeros((128, 160)))
+    lens = replace(LENS, **{name: getattr(LENS, name) + share * LENS.fx})
+    cloud = replace(capture(9, wall(0.0), (0.7, 0.0, 0.0)), lens=lens)
+    if abs(share) < 0.02:
+        corrected(cloud, field)
+    else:
+        with pytest.raises(UserError, match="is not that of the flat field"):
+            corrected(cloud, field)
