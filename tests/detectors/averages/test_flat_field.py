@@ -22,6 +22,7 @@ from detectors.averages.flat_captures import (
     _disagreement_m2,
     _groups,
     _moved,
+    _solved,
     flattened,
     separated,
 )
@@ -457,6 +458,98 @@ def test_a_drifting_pattern_s_variance_holds_for_the_next_capture() -> None:
         quiet = replace(first, variance_m2=np.full((64, 64), part * noisy_m2))
         noisy = replace(second, variance_m2=np.full((64, 64), part * noisy_m2))
         assert len(separated([quiet, noisy], small_lens).field.warnings) == count
+
+
+def test_pattern_and_shape_are_those_of_dense_least_squares() -> None:
+    """Two captures of 4 x 30 pixels in steps of 1 m: two rows of the first see one cell, and in the
+    second each row sees half of that cell's neighbours. Each value is pattern + shape + noise, with
+    their variances as a prior."""
+    random = np.random.default_rng(11)
+    shape = (4, 30)
+    rows, columns = np.indices(shape)
+    noise_m2 = np.stack([np.full(shape, 0.04), np.full(shape, 0.09)])
+    residuals = random.normal(size=(2, *shape))
+    residuals[0, 1, 3] = np.nan
+    residuals[:, 3, 7] = np.nan
+    captures = []
+    cells = []
+    for number, first_row in enumerate((0, 1)):
+        cell_row = (rows + first_row) // 2 + 10 * number
+        places_m = np.stack([columns + 0.25, cell_row + 0.25], axis=-1)
+        captures.append(lone(0.5, residual_m=residuals[number], places_m=places_m))
+        cells.append(cell_row * 30 + columns)
+    shape_m2 = 0.25
+    result = _solved(captures, residuals, noise_m2, shape_m2)
+    error_m, variance_m2, shapes_m = result
+    finite = np.isfinite(residuals)
+    value = residuals[finite]
+    noise = noise_m2[finite]
+    pattern_m2 = np.mean(value**2) - noise.mean() - shape_m2
+    pixel = np.broadcast_to(np.arange(120).reshape(shape), residuals.shape)[finite]
+    names, cell = np.unique(np.stack(cells)[finite], return_inverse=True)
+    design = np.zeros((len(value), 120 + len(names)))
+    design[np.arange(len(value)), pixel] = 1.0
+    design[np.arange(len(value)), 120 + cell] = 1.0
+    prior = np.r_[np.full(120, 1 / pattern_m2), np.full(len(names), 1 / shape_m2)]
+    information = design.T @ (design / noise[:, None]) + np.diag(prior)
+    solution = np.linalg.solve(information, design.T @ (value / noise))
+    covariance = np.linalg.inv(information)
+    seen = finite.any(axis=0)
+    np.testing.assert_allclose(error_m[seen], solution[:120].reshape(shape)[seen], atol=1e-3)
+    np.testing.assert_allclose(shapes_m[finite], solution[120:][cell], atol=1e-3)
+    exact_m2 = covariance.diagonal()[:120].reshape(shape)
+    # beliefs go around in loops
+    np.testing.assert_allclose(variance_m2[seen], exact_m2[seen], rtol=0.25)
+    assert np.isnan(error_m[~seen]).all()
+    assert np.isnan(variance_m2[~seen]).all()
+    assert np.isnan(shapes_m[~finite]).all()
+
+
+def test_without_shared_cells_each_value_has_noise_and_shape() -> None:
+    """Two captures of cells of their own: the variance is that of two values and the prior."""
+    random = np.random.default_rng(12)
+    shape = (4, 30)
+    rows, columns = np.indices(shape)
+    residuals = random.normal(size=(2, *shape))
+    noise_m2 = random.uniform(0.02, 0.2, (2, *shape))
+    captures = []
+    for number in range(2):
+        places_m = np.stack([columns + 0.25, rows + 10 * number + 0.25], axis=-1)
+        captures.append(lone(0.5, residual_m=residuals[number], places_m=places_m))
+    for shape_m2 in (0.25, 3.0):
+        error_m, variance_m2, _ = _solved(captures, residuals, noise_m2, shape_m2)
+        beyond_m2 = np.mean(residuals**2) - noise_m2.mean() - shape_m2
+        # a pattern below the noise counts as large as the noise
+        pattern_m2 = max(beyond_m2, noise_m2.mean())
+        weights = 1 / (noise_m2 + shape_m2)
+        expected_m2 = 1 / (1 / pattern_m2 + weights.sum(axis=0))
+        np.testing.assert_allclose(variance_m2, expected_m2, rtol=1e-9)
+        expected_m = (weights * residuals).sum(axis=0) * expected_m2
+        np.testing.assert_allclose(error_m, expected_m, atol=1e-3)
+
+
+def test_changes_in_time_and_in_range_compare_halves_and_ends() -> None:
+    """Three captures nearby, two in the middle, one far away: the first of the near ones and of the
+    middle ones beside the others of both, and the near ones beside the far one."""
+    random = np.random.default_rng(10)
+    distances_m = (0.5, 0.7, 0.5, 0.9, 0.7, 0.5)
+    residuals = random.normal(size=(6, 20, 30))
+    captures = []
+    for distance_m, residual_m in zip(distances_m, residuals, strict=True):
+        captures.append(lone(distance_m, residual_m=residual_m, variance_m2=0.01))
+    result = separated(captures, Lens(30, 20, 50.0, 50.0, 15.0, 10.0))
+    near = residuals[[0, 2, 5]].mean(axis=0)
+    first = residuals[[0, 1]].mean(axis=0)
+    last = residuals[[2, 5, 4]].mean(axis=0)
+    assert result.in_range is not None
+    assert result.in_time is not None
+    in_range_m = np.sqrt(np.mean((near - residuals[3]) ** 2))
+    assert result.in_range.difference_m == pytest.approx(in_range_m)
+    assert result.in_range.noise_m == pytest.approx(np.sqrt(0.01 / 3 + 0.01))
+    in_time_m = np.sqrt(np.mean((first - last) ** 2))
+    assert result.in_time.difference_m == pytest.approx(in_time_m)
+    assert result.in_time.noise_m == pytest.approx(np.sqrt(0.01 / 2 + 0.01 / 3))
+    assert result.field.distances_m == (0.5, 0.9)
 
 
 # ---- the correction
