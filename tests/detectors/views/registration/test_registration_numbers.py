@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from detectors.rigid_motion import moved_by
 from detectors.views.marks.mark import Mark, MarkSet, off_line_problem
 from detectors.views.registration import register, registered
+from detectors.views.registration.by_marks import JointState, ViewData
 from detectors.views.registration.by_points import (
     LEAST_VARIANCE,
     _covariance,
@@ -430,3 +432,88 @@ def test_marks_on_a_line_are_told(off_mm, sigma_mm, is_line) -> None:
     assert bool(text) == is_line
     if is_line:
         assert f"{off_mm:.1f} mm off it" in text
+
+
+# --- the joint adjustment ---
+
+ORDERS = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
+"""Orders of the surface's terms in x and y."""
+
+
+def plain_residuals(state: JointState, data: list[ViewData]) -> tuple[np.ndarray, list]:
+    """All residuals of the adjustment one after another: points across the surface, marks within
+    the plane, each view's own terms; and the sizes of these parts."""
+    parts = []
+    for v, view in enumerate(data):
+        x, y, z = transform_points(state.T[v], view.points_m).T
+        height = np.zeros(len(x))
+        for term, (i, j) in enumerate(ORDERS):
+            along_x = np.polynomial.chebyshev.chebval(x / state.half_m[0], np.eye(4)[i])
+            along_y = np.polynomial.chebyshev.chebval(y / state.half_m[1], np.eye(4)[j])
+            height += (state.surface[term] + state.view_terms[v, term]) * along_x * along_y
+        parts.append(z - height)
+        for mark, label in view.marks:
+            place = transform_points(state.T[v], mark.centre_m)
+            parts.append(place[:2] - state.marks_m[label])
+        parts.append(state.view_terms[v])
+    return np.concatenate(parts), [len(part) for part in parts]
+
+
+def test_the_normal_equations_are_those_of_numerical_derivatives() -> None:
+    """Two views of a bent surface with three marks: the Gauss-Newton step's matrix and right side
+    from differences of all residuals, with the weights held."""
+    random = np.random.default_rng(15)
+    T = np.stack([np.eye(4), moved_by(np.array([0.1, -0.2, 0.3, 0.01, 0.02, 0.8]), np.zeros(3))])
+    view_terms = np.zeros((2, 10))
+    view_terms[:, 0] = [2e-4, -3e-4]  # levels only, whose slope is 0
+    state = JointState(
+        T=T,
+        surface=1e-3 * random.normal(size=10),
+        view_terms=view_terms,
+        marks_m=random.uniform(-0.1, 0.1, (3, 2)),
+        shared_m=4e-4,
+        half_m=np.array([0.2, 0.15]),
+    )
+    data = []
+    for v, labels in enumerate(((0, 1, 2), (2, 0))):
+        across = random.normal(size=(40, 2)) * [0.08, 0.06]
+        # some points are far off
+        height = 1e-3 * random.standard_t(2, size=(40, 1))
+        seen = transform_points(np.linalg.inv(T[v]), np.hstack([across, height]))
+        marks = []
+        for label in labels:
+            place = np.append(state.marks_m[label] + 1e-3 * random.normal(size=2), 0.0)
+            root = 1e-4 * random.normal(size=(3, 3))
+            mark = mark_at(transform_points(np.linalg.inv(T[v]), place))
+            marks.append((replace(mark, covariance_m2=root @ root.T), label))
+        data.append(ViewData(seen, tuple(marks), noise_m=2e-4, sigma_m=9e-4))
+    residuals, sizes = plain_residuals(state, data)
+    weights = []
+    position = 0
+    for v, view in enumerate(data):
+        off = residuals[position : position + 40]
+        scale = max(view.noise_m, np.median(np.abs(off)) / 0.6745)
+        tukey = np.maximum(1.0 - (off / scale / 4.685) ** 2, 0.0) ** 2
+        weights.append(np.diag(tukey / 9e-4**2))
+        turn = T[v][:2, :3]
+        for mark, _ in view.marks:
+            weights.append(np.linalg.inv(turn @ mark.covariance_m2 @ turn.T))
+        weights.append(np.eye(10) / 4e-4**2)
+        position += 40 + 2 * len(view.marks) + 10
+    assert position == sum(sizes)
+    weight = block_diag(*weights)
+    assert (np.diag(weight)[:40] < 0.5 / 9e-4**2).any()
+    count = 6 + 10 + 6 + 20
+    jacobian = np.empty((len(residuals), count))
+    for unknown in range(count):
+        step = np.zeros(count)
+        step[unknown] = 1e-6
+        ahead, _ = plain_residuals(state.moved(step, 4e-4), data)
+        behind, _ = plain_residuals(state.moved(-step, 4e-4), data)
+        jacobian[:, unknown] = (ahead - behind) / 2e-6
+    matrix, right = state.equations(data)
+    expected = jacobian.T @ weight @ jacobian
+    size = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+    np.testing.assert_allclose(matrix / size, expected / size, atol=1e-5)
+    slope = -jacobian.T @ weight @ residuals
+    np.testing.assert_allclose(right, slope, atol=1e-4 * np.abs(slope).max(), rtol=1e-3)
