@@ -106,6 +106,15 @@ def test_a_sandwich_is_that_of_sums_over_cubes() -> None:
     expected = plain_sandwich(curvature, scores, points, PITCH_M)
     np.testing.assert_allclose(result, expected, rtol=1e-9)
     np.testing.assert_array_equal(result, result.T)
+    # the objective's unit does not matter, nor that of length
+    for unit in (1e-14, 1e14):
+        other = registered.clustered_sandwich(unit * curvature, unit * scores, points, PITCH_M)
+        np.testing.assert_allclose(other, result, rtol=1e-9)
+    longer = np.array([1.0] * 3 + [1e6] * 3)
+    other = registered.clustered_sandwich(
+        curvature / np.outer(longer, longer), scores / longer, 1e6 * points, 1e6 * PITCH_M
+    )
+    np.testing.assert_allclose(other / np.outer(longer, longer), result, rtol=1e-7)
 
 
 def test_a_sandwich_needs_seven_cubes_and_a_definite_curvature() -> None:
