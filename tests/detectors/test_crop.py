@@ -9,8 +9,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from detectors import load_detector
 from detectors.crop import (
+    CENTRE_SPREAD,
     AutoCrop,
     BoxCrop,
+    Candidate,
     CropConfig,
     NoCrop,
     PolygonCrop,
@@ -508,3 +510,94 @@ def test_the_kind_chooses_the_declaration() -> None:
     ):
         with pytest.raises(ValidationError):
             adapter.validate_json(wrong)
+
+
+# --- what is known of a candidate ---
+
+
+def flat_candidate(own: np.ndarray, slope: float = 0.0, organised: bool = True) -> Candidate:
+    """Pixels of a plane z = 0.8 + slope x, seen through a lens of 200 pixels."""
+    height, width = own.shape
+    lens = Lens(width, height, 200.0, 200.0, (width - 1) / 2, (height - 1) / 2)
+    slopes = lens.region_slopes(lens.whole)
+    z_m = 0.8 / (1.0 - slope * slopes[..., 0])
+    cloud = Cloud(
+        points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
+        reason=np.zeros(own.shape, np.uint8),
+        count=np.ones(own.shape, int),
+        variance_m2=np.full(own.shape, np.nan),
+        region=Region(0, height, 0, width),
+        z_step_m=0.0,
+        n_frames=1,
+        organised=organised,
+        lens=lens,
+    )
+    return Candidate(own=own, filled=holes_filled(own), outline=own, grid=cloud)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "on_edge"),
+    [
+        ((0, 30), (0, 40), 1.0),
+        ((1, 29), (1, 39), 0.0),
+        # one side along the picture's edge
+        ((0, 11), (5, 25), 20),
+        ((19, 30), (5, 25), 20),
+        ((5, 25), (0, 11), 20),
+        ((5, 25), (29, 40), 20),
+        # a corner: both sides share a pixel
+        ((0, 11), (0, 21), 11 + 21 - 1),
+        ((1, 12), (1, 22), 0.0),
+    ],
+)
+def test_the_part_of_an_outline_that_the_picture_cuts_off(rows, columns, on_edge) -> None:
+    own = np.zeros((30, 40), bool)
+    own[slice(*rows), slice(*columns)] = True
+    own[(rows[0] + rows[1]) // 2, (columns[0] + columns[1]) // 2] = False  # a hole has no outline
+    height = rows[1] - rows[0]
+    width = columns[1] - columns[0]
+    length = 2 * (height + width) - 4
+    expected = on_edge if isinstance(on_edge, float) else on_edge / length
+    assert flat_candidate(own).cut_off == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5, 1.2, 2.5])
+def test_a_candidate_s_tilt_extent_depths_and_weight(slope: float) -> None:
+    """A rectangle around the middle of a picture: sides on the plane, percentiles of z, and the
+    share of the pixels under a bell about the middle, less at a grazing angle."""
+    own = np.zeros((61, 81), bool)
+    own[20:41, 30:51] = True
+    candidate = flat_candidate(own, slope)
+    assert candidate.share == pytest.approx(21 * 21 / (61 * 81))
+    tilt = np.arctan(slope)
+    assert candidate.tilt_deg == pytest.approx(np.degrees(tilt), abs=1e-3)
+    points = candidate.grid.points_m[own]
+    x, y, z = points.T
+    assert candidate.depths_m == pytest.approx(tuple(np.quantile(z, (0.01, 0.5, 0.99))))
+    long, short = candidate.extent_m
+    sides = sorted([np.ptp(x) / np.cos(tilt), np.ptp(y)])
+    if slope == 0.0:
+        assert (short, long) == pytest.approx(tuple(sides), rel=0.02)
+    else:
+        assert long == pytest.approx(sides[1], rel=0.06)
+    bell_rows = np.exp(-0.5 * (((np.arange(61) + 0.5) / 61 - 0.5) / CENTRE_SPREAD) ** 2)
+    bell_columns = np.exp(-0.5 * (((np.arange(81) + 0.5) / 81 - 0.5) / CENTRE_SPREAD) ** 2)
+    weight = bell_rows[20:41].sum() * bell_columns[30:51].sum()
+    weight /= bell_rows.sum() * bell_columns.sum()
+    assert candidate.weight == pytest.approx(weight * min(1.0, (np.cos(tilt) / 0.5) ** 2), rel=1e-4)
+
+
+@pytest.mark.parametrize(("step_m", "is_one_plane"), [(0.0, True), (0.0019, True), (0.0021, False)])
+def test_surfaces_continue_each_other_if_they_lie_in_one_plane(step_m, is_one_plane) -> None:
+    """Nine tenths of the points of both within 2 mm of the first one's plane."""
+    left = np.zeros((40, 80), bool)
+    left[:, :30] = True
+    right = np.zeros((40, 80), bool)
+    right[:, 40:] = True
+    first = flat_candidate(left)
+    second = flat_candidate(right)
+    second.grid.points_m[..., 2] += step_m
+    assert first.continues(second, 0.002) == is_one_plane
+    # a tenth may be off
+    second.grid.points_m[:4, :, 2] -= 0.5
+    assert not first.continues(second, 0.0001) or step_m == 0.0

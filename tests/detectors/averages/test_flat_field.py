@@ -22,6 +22,7 @@ from detectors.averages.flat_captures import (
     _disagreement_m2,
     _groups,
     _moved,
+    _solved,
     flattened,
     separated,
 )
@@ -459,6 +460,98 @@ def test_a_drifting_pattern_s_variance_holds_for_the_next_capture() -> None:
         assert len(separated([quiet, noisy], small_lens).field.warnings) == count
 
 
+def test_pattern_and_shape_are_those_of_dense_least_squares() -> None:
+    """Two captures of 4 x 30 pixels in steps of 1 m: two rows of the first see one cell, and in the
+    second each row sees half of that cell's neighbours. Each value is pattern + shape + noise, with
+    their variances as a prior."""
+    random = np.random.default_rng(11)
+    shape = (4, 30)
+    rows, columns = np.indices(shape)
+    noise_m2 = np.stack([np.full(shape, 0.04), np.full(shape, 0.09)])
+    residuals = random.normal(size=(2, *shape))
+    residuals[0, 1, 3] = np.nan
+    residuals[:, 3, 7] = np.nan
+    captures = []
+    cells = []
+    for number, first_row in enumerate((0, 1)):
+        cell_row = (rows + first_row) // 2 + 10 * number
+        places_m = np.stack([columns + 0.25, cell_row + 0.25], axis=-1)
+        captures.append(lone(0.5, residual_m=residuals[number], places_m=places_m))
+        cells.append(cell_row * 30 + columns)
+    shape_m2 = 0.25
+    result = _solved(captures, residuals, noise_m2, shape_m2)
+    error_m, variance_m2, shapes_m = result
+    finite = np.isfinite(residuals)
+    value = residuals[finite]
+    noise = noise_m2[finite]
+    pattern_m2 = np.mean(value**2) - noise.mean() - shape_m2
+    pixel = np.broadcast_to(np.arange(120).reshape(shape), residuals.shape)[finite]
+    names, cell = np.unique(np.stack(cells)[finite], return_inverse=True)
+    design = np.zeros((len(value), 120 + len(names)))
+    design[np.arange(len(value)), pixel] = 1.0
+    design[np.arange(len(value)), 120 + cell] = 1.0
+    prior = np.r_[np.full(120, 1 / pattern_m2), np.full(len(names), 1 / shape_m2)]
+    information = design.T @ (design / noise[:, None]) + np.diag(prior)
+    solution = np.linalg.solve(information, design.T @ (value / noise))
+    covariance = np.linalg.inv(information)
+    seen = finite.any(axis=0)
+    np.testing.assert_allclose(error_m[seen], solution[:120].reshape(shape)[seen], atol=1e-3)
+    np.testing.assert_allclose(shapes_m[finite], solution[120:][cell], atol=1e-3)
+    exact_m2 = covariance.diagonal()[:120].reshape(shape)
+    # beliefs go around in loops
+    np.testing.assert_allclose(variance_m2[seen], exact_m2[seen], rtol=0.25)
+    assert np.isnan(error_m[~seen]).all()
+    assert np.isnan(variance_m2[~seen]).all()
+    assert np.isnan(shapes_m[~finite]).all()
+
+
+def test_without_shared_cells_each_value_has_noise_and_shape() -> None:
+    """Two captures of cells of their own: the variance is that of two values and the prior."""
+    random = np.random.default_rng(12)
+    shape = (4, 30)
+    rows, columns = np.indices(shape)
+    residuals = random.normal(size=(2, *shape))
+    noise_m2 = random.uniform(0.02, 0.2, (2, *shape))
+    captures = []
+    for number in range(2):
+        places_m = np.stack([columns + 0.25, rows + 10 * number + 0.25], axis=-1)
+        captures.append(lone(0.5, residual_m=residuals[number], places_m=places_m))
+    for shape_m2 in (0.25, 3.0):
+        error_m, variance_m2, _ = _solved(captures, residuals, noise_m2, shape_m2)
+        beyond_m2 = np.mean(residuals**2) - noise_m2.mean() - shape_m2
+        # a pattern below the noise counts as large as the noise
+        pattern_m2 = max(beyond_m2, noise_m2.mean())
+        weights = 1 / (noise_m2 + shape_m2)
+        expected_m2 = 1 / (1 / pattern_m2 + weights.sum(axis=0))
+        np.testing.assert_allclose(variance_m2, expected_m2, rtol=1e-9)
+        expected_m = (weights * residuals).sum(axis=0) * expected_m2
+        np.testing.assert_allclose(error_m, expected_m, atol=1e-3)
+
+
+def test_changes_in_time_and_in_range_compare_halves_and_ends() -> None:
+    """Three captures nearby, two in the middle, one far away: the first of the near ones and of the
+    middle ones beside the others of both, and the near ones beside the far one."""
+    random = np.random.default_rng(10)
+    distances_m = (0.5, 0.7, 0.5, 0.9, 0.7, 0.5)
+    residuals = random.normal(size=(6, 20, 30))
+    captures = []
+    for distance_m, residual_m in zip(distances_m, residuals, strict=True):
+        captures.append(lone(distance_m, residual_m=residual_m, variance_m2=0.01))
+    result = separated(captures, Lens(30, 20, 50.0, 50.0, 15.0, 10.0))
+    near = residuals[[0, 2, 5]].mean(axis=0)
+    first = residuals[[0, 1]].mean(axis=0)
+    last = residuals[[2, 5, 4]].mean(axis=0)
+    assert result.in_range is not None
+    assert result.in_time is not None
+    in_range_m = np.sqrt(np.mean((near - residuals[3]) ** 2))
+    assert result.in_range.difference_m == pytest.approx(in_range_m)
+    assert result.in_range.noise_m == pytest.approx(np.sqrt(0.01 / 3 + 0.01))
+    in_time_m = np.sqrt(np.mean((first - last) ** 2))
+    assert result.in_time.difference_m == pytest.approx(in_time_m)
+    assert result.in_time.noise_m == pytest.approx(np.sqrt(0.01 / 2 + 0.01 / 3))
+    assert result.field.distances_m == (0.5, 0.9)
+
+
 # ---- the correction
 
 
@@ -731,3 +824,99 @@ def test_an_impossible_flat_field_is_refused(tmp_path, change, message):
     (tmp_path / "tiny.yaml").write_text(STUDY)
     with pytest.raises(DeclarationError, match=message):
         load_experiment(tmp_path / "tiny.yaml", [change])
+
+
+# ---- numbers of a field by hand
+
+
+def plain_field(error_m: np.ndarray, **values: object) -> FlatField:
+    """A field of the camera above, known to 0.01 mm, measured at 0.5 to 1.0 m."""
+    variance_m2 = np.full(error_m.shape, (0.01 * MM) ** 2)
+    return replace(FlatField(error_m, variance_m2, LENS, (0.5, 1.0)), **values)
+
+
+def test_the_rms_of_a_pattern_is_that_without_the_map_s_noise() -> None:
+    error_m = np.full((128, 160), 5e-4)
+    error_m[::2] = -7e-4
+    error_m[5, 5] = np.nan
+    noisy = plain_field(error_m, variance_m2=np.full(error_m.shape, 1.3e-7))
+    squares = (64 * 160 * 4.9e-7 + (64 * 160 - 1) * 2.5e-7) / (128 * 160 - 1)
+    assert noisy.rms_m == pytest.approx(np.sqrt(squares - 1.3e-7))
+    assert plain_field(0.0 * error_m).rms_m == 0.0
+
+
+def test_a_correction_moves_points_along_their_rays_by_the_error() -> None:
+    random = np.random.default_rng(9)
+    error_m = 1e-3 * random.standard_normal((128, 160))
+    error_m[:3] = np.nan
+    field = plain_field(error_m, variance_m2=random.uniform(1e-9, 5e-9, error_m.shape))
+    cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0))
+    moved = corrected(cloud, field)
+    before_m = np.linalg.norm(cloud.points_m, axis=-1)
+    after_m = np.linalg.norm(moved.points_m, axis=-1)
+    known = np.isfinite(error_m)
+    np.testing.assert_allclose((before_m - after_m)[known], error_m[known], atol=1e-15)
+    np.testing.assert_array_equal(moved.points_m[~known], cloud.points_m[~known])
+    rays = cloud.points_m / before_m[..., None]
+    np.testing.assert_allclose(moved.points_m / after_m[..., None], rays, atol=1e-12)
+    # along the axis: the frames' noise and the map's, or the pattern where that is unknown
+    cosine2 = rays[..., 2] ** 2
+    assert moved.mean_variance_m2 is not None
+    frames_m2 = moved.mean_variance_m2 - cosine2 * np.where(known, field.variance_m2, 0.0)
+    unknown_m2 = frames_m2[~known] - (cosine2 * field.rms_m**2)[~known]
+    scatter_m2 = NOISE_M**2 / FRAMES
+    assert np.median(frames_m2[known]) == pytest.approx(scatter_m2, rel=0.02)
+    assert np.median(unknown_m2) == pytest.approx(scatter_m2, rel=0.05)
+    # a part of the sensor takes its part of the map
+    part = replace(
+        cloud,
+        points_m=cloud.points_m[20:60, 30:90],
+        reason=cloud.reason[20:60, 30:90],
+        count=cloud.count[20:60, 30:90],
+        variance_m2=cloud.variance_m2[20:60, 30:90],
+        region=Region(20, 60, 30, 90),
+    )
+    np.testing.assert_array_equal(corrected(part, field).points_m, moved.points_m[20:60, 30:90])
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "text"),
+    [
+        (0.42, ""),
+        (0.41, "was measured at 0.50 to 1.00 m, this capture is at 0.41 m"),
+        (1.19, ""),
+        (1.21, "was measured at 0.50 to 1.00 m, this capture is at 1.21 m"),
+    ],
+)
+def test_a_capture_a_fifth_nearer_or_farther_is_doubted(distance_m, text) -> None:
+    field = plain_field(np.zeros((128, 160)))
+    cloud = capture(9, wall(0.0), (distance_m, 0.0, 0.0), noise_m=1e-6)
+    notes = doubts(cloud, field, "f.npz")
+    assert [text in note for note in notes] == ([True] if text else [])
+    lone_distance = replace(field, distances_m=(1.0, 1.009))
+    if distance_m < 0.5:
+        assert "measured at 1.00 m, this" in doubts(cloud, lone_distance, "f.npz")[0]
+
+
+@pytest.mark.parametrize(("rows", "is_doubted"), [(12, False), (13, True)])
+def test_a_map_that_covers_less_than_nine_tenths_is_doubted(rows, is_doubted) -> None:
+    error_m = np.zeros((128, 160))
+    error_m[:rows] = np.nan
+    cloud = capture(9, wall(0.0), (0.7, 0.0, 0.0), noise_m=1e-6)
+    notes = doubts(cloud, plain_field(error_m), "f.npz")
+    covers = f"covers {100 * (1 - rows / 128):.0f} % of the valid pixels"
+    assert [covers in note for note in notes] == ([True] if is_doubted else [])
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy"])
+@pytest.mark.parametrize("share", [0.0199, 0.0201, -0.0199, -0.0201])
+def test_a_lens_two_per_cent_off_is_another_one(name: str, share: float) -> None:
+    """Of the focal length, which is more than the width."""
+    field = plain_field(np.zeros((128, 160)))
+    lens = replace(LENS, **{name: getattr(LENS, name) + share * LENS.fx})
+    cloud = replace(capture(9, wall(0.0), (0.7, 0.0, 0.0)), lens=lens)
+    if abs(share) < 0.02:
+        corrected(cloud, field)
+    else:
+        with pytest.raises(UserError, match="is not that of the flat field"):
+            corrected(cloud, field)

@@ -3,6 +3,7 @@ one damage once."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from scipy.special import ndtri
 from scipy.stats import binom, multivariate_normal, norm
 
 from detectors import load_detector
+from detectors.findings import missing as missing_module
 from detectors.findings.missing import (
     ALPHA,
     LEAST_POINTS,
@@ -559,13 +561,22 @@ def test_scattered_dropouts_alone_have_their_share_as_rate() -> None:
     assert missing.facts["expected_by_chance"] == 0.0
     assert missing.least_points == LEAST_POINTS
     assert not missing.detections
-    # beside a hole, the hole's pixels count neither as dropouts nor as known
+
+
+def test_the_rate_is_that_of_the_pixels_that_are_no_finding() -> None:
+    """A hole's pixels count neither as dropouts nor as known; dropouts at all four edges count."""
+    single = np.zeros(SHAPE, bool)
+    single[0:90:89, 10:110:9] = True
+    single[5:85:7, 0:120:119] = True
+    single[10:80:7, 5:115:10] = True
     hole = disc(60.4, 45.2, 14)
-    missing = missing_returns(*looked(gone | hole))
-    assert missing is not None
     around = cv2.dilate(hole.astype(np.uint8), np.ones((3, 3))) > 0
-    rest = (gone & ~around).sum()
-    assert missing.dropouts == pytest.approx(rest / (gone.size - hole.sum()), rel=0.03)
+    single &= ~around
+    missing = missing_returns(*looked(single | hole))
+    assert missing is not None
+    assert len(missing.detections) == 1
+    assert missing.outline.all()
+    assert missing.dropouts == pytest.approx(single.sum() / (single.size - hole.sum()), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -635,6 +646,40 @@ def test_the_square_is_the_one_that_makes_as_many_missing_neighbours(rate, side)
     both = multivariate_normal.cdf([level, level], cov=[[1.0, correlation], [correlation, 1.0]])
     frequent = (low[:, 1:] & low[:, :-1]).mean()
     assert frequent == pytest.approx(both, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("shape", "fields"), [((100, 120), 83), ((500, 1000), 10), ((50, 100), 100)]
+)
+def test_simulated_fields_hold_a_million_pixels(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], fields: int
+) -> None:
+    """But ten fields at least, and a hundred at most."""
+    counts = []
+
+    def counted(shape: tuple[int, int], side: int, count: int) -> Iterator[np.ndarray]:
+        counts.append(count)
+        return _fields(shape, side, 2)
+
+    monkeypatch.setattr(missing_module, "_fields", counted)
+    dropouts = np.random.default_rng(14).random(shape) < 0.05
+    everywhere = np.ones(shape, bool)
+    chance = missing_module._chance_of(dropouts, everywhere, everywhere)
+    assert counts == [fields]
+    assert chance.rate == pytest.approx(dropouts.mean())
+
+
+def test_a_larger_square_is_taken_beyond_two_standard_errors() -> None:
+    """Of single pixels, the share of missing neighbours is the rate: a measured share of up to two
+    of its standard errors more is chance."""
+    image = np.random.default_rng(13).random((200, 300)) < 0.1
+    known = np.ones(image.shape, bool)
+    pairs = image[:-1].sum() + image[:, :-1].sum()
+    both = (image[:-1] & image[1:]).sum() + (image[:, :-1] & image[:, 1:]).sum()
+    share = both / pairs
+    error = np.sqrt(share * (1.0 - share) / pairs)
+    for sigmas, side in ((-1.0, 1), (1.9, 1), (2.1, 2), (3.9, 2)):
+        assert _square(image, known, share - sigmas * error) == side
 
 
 def test_neighbours_that_are_not_known_do_not_count_as_returned() -> None:

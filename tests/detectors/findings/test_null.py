@@ -13,6 +13,7 @@ from scipy import ndimage, stats
 from scipy.stats import poisson
 
 from detectors import load_detector
+from detectors.findings import null
 from detectors.findings.null import (
     EXPONENTS,
     FEWEST_PEAKS,
@@ -366,3 +367,11 @@ def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
     detections = DETECTOR.find(cloud, evidence, 8.0)
     assert len(detections) == 1
     assert each_object_once(cloud, evidence, detections) == detections
+
+
+def test_the_prior_weights_of_exponents_are_probabilities() -> None:
+    assert null.PRIOR.sum() == pytest.approx(1.0, abs=1e-12)
+    assert (null.PRIOR > 0).all()
+    assert len(null.PRIOR) == len(null.EXPONENTS)
+    # averages of a camera's noise are near normal
+    assert null.PRIOR[:2].sum() > 0.8

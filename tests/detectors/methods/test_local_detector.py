@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection
-from detectors.methods.local import LocalConfig, LocalDetector, _scored
+from detectors.methods.local import LocalConfig, LocalDetector, _scored, _strongest
 from detectors.methods.matched import MatchedDetector
 from harness.testing import check_detector
 from harness.testing.synthetic_clouds import LENS, plane, with_gaps
@@ -287,3 +287,34 @@ def test_findings_at_many_thresholds_are_those_of_each(detector: LocalDetector) 
                 expected.centre_m,
                 atol=1e-12,
             )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [
+        (1.0, 20.0),
+        # half of the wide departure confirms it, a quarter does not; between, it counts in part
+        (0.50, 20.0),
+        (0.49, 20.0 * 0.96),
+        (0.40, 20.0 * 0.6),
+        (0.30, 20.0 * 0.2),
+        # then the narrow one's own score is left
+        (0.24, (2.0 * 0.24 - 0.6) / 0.4),
+    ],
+)
+def test_a_wide_mean_counts_as_far_as_narrower_ones_confirm_it(sign, share, expected) -> None:
+    """The wide mean departs by 2, 20 deviations; the narrow one, of deviation 0.4, by a share of
+    that less 1.5 deviations, which are allowed for."""
+    around = np.full((2, 1), 0.4)
+    departures = sign * np.array([[2.0 * share - 1.5 * 0.4], [2.0]])
+    deviations = np.array([[0.4], [0.1]])
+    (result,) = _strongest(around + departures, around, deviations)
+    assert result == pytest.approx(sign * expected, rel=1e-4)
+
+
+def test_the_narrowest_mean_needs_no_confirmation() -> None:
+    means = np.array([[3.0, -3.0], [3.0, -3.0]])
+    around = np.array([[1.0, -1.0], [2.9, -2.9]])
+    deviations = np.full((2, 2), 0.25)
+    np.testing.assert_allclose(_strongest(means, around, deviations), [8.0, -8.0], rtol=1e-6)

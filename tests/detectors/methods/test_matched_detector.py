@@ -17,6 +17,7 @@ from detectors.findings.hole_model import (
     whitened,
 )
 from detectors.findings.templates import (
+    SLOTS_DEG,
     bank,
     halved,
     responses,
@@ -359,3 +360,24 @@ def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
     # loud pixels that fill less than half of the template's disc are not its finding
     core, _, _ = _cores(peaks, np.array([9.0]), values, is_known)
     assert not core.any()
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 45.0])
+def test_a_slot_has_a_higher_score_than_discs_and_dents_give_it(angle_deg: float) -> None:
+    """A slot of the bank's own length and width under white noise: the best disc or dent would
+    give it two thirds of its energy's root, and the slot itself gives more."""
+    slots = [template.image for template in bank(1) if template.slot]
+    slot = slots[SLOTS_DEG.index(angle_deg)]
+    half = len(slot) // 2
+    depth = np.zeros(SHAPE)
+    depth[45 - half : 46 + half, 60 - half : 61 + half] = 25.0 * slot / np.sqrt((slot**2).sum())
+    by_others = 0.0
+    for template in bank(1):
+        if not template.slot:
+            correlation = cv2.filter2D(depth, -1, template.image).max()
+            by_others = max(by_others, correlation / np.sqrt((template.image**2).sum()))
+    assert by_others < 0.7 * 25.0
+    noise = np.random.default_rng(23).standard_normal(SHAPE)
+    evidence = DETECTOR.analyse(cloud_of(3e-4 * (noise + depth)))
+    score = np.nanmax(evidence.score[40:51, 55:66])
+    assert 1.1 * by_others < score < 1.05 * 25.0

@@ -176,3 +176,15 @@ def test_the_stronger_of_two_templates_is_kept(down: int, right: int) -> None:
     _keep_stronger(signed, template, scores, 1 / 2.0, 1.3, down, right, 3)
     np.testing.assert_allclose(signed, expected, rtol=1e-5)
     np.testing.assert_array_equal(template, expected_by)
+
+
+def test_the_limit_of_strong_scores_is_that_of_the_inside() -> None:
+    """A rim that scatters four times as widely does not raise it: a block at six deviations of the
+    inside does not count."""
+    wide = Template(np.zeros((1, 1)), 5.0)
+    scores = noisy(6, rim=4.0)
+    scores[30:60, 30:90] = 6.0
+    without = scores.copy()
+    without[30:60, 30:90] = 0.0
+    expected = reference.deviations(without, depth_px(), np.zeros(SHAPE, bool))[-1]
+    assert evened(scores, wide, zones()) == pytest.approx(expected, rel=0.05)

@@ -23,7 +23,13 @@ from detectors.pixels.masks import (
     parts_with,
     shrunk,
 )
-from detectors.surfaces.smooth_surfaces import links, turns, unit_normals
+from detectors.surfaces.smooth_surfaces import (
+    WIDEST_SLOPE,
+    _before_lens,
+    links,
+    turns,
+    unit_normals,
+)
 
 
 def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
@@ -285,3 +291,27 @@ def test_a_notch_may_touch_the_edge_of_the_picture() -> None:
     mask[:12, 20:32] = False
     filled = notches_filled(mask, 10)
     assert filled[5:12, 20:32].all()
+
+
+@pytest.mark.parametrize(
+    ("point", "is_before"),
+    [
+        ((0.0, 0.0, 1.0), True),
+        ((WIDEST_SLOPE - 0.01, 0.0, 1.0), True),
+        ((0.0, -WIDEST_SLOPE + 0.01, 1.0), True),
+        ((WIDEST_SLOPE, 0.0, 1.0), False),
+        ((-WIDEST_SLOPE, 0.0, 1.0), False),
+        ((0.0, 2 * WIDEST_SLOPE, 2.0), False),
+        ((0.0, 0.0, 0.0), False),
+        ((0.0, 0.0, -1.0), False),
+    ],
+)
+def test_a_camera_at_the_origin_sees_points_before_it_at_less_than_80_degrees(
+    point, is_before
+) -> None:
+    assert np.degrees(np.arctan(WIDEST_SLOPE)) == pytest.approx(80.0, abs=0.1)
+    others = rough_points(2)
+    assert _before_lens(others)
+    others[4, 5] = point
+    assert _before_lens(others) == is_before
+    assert not _before_lens(np.full((3, 4, 3), np.nan))

@@ -154,3 +154,16 @@ def test_noise_that_rounding_or_few_pixels_hide_has_no_reach() -> None:
     assert noise_reach_px(frames_of(3, 2, shape=(71, 71)), 0.0) == 3.0
     assert noise_reach_px(frames_of(9, 2), 0.0) == 9.0
     assert noise_reach_px([], 0.0) == 0.0
+
+
+def test_noise_that_all_pixels_of_a_row_share_has_no_reach_along_rows() -> None:
+    """A narrow picture whose rows have one value each: along rows there is no end, and one end of
+    two is not enough."""
+    frames = []
+    for seed in range(2):
+        rows = np.random.default_rng(seed).standard_normal((600, 1)).astype(np.float32)
+        z_m = (0.7 + 1e-3 * rows + np.zeros((600, 9))).astype(np.float32)
+        frames.append(Frame(f"frame {seed}", z_m, np.zeros(z_m.shape, np.uint8)))
+    assert noise_reach_px(frames, 0.0) == 0.0
+    turned = [replace(frame, z_m=frame.z_m.T.copy(), reason=frame.reason.T) for frame in frames]
+    assert noise_reach_px(turned, 0.0) == 0.0

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from detectors.recordings.arrays import (
     raw_layout_of,
 )
 from detectors.recordings.clouds import _grid_of
+from detectors.recordings.depth_images import _colours_of, depth_files, depth_named, png_kind
 from detectors.recordings.distances import (
     _weight,
     decided_unit,
@@ -757,3 +759,37 @@ def test_bare_numbers_are_a_lens_or_a_matrix(tmp_path, text, expected) -> None:
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == expected
     assert not any(lens.distortion)
     assert parsed_lens(path)
+
+
+# --- pictures ---
+
+
+def test_colours_belong_to_the_depth_nearest_in_time() -> None:
+    """By time stamps within 20 ms, or by the same number."""
+    depths = [Path(f"depth/{stamp}.png") for stamp in ("10.000", "10.040", "10.100")]
+    colours = [Path(f"rgb/{stamp}.png") for stamp in ("9.981", "10.005", "10.0605", "10.1199")]
+    assert _colours_of(depths, colours, 0.02) == [colours[1], None, colours[3]]
+    numbered = [Path(f"d/depth_{number}.png") for number in (1, 2, 10)]
+    pictures = [Path(f"d/color_{number}.png") for number in (10, 1)]
+    assert _colours_of(numbered, pictures, 0.0) == [pictures[1], None, pictures[0]]
+    assert _colours_of(numbered, [], 0.0) == [None, None, None]
+
+
+def test_depth_pictures_are_sorted_by_their_numbers() -> None:
+    names = ["depth_10", "depth_9", "depth_9.5", "ir_3", "conf7", "depth_100"]
+    paths = [Path(f"{name}.png") for name in names]
+    chosen = depth_named(paths, paths)
+    assert [path.stem for path in chosen] == ["depth_9", "depth_9.5", "depth_10", "depth_100"]
+    others = [Path(f"{name}.png") for name in ("b12", "b2", "ir_1", "b_mask", "b3_conf", "air1")]
+    assert [path.stem for path in depth_named(others, others)] == ["air1", "b2", "b12"]
+
+
+def test_the_kind_of_a_png_stands_in_its_header(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "7.png"), np.zeros((5, 9), np.uint16))
+    cv2.imwrite(str(tmp_path / "8.png"), np.zeros((5, 9, 3), np.uint8))
+    assert png_kind(tmp_path / "7.png") == (9, 5, 16, 0)
+    assert png_kind(tmp_path / "8.png") == (9, 5, 8, 2)
+    (tmp_path / "9.png").write_bytes((tmp_path / "7.png").read_bytes()[:25])
+    with pytest.raises(UserError, match="is truncated"):
+        png_kind(tmp_path / "9.png")
+    assert [path.name for path in depth_files(tmp_path)] == ["7.png", "8.png", "9.png"]

@@ -242,3 +242,11 @@ def test_few_points_are_a_plane_and_said_to_be_few() -> None:
     sparse[5, 5] = 0.7
     with pytest.raises(UserError, match="1 valid points cannot determine"):
         found(sparse)
+
+
+@pytest.mark.parametrize("scale_mm", [60.0, 90.0])
+def test_a_free_form_of_a_stated_scale_states_it(scale_mm: float) -> None:
+    z = face(lambda x, y: 0.7 + 0.01 * np.tanh(x / 0.2) + 0.004 * np.sin(y / 0.1))
+    answer = found(measured(z, damage=()), shape="free_form", scale_mm=scale_mm)
+    assert answer.scale_m == pytest.approx(1e-3 * scale_mm, rel=1e-9)
+    assert f"absorbs shallow damage wider than {scale_mm:.0f} mm" in answer.description

@@ -12,7 +12,15 @@ from scipy.interpolate import BSpline
 from scipy.optimize import linprog
 
 from detectors.surfaces.free_form import free_form
-from detectors.surfaces.surface import Chebyshev, Surface, SurfaceConfig, fit_surface
+from detectors.surfaces.surface import (
+    Chebyshev,
+    Surface,
+    SurfaceConfig,
+    bisquare_weights,
+    fit_surface,
+    polynomial,
+    quadric,
+)
 from harness.vocabulary.errors import UserError
 
 METHODS = ("lar", "bisquare", "lts", "least_squares")
@@ -228,9 +236,16 @@ def test_every_degree_holds_its_polynomials(degree: int) -> None:
 
 
 def test_too_few_or_degenerate_points_are_a_clear_mistake() -> None:
-    x, y, z = cloud(9)
-    with pytest.raises(UserError, match="9 valid points cannot determine the 10 coefficients"):
-        fit(x, y, z)
+    x, y, z = cloud(10)
+    for degree, cross, terms in ((3, True, 10), (3, False, 7), (2, True, 6), (1, False, 3)):
+        settings = {"degree": degree, "drop_cross_terms": not cross, "method": "least_squares"}
+        few = terms - 1
+        message = f"{few} valid points cannot determine the {terms} coefficients"
+        with pytest.raises(UserError, match=message):
+            fit(x[:few], y[:few], z[:few], **settings)
+        # just enough points lie on the surface
+        exact = fit(x[:terms], y[:terms], z[:terms], **settings)
+        assert difference_m(exact, z[:terms], x[:terms], y[:terms]) < 1e-9
     line = np.linspace(0, 1, 50)
     with pytest.raises(UserError, match="lie on a line"):
         fit(line, line, np.ones(50))
@@ -294,3 +309,86 @@ def spline_design(places: np.ndarray, spacing: float, count: int) -> np.ndarray:
 def squared_differences(count: int, order: int) -> np.ndarray:
     differences = np.diff(np.eye(count), order, axis=0)
     return differences.T @ differences
+
+
+def test_the_weights_are_tukeys() -> None:
+    r = np.array([0.0, 1.0, -1.0, 1.999, -2.0, 5.0])
+    expected = [1.0, 0.75**2, 0.75**2, (1.0 - 0.9995**2) ** 2, 0.0, 0.0]
+    np.testing.assert_allclose(bisquare_weights(r, 2.0), expected, atol=1e-15)
+    # below a nanometre all is rounding
+    np.testing.assert_allclose(bisquare_weights(np.array([5e-10]), 0.0), [0.75**2])
+
+
+def test_a_weighted_polynomial_is_numpys() -> None:
+    random = np.random.default_rng(5)
+    points = np.column_stack(cloud(300, seed=5))
+    weights = random.uniform(0.0, 2.0, 300)
+    weights[:30] = 0.0
+    points[:30, 2] += 1.0
+    root = np.sqrt(weights)
+    design = monomials(points[:, 0], points[:, 1])
+    coefficients = np.linalg.lstsq(design * root[:, None], points[:, 2] * root, rcond=None)[0]
+    surface = polynomial(points, weights, 3)
+    # the ridge is 1e-9 of the largest element
+    np.testing.assert_allclose(surface(points), design @ coefficients, atol=1e-7)
+
+
+CENTRE_M = np.array([0.1, -0.05, 1.0])
+
+
+def rays(seed: int, central: bool) -> np.ndarray:
+    """Places (x/z, y/z) of rays through the origin, or (x, y) of parallel ones."""
+    width = 0.22 if central else 0.2
+    return np.random.default_rng(seed).uniform(-width, width, (400, 2)) + (
+        CENTRE_M[:2] / CENTRE_M[2] if central else CENTRE_M[:2]
+    )
+
+
+@pytest.mark.parametrize("central", [True, False])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("radii_m", [(0.4, 0.4, 0.4), (0.4, 1e6, 0.4), (0.5, 0.4, 0.3)])
+def test_a_quadric_is_the_near_or_the_far_side_of_an_ellipsoid(central, sign, radii_m) -> None:
+    """A sphere, a cylinder and an ellipsoid, from outside and from inside; points without weight
+    do not count, and other rays meet the same surface."""
+
+    def seen(places: np.ndarray) -> np.ndarray:
+        count = len(places)
+        direction = np.tile([0.0, 0.0, 1.0], (count, 1))
+        start = np.zeros((count, 3))
+        if central:
+            direction[:, :2] = places
+        else:
+            start[:, :2] = places
+        ray = direction / radii_m
+        off = (start - CENTRE_M) / radii_m
+        a = (ray**2).sum(axis=1)
+        b = (ray * off).sum(axis=1)
+        c = (off**2).sum(axis=1) - 1.0
+        t = (-b + sign * np.sqrt(b * b - a * c)) / a
+        return start + direction * t[:, None]
+
+    points = seen(rays(1, central))
+    assert np.isfinite(points).all()
+    weights = np.ones(400)
+    weights[:40] = 0.0
+    spoiled = points.copy()
+    spoiled[:40] *= 1.02
+    surface = quadric(spoiled, weights, central)
+    assert surface is not None
+    others = seen(rays(2, central))
+    np.testing.assert_allclose(surface(others), others[:, 2], atol=2e-5)
+    # a point off the surface gets the surface on its own ray
+    moved = others * 1.1 if central else others + np.array([0.0, 0.0, 0.1])
+    np.testing.assert_allclose(surface(moved), others[:, 2], atol=2e-5)
+
+
+def test_a_ray_that_misses_a_quadric_has_no_surface() -> None:
+    places = rays(1, False)
+    off = places - CENTRE_M[:2]
+    z = CENTRE_M[2] - np.sqrt(0.16 - (off**2).sum(axis=1))
+    surface = quadric(np.column_stack([places, z]), np.ones(400), False)
+    assert surface is not None
+    beside = np.array(
+        [[CENTRE_M[0] + 0.39, CENTRE_M[1], 1.0], [CENTRE_M[0] + 0.41, CENTRE_M[1], 1.0]]
+    )
+    np.testing.assert_array_equal(np.isfinite(surface(beside)), [True, False])

@@ -329,6 +329,56 @@ def test_what_a_cell_knows_of_its_views() -> None:
     assert result.cloud.n_frames == 21
 
 
+def test_a_map_as_a_cloud_states_its_samples_variances_and_views() -> None:
+    """Three views of a facing plane, of 4, 6 and 10 frames of 0.5 mm: the variance over the number
+    is what more frames would lower, and the mean's variance is the map's."""
+    poses = arc(3, 10.0)
+    rng = np.random.default_rng(12)
+    views = []
+    for number, (T, frames) in enumerate(zip(poses, (4, 6, 10), strict=True)):
+        views.append(
+            seen(
+                Plane(),
+                T,
+                rng,
+                noise_m=NOISE_M,
+                frames=frames,
+                name=f"v{number}",
+                rgb=np.full((120, 160, 3), (40 * number, 200 - 30 * number, 7), np.uint8),
+                amplitude=np.full((120, 160), 100.0 * 2**number),
+            )
+        )
+    result = fused(views, poses)
+    cells = interior(result)
+    assert cells.sum() > 1000
+    surface_map = result.surface_map
+    cloud = result.cloud
+    assert (cloud.count[cells] == 20).all()
+    assert cloud.n_frames == 20
+    per_frame_m2 = cloud.variance_m2[cells] / cloud.count[cells]
+    np.testing.assert_allclose(per_frame_m2, surface_map.temporal_m2[cells])
+    # cells take the mean over triangles of pixels, about half of a pixel's variance
+    by_frames_m2 = NOISE_M**2 / 20
+    assert 0.3 * by_frames_m2 < np.median(per_frame_m2) < by_frames_m2
+    np.testing.assert_array_equal(cloud.mean_variance_m2, surface_map.variance_m2)
+    shares = surface_map.shares[:, cells]
+    np.testing.assert_allclose(shares.sum(axis=0), 1.0)
+    assert cloud.map_views is not None
+    all_shares = surface_map.shares.sum(axis=(1, 2)) / surface_map.shares.sum()
+    np.testing.assert_allclose(cloud.map_views.shares, all_shares)
+    np.testing.assert_allclose(cloud.map_views.pixel_m, PITCH_M, rtol=0.05)
+    assert cloud.rgb is not None
+    assert cloud.amplitude is not None
+    red = np.array([0.0, 40.0, 80.0]) @ shares
+    np.testing.assert_allclose(cloud.rgb[cells][:, 0], red, atol=0.51)
+    np.testing.assert_allclose(cloud.rgb[cells][:, 2], 7)
+    bright = np.array([100.0, 200.0, 400.0]) @ shares
+    np.testing.assert_allclose(cloud.amplitude[cells], bright, rtol=1e-9)
+    covered = surface_map.seen_by.any(axis=0)
+    np.testing.assert_array_equal(cloud.valid, covered)
+    assert np.isnan(cloud.points_m[~covered]).all()
+
+
 # ---------------------------------------------------------------- outliers
 
 

@@ -12,10 +12,19 @@ import pytest
 
 from detectors.pixels.noise import rounding_left_m2
 from detectors.rigid_motion import moved_by
+from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from detectors.views.mapping import fusion
 from detectors.views.mapping.fusion import BetweenViews, combine, depth_noise
+from detectors.views.mapping.placing import (
+    LONGEST_EDGE,
+    CellGrid,
+    ChosenView,
+    grid_over,
+    place,
+    raster_between,
+)
 from detectors.views.registration.registered import Registration
-from harness.vocabulary.geometry import Cloud, Lens, transform_points
+from harness.vocabulary.geometry import Cloud, Lens, Region, transform_points
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.0])
@@ -227,18 +236,19 @@ def averaged(z_m: np.ndarray, sigma_m: np.ndarray, count: np.ndarray, seed: int 
 ROWS = np.linspace(0.0, 1.0, 150)[:, None]
 COLUMNS = np.linspace(0.0, 1.0, 200)[None]
 INSIDE = np.ones((150, 200), bool)
-INSIDE[:, :10] = False
+INSIDE[:, :60] = False
 COUNT = np.where(COLUMNS < 0.5, 6, 20) + 0 * ROWS.astype(int)
 
 
 def test_the_noise_of_depth_follows_the_amplitude() -> None:
-    """v = k / amplitude^2 + c over the number of samples: 30,000 variances, of which a tenth is
-    spoiled by damage, tell it to some per cent."""
+    """v = k / amplitude^2 + c over the number of samples: 21,000 variances, of which some are spoiled
+    by damage, tell it to some per cent."""
     amplitude = 60.0 + 540.0 * ROWS + 0.0 * COLUMNS
     sigma_m = np.sqrt((0.06 / amplitude) ** 2 + 1e-4**2)
     cloud = replace(averaged(0.8 + 0 * amplitude, sigma_m, COUNT), amplitude=amplitude)
     spoiled = cloud.variance_m2.copy()
     spoiled[:, 100:110] *= 400.0
+    spoiled[:, :60] *= 50.0  # not of the target
     cloud = replace(cloud, variance_m2=spoiled)
     variance, repeated = depth_noise(cloud, INSIDE, np.full(amplitude.shape, np.nan))
     assert repeated
@@ -246,7 +256,7 @@ def test_the_noise_of_depth_follows_the_amplitude() -> None:
     # pixels without an amplitude count like the median one; with a tenth of them it is no measure
     few = np.where(np.arange(200) < 15, 0.0, amplitude)
     variance, _ = depth_noise(replace(cloud, amplitude=few), INSIDE, amplitude * np.nan)
-    typical = np.median(sigma_m[:, 20:] ** 2)
+    typical = np.median(sigma_m**2)
     assert variance[40, 5] * COUNT[40, 5] == pytest.approx(typical, rel=0.15)
     many = np.where(np.arange(200) < 25, np.nan, amplitude)
     without, _ = depth_noise(replace(cloud, amplitude=many), INSIDE, amplitude * np.nan)
@@ -279,7 +289,7 @@ def test_single_frames_have_the_noise_of_their_roughness() -> None:
     # 39 pixels with several samples do not make repeated frames, 40 do
     for pixels in (39, 40):
         count = ones.copy()
-        count[100, 20 : 20 + pixels] = 5
+        count[100, 80 : 80 + pixels] = 5
         _, repeated = depth_noise(averaged(z_m, sigma_m, count), INSIDE, rough)
         assert repeated == (pixels == 40)
 
@@ -297,3 +307,127 @@ def test_the_mean_of_rounded_distances_keeps_an_error_of_rounding() -> None:
         expected = sigma_m[0, 0] ** 2 / 400 + left_m2
         assert float(np.median(variance)) == pytest.approx(expected, rel=0.03)
     assert rounding_left_m2(step_m, 0.0) == pytest.approx(step_m**2 / 12.0, rel=0.01)
+
+
+# --- cells and places ---
+
+
+@pytest.mark.parametrize("organised", [True, False])
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_cells_hold_the_mean_of_their_parts(organised: bool, parts: int) -> None:
+    """A linear function of unevenly spaced samples is exact in the middle of a cell of several
+    spacings; a cell is unknown if less than half of it is covered."""
+    random = np.random.default_rng(10)
+    v, u = np.mgrid[:16, :21].astype(float)
+    places = np.stack([u, v], axis=-1) + 0.1 * random.standard_normal((16, 21, 2))
+    places[[0, -1]] = np.stack([u, v], axis=-1)[[0, -1]]
+    places[:, [0, -1]] = np.stack([u, v], axis=-1)[:, [0, -1]]
+    values = 5.0 + 2.0 * places[..., 0] - 3.0 * places[..., 1]
+    # cells from -2 on: the samples begin in the middle of a cell or between two
+    grid = CellGrid(-2.0, -1.0, float(parts), (20 // parts, 26 // parts))
+    if not organised:
+        places = places.reshape(1, -1, 2)
+    raster = raster_between(places, np.ones(places.shape[:2], bool), organised, 1.0, grid)
+    result = raster.at_cells(values.ravel())
+    x, y = grid.places()
+    known = np.zeros(grid.shape, bool)
+    for row, column in np.ndindex(*grid.shape):
+        offsets = np.arange(parts) - (parts - 1) / 2
+        part_x = x[row, column] + offsets
+        part_y = y[row, column] + offsets
+        inside = ((part_x >= 0) & (part_x <= 20))[None] & ((part_y >= 0) & (part_y <= 15))[:, None]
+        known[row, column] = 2 * inside.sum() >= parts**2
+        if inside.all():
+            expected = 5.0 + 2.0 * x[row, column] - 3.0 * y[row, column]
+            assert result[row, column] == pytest.approx(expected, abs=1e-9)
+    np.testing.assert_array_equal(np.isfinite(result), known)
+    assert known.any()
+    assert not known.all()
+    sums = np.asarray(raster.weights.sum(axis=1)).reshape(grid.shape)
+    np.testing.assert_allclose(sums[known], 1.0)
+    squares = np.asarray((raster.weights.toarray() ** 2).sum(axis=1)).reshape(grid.shape)
+    np.testing.assert_allclose(raster.concentration, squares)
+
+
+def test_triangles_without_a_grid_do_not_cross_a_gap() -> None:
+    """Edges, diagonals included, of more than four times the median."""
+    v, u = np.mgrid[:12, :12].astype(float)
+    diagonal = np.sqrt(LONGEST_EDGE**2 - 1.0)
+    for gap, is_crossed in ((diagonal - 0.05, True), (LONGEST_EDGE + 0.05, False)):
+        places = np.stack([u + np.where(u > 5, gap - 1.0, 0.0), v], axis=-1).reshape(1, -1, 2)
+        grid = CellGrid(7.0, 3.0, 1.0, (3, 1))
+        raster = raster_between(places, np.ones((1, 144), bool), False, 1.0, grid)
+        assert np.isfinite(raster.at_cells(np.ones(144))).all() == is_crossed
+
+
+def chosen(slope: float, fx: float, fy: float, organised: bool = True) -> ChosenView:
+    """A plane z = 0.9 + slope x through a lens."""
+    lens = Lens(61, 41, fx, fy, 30.0, 20.0)
+    slopes = lens.region_slopes(lens.whole)
+    z_m = 0.9 / (1.0 - slope * slopes[..., 0])
+    points = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
+    inside = np.ones(z_m.shape, bool)
+    inside[:5] = False
+    if not organised:
+        points = points.reshape(1, -1, 3)
+        inside = inside.reshape(1, -1)
+    flat = np.zeros(inside.shape, np.uint8)
+    cloud = Cloud(
+        points_m=points,
+        reason=flat,
+        count=flat + 1,
+        variance_m2=np.full(inside.shape, np.nan),
+        region=Region(0, inside.shape[0], 0, inside.shape[1]),
+        z_step_m=0.0,
+        n_frames=1,
+        organised=organised,
+        lens=lens,
+    )
+    return ChosenView("v", cloud, inside, Registration("v", "icp", np.eye(4)))
+
+
+def test_the_step_of_slopes_is_the_median_of_both_axes() -> None:
+    assert chosen(0.3, 400.0, 400.0).slope_step == pytest.approx(1 / 400.0)
+    # 60 steps in each of 36 rows, 35 in each of 61 columns: slightly more along rows
+    assert chosen(0.0, 300.0, 500.0).slope_step == pytest.approx(1 / 300.0)
+    # without a grid, as many points on squares
+    free = chosen(0.0, 300.0, 500.0, organised=False).slope_step
+    assert free == pytest.approx(np.sqrt(60 / 300.0 * 35 / 500.0 / (61 * 36)))
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_pixels_are_placed_where_their_rays_meet_the_surface(slope: float) -> None:
+    """A view of points 3 mm behind a plane, along their rays; and the sizes of its pixels."""
+    view = chosen(slope, 300.0, 500.0)
+    x, y, z = view.cloud.points_m[view.inside].T
+    surface = fit_surface(x, y, z, SurfaceConfig(degree=1, method="least_squares"))
+    behind = view.cloud.points_m * (1.0 + 0.003 / view.cloud.points_m[..., 2:])
+    shifted = replace(view, cloud=replace(view.cloud, points_m=behind))
+    placed = place(shifted, np.eye(4), surface)
+    expected = view.cloud.points_m[..., :2]
+    np.testing.assert_allclose(placed.places_m[view.inside], expected[view.inside], atol=2e-6)
+    off_m = behind[..., 2] - (0.9 + slope * behind[..., 0])
+    np.testing.assert_allclose(placed.deviation_m[view.inside], off_m[view.inside], atol=1e-9)
+    assert np.isnan(placed.deviation_m[~view.inside]).all()
+    assert np.isnan(placed.places_m[~view.inside]).all()
+    by_u = expected[6:, 1:] - expected[6:, :-1]
+    by_v = expected[6:, :-1] - expected[5:-1, :-1]
+    sides = np.sqrt(np.median(by_u**2, axis=(0, 1)) + np.median(by_v**2, axis=(0, 1)))
+    np.testing.assert_allclose(placed.pixel_m, sides, rtol=0.01)
+    area = np.median(by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0])
+    assert placed.pitch_m == pytest.approx(np.sqrt(area), rel=0.01)
+    if slope == 0.0:
+        np.testing.assert_allclose(placed.pixel_m, [0.9 / 300.0, 0.9 / 500.0], rtol=1e-6)
+    # cells at whole multiples of their side, from the first within to the last
+    for cell_m in (None, 0.0137):
+        grid = grid_over([placed], cell_m)
+        step = placed.pitch_m if cell_m is None else cell_m
+        assert grid.step == step
+        low = expected[view.inside].min(axis=0)
+        high = expected[view.inside].max(axis=0)
+        x, y = grid.places()
+        for axis, values in ((0, x), (1, y)):
+            multiples = values / step
+            np.testing.assert_allclose(multiples, np.rint(multiples), atol=1e-6)
+            assert low[axis] - 1e-6 <= values.min() < low[axis] + step
+            assert high[axis] - step < values.max() <= high[axis] + 1e-6

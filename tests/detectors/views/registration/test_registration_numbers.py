@@ -7,18 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from detectors.rigid_motion import moved_by
-from detectors.views.marks.mark import MarkSet
+from detectors.views.marks.mark import Mark, MarkSet, off_line_problem
 from detectors.views.registration import register, registered
+from detectors.views.registration.by_marks import JointState, ViewData
 from detectors.views.registration.by_points import (
     LEAST_VARIANCE,
     _covariance,
     coherent_point_drift,
 )
+from detectors.views.registration.pairing import FIT_CHI2, pair_marks
 from detectors.views.registration.settings import CpdRegistration
 from detectors.views.view import PreparedView, View
 from harness.vocabulary.geometry import Cloud, Lens, transform_points
@@ -102,6 +106,15 @@ def test_a_sandwich_is_that_of_sums_over_cubes() -> None:
     expected = plain_sandwich(curvature, scores, points, PITCH_M)
     np.testing.assert_allclose(result, expected, rtol=1e-9)
     np.testing.assert_array_equal(result, result.T)
+    # the objective's unit does not matter, nor that of length
+    for unit in (1e-14, 1e14):
+        other = registered.clustered_sandwich(unit * curvature, unit * scores, points, PITCH_M)
+        np.testing.assert_allclose(other, result, rtol=1e-9)
+    longer = np.array([1.0] * 3 + [1e6] * 3)
+    other = registered.clustered_sandwich(
+        curvature / np.outer(longer, longer), scores / longer, 1e6 * points, 1e6 * PITCH_M
+    )
+    np.testing.assert_allclose(other / np.outer(longer, longer), result, rtol=1e-7)
 
 
 def test_a_sandwich_needs_seven_cubes_and_a_definite_curvature() -> None:
@@ -358,3 +371,158 @@ def test_agreement_of_marks_leaves_the_farthest_tenth_out() -> None:
     result = register._agreement(reference, sampling, view, np.eye(4))
     assert result.marks_m == pytest.approx(2e-4, rel=1e-6)
     assert result.marks_scatter == pytest.approx(3.09 / np.sqrt(2 * 100 / 25))
+
+
+# --- pairs of marks ---
+
+
+def mark_at(place: np.ndarray, sigma_m: float = 1e-4) -> Mark:
+    return Mark(
+        centre_m=place,
+        covariance_m2=sigma_m**2 * np.eye(3),
+        normal=np.array([0.0, 0.0, -1.0]),
+        pixels=np.arange(20),
+        area_m2=1e-4,
+    )
+
+
+RECTANGLE_M = 0.1 * np.array([[0.8, 0.6], [-0.8, 0.6], [-0.8, -0.6], [0.8, -0.6]])
+"""Four marks, each 0.1 m from the middle."""
+
+
+@pytest.mark.parametrize(("guess_deg", "is_clear"), [(0.0, True), (54.5, True), (57.5, False)])
+def test_twin_placements_need_odds_of_90_to_1(guess_deg: float, is_clear: bool) -> None:
+    """A rectangle and its half turn: with the guess turned by an angle from the first, the root
+    mean squares from it are 0.2 m sin and cos of half of the angle, so that over 50 mm the odds
+    are 8 times its cosine: 4.5 at 55.8 degrees."""
+    places = np.column_stack([RECTANGLE_M, np.full(4, 0.7)])
+    marks = [mark_at(place) for place in places]
+    turn = np.array([0.0, 0.0, np.deg2rad(guess_deg), 0.0, 0.0, 0.0])
+    guess = moved_by(turn, np.array([0.0, 0.0, 0.7]))
+    pairing = pair_marks(marks, marks, guess)
+    np.testing.assert_array_equal(pairing.pairs, np.repeat(np.arange(4)[:, None], 2, axis=1))
+    assert (pairing.problem == "") == is_clear
+    if not is_clear:
+        near_mm = 200 * np.sin(np.deg2rad(guess_deg / 2))
+        far_mm = 200 * np.cos(np.deg2rad(guess_deg / 2))
+        assert f"{near_mm:.0f} mm from one, {far_mm:.0f} mm from the other" in pairing.problem
+    blind = pair_marks(marks, marks, None)
+    assert "there is no guess to choose by" in blind.problem
+
+
+def test_a_mark_is_matched_within_the_limit_of_chi_square() -> None:
+    """One of six marks is moved across its plane; both have 0.1 mm of noise and 1 mm that views do
+    not share."""
+    random = np.random.default_rng(12)
+    places = np.column_stack([random.uniform(-0.2, 0.2, (6, 2)), np.full(6, 0.8)])
+    marks = [mark_at(place) for place in places]
+    deviation = np.sqrt(2 * (1e-3**2 + 1e-4**2))
+    for sigmas, is_matched in ((0.5, True), (12.0, False)):
+        moved = places.copy()
+        moved[2, 2] += sigmas * deviation
+        pairing = pair_marks(marks, [mark_at(place) for place in moved], None)
+        assert pairing.problem == ""
+        assert (2 in pairing.pairs[:, 0]) == is_matched
+        np.testing.assert_array_equal(pairing.pairs[:, 0], pairing.pairs[:, 1])
+    # three degrees of freedom: a true match is lost once in 10,000
+    assert stats.chi2.sf(FIT_CHI2, 3) == pytest.approx(1e-4, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("off_mm", "sigma_mm", "is_line"),
+    [(4.1, 0.01, False), (3.9, 0.01, True), (10.1, 2.0, False), (9.9, 2.0, True)],
+)
+def test_marks_on_a_line_are_told(off_mm, sigma_mm, is_line) -> None:
+    """Four marks whose distance from their line is a root mean square of 2 % of that along it, or
+    five deviations of a mark, whichever is more."""
+    places = np.array([[-0.2, 0.0, 0.7], [0.2, 0.0, 0.7], [-0.2, 0.0, 0.7], [0.2, 0.0, 0.7]])
+    places[:, 1] = np.array([1.0, 1.0, -1.0, -1.0]) * off_mm * 1e-3
+    text = off_line_problem([mark_at(place, sigma_mm * 1e-3) for place in places])
+    assert bool(text) == is_line
+    if is_line:
+        assert f"{off_mm:.1f} mm off it" in text
+
+
+# --- the joint adjustment ---
+
+ORDERS = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
+"""Orders of the surface's terms in x and y."""
+
+
+def plain_residuals(state: JointState, data: list[ViewData]) -> tuple[np.ndarray, list]:
+    """All residuals of the adjustment one after another: points across the surface, marks within
+    the plane, each view's own terms; and the sizes of these parts."""
+    parts = []
+    for v, view in enumerate(data):
+        x, y, z = transform_points(state.T[v], view.points_m).T
+        height = np.zeros(len(x))
+        for term, (i, j) in enumerate(ORDERS):
+            along_x = np.polynomial.chebyshev.chebval(x / state.half_m[0], np.eye(4)[i])
+            along_y = np.polynomial.chebyshev.chebval(y / state.half_m[1], np.eye(4)[j])
+            height += (state.surface[term] + state.view_terms[v, term]) * along_x * along_y
+        parts.append(z - height)
+        for mark, label in view.marks:
+            place = transform_points(state.T[v], mark.centre_m)
+            parts.append(place[:2] - state.marks_m[label])
+        parts.append(state.view_terms[v])
+    return np.concatenate(parts), [len(part) for part in parts]
+
+
+def test_the_normal_equations_are_those_of_numerical_derivatives() -> None:
+    """Two views of a bent surface with three marks: the Gauss-Newton step's matrix and right side
+    from differences of all residuals, with the weights held."""
+    random = np.random.default_rng(15)
+    T = np.stack([np.eye(4), moved_by(np.array([0.1, -0.2, 0.3, 0.01, 0.02, 0.8]), np.zeros(3))])
+    view_terms = np.zeros((2, 10))
+    view_terms[:, 0] = [2e-4, -3e-4]  # levels only, whose slope is 0
+    state = JointState(
+        T=T,
+        surface=1e-3 * random.normal(size=10),
+        view_terms=view_terms,
+        marks_m=random.uniform(-0.1, 0.1, (3, 2)),
+        shared_m=4e-4,
+        half_m=np.array([0.2, 0.15]),
+    )
+    data = []
+    for v, labels in enumerate(((0, 1, 2), (2, 0))):
+        across = random.normal(size=(40, 2)) * [0.08, 0.06]
+        # some points are far off
+        height = 1e-3 * random.standard_t(2, size=(40, 1))
+        seen = transform_points(np.linalg.inv(T[v]), np.hstack([across, height]))
+        marks = []
+        for label in labels:
+            place = np.append(state.marks_m[label] + 1e-3 * random.normal(size=2), 0.0)
+            root = 1e-4 * random.normal(size=(3, 3))
+            mark = mark_at(transform_points(np.linalg.inv(T[v]), place))
+            marks.append((replace(mark, covariance_m2=root @ root.T), label))
+        data.append(ViewData(seen, tuple(marks), noise_m=2e-4, sigma_m=9e-4))
+    residuals, sizes = plain_residuals(state, data)
+    weights = []
+    position = 0
+    for v, view in enumerate(data):
+        off = residuals[position : position + 40]
+        scale = max(view.noise_m, np.median(np.abs(off)) / 0.6745)
+        tukey = np.maximum(1.0 - (off / scale / 4.685) ** 2, 0.0) ** 2
+        weights.append(np.diag(tukey / 9e-4**2))
+        turn = T[v][:2, :3]
+        for mark, _ in view.marks:
+            weights.append(np.linalg.inv(turn @ mark.covariance_m2 @ turn.T))
+        weights.append(np.eye(10) / 4e-4**2)
+        position += 40 + 2 * len(view.marks) + 10
+    assert position == sum(sizes)
+    weight = block_diag(*weights)
+    assert (np.diag(weight)[:40] < 0.5 / 9e-4**2).any()
+    count = 6 + 10 + 6 + 20
+    jacobian = np.empty((len(residuals), count))
+    for unknown in range(count):
+        step = np.zeros(count)
+        step[unknown] = 1e-6
+        ahead, _ = plain_residuals(state.moved(step, 4e-4), data)
+        behind, _ = plain_residuals(state.moved(-step, 4e-4), data)
+        jacobian[:, unknown] = (ahead - behind) / 2e-6
+    matrix, right = state.equations(data)
+    expected = jacobian.T @ weight @ jacobian
+    size = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+    np.testing.assert_allclose(matrix / size, expected / size, atol=1e-5)
+    slope = -jacobian.T @ weight @ residuals
+    np.testing.assert_allclose(right, slope, atol=1e-4 * np.abs(slope).max(), rtol=1e-3)
