@@ -23,8 +23,8 @@ from scipy import ndimage, optimize, special
 
 from detectors.findings.measure import extents
 from detectors.interface import Detection, Detector, Evidence
+from detectors.levels import findings_at
 from detectors.pixels.masks import grown, holes_filled, parts_with
-from detectors.score_map import findings_at
 from harness.vocabulary.geometry import Cloud
 
 # --- the tail ---

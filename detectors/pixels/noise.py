@@ -29,6 +29,9 @@ LONE_FRACTIONS = 20  # parts of a rounding step in which the mean error of round
 LONE_LEAST_STEPS = 0.2
 """Least scatter there, in rounding steps, that noise before the rounding leaves: 0.24 for a
 deviation of 0.1 step."""
+WIDEST_NATIVE_PX = 6.5
+"""Noise that reaches farther was upsampled, aligned to another camera or smoothed: filters of known
+cameras average at most 5 pixels, and a measured reach scatters by one."""
 LEAST_FRAMES = 4  # fewest frames whose scatter shows noise
 SCATTER_PX = 7
 """Side of the square of its average: to 12 % from 49 x 3 differences."""
@@ -138,11 +141,11 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     the median over pairs of successive frames.
 
     A single frame is judged by its deviations from its local mean, without what rounding to
-    ``z_step_m`` makes of that mean (`_reach_of_one`). 0 means unknown (no noise beyond rounding,
+    ``z_step_m`` makes of that mean (`reach_of_one`). 0 means unknown (no noise beyond rounding,
     movement, or a pattern or a curved surface in one frame)."""
     pictures = [frame.z_m.astype(np.float64) for frame in frames]
     if len(frames) == 1:
-        return _reach_of_one(pictures[0], z_step_m)
+        return reach_of_one(pictures[0], z_step_m)
     lags: list[int] = []
     for first, second in pairwise(pictures):
         lags += _lags(_noise_of_two(second - first))
@@ -150,7 +153,7 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     return float(np.median(ends)) if len(ends) > len(lags) / 2 else 0.0
 
 
-def _reach_of_one(picture: np.ndarray, z_step_m: float) -> float:
+def reach_of_one(picture: np.ndarray, z_step_m: float) -> float:
     """Return the reach that a single picture (h, w) of z shows, in pixels; 0 if it is unknown.
 
     Lags up to `LONE_MOST_PX` are those of a camera's own pixels, whatever lies below. Where

@@ -25,6 +25,8 @@ DEFAULT_K = 5.0
 """
 FAINT_CALLS = 0.05
 """Noise explains a finding if at least this many false calls of its score are expected."""
+FALLBACK = "a fallback"
+"""First words of the origin of a threshold that the capture could not set."""
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
 NULL_FACTS = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
@@ -123,7 +125,7 @@ def threshold_of(
         used = f"the capture cannot set its own threshold, {k:.3g} is used"
         warnings = [f"{used}: {why}" for why in own.doubts]
         unknown = "the number of false calls is unknown"
-        origin = f"a fallback, {k:.3g} units of score: {unknown}; {peaks}"
+        origin = f"{FALLBACK}, {k:.3g} units of score: {unknown}; {peaks}"
         return k, origin, replace(searched, warnings=(*evidence.warnings, *warnings))
     expected = f"{_calls_text(own.expected)} false calls expected"
     interval = f"95 % interval {_calls_text(own.low)} to {_calls_text(own.high)}"
