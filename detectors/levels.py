@@ -1,4 +1,4 @@
-"""What a detector finds at each of several thresholds."""
+"""Findings of a detector at each of several thresholds."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Contender:
 
 @dataclass(frozen=True)
 class _Sought:
-    """What candidates found of the same holes."""
+    """The holes that candidates found of the same ones."""
 
     found: dict[str, np.ndarray]
     """By candidate (n,) bool: which of the holes it found."""
