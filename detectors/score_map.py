@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from detectors.findings.measure import HoleModelConfig, centres_of, measure_detection
-from detectors.interface import Detection, Detector, Evidence, Measurement
+from detectors.interface import Detection, Evidence, Measurement
+from detectors.levels import Findings as Findings
+from detectors.levels import above as above
+from detectors.levels import findings_at as findings_at
 from detectors.pixels.clusters import nested_clusters
 from detectors.pixels.masks import on_grid as on_grid
 from harness.vocabulary.config import Config
@@ -129,73 +131,6 @@ class ScoreMapDetector(ABC, Generic[S]):
     ) -> Measurement:
         """Measure the thesis' extents and fit the model of a blurred hole."""
         return measure_detection(cloud, evidence, detection, self.settings.hole_model)
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Detections at one threshold, as arrays."""
-
-    scores: np.ndarray
-    """(k,): of each detection."""
-    pixels: np.ndarray
-    """(n,): flat indices into the cloud's grid, ascending."""
-    labels: np.ndarray
-    """(n,): the number of the detection that has each pixel, -1 for none."""
-    centres_m: np.ndarray
-    """(k, 3): of each detection, in the cloud's frame."""
-
-    @classmethod
-    def of(cls, detections: Sequence[Detection]) -> Findings:
-        """Convert detections to arrays."""
-        sizes = [len(detection.pixels) for detection in detections]
-        no_pixels = np.zeros(0, np.int64)
-        centres_m = np.array([detection.centre_m for detection in detections])
-        return cls(
-            scores=np.array([detection.score for detection in detections]),
-            pixels=np.concatenate([no_pixels, *(detection.pixels for detection in detections)]),
-            labels=np.repeat(np.arange(len(detections)), sizes),
-            centres_m=centres_m.reshape(-1, 3),
-        )
-
-    @property
-    def detections(self) -> tuple[Detection, ...]:
-        """The arrays as single detections, strongest first."""
-        by_label = np.argsort(self.labels, kind="stable")
-        counts = np.bincount(self.labels + 1, minlength=len(self.scores) + 1)
-        _, *groups = np.split(self.pixels[by_label], np.cumsum(counts)[:-1])
-        detections = [
-            Detection(score, pixels, centre_m)
-            for score, pixels, centre_m in zip(
-                self.scores.tolist(),
-                groups,
-                self.centres_m,
-                strict=True,
-            )
-        ]
-        detections.sort(key=lambda detection: (-detection.score, int(detection.pixels[0])))
-        return tuple(detections)
-
-
-def findings_at(
-    detector: Detector,
-    cloud: Cloud,
-    evidence: Evidence,
-    thresholds: Sequence[float],
-) -> list[Findings]:
-    """Return a detector's detections at each of several rising thresholds.
-
-    A detector's own method ``findings`` does it at once, unless a subclass has overridden ``find``
-    without it."""
-    owner = next(vars(kind) for kind in type(detector).__mro__ if "find" in vars(kind))
-    if "findings" in owner:
-        return list(owner["findings"](detector, cloud, evidence, thresholds))
-    return [Findings.of(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
-
-
-def above(evidence: Evidence, threshold: float) -> np.ndarray:
-    """Return the flat indices, ascending, of the pixels whose score exceeds the threshold."""
-    with np.errstate(invalid="ignore"):
-        return np.flatnonzero(evidence.score.reshape(-1) > threshold)
 
 
 def _scored_pixels(

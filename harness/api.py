@@ -46,8 +46,9 @@ from detectors.recordings import open_capture
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
-from harness.inspection.arguments import DEFAULT_DETECTOR
-from harness.inspection.judging import analysed, judged, threshold_of
+from harness.inspection.arguments import CANDIDATES, DEFAULT_DETECTOR, rate_text
+from harness.inspection.choosing import candidate_of, chosen
+from harness.inspection.judging import judged
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_figures import draw_overlay
 from harness.runs.options import EngineOptions
@@ -164,9 +165,10 @@ def detect(
 ) -> Judged:
     """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's
     own noise sets it, as in ``tofpod detect``; ``evidence.warnings`` of the result say
-    if that is not reliable. ``settings`` are those of the detector; the default detector chooses
-    the shape of its surface by evidence unless they state it. Raises UserError if the cloud cannot
-    be judged.
+    if that is not reliable. ``settings`` are those of the detector. By default, the detector
+    is chosen as by ``tofpod detect`` (with a ``threshold`` it is the first of `CANDIDATES`); all
+    candidates have the ``settings``, and choose the shape of their surface unless these state it.
+    Raises UserError if the cloud cannot be judged.
 
     >>> tofpod.detect(cloud, "thesis", threshold=-1)
     Traceback (most recent call last):
@@ -175,12 +177,19 @@ def detect(
     """
     if threshold is not None and not 0 < threshold < float("inf"):
         raise UserError(f"threshold {threshold:g}", legal="a number above 0")
-    chosen = {"surface": {"shape": "auto"}} if detector == DEFAULT_DETECTOR else {}
-    finder = load_detector(detector, chosen | settings)
-    evidence = analysed(finder, cloud)
     options = argparse.Namespace(threshold=threshold, quiet_capture=None, false_calls=None)
-    used, _, evidence = threshold_of(options, finder, cloud, evidence, lambda: (float("nan"), ""))
-    return judged(finder, cloud, evidence, used)
+    names: tuple[str, ...] = (detector,)
+    if detector == DEFAULT_DETECTOR:
+        settings = {"surface": {"shape": "auto"}, **settings}
+        names = CANDIDATES if threshold is None else CANDIDATES[:1]
+    candidates = []
+    for name in names:
+        loaded = load_detector(name, settings), settings
+        candidates.append(candidate_of(options, loaded, cloud, lambda _: (float("nan"), "")))
+    best = candidates[0]
+    if len(candidates) > 1:
+        best = chosen(candidates, cloud, rate_text(options))
+    return judged(best.detector, cloud, best.evidence, best.threshold)
 
 
 def findings_table(found: Judged) -> pd.DataFrame:

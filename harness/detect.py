@@ -37,7 +37,11 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--detector",
         default=cli.DEFAULT_DETECTOR,
-        help=f"name of the detector (default: {cli.DEFAULT_DETECTOR})",
+        help=(
+            f"name of the detector; {cli.DEFAULT_DETECTOR} (default): of "
+            f"{', '.join(cli.CANDIDATES)}, the one that finds most of the holes implanted in the "
+            "capture"
+        ),
     )
     setting = "a setting of the detector by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)

@@ -248,4 +248,3 @@ def _diameter_m(fit: HoleFit) -> float:
     if fit.shape == "slot":
         return diameter_m * math.sqrt(4.0 / math.pi * math.exp(fit.stretch))
     return diameter_m
-

@@ -33,6 +33,7 @@ from scipy import ndimage, optimize, special
 
 from detectors.findings.measure import extents
 from detectors.interface import Detection, Detector, Evidence
+from detectors.levels import findings_at
 from detectors.pixels.masks import grown, holes_filled, parts_with
 from harness.vocabulary.geometry import Cloud
 
@@ -561,7 +562,8 @@ def _peaks(
     least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
     steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
-    counts = [len(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
+    findings = findings_at(detector, cloud, evidence, thresholds)
+    counts = [len(at_threshold.scores) for at_threshold in findings]
     floor = thresholds[_floor_among(counts)]
     hidden = marks.covered.reshape(-1)
     proud = marks.proud.reshape(-1)

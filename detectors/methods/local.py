@@ -24,7 +24,8 @@ from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN, root_of
 from detectors.pixels.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.score_map import Findings, above, on_grid
-from detectors.surfaces.background import Background, background
+from detectors.surfaces.background import Background
+from detectors.surfaces.shared import shared_background
 from detectors.surfaces.smooth_surfaces import raster
 from detectors.surfaces.surface import SurfaceConfig
 from harness.vocabulary.config import Config
@@ -128,7 +129,7 @@ class LocalDetector:
         For an organised cloud, they are the means over squares of ``pixels`` a side. Raises
         UserError on an empty crop, or if no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
-        ground = background(cloud, mask, self.settings.surface)
+        ground = shared_background(cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
         if cloud.organised:
             rows, columns = np.nonzero(judged)
@@ -137,20 +138,9 @@ class LocalDetector:
         else:
             _, rows, columns, _ = raster(cloud.points_m[judged], cloud)
         shape = int(rows.max()) + 1, int(columns.max()) + 1
-        cells = rows * shape[1] + columns
-        share = _shares(cloud, judged, ground.residual_m)
-        weights = np.bincount(cells, share, shape[0] * shape[1])
-        typical = 1.0
-        if pixels > 1 or not cloud.organised:
-            typical = median_of(weights[weights > 0])
-        share = share / typical
-        weights = (weights / typical).reshape(shape).astype(np.float32)
-        sums = np.bincount(cells, share * ground.residual_m[judged], weights.size).reshape(shape)
-        residual_m = sums / np.maximum(weights, 1e-12)
         cell = np.full(mask.shape, -1, dtype=np.int64)
-        cell[judged] = cells
-        rounding_m2 = rounding_variances(cloud, judged)
-        return LocalPicture(ground, cell, (residual_m, weights, rounding_m2))
+        cell[judged] = rows * shape[1] + columns
+        return LocalPicture(ground, cell, _on_cells(cloud, ground.residual_m, cell, shape))
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop. Raises UserError on an empty crop, or if no surface can
@@ -170,6 +160,29 @@ class LocalDetector:
             unit=unit,
             signed=signed,
             cell=cell,
+        )
+
+    def rescored(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        residual_m: np.ndarray,
+    ) -> LocalEvidence:
+        """Return the evidence for other residuals (h, w) from the same surface, on the same
+        pixels: as `analyse`, without a fit."""
+        assert isinstance(evidence, LocalEvidence)
+        residuals = _on_cells(cloud, residual_m, evidence.cell, evidence.signed.shape)
+        signed, typical_m, unit = self.scored(*residuals)
+        judged = evidence.cell >= 0
+        scores = on_grid(signed.ravel()[evidence.cell[judged]], judged)
+        return replace(
+            evidence,
+            score=np.abs(scores),
+            residual_m=residual_m,
+            scale_m=typical_m,
+            behind=scores > 0,
+            unit=unit,
+            signed=signed,
         )
 
     def scored(
@@ -258,6 +271,29 @@ class LocalDetector:
         scores = evidence.score.reshape(-1)[detection.pixels]
         core = replace(detection, pixels=detection.pixels[scores >= CORE * detection.score])
         return measure_detection(cloud, evidence, core, self.settings.hole_model)
+
+
+def _on_cells(
+    cloud: Cloud,
+    residual_m: np.ndarray,
+    cell: np.ndarray,
+    shape: tuple[int, ...],
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Return the ``residuals`` of a `LocalPicture` (r, c) = ``shape`` from those of points (h, w)
+    and the cell of each (h, w)."""
+    judged = cell >= 0
+    cells = cell[judged]
+    size = shape[0] * shape[1]
+    share = _shares(cloud, judged, residual_m)
+    weights = np.bincount(cells, share, size)
+    typical = 1.0
+    if not cloud.organised or np.bincount(cells).max() > 1:
+        typical = median_of(weights[weights > 0])
+    share = share / typical
+    weights = (weights / typical).reshape(shape).astype(np.float32)
+    sums = np.bincount(cells, share * residual_m[judged], size).reshape(shape)
+    means_m = sums / np.maximum(weights, 1e-12)
+    return means_m, weights, rounding_variances(cloud, judged)
 
 
 def _shares(

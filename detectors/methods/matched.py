@@ -100,17 +100,17 @@ class MatchedDetector(LocalDetector):
         """Score every pixel of the crop by its depth and by the missing pixels around: the
         logarithms of the two likelihoods add up. Raises UserError on an empty crop, or if no
         surface can be fitted."""
-        evidence = super().analyse(cloud)
-        missing = missing_evidence(cloud, evidence)
-        if missing is None:
-            return evidence
-        score = np.sqrt(evidence.score**2 + missing)
-        scored = evidence.cell >= 0
-        cells = evidence.cell[scored]
-        signed = evidence.signed.copy()
-        flat = signed.ravel()
-        flat[cells] = np.copysign(score[scored], flat[cells])
-        return replace(evidence, score=score, signed=signed)
+        return _with_missing(cloud, super().analyse(cloud))
+
+    def rescored(
+        self,
+        cloud: Cloud,
+        evidence: Evidence,
+        residual_m: np.ndarray,
+    ) -> LocalEvidence:
+        """Return the evidence for other residuals (h, w) from the same surface, on the same
+        pixels: as `analyse`, without a fit."""
+        return _with_missing(cloud, super().rescored(cloud, evidence, residual_m))
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
         """Return the residuals on a grid in which noise reaches no farther than a camera's own
@@ -156,6 +156,20 @@ class MatchedDetector(LocalDetector):
         """Return the detector that whitens with the learned covariance instead of the capture's
         own."""
         return type(self)(self.settings, learned.get("covariance"))
+
+
+def _with_missing(cloud: Cloud, evidence: LocalEvidence) -> LocalEvidence:
+    """Return the evidence with what missing pixels around each pixel add to its score."""
+    missing = missing_evidence(cloud, evidence)
+    if missing is None:
+        return evidence
+    score = np.sqrt(evidence.score**2 + missing)
+    scored = evidence.cell >= 0
+    cells = evidence.cell[scored]
+    signed = evidence.signed.copy()
+    flat = signed.ravel()
+    flat[cells] = np.copysign(score[scored], flat[cells])
+    return replace(evidence, score=score, signed=signed)
 
 
 # --- residuals in deviations of the local noise ---

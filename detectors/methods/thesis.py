@@ -3,6 +3,7 @@ defaults follow the text: a robust cubic and a robust deviation of the residual.
 ``surface: {method: least_squares, drop_cross_terms: true}, scale: raw_z_std`` with k = 1.2.
 `highest_before` follows the text's rule against outliers."""
 
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
 from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
-from detectors.surfaces.background import background
+from detectors.surfaces.shared import shared_background
 from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 
@@ -92,7 +93,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
         """Analyse with a surface whose shape is chosen. One unit of score is the noise around each
         pixel."""
-        ground = background(cloud, mask, self.settings.surface)
+        ground = shared_background(cloud, mask, self.settings.surface)
         unit_m = np.maximum(ground.noise_m, rounding_floor(cloud, mask))
         stated_m = self._stated_deviation(cloud, mask)
         if stated_m is not None:
@@ -108,6 +109,15 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             notes={"surface": ground.description, **ground.notes},
             warnings=(ground.warning,) if ground.warning else (),
         )
+
+    def rescored(self, cloud: Cloud, evidence: Evidence, residual_m: np.ndarray) -> Evidence:
+        """Return the evidence for other residuals (h, w) from the same surface, in the same units
+        of score."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit_m = np.abs(evidence.residual_m) / evidence.score
+        unit_m[~(unit_m > 0)] = evidence.scale_m
+        score = np.where(np.isfinite(evidence.score), np.abs(residual_m) / unit_m, np.nan)
+        return replace(evidence, score=score, residual_m=residual_m)
 
     def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray | None:
         """Return the standard deviation (n,) that the cloud states of each point, metres."""

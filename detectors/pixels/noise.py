@@ -18,8 +18,20 @@ FARTHEST_LAG_PX = 30
 LONE_LEVEL_PX = 21  # side of the square of the local mean in a single frame
 LONE_SIGMAS = 5.0  # deviations that mark an edge there
 LONE_MOST_PX = 7
-"""Longest lag that is attributed to noise there, and not to a pattern or the surface."""
+"""Longest lag there up to which noise may lie over a wider pattern."""
+LONE_FARTHEST_PX = 15
+"""Longest lag of upsampled noise there: wider noise is lost with the local mean."""
+LONE_TENT = 0.2
+"""Largest difference of upsampled noise's correlation from that of a square of pixels. Native noise
+on a wider pattern falls at once and then lingers: it differs by 0.3 and more."""
 LONE_OFF_PX = 0.3  # largest distance from the middle of the known pixels around
+LONE_FRACTIONS = 20  # parts of a rounding step in which the mean error of rounding is taken
+LONE_LEAST_STEPS = 0.2
+"""Least scatter there, in rounding steps, that noise before the rounding leaves: 0.24 for a
+deviation of 0.1 step."""
+WIDEST_NATIVE_PX = 6.5
+"""Noise that reaches farther was upsampled, aligned to another camera or smoothed: filters of known
+cameras average at most 5 pixels, and a measured reach scatters by one."""
 LEAST_FRAMES = 4  # fewest frames whose scatter shows noise
 SCATTER_PX = 7
 """Side of the square of its average: to 12 % from 49 x 3 differences."""
@@ -128,20 +140,56 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     """Return the lag, in pixels, at which neighbours along rows and columns stop sharing noise:
     the median over pairs of successive frames.
 
-    A single frame is judged by its deviations from its local mean, if they exceed the rounding to
-    ``z_step_m``. 0 means unknown (no noise beyond rounding, movement, or a curved surface in one
-    frame)."""
+    A single frame is judged by its deviations from its local mean, without what rounding to
+    ``z_step_m`` makes of that mean (`reach_of_one`). 0 means unknown (no noise beyond rounding,
+    movement, or a pattern or a curved surface in one frame)."""
     pictures = [frame.z_m.astype(np.float64) for frame in frames]
-    lags: list[int] = []
     if len(frames) == 1:
-        farthest = LONE_MOST_PX
-        lags += _lags(_noise_of_one(pictures[0], z_step_m))
-    else:
-        farthest = FARTHEST_LAG_PX
-        for first, second in pairwise(pictures):
-            lags += _lags(_noise_of_two(second - first))
-    ends = [lag for lag in lags if 0 < lag <= farthest]
+        return reach_of_one(pictures[0], z_step_m)
+    lags: list[int] = []
+    for first, second in pairwise(pictures):
+        lags += _lags(_noise_of_two(second - first))
+    ends = [lag for lag in lags if 0 < lag <= FARTHEST_LAG_PX]
     return float(np.median(ends)) if len(ends) > len(lags) / 2 else 0.0
+
+
+def reach_of_one(picture: np.ndarray, z_step_m: float) -> float:
+    """Return the reach that a single picture (h, w) of z shows, in pixels; 0 if it is unknown.
+
+    Lags up to `LONE_MOST_PX` are those of a camera's own pixels, whatever lies below. Where
+    correlation goes on, a pattern of the camera or the target's shape may be the reason; upsampled
+    depth has no finer noise, so that its correlation falls as that of a square of pixels whose side
+    is the sum of the correlation over all lags, in both directions. The shorter side counts, as the
+    contours of rounded depth lengthen the other. The local mean takes wide noise with it: 12 pixels
+    come out as some 9, and noise below 0.2 rounding steps as half as wide."""
+    noise_and_known = _noise_of_one(picture, z_step_m)
+    if noise_and_known is None:
+        return 0.0
+    lags = _lags(noise_and_known)
+    ends = [lag for lag in lags if 0 < lag <= LONE_MOST_PX]
+    if len(ends) > len(lags) / 2:
+        return float(np.median(ends))
+    noise, usable = noise_and_known
+    sides = [_side_of_tent(noise, usable), _side_of_tent(noise.T, usable.T)]
+    return float(round(min(sides)))
+
+
+def _side_of_tent(noise: np.ndarray, usable: np.ndarray) -> float:
+    """Return the side, in pixels, of the square whose mean correlates noise (h, w) along rows like
+    this; 0 if none does, or if it is wider than `LONE_FARTHEST_PX`."""
+    variance = _mean_product(noise, usable, 0)
+    if not variance > 0:
+        return 0.0
+    lags = np.arange(LONE_LEVEL_PX)
+    products = [_mean_product(noise, usable, int(lag)) for lag in lags]
+    correlation = np.array(products) / variance
+    low = np.flatnonzero(correlation < SHARED)
+    end = int(low[0]) if len(low) else len(lags)
+    # the correlation of a square of b pixels, 1 - lag / b, adds up to (b + 1) / 2
+    side = 2.0 * float(correlation[:end].sum()) - 1.0
+    tent = np.maximum(1.0 - lags / max(side, 1.0), 0.0)
+    differs = float(np.abs(correlation - tent)[:end].max()) > LONE_TENT
+    return 0.0 if differs or side > LONE_FARTHEST_PX else side
 
 
 def _lags(noise_and_known: tuple[np.ndarray, np.ndarray] | None) -> list[int]:
@@ -174,16 +222,17 @@ def _noise_of_two(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray] | Non
 
 
 def _noise_of_one(picture: np.ndarray, z_step_m: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the noise (h, w) of a single frame away from edges, and where it is known (h, w)."""
+    """Return the noise (h, w) of a single frame away from edges, and where it is known (h, w); None
+    where rounding hides it.
+
+    Rounding makes contours of a smooth surface, whose errors are alike along them. This error
+    depends on the local mean alone, by its fraction of a step, and is subtracted."""
     window = _window(picture)
     if window is None:
         return None
     usable = np.isfinite(window)
     noise = _levelled(window, usable, LONE_LEVEL_PX)
-    sigma = sigma_of(noise[usable])
-    # with smaller noise, rounding errors are correlated
-    if sigma < 0.5 * z_step_m:
-        return None
+    sigma = max(sigma_of(noise[usable]), 0.5 * z_step_m)
     usable &= np.abs(noise) < LONE_SIGMAS * sigma
     # where known pixels lie to one side, their mean keeps a part of the surface's tilt
     rows, columns = np.indices(usable.shape, float)
@@ -191,7 +240,29 @@ def _noise_of_one(picture: np.ndarray, z_step_m: float) -> tuple[np.ndarray, np.
     off_columns = _levelled(columns, usable, LONE_LEVEL_PX)
     noise = _levelled(window, usable, LONE_LEVEL_PX)
     usable &= np.hypot(off_rows, off_columns) < LONE_OFF_PX
+    if usable.sum() < REACH_PIXELS:
+        return None
+    if z_step_m > 0:
+        noise = noise - _rounding_of_means(window - noise, noise, usable, z_step_m)
+        if float(np.std(noise[usable])) < LONE_LEAST_STEPS * z_step_m:
+            return None
     return noise * usable, usable
+
+
+def _rounding_of_means(
+    means_m: np.ndarray,
+    noise_m: np.ndarray,
+    usable: np.ndarray,
+    z_step_m: float,
+) -> np.ndarray:
+    """Return the mean noise (h, w) of the usable pixels whose local means (h, w) have the same
+    fraction of a step."""
+    steps = np.where(usable, means_m, 0.0) / z_step_m
+    fractions = ((steps - np.floor(steps)) * LONE_FRACTIONS).astype(np.int64)
+    fractions = np.minimum(fractions, LONE_FRACTIONS - 1)
+    counts = np.bincount(fractions[usable], minlength=LONE_FRACTIONS)
+    sums_m = np.bincount(fractions[usable], noise_m[usable], LONE_FRACTIONS)
+    return np.asarray((sums_m / np.maximum(counts, 1))[fractions])
 
 
 def _levelled(
@@ -211,15 +282,18 @@ def _first_unlike_lag(noise: np.ndarray, usable: np.ndarray) -> int:
     """Return the first lag along rows at which the mean product of noise falls below `SHARED` of
     that at lag 0; 0 if there is none."""
 
-    def product(lag: int) -> float:
-        width = noise.shape[1] - lag
-        pairs = (usable[:, lag:] & usable[:, :width]).sum()
-        return float((noise[:, lag:] * noise[:, :width]).sum()) / max(pairs, 1)
-
-    variance = product(0)
+    variance = _mean_product(noise, usable, 0)
     if not variance > 0:
         return 0
     for lag in range(1, min(FARTHEST_LAG_PX, noise.shape[1])):
-        if product(lag) < SHARED * variance:
+        if _mean_product(noise, usable, lag) < SHARED * variance:
             return lag
     return 0
+
+
+def _mean_product(noise: np.ndarray, usable: np.ndarray, lag: int) -> float:
+    """Return the mean product of noise (h, w) at usable pixels that are ``lag`` apart along
+    rows."""
+    width = noise.shape[1] - lag
+    pairs = (usable[:, lag:] & usable[:, :width]).sum()
+    return float((noise[:, lag:] * noise[:, :width]).sum()) / max(pairs, 1)

@@ -28,7 +28,10 @@ MERGES = ("fusion", "grid", "volume")
 MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
-DEFAULT_DETECTOR = "matched"
+DEFAULT_DETECTOR = "auto"
+"""The detector is chosen on the capture among `CANDIDATES`."""
+CANDIDATES = ("matched", "local", "thesis")
+"""Detectors among which a capture chooses; the first is used where it cannot."""
 # prefix of the --set keys for merging views; all other keys are the detector's
 PREFIX = "mapping."
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
@@ -150,30 +153,55 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
             )
 
 
-def detector_of(
+def detectors_of(
     arguments: argparse.Namespace, crop: str, assignments: Sequence[str]
+) -> list[tuple[Detector, dict[str, Any]]]:
+    """Return `detector_of` for --detector, or for each of `CANDIDATES` that has all of the settings
+    if the capture is to choose. Raises UserError of the first if none has.
+
+    A stated threshold is in units of one detector's score, so that nothing is to be chosen."""
+    if arguments.detector != DEFAULT_DETECTOR:
+        return [detector_of(arguments, crop, assignments)]
+    if arguments.threshold is not None:
+        return [detector_of(arguments, crop, assignments)]
+    loaded = []
+    mistakes = []
+    for name in CANDIDATES:
+        try:
+            loaded.append(detector_of(arguments, crop, assignments, name))
+        except UserError as mistake:
+            mistakes.append(mistake)
+    if not loaded:
+        raise mistakes[0]
+    return loaded
+
+
+def detector_of(
+    arguments: argparse.Namespace,
+    crop: str,
+    assignments: Sequence[str],
+    name: str | None = None,
 ) -> tuple[Detector, dict[str, Any]]:
-    """Return the detector with the crop and settings of --crop and --set, and all of its
-    settings."""
+    """Return the detector of this ``name`` (default: --detector, or the first of `CANDIDATES`) with
+    the crop and settings of --crop and --set, and all of its settings."""
     from detectors import detector_type, load_detector
 
+    if name is None:
+        is_stated = arguments.detector != DEFAULT_DETECTOR
+        name = arguments.detector if is_stated else CANDIDATES[0]
     settings: dict[str, Any] = {}
-    settings_type = detector_type(arguments.detector).settings_type
+    settings_type = detector_type(name).settings_type
     if "crop" in settings_type.model_fields:
         # with several views, --crop and --target belong to the mapping
         settings["crop"] = crop_from_text(
             crop, arguments.target if crop == arguments.crop else None
         )
     elif arguments.target is not None:
-        raise UserError(
-            f"--target {arguments.target}: detector {arguments.detector} has no crop for it"
-        )
+        raise UserError(f"--target {arguments.target}: detector {name} has no crop for it")
     reference = getattr(arguments, "reference", None)
     if reference is not None:
         if "surface" not in settings_type.model_fields:
-            raise UserError(
-                f"--reference {reference}: detector {arguments.detector} has no surface setting"
-            )
+            raise UserError(f"--reference {reference}: detector {name} has no surface setting")
         settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
     elif "surface" in settings_type.model_fields and not any(
         assignment.startswith(STATED_SURFACE) for assignment in assignments
@@ -181,7 +209,15 @@ def detector_of(
         settings["surface"] = {"shape": "auto"}
     for assignment in assignments:
         assign(settings, assignment)
-    return load_detector(arguments.detector, settings), settings_type.from_data(settings).to_data()
+    return load_detector(name, settings), settings_type.from_data(settings).to_data()
+
+
+def rate_text(arguments: argparse.Namespace) -> str:
+    """Return the rate of false calls at which detectors are compared, in words."""
+    if arguments.quiet_capture is not None:
+        return "thresholds that are silent on the quiet capture"
+    calls = arguments.false_calls or DEFAULT_FALSE_CALLS
+    return f"{calls:g} expected false call{'s' * (calls != 1)}"
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:

@@ -22,6 +22,8 @@ from harness.vocabulary.geometry import Cloud
 DEFAULT_K = 5.0
 """Robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond.
 """
+FALLBACK = "a fallback"
+"""First words of the origin of a threshold that the capture could not set."""
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")
 """Arguments of which each sets the threshold."""
 NULL_FACTS = ("threshold", "expected", "at_marks", "low", "high")
@@ -121,7 +123,7 @@ def threshold_of(
         used = f"the capture cannot set its own threshold, {k:.3g} is used"
         warnings = [f"{used}: {why}" for why in own.doubts]
         unknown = "the number of false calls is unknown"
-        origin = f"a fallback, {k:.3g} units of score: {unknown}; {peaks}"
+        origin = f"{FALLBACK}, {k:.3g} units of score: {unknown}; {peaks}"
         return k, origin, replace(searched, warnings=(*evidence.warnings, *warnings))
     expected = f"{calls_text(own.expected)} false calls expected"
     interval = f"95 % interval {calls_text(own.low)} to {calls_text(own.high)}"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.crop import AutoCrop, Choice, choice_of, described_text
+from detectors.pixels.noise import WIDEST_NATIVE_PX
 from harness.records.examples import Circle3d, Scene3d
 from harness.report.findings import Finding, Judged, probability, save_targets
 from harness.vocabulary.geometry import MM, Cloud
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.views.mapping.merge import Mapped
     from detectors.views.view import PreparedView
-
-# filters of known cameras average at most 5 pixels; a measured reach scatters by one
-WIDEST_NATIVE_PX = 6.5
 
 
 def mm(metres: float) -> str:

@@ -7,7 +7,7 @@ import argparse
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,8 @@ from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
-from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
+from harness.inspection.choosing import candidate_of, chosen, noted
+from harness.inspection.judging import judged, refuse_thresholds
 from harness.inspection.limit import Limit, limit_of
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
 from harness.inspection.verdict import CLASSES, FLAGS, InspectionVerdict, calls_text, verdict_of
@@ -92,7 +93,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
     cli.limit_depth_m(arguments)
-    detector, settings = _detector_of(arguments, config)
+    detectors = _detectors_of(arguments, config)
     flat_field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
     guesses: Sequence[np.ndarray | None] = (None,) * len(paths)
     if arguments.poses:
@@ -110,7 +111,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     choices = []
     for view in views:
         with mistakes_named(view if config else None):
-            target_settings = config or getattr(detector, "settings", None)
+            target_settings = config or getattr(detectors[0][0], "settings", None)
             choices.append(output.choice_by(target_settings, view.cloud))
     mapped = None
     registrations: Mapping[str, Any] = {}
@@ -120,20 +121,30 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         registrations = registration_data(mapped)
         cloud = mapped.merged.cloud
 
-    def silent_threshold() -> tuple[float, str]:
-        """Return the lowest threshold that is silent on the quiet capture, and its origin."""
-        undamaged = _averaged(arguments, quiet_recordings[0], flat_field)
+    @cache
+    def quiet_cloud() -> Cloud:
+        return _averaged(arguments, quiet_recordings[0], flat_field)
+
+    def silent_threshold(detector: Detector) -> tuple[float, str]:
+        """Return a detector's lowest threshold that is silent on the quiet capture, and its
+        origin."""
+        undamaged = quiet_cloud()
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
         frames = f"{undamaged.n_frames} frames, here {cloud.n_frames}"
         quiet = f"{arguments.quiet_capture}, one repeat of {frames}"
         return threshold, f"the lowest that is silent on {quiet}"
 
-    evidence = analysed(detector, cloud)
+    candidates = [candidate_of(arguments, loaded, cloud, silent_threshold) for loaded in detectors]
+    candidate = candidates[0]
+    if arguments.detector == cli.DEFAULT_DETECTOR and arguments.threshold is not None:
+        candidate = noted(candidate, "as --threshold is in units of its score")
+    elif arguments.detector == cli.DEFAULT_DETECTOR:
+        candidate = chosen(candidates, cloud, cli.rate_text(arguments))
+    detector = candidate.detector
+    threshold = candidate.threshold
     capture_doubts = _capture_doubts(arguments, views, flat_field)
-    evidence = replace(evidence, warnings=(*capture_doubts, *evidence.warnings))
-    threshold, threshold_origin, evidence = threshold_of(
-        arguments, detector, cloud, evidence, silent_threshold
-    )
+    warnings = (*capture_doubts, *candidate.evidence.warnings)
+    evidence = replace(candidate.evidence, warnings=warnings)
     result = judged(detector, cloud, evidence, threshold)
     return Inspection(
         arguments=arguments,
@@ -144,10 +155,10 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         mapped=mapped,
         registrations=registrations,
         detector=detector,
-        settings=settings,
+        settings=candidate.settings,
         result=result,
         threshold=threshold,
-        threshold_origin=threshold_origin,
+        threshold_origin=candidate.origin,
         verdict=verdict_of(result, threshold, _outline(choices, mapped)),
         limit=_limit(arguments, detector, result, threshold),
     )
@@ -171,17 +182,17 @@ def _limit(
     return limit_of(detector, result, threshold, cli.limit_depth_m(arguments))
 
 
-def _detector_of(
+def _detectors_of(
     arguments: argparse.Namespace, config: MappingConfig | None
-) -> tuple[Detector, dict[str, Any]]:
-    """Return the detector and its settings. With several views the target is cut out of each view,
-    and settings of the map are not the detector's."""
+) -> list[tuple[Detector, dict[str, Any]]]:
+    """Return the detectors to choose from, and their settings. With several views the target is cut
+    out of each view, and settings of the map are not the detector's."""
     if config is None:
-        return cli.detector_of(arguments, arguments.crop, arguments.set)
+        return cli.detectors_of(arguments, arguments.crop, arguments.set)
     own_settings = [
         assignment for assignment in arguments.set if not assignment.startswith(cli.PREFIX)
     ]
-    return cli.detector_of(arguments, "none", own_settings)
+    return cli.detectors_of(arguments, "none", own_settings)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -246,6 +257,9 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
         _print_capture(run)
     else:
         _print_map(run, run.mapped)
+    notes = run.result.evidence.notes
+    if "choice" in notes:
+        print(f"detector: {notes['choice']['text']}")
     print(f"surface: {_surface_text(run)}")
     if run.result.missing is not None:
         print(run.result.missing.blind_text)

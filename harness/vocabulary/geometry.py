@@ -328,6 +328,11 @@ class Cloud:
         """Its automatic crops by their settings: several detectors share them."""
         return {}
 
+    @cached_property
+    def surfaces(self) -> dict[Any, Any]:
+        """Its fitted surfaces by mask and settings: several detectors share them."""
+        return {}
+
     @property
     def valid(self) -> np.ndarray:
         """The pixels that have a point, (h, w) bool."""

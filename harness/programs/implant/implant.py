@@ -128,8 +128,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--detector",
-        default=cli.DEFAULT_DETECTOR,
-        help=f"detector's name (default: {cli.DEFAULT_DETECTOR})",
+        default=cli.CANDIDATES[0],
+        help=f"detector's name (default: {cli.CANDIDATES[0]})",
     )
     add(
         "--set",

@@ -167,3 +167,49 @@ def test_noise_that_all_pixels_of_a_row_share_has_no_reach_along_rows() -> None:
     assert noise_reach_px(frames, 0.0) == 0.0
     turned = [replace(frame, z_m=frame.z_m.T.copy(), reason=frame.reason.T) for frame in frames]
     assert noise_reach_px(turned, 0.0) == 0.0
+
+
+def rounded_plane(side: int, noise_steps: float, step_m: float = 1e-3) -> Frame:
+    """A frame of a tilted plane that is rounded to steps, whose contours are 16 rows apart."""
+    rows, columns = np.indices((300, 300))
+    white = np.random.default_rng(5).standard_normal((300, 300))
+    steps = 500.3 + 0.06 * rows + 0.02 * columns + noise_steps * side * cv2.blur(white, (side,) * 2)
+    z_m = (np.round(steps) * step_m).astype(np.float32)
+    return Frame("0", z_m, np.zeros(z_m.shape, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("side", "noise_steps", "reach_px"),
+    [
+        (1, 0.1, 1),
+        (1, 0.3, 1),
+        (3, 0.2, 3),
+        (3, 0.45, 3),
+        (5, 1.0, 5),
+        (5, 0.0, 0),
+        (1, 0.05, 0),
+    ],
+)
+def test_one_rounded_frame_shows_noise_finer_than_its_steps(side, noise_steps, reach_px) -> None:
+    """Contours of the rounded plane, 16 pixels apart, are not taken for noise."""
+    frame = rounded_plane(side, noise_steps)
+    assert noise_reach_px([frame], 1e-3) == pytest.approx(reach_px, abs=0.5)
+
+
+def test_one_frame_tells_upsampled_noise_from_a_pattern_under_native_noise() -> None:
+    rng = np.random.default_rng(2)
+    shape = (300, 300)
+    coarse = cv2.blur(rng.standard_normal((100, 100)), (3, 3)) * 3
+    upsampled = cv2.resize(coarse, shape, interpolation=cv2.INTER_LINEAR)
+    pattern = 18 * cv2.blur(cv2.blur(rng.standard_normal(shape), (15, 15)), (7, 7))
+    fine = rng.standard_normal(shape)
+    blank = np.zeros(shape, np.uint8)
+
+    def reach_of(noise: np.ndarray) -> float:
+        z_m = (0.7 + 1e-3 * noise).astype(np.float32)
+        return noise_reach_px([Frame("0", z_m, blank)], 0.0)
+
+    assert reach_of(upsampled) == 7.0
+    # the fine noise's own reach, or none: never that of the pattern
+    assert reach_of(fine + 1.5 * pattern) == 0.0
+    assert reach_of(fine + 0.3 * pattern) == 1.0
