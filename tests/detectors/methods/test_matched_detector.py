@@ -9,13 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from detectors.findings.hole_model import (
-    HolePatch,
-    fit_hole,
-    pictures,
-    straight_sight,
-    whitened,
-)
 from detectors.findings.templates import (
     bank,
     halved,
@@ -73,51 +66,6 @@ def hole(u: float, v: float, radius_px: float, depth_m: float) -> np.ndarray:
 
 def detections_in(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
     return DETECTOR.find(cloud, DETECTOR.analyse(cloud), threshold)
-
-
-def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
-    """A hundred blind holes of 10 mm and 6 mm: scatter and stated errors are those of the
-    Cramér-Rao bound, where plain least squares scatter half as widely again, and the far pixels
-    that are left out would add next to nothing."""
-    pitch_m = 1.4e-3
-    shape = (31, 31)
-    noise_m = 4e-4
-    per_px_m = np.array([[pitch_m, 0.0, 0.0], [0.0, pitch_m, 0.0]])
-    lags = BLUR_PX - np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
-    correlation = np.outer(np.maximum(lags, 0), np.maximum(lags, 0)) / BLUR_PX**2
-    correlation[LONGEST_LAG_PX, LONGEST_LAG_PX] += 0.1
-    blank = HolePatch(
-        residual_m=np.zeros(shape),
-        used=np.ones(shape, bool),
-        metric_m2=per_px_m @ per_px_m.T,
-        blur_px=(5.0, 5.0),
-        noise_m=noise_m,
-        sights=straight_sight(per_px_m)[None],
-    )
-    truth = np.array([15.2, 14.7, 5e-3, 6e-3, 0.5])
-    image_m = pictures(blank, truth[None])[0]
-    near = grown(image_m > 0.5 * truth[3], 7)
-    everywhere = np.ones(shape, bool)
-    radii_m: dict[str, np.ndarray] = {}
-    errors_m: dict[str, np.ndarray] = {}
-    for name, by_lag, kept, draws in (
-        ("all", correlation, everywhere, 10),
-        ("thinned", correlation, near, 100),
-        ("plain", None, near, 100),
-    ):
-        fits = []
-        for seed in range(draws):
-            rough = 0.3 * np.random.default_rng(100 + seed).standard_normal(shape)
-            seen_m = image_m + noise_m * (blurred(seed, shape) + rough)
-            patch = whitened(replace(blank, residual_m=seen_m), by_lag, 0.0, kept)
-            fits.append(fit_hole(patch, 15.0, 15.0, 4e-3, 5e-3, 0.0))
-        radii_m[name] = np.array([fit.radius_m for fit in fits])
-        errors_m[name] = np.sqrt([fit.covariance[2, 2] for fit in fits])
-    thinned_m = radii_m["thinned"]
-    assert thinned_m.std() < 0.7 * radii_m["plain"].std()
-    assert np.median(errors_m["thinned"][:10] / errors_m["all"]) < 1.04
-    assert 0.6 < thinned_m.std() / np.median(errors_m["thinned"]) < 1.3
-    assert thinned_m.mean() == pytest.approx(5e-3, abs=1e-4)
 
 
 def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
