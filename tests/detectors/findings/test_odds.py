@@ -13,6 +13,7 @@ from detectors.findings.null import (
     MARKS,
     PLAIN,
     RIM,
+    Marks,
     OwnThreshold,
     Tail,
     interval_of,
@@ -263,6 +264,22 @@ def test_a_finding_at_print_is_more_likely_false() -> None:
             at_print.append(probability)
     assert len(at_print) >= 5
     assert np.median(at_print) > 0.5
+
+
+def test_a_wide_hole_is_its_own_mark() -> None:
+    """A dark disc of 50 pixels: the finding that fills it is the hole itself, a small one at its
+    edge is not."""
+    rows, columns = np.mgrid[:130, :170]
+    disc = np.hypot(rows - 65, columns - 80) < 25.0
+    labels = disc.astype(np.int64)
+    areas = np.bincount(labels.ravel())
+    marks = Marks(np.zeros_like(disc), disc, labels, areas, margin_px=6)
+    hole = np.flatnonzero(np.hypot(rows - 65, columns - 80) < 20.0)
+    assert not marks.hold(Detection(9.0, hole, np.zeros(3)))
+    beside = np.flatnonzero(np.hypot(rows - 65, columns - 108) < 3.0)
+    assert marks.hold(Detection(9.0, beside, np.zeros(3)))
+    apart = np.flatnonzero(np.hypot(rows - 65, columns - 120) < 3.0)
+    assert not marks.hold(Detection(9.0, apart, np.zeros(3)))
 
 
 def test_small_marks_are_no_less_noisy() -> None:
