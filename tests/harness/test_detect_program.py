@@ -137,11 +137,14 @@ def test_it_finds_the_hole_and_writes_everything(
     )
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
-    columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,length_mm,width_mm"
-    assert header == f"{columns},angle_deg,findings_version\n"
+    place = "id,kind,u_px,v_px,x_mm,y_mm,z_mm"
+    sizes = "diameter_mm,diameter_se_mm,depth_mm,depth_se_mm,sight_depth_mm,shape,volume_mm3"
+    sides = "length_mm,width_mm,angle_deg"
+    assert header == f"{place},{sizes},points,score,{sides},findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     assert row["kind"] == "hole"
-    number = {key: float(value) for key, value in row.items() if key != "kind"}
+    words = ("kind", "shape")
+    number = {key: float(value) for key, value in row.items() if key not in words}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
     position = [number["x_mm"], number["y_mm"], number["z_mm"]]
     np.testing.assert_allclose(position, TRUE_CENTRE_MM, atol=1.0)
@@ -187,6 +190,7 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     assert row["kind"] == finding["kind"] == "hole"
     for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {
         "kind",
+        "shape",
         "findings_version",
     }:
         assert float(row[column]) == pytest.approx(finding[column], abs=1e-4)
