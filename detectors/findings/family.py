@@ -91,7 +91,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class ShapeFit:
     """A fit that has converged."""
 
     fit: HoleFit
@@ -162,7 +162,7 @@ def sized(
         for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
             if fit.converged and _is_determined(fit):
-                candidates.append(Candidate(fit, blurred, loss))
+                candidates.append(ShapeFit(fit, blurred, loss))
                 first = _start_after(fit)
     return averaged(candidates) if candidates else None
 
@@ -203,7 +203,7 @@ def _start_after(fit: HoleFit) -> Start:
     )
 
 
-def averaged(candidates: Sequence[Candidate]) -> Size:
+def averaged(candidates: Sequence[ShapeFit]) -> Size:
     """Return the average of fits to the same pixels."""
     criteria = np.array([candidate.criterion for candidate in candidates])
     priors = np.array([PRIOR[candidate.fit.shape] for candidate in candidates])

@@ -12,7 +12,7 @@ from detectors.findings.shapes import Shape
 
 FINER = 8  # points along each axis of a pixel
 MARGIN_PX = 4  # half of the widest blur, and more
-STEPS = 401  # depths that a line of sight is tried at
+STEPS = 201  # depths that a line of sight is tried at
 
 Start = tuple[float, float, float, float, float]
 Draw = Callable[[HolePatch, np.ndarray], np.ndarray]

@@ -15,7 +15,7 @@ from detectors.findings.family import (
     DEPTH_ERROR,
     DIAMETER_ERROR,
     RADIUS_ERROR_PX,
-    Candidate,
+    ShapeFit,
     Start,
     averaged,
     mixture,
@@ -167,8 +167,8 @@ def fit_of(shape: Shape, chi_square: float, **changes: float) -> HoleFit:
 def test_weights_are_priors_times_the_evidence() -> None:
     """Equal numbers of parameters: exp(-BIC / 2) is chi square to the power -n / 2."""
     patch = patch_of(FRONTAL_PX_M)
-    disc = Candidate(fit_of("disc", 52.0), patch)
-    cap = Candidate(fit_of("cap", 50.0), patch, loss=2.0)
+    disc = ShapeFit(fit_of("disc", 52.0), patch)
+    cap = ShapeFit(fit_of("cap", 50.0), patch, loss=2.0)
     size = averaged([disc, cap])
     ratio = 0.7 / 0.15 * (50.0 / 52.0) ** 25.0 * math.e
     assert size.weights["disc"] / size.weights["cap"] == pytest.approx(ratio)
@@ -177,7 +177,7 @@ def test_weights_are_priors_times_the_evidence() -> None:
 def test_errors_are_those_of_the_fit_of_what_it_leaves_and_of_the_model() -> None:
     patch = replace(patch_of(FRONTAL_PX_M), metric_m2=np.diag([1e-6, 4e-6]), blur_px=(2.0, 1.5))
     # residuals have twice the noise's variance; pi 36 / 2 pixels lie inside, a third independent
-    slack = Candidate(fit_of("disc", 100.0), patch)
+    slack = ShapeFit(fit_of("disc", 100.0), patch)
     inside = math.pi * 36.0 / 2.0 / 3.0
     raised = 1.0 + inside * 0.5
     assert slack.raised == pytest.approx(raised)
@@ -185,12 +185,12 @@ def test_errors_are_those_of_the_fit_of_what_it_leaves_and_of_the_model() -> Non
     expected_m2 = raised * 4e-8 + edge_m2 + (DIAMETER_ERROR["disc"] * 12e-3) ** 2
     assert slack.diameter_variance_m2 == pytest.approx(expected_m2)
     assert slack.depth_variance_m2 == pytest.approx(raised * 4e-8 + (DEPTH_ERROR * 4e-3) ** 2)
-    assert Candidate(fit_of("disc", 40.0), patch).raised == 1.0
+    assert ShapeFit(fit_of("disc", 40.0), patch).raised == 1.0
 
 
 def test_a_slot_s_diameter_is_that_of_the_circle_with_its_area() -> None:
     patch = patch_of(FRONTAL_PX_M)
-    slot = Candidate(fit_of("slot", 50.0, stretch=math.log(3.0)), patch)
+    slot = ShapeFit(fit_of("slot", 50.0, stretch=math.log(3.0)), patch)
     size = averaged([slot])
     diameter_m = math.sqrt(4.0 / math.pi * 12e-3 * 36e-3)
     assert size.diameter_m == pytest.approx(diameter_m)

@@ -103,19 +103,20 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
         assert np.hypot(row - 45.2, column - 60.4) < 8.0
 
 
-def test_a_hole_that_the_model_does_not_fit_is_measured_by_its_contour() -> None:
+def test_the_error_of_a_hole_contains_what_the_model_does_not_explain() -> None:
     """A mouth as sharp as no camera with the assumed window shows it, beside the same through that
     window."""
     rows, columns = np.indices(SHAPE)
     sharp = 0.01 * (np.hypot(columns - 60, rows - 45) < 4.0)
-    notes = []
+    errors_m = []
     for image in (sharp, hole(60, 45, 4.0, 0.01)):
         cloud = cloud_of(image + 1e-4 * blurred(17))
         evidence = DETECTOR.analyse(cloud)
         detection = DETECTOR.find(cloud, evidence, 6.0)[0]
-        notes.append(DETECTOR.measure(cloud, evidence, detection).model_note)
-    assert "does not fit" in notes[0]
-    assert not notes[1]
+        measured = DETECTOR.measure(cloud, evidence, detection)
+        assert not measured.model_note
+        errors_m.append(measured.model_diameter_se_m)
+    assert errors_m[0] > 1.5 * errors_m[1]
 
 
 def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
