@@ -1,14 +1,14 @@
 """The size of a damage by a family of shapes, averaged by their evidence.
 
-Each shape of `detectors.findings.shapes` is fitted to the same pixels. A shape's weight is its prior
-times exp(-BIC / 2), with the Bayesian information criterion n ln(chi^2 / n) + p ln n of n
+Each shape of `detectors.findings.shapes` is fitted to the same pixels. A shape's weight is its
+prior times exp(-BIC / 2), with the Bayesian information criterion n ln(chi^2 / n) + p ln n of n
 independent pixels and p parameters (Burnham and Anderson 2002, 6.4). Of an averaged size, the
 variance is the mean variance within the shapes plus the variance between them: where the blur hides
 the shape, the stated error contains that nobody can tell a drilled hole from a dent.
 
 What no shape explains adds to a shape's variance as an error that all n pixels of the damage share:
-if the residuals' variance is 1 + e times the noise's, the part e repeats itself from pixel to pixel,
-so that it does not average out and the variance of a size is raised by 1 + n e / (1 + e)."""
+if the residuals' variance is 1 + e times the noise's, the part e repeats itself from pixel to
+pixel, so that it does not average out and the variance of a size is raised by 1 + n e / (1 + e)."""
 
 import math
 from collections.abc import Sequence
@@ -33,8 +33,8 @@ BLURS = (
     (0.5, False, 9.0),
     (0.25, False, 9.0),
 )
-"""Blurs that are tried for a recording, whose own is known by its noise alone: side over that of the
-noise, whether it is soft, and penalty in the information criterion. Rounded noise looks sharper
+"""Blurs that are tried for a recording, whose own is known by its noise alone: side over that of
+the noise, whether it is soft, and penalty in the information criterion. Rounded noise looks sharper
 than it is; a camera's maker may smooth the noise more than the scene."""
 MOST_OPEN = 0.3  # largest relative error of a radius that counts as measured
 RADIUS_ERROR_PX = 0.05
@@ -91,7 +91,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class ShapeFit:
     """A fit that has converged."""
 
     fit: HoleFit
@@ -118,8 +118,8 @@ class Candidate:
         excess = max(per_pixel - 1.0, 0.0)
         pixel_m2 = math.sqrt(float(np.linalg.det(self.patch.metric_m2)))
         pixels = math.pi * fit.radius_m**2 * math.exp(fit.stretch) / pixel_m2
-        share = fit.independent / (np.count_nonzero(self.patch.used) + self.patch.left_out)
-        return 1.0 + min(pixels * share, fit.independent) * excess / (1.0 + excess)
+        inside = min(pixels / math.prod(self.patch.noise_px), fit.independent)
+        return 1.0 + inside * excess / (1.0 + excess)
 
     @property
     def diameter_variance_m2(self) -> float:
@@ -162,7 +162,7 @@ def sized(
         for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
             if fit.converged and _is_determined(fit):
-                candidates.append(Candidate(fit, blurred, loss))
+                candidates.append(ShapeFit(fit, blurred, loss))
                 first = _start_after(fit)
     return averaged(candidates) if candidates else None
 
@@ -203,7 +203,7 @@ def _start_after(fit: HoleFit) -> Start:
     )
 
 
-def averaged(candidates: Sequence[Candidate]) -> Size:
+def averaged(candidates: Sequence[ShapeFit]) -> Size:
     """Return the average of fits to the same pixels."""
     criteria = np.array([candidate.criterion for candidate in candidates])
     priors = np.array([PRIOR[candidate.fit.shape] for candidate in candidates])

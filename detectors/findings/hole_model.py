@@ -14,13 +14,13 @@ than the floor; a floor that is not flat; the lower weight of deep neighbours in
 (holes of 2 to 3 times the blur are measured up to 16 % too deep at 33 mm)."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numba
 import numpy as np
 
 from detectors.findings.shapes import DISC, SHAPES, SLOT, Shape, reliefs
-from detectors.findings.whitening import correlated_products, covariance_factor
+from detectors.findings.whitening import correlated_products
 from detectors.pixels.clusters import PLAIN
 
 # --- the picture ---
@@ -55,12 +55,6 @@ LONGEST = 3.0  # largest logarithm of a slot's length over its width
 
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Prior mean and standard deviation of the wall, which is uniform from 0 to 1."""
-MODEL_ERROR = 0.05
-"""Error by light between wall and floor, on simulated clouds, as a share of a pixel's depth."""
-MOST_MISFIT = 1.5
-"""Largest misfit of a valid fit: simulations with the model's optics give 0.3 to 1.05, with others
-1.1 to 3."""
-THIN_PX = 4  # far pixels show the offset alone: of 16, one nearly suffices
 
 
 # --- viewpoints ---
@@ -135,10 +129,6 @@ class HolePatch:
     """Standard deviation of the residuals beside the hole."""
     sights: np.ndarray
     """(s, 8): the viewpoints (`sight`)."""
-    factor: np.ndarray | None = None
-    """(n, n): lower triangular L of the covariance L L' of the n used pixels' errors, if known."""
-    left_out: int = 0
-    """Number of pixels beside the used ones that would add too little."""
     soft: bool = False
     """True if the blur falls off from its middle like a lens' or a beam's: two rectangles in turn,
     of 1 / sqrt(2) of its sides; False if it ends sharply like a filter's window."""
@@ -351,44 +341,21 @@ class HoleFit:
     """(8, 8): of u, v, radius, depth, offset, wall, stretch and angle, in px, metres and radians;
     0 for those that the shape lacks."""
     converged: bool
-    misfit: float
-    """Deviation of the residuals over that of noise and model error; 0 if unknown."""
     shape: Shape = "disc"
     stretch: float = 0.0
     """Logarithm of a slot's length over its width."""
     angle_rad: float = 0.0
     """Angle of a slot's length on the surface, from the direction of the rows."""
     chi_square: float = np.nan
-    """Sum of squared residuals over the noise's variance, by independent pixels."""
+    """Sum of squared residuals over the noise's variance, of independent pixels."""
     independent: float = np.nan
-    """Number of independent pixels: all that are whitened, or else one in each blur."""
+    """Number of independent pixels: one in each rectangle that shares noise."""
 
     @property
     def numbers(self) -> np.ndarray:
         """The damage (7,) as `pictures` draws it."""
         place_and_size = [self.u_px, self.v_px, self.radius_m, self.depth_m]
         return np.array([*place_and_size, self.wall, self.stretch, self.angle_rad])
-
-
-def whitened(
-    patch: HolePatch,
-    by_lag: np.ndarray | None,
-    offset_m: float,
-    near: np.ndarray,
-) -> HolePatch:
-    """Return the patch with the covariance of its errors; without a covariance, as it is.
-
-    Errors are noise with the correlation ``by_lag`` (odd, odd), and those of the model, which are
-    shares of the depth beyond ``offset_m``. Of the pixels that are not ``near`` (h, w) bool, those
-    of every `THIN_PX`-th row and column are used."""
-    used = patch.used & near
-    used[::THIN_PX, ::THIN_PX] = patch.used[::THIN_PX, ::THIN_PX]
-    error_m = MODEL_ERROR * np.abs(patch.residual_m - offset_m)
-    factor = covariance_factor(used, by_lag, max(patch.noise_m, LEAST_M), error_m)
-    if factor is None:
-        return patch
-    left_out = int(np.count_nonzero(patch.used) - np.count_nonzero(used))
-    return replace(patch, used=used, factor=factor, left_out=left_out)
 
 
 def fit_hole(
@@ -403,15 +370,13 @@ def fit_hole(
     stretch: float = 0.0,
     angle_rad: float = 0.0,
 ) -> HoleFit:
-    """Fit a damage of one shape to at least six used pixels by least squares (Levenberg and
-    Marquardt) from start values. With the covariance in the patch, the fit has maximum likelihood;
-    else the covariance is that of `sandwich_covariance`.
+    """Fit a damage of one shape to at least eight used pixels by least squares (Levenberg and
+    Marquardt) from start values. Its covariance is that of `sandwich_covariance`.
 
     Fitted are q = (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2),
     which has `WALL_PRIOR`; of a slot, its stretch and angle instead of the wall. The fourth is the
     hole's volume. The blur preserves it, so that only the radius of a small hole is
     ill-determined."""
-    factor = patch.factor
     blur_u, blur_v = patch.blur_px
     height, width = patch.used.shape
     volume = depth_m * radius_m**2
@@ -419,8 +384,7 @@ def fit_hole(
     hole, offset, rows, converged = _descent(
         patch.residual_m[patch.used],
         np.flatnonzero(patch.used),
-        np.zeros((0, 0)) if factor is None else factor,
-        patch.prior_weight if factor is None else 1.0 / WALL_PRIOR[1],
+        patch.prior_weight,
         np.array([u, v, math.log(radius_m), volume, offset_m, x, stretch, angle_rad]),
         SHAPES.index(shape),
         patch.sights,
@@ -435,20 +399,7 @@ def fit_hole(
     left = rows[8]
     square = float(left @ left)
     u, v, radius, depth, wall, stretch, angle = hole.tolist()
-    # pixels that are left out have the noise that is known
-    pixels = len(left) + patch.left_out
-    if factor is None:
-        covariance = sandwich_covariance(patch, derivatives, square)
-        misfit = 0.0
-        sharing = math.prod(patch.noise_px)
-        independent = pixels / sharing
-        chi_square = square / max(patch.noise_m, LEAST_M) ** 2 / sharing
-    else:
-        independent = float(pixels)
-        chi_square = square + patch.left_out
-        variance = chi_square / max(pixels - 6, 1)
-        covariance = _likelihood_covariance(patch, derivatives, variance, depth)
-        misfit = math.sqrt(variance)
+    sharing = math.prod(patch.noise_px)
     return HoleFit(
         u_px=u,
         v_px=v,
@@ -456,29 +407,14 @@ def fit_hole(
         depth_m=depth,
         offset_m=offset,
         wall=wall,
-        covariance=covariance,
+        covariance=sandwich_covariance(patch, derivatives, square),
         converged=converged,
-        misfit=misfit,
         shape=shape,
         stretch=stretch,
         angle_rad=angle,
-        chi_square=chi_square,
-        independent=independent,
+        chi_square=square / max(patch.noise_m, LEAST_M) ** 2 / sharing,
+        independent=len(left) / sharing,
     )
-
-
-def _likelihood_covariance(
-    patch: HolePatch,
-    derivatives: np.ndarray,
-    variance: float,
-    depth_m: float,
-) -> np.ndarray:
-    """Return the covariance (p, p) of (u, v, radius, depth, offset, wall ..) by whitened derivatives
-    (p, n): the inverse of the information times the residuals' ``variance``, and the model's
-    errors of radius and depth."""
-    information = derivatives @ derivatives.T
-    information[5, 5] += WALL_PRIOR[1] ** -2
-    return np.linalg.pinv(information, hermitian=True) * variance
 
 
 def sandwich_covariance(
@@ -578,7 +514,6 @@ def _smooth_rows(image, side):  # type: ignore[no-untyped-def]
 def _descent(  # type: ignore[no-untyped-def]
     data,
     pixels,
-    factor,
     weight,
     start,
     shape,
@@ -595,8 +530,7 @@ def _descent(  # type: ignore[no-untyped-def]
 
     The first rows are derivatives of the used pixels, at flat indices ``pixels`` (n,), by (u, v,
     radius, depth, offset, wall, stretch, angle), 0 for those that the shape lacks; the ninth is the
-    damage minus ``data`` (n,); the tenth is that of the last trial. With a ``factor`` (n, n) that
-    is not empty, they are whitened. ``weight``: of the prior."""
+    damage minus ``data`` (n,); the tenth is that of the last trial. ``weight``: of the prior."""
     n = len(data)
     q = start
     step = np.zeros(8)
@@ -619,7 +553,6 @@ def _descent(  # type: ignore[no-untyped-def]
         changed = np.array([0, 1, 2, 3, 4])
     else:
         changed = np.array([0, 1, 2, 3])
-    _whiten(rows[4:5], factor)
     # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
@@ -636,7 +569,6 @@ def _descent(  # type: ignore[no-untyped-def]
         image = _drawn(shape, holes[:1], sights, metric, blur_u, blur_v, soft, h, w).ravel()
         for i in range(n):
             left[0, i] = image[pixels[i]] + trial_q[4] - data[i]
-        _whiten(left, factor)
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
         new_square = prior**2
         for i in range(n):
@@ -670,11 +602,6 @@ def _descent(  # type: ignore[no-untyped-def]
                     rows[row, i] = (images[k * h * w + pixels[i]] - image[pixels[i]]) * per_step
             for i in range(n):
                 rows[8, i] = left[0, i]
-            _whiten(rows[:4], factor)
-            if shape == DISC:
-                _whiten(rows[5:6], factor)
-            if shape == SLOT:
-                _whiten(rows[6:8], factor)
             # derivatives by q from those by the hole's parameters
             bend = 0.5 * math.pi * math.sin(math.pi * trial_q[5])
             turn[2, 2] = radius
@@ -695,29 +622,10 @@ def _descent(  # type: ignore[no-untyped-def]
     return best, q[4], rows, converged
 
 
-# sums in any order, so that the compiler uses vectors
-@numba.njit(fastmath={"reassoc", "contract", "nsz"}, **PLAIN)
-def _whiten(rows: np.ndarray, factor: np.ndarray) -> None:
-    """Solve L x = r in place for each of the rows r (k, n) with a lower triangular ``factor`` L
-    (n, n), unless it is empty."""
-    first = 0  # leading zeros stay zeros
-    while first < len(factor) and not rows[:, first].any():
-        first += 1
-    for i in range(len(factor) - first):
-        factor_row = factor[first + i, first:]
-        per_pivot = 1.0 / factor[first + i, first + i]
-        for k in range(len(rows)):
-            row = rows[k, first:]
-            total = 0.0
-            for j in range(i):
-                total += factor_row[j] * row[j]
-            row[i] = (row[i] - total) * per_pivot
-
-
 @numba.njit(**PLAIN)
 def _damped(products, damping):  # type: ignore[no-untyped-def]
-    """Return the step (p,) of damped normal equations ``products`` (p + 1, p + 1), right side last, and
-    its predicted gain, by Cholesky's factor of the matrix with its diagonal times 1 +
+    """Return the step (p,) of damped normal equations ``products`` (p + 1, p + 1), right side
+    last, and its predicted gain, by Cholesky's factor of the matrix with its diagonal times 1 +
     ``damping``."""
     p = len(products) - 1
     lower = np.zeros((p + 1, p))

@@ -8,9 +8,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from detectors.findings.hole_model import NODES, WALL_PRIOR, WEIGHTS, HolePatch
+from detectors.findings.shapes import Shape
 
 FINER = 8  # points along each axis of a pixel
 MARGIN_PX = 4  # half of the widest blur, and more
+STEPS = 201  # depths that a line of sight is tried at
 
 Start = tuple[float, float, float, float, float]
 Draw = Callable[[HolePatch, np.ndarray], np.ndarray]
@@ -55,6 +57,54 @@ def picture(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
             passed = within(t * drift * scale - below * beam, radius * scale)
             total += share / cosine * thick * (is_seen & entered & passed)
     return down @ total @ across.T
+
+
+def relief(patch: HolePatch, numbers: np.ndarray, shape: Shape) -> np.ndarray:
+    """Return the residual (h, w), without offset, of a cap, a bowl or a slot with ``numbers`` (7,)
+    as `detectors.findings.shapes` has them, seen by one viewpoint.
+
+    A line of sight that meets the surface at the place p is at p - t * drift at the depth t along
+    the normal. It sees the first of `STEPS` equal depths that is not above the relief there."""
+    u, v, radius, depth, _, stretch, angle = numbers
+    columns, across = _fine(patch.used.shape[1], patch.blur_px[0])
+    rows, down = _fine(patch.used.shape[0], patch.blur_px[1])
+    offset_px = np.stack(np.meshgrid(columns - u, rows - v), axis=-1)
+    # the surface's axes: along the rows, and at right angles to it
+    metric = patch.metric_m2
+    to_surface = np.linalg.cholesky(metric)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    cosine, drift_u, drift_v = patch.sights[0, :3]
+    deepest = depth * cosine
+    places_m = offset_px @ to_surface @ turn
+    drift = np.array([drift_u, drift_v]) @ to_surface @ turn
+    sees = np.full(places_m.shape[:2], np.nan)
+    for t in np.linspace(0.0, deepest, STEPS):
+        there_m = places_m - t * drift
+        height_m = _height_m(there_m, radius, deepest, stretch, shape)
+        is_met = np.isnan(sees) & (np.abs(height_m) <= abs(t))
+        sees[is_met] = t
+    return down @ (sees / cosine) @ across.T
+
+
+def _height_m(
+    places_m: np.ndarray,
+    radius_m: float,
+    deepest_m: float,
+    stretch: float,
+    shape: Shape,
+) -> np.ndarray:
+    """Return the depth of a shape along the normal at places (h, w, 2) in its own axes."""
+    along_m, across_m = np.moveaxis(places_m, -1, 0)
+    if shape == "slot":
+        inside = (np.abs(across_m) < radius_m) & (np.abs(along_m) < radius_m * math.exp(stretch))
+        return deepest_m * inside
+    share = np.minimum(np.hypot(along_m, across_m) / radius_m, 1.0)
+    if shape == "bowl":
+        return deepest_m * 0.5 * (1.0 + np.cos(np.pi * share))
+    deep_m = min(abs(deepest_m), radius_m)
+    ball_m = (radius_m**2 + deep_m**2) / (2.0 * deep_m)
+    above_m = np.sqrt(ball_m**2 - (share * radius_m) ** 2) - (ball_m - deep_m)
+    return deepest_m / deep_m * above_m
 
 
 def _fine(length: int, blur_px: float) -> tuple[np.ndarray, np.ndarray]:

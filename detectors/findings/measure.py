@@ -40,6 +40,7 @@ MARGIN_SHARE = 0.4
 """Margin around a detection, as a share of its size: a bowl's core is half as wide as its mouth."""
 FINE_BLUR_PX = 2.0  # a recording's blur is at least as wide as this in the pixels of the fit
 MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are fitted
+FEWEST_ACROSS = 6  # pixels of the fit across a detection
 LONG = 0.5  # logarithm of length over width from which a slot is tried
 MOST_STRETCH = 2.5  # largest start value of it
 OPEN_M = 20.0 * MM
@@ -204,7 +205,7 @@ def measure_detection(
     size, doubt = _modelled(around, config)
     if size is None:
         # a contour needs no fit, and so all pixels
-        fine = _surroundings(cloud, evidence, detection, config, most_binned=1)
+        fine = _surroundings(cloud, evidence, detection, config, fine=True)
         return _by_contour(measured, fine or around, doubt)
     fit = size.best
     spread = around.per_px_m.T @ fit.covariance[:2, :2] @ around.per_px_m
@@ -311,11 +312,12 @@ def _surroundings(
     evidence: Evidence,
     detection: Detection,
     config: HoleModelConfig,
-    most_binned: int = 64,
+    *,
+    fine: bool = False,
 ) -> _Surroundings | None:
     """Cut out the detection with a margin of twice the blur or `MARGIN_SHARE` of its size on each
-    side, in means over squares of pixels where these are small, of ``most_binned`` pixels a side;
-    None with too few valid pixels around."""
+    side, in means over squares of pixels where these are small; None with too few valid pixels
+    around. ``fine``: all pixels instead."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
     blur_px = blur_in_cells(cloud, config)
@@ -344,11 +346,14 @@ def _surroundings(
         return None
     origin_m, per_px_m = plane
     u0, v0 = _centroid(own)
-    by_blur = 1
-    by_size = max(residual_m.shape) // MOST_SIDE_PX
-    if cloud.noise_reach_px:  # its blurs are many fits
-        by_blur = int(min(blur_px) / FINE_BLUR_PX)
-    binned = min(max(by_blur, by_size, 1), most_binned)
+    binned = 1
+    if not fine:
+        # several pixels across the detection: a slot is long, but narrow
+        across_px = len(rows) / widest
+        binned = min(max(residual_m.shape) // MOST_SIDE_PX, int(across_px / FEWEST_ACROSS))
+        if cloud.noise_reach_px:  # its blurs are many fits
+            binned = max(binned, int(min(blur_px) / FINE_BLUR_PX))
+        binned = max(binned, 1)
     invalid = ~np.isfinite(points_m[..., 2])
     if binned > 1:
         residual_m = _means(residual_m, binned)

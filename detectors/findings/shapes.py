@@ -173,6 +173,18 @@ def _sum_before(sums, place):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**PLAIN)
+def _way_inside(place, drift, half):  # type: ignore[no-untyped-def]
+    """Return the depth at which a line of sight that is at ``place`` - t * ``drift`` at the depth t
+    leaves -``half`` to ``half``."""
+    place = min(max(place, -half), half)
+    if drift > 0.0:
+        return (place + half) / drift
+    if drift < 0.0:
+        return (place - half) / drift
+    return np.inf
+
+
+@numba.njit(**PLAIN)
 def _seen(  # type: ignore[no-untyped-def]
     shape,
     along,
@@ -190,6 +202,12 @@ def _seen(  # type: ignore[no-untyped-def]
     0 and the relief's deepest; where the sight line could meet the relief several times, false
     position with halved weights finds one of them."""
     start = profile(shape, along, across, radius, deepest, stretch, edge)
+    if shape == SLOT:
+        # upright walls: the line of sight ends at the floor or where it leaves the mouth
+        sign = math.copysign(1.0, deepest)
+        to_end = _way_inside(along, sign * drift_along, radius * stretch)
+        to_side = _way_inside(across, sign * drift_across, radius)
+        return start * min(min(to_end, to_side) / abs(deepest), 1.0)
     square = (drift_along**2 + drift_across**2) * deepest**2
     if start == 0.0 or square < (1e-3 * radius) ** 2:
         return start

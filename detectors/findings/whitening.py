@@ -2,9 +2,9 @@
 
 A picture holds residuals in standard deviations of the local noise. Its noise is stationary: the
 covariance C of two pixels depends on their offset alone. The matched filters need C^-1 r for the
-residuals r of the known pixels (`inverse_times`); the fit of a hole needs a factor of C
-(`covariance_factor`). Pictures are padded to larger grids by the longest lag, so that nothing
-wraps around. `detectors.findings.whitening_reference` has the same equations in dense algebra."""
+residuals r of the known pixels (`inverse_times`). Pictures are padded to larger grids by the
+longest lag, so that nothing wraps around. `detectors.findings.whitening_reference` has the same
+equations in dense algebra."""
 
 import math
 from typing import NamedTuple
@@ -13,7 +13,6 @@ import cv2
 import numba
 import numpy as np
 import scipy.fft
-import scipy.linalg
 
 from detectors.pixels.clusters import PLAIN
 
@@ -21,7 +20,6 @@ LONGEST_LAG_PX = 28  # lag at which Parzen's window fades the covariance to 0
 GRID = 96  # side of the grid that holds the widest template and the reach of its whitened edge
 LEAST_POWER = 0.01  # least value of the spectrum, as a share of its mean
 LEAST_VARIANCE = 1e-12  # least value of the spectrum of a picture without noise
-MOST_WHITENED = 2000  # most pixels whose dense covariance is factored: 0.1 s and 32 MB
 
 # --- the descent of `inverse_times` ---
 
@@ -112,14 +110,6 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     power = scipy.fft.rfft2(centred(covariance, shape)).real
     least = max(LEAST_POWER * float(power.mean()), LEAST_VARIANCE)
     return np.maximum(power, least).astype(np.float32)
-
-
-def correlation(covariance: np.ndarray) -> np.ndarray:
-    """Return the correlation (2 `LONGEST_LAG_PX` + 1, squared) by lag of noise with the `spectrum`
-    of a covariance."""
-    grid = (GRID, GRID)
-    by_lag = scipy.fft.irfft2(spectrum(covariance, grid), grid)[_lags()]
-    return np.asarray(by_lag / by_lag[LONGEST_LAG_PX, LONGEST_LAG_PX], np.float64)
 
 
 def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
@@ -296,64 +286,6 @@ def _spread(
 
 
 # --- dense covariances of few pixels ---
-
-
-def covariance_factor(
-    used: np.ndarray,
-    correlation: np.ndarray | None,
-    deviation: float,
-    model_error: np.ndarray,
-) -> np.ndarray | None:
-    """Return the lower triangular L (n, n) of the covariance L L' of the errors at some pixels.
-
-    Errors are noise of one ``deviation`` and the model's own, both with the same ``correlation``.
-    None if there are too many pixels, or if the correlation is unknown or zero.
-
-    Args:
-        used: (r, c) bool, the n pixels.
-        correlation: (odd, odd), by lag, lag 0 in the middle; None if unknown.
-        deviation: standard deviation of the noise, metres.
-        model_error: (r, c), size of the model's error at each used pixel, metres."""
-    if correlation is None or np.count_nonzero(used) > MOST_WHITENED:
-        return None
-    rows, columns = np.nonzero(used)
-    matrix = _lower_covariance(
-        rows,
-        columns,
-        model_error[used],
-        deviation**2,
-        correlation,
-    )
-    # in LAPACK's order of elements its transpose is an upper triangle, which needs no copy
-    _, failed = scipy.linalg.lapack.dpotrf(
-        matrix.T,
-        lower=False,
-        clean=False,
-        overwrite_a=True,
-    )
-    return None if failed else matrix
-
-
-@numba.njit(**PLAIN)
-def _lower_covariance(  # type: ignore[no-untyped-def]
-    rows,
-    columns,
-    error,
-    variance,
-    correlation,
-):
-    """Return the lower triangle (n, n) of the covariance of pixels, 0 above it."""
-    covariance = np.zeros((len(rows), len(rows)))
-    middle_row = len(correlation) // 2
-    middle_column = correlation.shape[1] // 2
-    for i in range(len(rows)):
-        for j in range(i + 1):
-            row = rows[i] - rows[j] + middle_row
-            column = columns[i] - columns[j] + middle_column
-            if row < len(correlation) and 0 <= column < correlation.shape[1]:
-                covariance[i, j] = correlation[row, column] * variance
-        covariance[i, i] += error[i] ** 2
-    return covariance
 
 
 def correlated_products(

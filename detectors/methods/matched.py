@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import cv2
@@ -37,7 +36,6 @@ import numpy as np
 
 from detectors.findings import templates, whitening
 from detectors.findings.missing import missing_evidence
-from detectors.interface import Evidence
 from detectors.methods import local
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.methods.scatter import FAINT, WIDE_PX, evened, tail_of, zones_of
@@ -134,12 +132,6 @@ class MatchedDetector(LocalDetector):
             " narrowest"
         )
         return signed, depth_m, unit
-
-    def correlation(self, evidence: Evidence) -> np.ndarray:
-        """Return the correlation of the noise by lag, learned or from the residuals."""
-        if self._covariance is None:
-            return _own_correlation(evidence)
-        return whitening.correlation(self._covariance)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the
@@ -278,16 +270,6 @@ def _subtract_layers(
             if 0 < depth_px[i, j] <= RIM_PX:
                 layer = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
                 noise[i, j] -= np.float32(shared[layer])
-
-
-@lru_cache(maxsize=1)
-def _own_correlation(evidence: Evidence) -> np.ndarray:
-    """Return the correlation of a cloud's residuals by lag, once for all findings of the cloud."""
-    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
-    residual_m = evidence.residual_m[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-    weights = np.isfinite(residual_m).astype(np.float32)
-    residuals = _in_deviations(np.nan_to_num(residual_m), weights, (0.0, 0.0))
-    return whitening.correlation(_covariance(residuals))
 
 
 def _covariance(residuals: _Residuals) -> np.ndarray:

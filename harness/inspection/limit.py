@@ -32,6 +32,8 @@ LEAST_PX = 1.0
 """Width of the smallest discs."""
 STEP = 1.4
 """Ratio of neighbouring sizes."""
+FINEST = 0.2
+"""Least difference of the steps of two sizes: 7 %."""
 MOST_SIZES = 9
 """Most sizes, of which each costs an analysis of the cloud."""
 MOST_PLACES = 40
@@ -95,8 +97,8 @@ def limit_of(
             fix="leave out --limit, or give depth images",
         )
     free = free_area(result)
-    counts: dict[int, SizeCount] = {}
-    step = 0
+    counts: dict[float, SizeCount] = {}
+    step = 0.0
     while len(counts) < MOST_SIZES:
         count = _counted(detector, result, threshold, free, _disc(result, step, depth_m))
         if count is None:
@@ -123,7 +125,7 @@ class Disc:
     depth_m: float
 
 
-def _disc(result: Judged, step: int, depth_m: float | None) -> Disc:
+def _disc(result: Judged, step: float, depth_m: float | None) -> Disc:
     """Return the disc that is ``step`` sizes larger than the first."""
     diameter_m = FIRST_PX * STEP**step * _pitch_m(result)
     return Disc(diameter_m, HALF * diameter_m if depth_m is None else depth_m)
@@ -133,17 +135,24 @@ def _pitch_m(result: Judged) -> float:
     return pitch_mm(result.cloud, result.evidence) * MM
 
 
-def next_step(counts: dict[int, SizeCount]) -> int | None:
-    """Return the step of the next size: smaller ones until few are found, then larger ones until
-    nearly all are; None at the end."""
-    smallest = min(counts)
-    largest = max(counts)
-    next_px = FIRST_PX * STEP ** (smallest - 1)
-    if _share(counts[smallest]) > RARE and next_px >= LEAST_PX:
-        return smallest - 1
-    if _share(counts[largest]) < USUAL:
-        return largest + 1
-    return None
+def next_step(counts: dict[float, SizeCount]) -> float | None:
+    """Return the step of the next size: smaller ones until few are found, larger ones until nearly
+    all are, then between them, as a curve needs two sizes of which some are found and some are
+    missed; None at the end."""
+    steps = sorted(counts)
+    next_px = FIRST_PX * STEP ** (steps[0] - 1)
+    if _share(counts[steps[0]]) > RARE and next_px >= LEAST_PX:
+        return steps[0] - 1
+    if _share(counts[steps[-1]]) < USUAL:
+        return steps[-1] + 1
+    mixed = [step for step in steps if 0 < _share(counts[step]) < 1]
+    below = [step for step in steps if _share(counts[step]) < WANTED]
+    if len(mixed) >= 2 or not below:
+        return None
+    above = next(step for step in steps if step > below[-1])
+    if above - below[-1] <= FINEST:
+        return None
+    return 0.5 * (below[-1] + above)
 
 
 def _share(count: SizeCount) -> float:

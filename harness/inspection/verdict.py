@@ -30,9 +30,8 @@ FLAGS = {
     "at_rim": "reaches the rim of the judged area: may be larger than stated",
     "open_behind": "shows what lies far behind, or nothing: may be wider than stated by up to the"
     " noise's reach, where the camera's filter mixes the rim with what is behind",
-    "size_from_contour": "no model of a hole fits: its diameter is that of its outline at half"
-    " depth",
-    "size_from_extent": "no model of a hole fits: its diameter is that of its outermost points",
+    "size_from_contour": "no shape fits: its diameter is that of its outline at half depth",
+    "size_from_extent": "no shape was fitted: its diameter is that of its outermost points",
     "depth_from_extreme": "its depth is that of its deepest point, which noise makes deeper",
 }
 """The flags of findings, with their meaning."""
@@ -110,7 +109,7 @@ def term_of(finding: Finding, floor_mm: float) -> str:
     """Return the name of what was found. ``floor_mm``: the least width at which a floor is seen."""
     if finding.kind != "hole":
         return finding.kind
-    if finding.is_long:
+    if finding.is_long or finding.shape == "slot":
         return "slot"
     if not finding.depth_mm < DENT_RATIO * finding.diameter_mm:
         return "hole"

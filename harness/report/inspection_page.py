@@ -316,9 +316,10 @@ def findings_grid(findings: Sequence[Finding]) -> Grid:
     columns: dict[str, Callable[[Finding], str]] = {
         "no.": lambda finding: str(finding.id),
         "what": lambda finding: finding.term or finding.kind,
+        "shape": lambda finding: finding.shape,
         "flags": lambda finding: ", ".join(finding.flags.split()).replace("_", " "),
         "width (mm)": _width,
-        "depth (mm)": lambda finding: _number(finding.depth_mm, 2),
+        "depth (mm)": _depth,
         "x (mm)": lambda finding: _number(finding.x_mm, 1),
         "y (mm)": lambda finding: _number(finding.y_mm, 1),
         "z (mm)": lambda finding: _number(finding.z_mm, 1),
@@ -326,14 +327,25 @@ def findings_grid(findings: Sequence[Finding]) -> Grid:
         "probability of noise": lambda finding: probability(finding.noise_probability),
     }
     rows = [[text(finding) for text in columns.values()] for finding in findings]
-    return Grid.of(columns, rows, left=3, kind="findings")
+    return Grid.of(columns, rows, left=4, kind="findings")
 
 
 def _width(finding: Finding) -> str:
     """Return the diameter, or length and width of a long finding."""
     if finding.is_long:
         return f"{finding.length_mm:.1f} × {finding.width_mm:.1f}"
-    return _number(finding.diameter_mm, 1)
+    return _with_error(finding.diameter_mm, finding.diameter_se_mm, 1)
+
+
+def _depth(finding: Finding) -> str:
+    return _with_error(finding.depth_mm, finding.depth_se_mm, 2)
+
+
+def _with_error(value: float, standard_error: float, digits: int) -> str:
+    """Return ``8.3 ± 0.2``, without the error where it is unknown."""
+    if not np.isfinite(standard_error):
+        return _number(value, digits)
+    return f"{_number(value, digits)}\u00a0±\u00a0{standard_error:.{digits}f}"
 
 
 def _number(value: float, digits: int) -> str:

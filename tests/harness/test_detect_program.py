@@ -146,12 +146,13 @@ def test_it_finds_the_hole_and_writes_everything(
     )
     with (out / "findings.csv").open() as stream:
         header = stream.readline()
-    columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,depth_mm,volume_mm3,points,score,length_mm,width_mm"
+    columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,diameter_se_mm,depth_mm,depth_se_mm"
+    columns += ",sight_depth_mm,shape,volume_mm3,points,score,length_mm,width_mm"
     said = "noise_probability,certainty,flags,term"
     assert header == f"{columns},angle_deg,{said},findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     assert row["kind"] == "hole"
-    words = ("kind", "noise_probability", "certainty", "flags", "term")
+    words = ("kind", "shape", "noise_probability", "certainty", "flags", "term")
     number = {key: float(value) for key, value in row.items() if key not in words}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
     position = [number["x_mm"], number["y_mm"], number["z_mm"]]
@@ -200,6 +201,7 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     assert row["noise_probability"] == "" and finding["noise_probability"] is None
     for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {
         "kind",
+        "shape",
         "noise_probability",
         "certainty",
         "flags",

@@ -69,7 +69,7 @@ def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def findings_of(out: Path) -> list[dict[str, float]]:
     with (out / "findings.csv").open(newline="") as stream:
-        words = ("kind", "certainty", "flags", "term")
+        words = ("kind", "shape", "certainty", "flags", "term")
         rows = [{k: v for k, v in row.items() if k not in words} for row in csv.DictReader(stream)]
     return [{k: float(v) if v else float("nan") for k, v in row.items()} for row in rows]
 

@@ -11,19 +11,13 @@ import pytest
 
 from detectors.findings import hole_model_reference as reference
 from detectors.findings.hole_model import (
-    DEPTH_ERROR,
-    MODEL_ERROR,
-    RADIUS_ERROR_PX,
-    THIN_PX,
     WALL_PRIOR,
     HolePatch,
-    _likelihood_covariance,
     fit_hole,
     pictures,
     sandwich_covariance,
     sight,
     straight_sight,
-    whitened,
 )
 from detectors.findings.measure import local_plane
 from detectors.findings.whitening import correlated_products
@@ -32,8 +26,6 @@ PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])
 EMITTER_M = np.array([-14e-3, 0.0, 1e-3])
 SIGHT = sight(CENTRE_M, PER_PX_M, EMITTER_M)
-WHITE = np.pad([[1.0]], 10)
-"""Correlation by lag of white noise."""
 
 
 def blank_patch(
@@ -179,7 +171,6 @@ def test_a_fit_is_that_of_the_reference(radius_mm: float, depth_mm: float, seed:
     fit = fit_hole(patch, *start)
     expected, offset_m, converged = reference.fitted(patch, start, draw)
     assert fit.converged == converged
-    assert fit.misfit == 0.0
     fitted = np.array([fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.offset_m, fit.wall])
     error = np.sqrt(np.diag(fit.covariance))[:6]
     # the sum of squares has kinks where circles cross strips, so that descents end near its least,
@@ -223,79 +214,6 @@ def test_a_sandwich_without_freedom_or_rank_is_not_a_number() -> None:
     square = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1e9])
     assert np.isnan(sandwich_covariance(patch, square, 1e-8)).all()
     assert np.isnan(sandwich_covariance(patch, np.zeros((6, 6)), 1e-8)).all()
-
-
-def test_a_likelihood_s_covariance_is_the_inverse_information_and_the_model_s_errors() -> None:
-    patch = blank_patch()
-    derivatives = np.random.default_rng(4).standard_normal((6, 40)) * 1e3
-    result = _likelihood_covariance(patch, derivatives, 1.7, 0.02)
-    information = derivatives @ derivatives.T
-    information[5, 5] += 12.0
-    expected = np.linalg.inv(information) * 1.7
-    pitch_m2 = (PER_PX_M[0] @ PER_PX_M[0] + PER_PX_M[1] @ PER_PX_M[1]) / 2
-    expected[2, 2] += 0.05**2 * pitch_m2
-    expected[3, 3] += (0.05 * 0.02) ** 2
-    np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-24)
-
-
-def test_a_deep_hole_without_noise_has_the_errors_of_the_model() -> None:
-    hole = np.array([18.3, 16.4, 8e-3, 0.03, 0.5])
-    blank = blank_patch(noise_m=1e-6)
-    patch = replace(blank, residual_m=pictures(blank, hole[None])[0])
-    patch = whitened(patch, WHITE, 0.0, patch.used)
-    fit = fit_hole(patch, 18.0, 16.0, 7e-3, 0.025, 0.0)
-    depth_se_m = np.sqrt(fit.covariance[3, 3])
-    radius_se_m = np.sqrt(fit.covariance[2, 2])
-    assert fit.depth_m == pytest.approx(0.03, rel=0.01)
-    assert depth_se_m == pytest.approx(DEPTH_ERROR * 0.03, rel=0.02)
-    assert radius_se_m == pytest.approx(RADIUS_ERROR_PX * 1.41e-3, rel=0.02)
-
-
-def test_the_misfit_of_noise_as_stated_is_1_and_that_of_twice_as_much_2() -> None:
-    hole = np.array([18.3, 16.4, 5e-3, 0.004, 0.5])
-    noise = np.random.default_rng(5).standard_normal((34, 37))
-    misfits = []
-    for times in (1.0, 2.0):
-        blank = blank_patch(noise_m=3e-4)
-        seen_m = pictures(blank, hole[None])[0] + times * 3e-4 * noise
-        patch = whitened(replace(blank, residual_m=seen_m), WHITE, 0.0, blank.used)
-        misfits.append(fit_hole(patch, 18.0, 16.0, 5e-3, 0.004, 0.0).misfit)
-    # 1,258 pixels: known to 2 %
-    assert misfits == pytest.approx([1.0, 2.0], rel=0.08)
-
-
-def test_a_misfit_counts_the_six_parameters_and_the_pixels_left_out() -> None:
-    hole = np.array([6.2, 5.7, 4e-3, 0.004, 0.5])
-    blank = blank_patch(noise_m=3e-4, shape=(12, 13))
-    noise_m = 3e-4 * np.random.default_rng(6).standard_normal((12, 13))
-    near = np.zeros((12, 13), bool)
-    near[3:9, 3:10] = True
-    seen_m = pictures(blank, hole[None])[0] + noise_m
-    patch = whitened(replace(blank, residual_m=seen_m), WHITE, 0.0, near)
-    fit = fit_hole(patch, 6.0, 6.0, 4e-3, 0.004, 0.0)
-    fitted = np.array([[fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.wall]])
-    errors_m = pictures(patch, fitted)[0] + fit.offset_m - seen_m
-    deviations_m = np.hypot(3e-4, MODEL_ERROR * seen_m)
-    square = ((errors_m / deviations_m)[patch.used] ** 2).sum()
-    pixels = patch.used.sum() + patch.left_out
-    assert pixels == 12 * 13
-    expected = np.sqrt((square + patch.left_out) / (pixels - 6))
-    assert fit.misfit == pytest.approx(expected, rel=1e-6)
-
-
-def test_far_pixels_are_thinned_and_errors_of_the_model_added() -> None:
-    patch = replace(blank_patch(noise_m=2e-4), residual_m=np.full((34, 37), 5e-3))
-    vicinity = np.zeros((34, 37), bool)
-    vicinity[10:20, 12:25] = True
-    thin = np.zeros_like(vicinity)
-    thin[::THIN_PX, ::THIN_PX] = True
-    result = whitened(patch, WHITE, 1e-3, vicinity)
-    np.testing.assert_array_equal(result.used, vicinity | thin)
-    assert result.left_out == 34 * 37 - (vicinity | thin).sum()
-    assert result.factor is not None
-    deviation_m = np.hypot(2e-4, MODEL_ERROR * 4e-3)
-    np.testing.assert_allclose(np.tril(result.factor), np.eye(len(result.factor)) * deviation_m)
-    assert whitened(patch, None, 1e-3, vicinity) is patch
 
 
 # ---- their parts

@@ -16,12 +16,9 @@ from detectors.findings.whitening import (
     GRID,
     LEAST_POWER,
     LONGEST_LAG_PX,
-    MOST_WHITENED,
     _spread,
     centred,
     correlated_products,
-    correlation,
-    covariance_factor,
     filters,
     grid_of,
     inverse_times,
@@ -78,13 +75,6 @@ def test_a_covariance_is_the_mean_product_of_quiet_pixels(lag: tuple[int, int]) 
     down, across = lag
     assert result[middle + down, middle + across] == pytest.approx(expected, abs=2e-6)
     assert result[middle - down, middle - across] == pytest.approx(expected, abs=2e-6)
-
-
-def test_a_correlation_is_the_covariance_over_the_variance() -> None:
-    """Of noise whose spectrum falls nowhere below a hundredth of its mean."""
-    lags = np.abs(np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1))
-    covariance = 3.0 * np.outer(0.4**lags, 0.5**lags)
-    np.testing.assert_allclose(correlation(covariance), covariance / 3.0, atol=1e-6)
 
 
 def test_the_least_power_is_a_hundredth_of_the_mean() -> None:
@@ -293,30 +283,6 @@ def test_scores_are_the_likelihoods_where_pixels_are_missing() -> None:
         assert abs((template * rough).sum() / energy**0.5 - exact) < 2.0 * CONVERGED
         # a part of the template is hidden
         assert 0.6 * worth.energy < energy < 1.02 * worth.energy
-
-
-def test_a_factor_is_that_of_the_covariance_of_the_used_pixels() -> None:
-    random = np.random.default_rng(4)
-    used = random.random((9, 11)) > 0.2
-    lags = np.abs(np.arange(-8, 9))
-    correlations = np.outer(0.6**lags, 0.7**lags)
-    error_m = np.where(used, 2e-4 * random.random(used.shape), np.nan)
-    factor = covariance_factor(used, correlations, 3e-4, error_m)
-    assert factor is not None
-    errors = 3e-4**2 + np.outer(error_m[used], error_m[used])
-    dense = reference.dense_covariance(used, correlations) * errors
-    product = np.tril(factor) @ np.tril(factor).T
-    np.testing.assert_allclose(product, dense, atol=1e-14 * dense.max())
-    assert covariance_factor(used, None, 3e-4, error_m) is None
-    assert covariance_factor(used, 0.0 * correlations, 3e-4, error_m) is None
-
-
-def test_too_many_pixels_have_no_factor() -> None:
-    white = np.eye(1)
-    for pixels, is_factored in ((MOST_WHITENED, True), (MOST_WHITENED + 1, False)):
-        used = np.ones((1, pixels), bool)
-        factor = covariance_factor(used, white, 1.0, np.zeros((1, pixels)))
-        assert (factor is not None) == is_factored
 
 
 @pytest.mark.parametrize(("across", "down"), [(1, 1), (3, 2), (2, 5)])

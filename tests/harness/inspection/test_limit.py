@@ -190,7 +190,11 @@ def test_sizes_go_down_until_few_are_found_and_up_until_nearly_all_are() -> None
     assert next_step({0: size(40)}) == -1
     assert next_step({0: size(10)}) == 1
     assert next_step({-1: size(10), 0: size(39)}) == 1
-    assert next_step({-1: size(10), 0: size(40)}) is None
+    # one mixed size determines no curve: sizes between what is missed and what is found
+    assert next_step({-1: size(10), 0: size(40)}) == -0.5
+    assert next_step({-1: size(10), -0.5: size(40), 0: size(40)}) == -0.75
+    assert next_step({-1: size(10), -0.5: size(20), 0: size(40)}) is None
+    assert next_step({-1: size(10), -0.85: size(40)}) is None
     # 4 pixels / 1.4^4 = 1.04 is the smallest size of a pixel and more
     assert next_step({-3: size(40)}) == -4
     assert next_step({-4: size(40)}) is None

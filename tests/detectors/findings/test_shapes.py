@@ -1,0 +1,220 @@
+"""The family of shapes against its plainly written reference, and averages of its fits by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from detectors.findings import hole_model_reference as reference
+from detectors.findings.family import (
+    BLURS,
+    DEPTH_ERROR,
+    DIAMETER_ERROR,
+    RADIUS_ERROR_PX,
+    ShapeFit,
+    Start,
+    averaged,
+    mixture,
+    sized,
+)
+from detectors.findings.hole_model import HoleFit, HolePatch, fit_hole, pictures, sight
+from detectors.findings.shapes import Shape
+
+EMITTER_M = np.array([-14e-3, 0.0, 1e-3])
+FRONTAL_PX_M = np.array([[1.4e-3, 0.0, 1e-4], [0.0, 1.5e-3, -2e-4]])
+OBLIQUE_PX_M = np.array([[1.4e-3, 0.0, 1.3e-3], [2e-4, 1.5e-3, 1e-4]])
+"""A surface turned by 43 degrees about the columns."""
+
+
+def patch_of(per_px_m: np.ndarray, noise_m: float = 1e-4) -> HolePatch:
+    shape = (36, 40)
+    viewpoint = sight(np.array([0.03, -0.02, 0.7]), per_px_m, EMITTER_M)
+    return HolePatch(
+        residual_m=np.zeros(shape),
+        used=np.ones(shape, bool),
+        metric_m2=per_px_m @ per_px_m.T,
+        blur_px=(4.5, 3.0),
+        noise_m=noise_m,
+        sights=viewpoint[None],
+    )
+
+
+def numbers_of(shape: Shape, depth_m: float = 5e-3) -> np.ndarray:
+    radius_m = 5e-3 if shape == "slot" else 12e-3
+    stretch = math.log(2.2) if shape == "slot" else 0.0
+    return np.array([19.3, 17.6, radius_m, depth_m, 0.5, stretch, 0.6])
+
+
+@pytest.mark.parametrize("per_px_m", [FRONTAL_PX_M, OBLIQUE_PX_M])
+@pytest.mark.parametrize("shape", ["cap", "bowl", "slot"])
+@pytest.mark.parametrize("depth_m", [5e-3, -3e-3])
+def test_a_picture_is_that_of_the_reference(
+    per_px_m: np.ndarray, shape: Shape, depth_m: float
+) -> None:
+    patch = patch_of(per_px_m)
+    numbers = numbers_of(shape, depth_m)
+    image_m = pictures(patch, numbers[None], shape)[0]
+    expected_m = reference.relief(patch, numbers, shape)
+    np.testing.assert_allclose(image_m, expected_m, atol=0.02 * abs(depth_m))
+    assert image_m.sum() == pytest.approx(expected_m.sum(), rel=0.015)
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume"),
+    [
+        ("cap", math.pi * 4.0 / 6.0 * (3.0 * 12.0**2 + 4.0**2)),
+        ("bowl", math.pi * 12.0**2 * 4.0 * (0.5 - 2.0 / math.pi**2)),
+        ("slot", 4.0 * 10.0 * 22.0),
+    ],
+)
+def test_a_frontal_picture_has_the_volume_of_the_solid(shape: Shape, volume: float) -> None:
+    """Volumes in mm3: of a spherical cap, of a raised cosine, and of a box."""
+    per_px_m = np.diag([1.4e-3, 1.5e-3, 0.0])[:2]
+    patch = replace(patch_of(per_px_m), sights=np.array([[1.0, 0, 0, 0, 0, 0, 1.0, 1.0]]))
+    image_m = pictures(patch, numbers_of(shape, 4e-3)[None], shape)[0]
+    assert image_m.sum() * 1.4e-3 * 1.5e-3 == pytest.approx(volume * 1e-9, rel=0.005)
+
+
+def test_a_soft_blur_has_the_second_moments_of_the_sharp_one() -> None:
+    patch = patch_of(FRONTAL_PX_M)
+    numbers = numbers_of("disc")[None]
+    numbers[0, 3] = -1e-3
+    rows, columns = np.indices(patch.used.shape)
+    moments = []
+    for soft in (False, True):
+        image = -pictures(replace(patch, soft=soft), numbers)[0]
+        across = np.average((columns - 19.3) ** 2, weights=image)
+        moments.append([across, np.average((rows - 17.6) ** 2, weights=image)])
+    np.testing.assert_allclose(moments[0], moments[1], rtol=0.02)
+
+
+@pytest.mark.parametrize("per_px_m", [FRONTAL_PX_M, OBLIQUE_PX_M])
+@pytest.mark.parametrize("shape", ["disc", "cap", "bowl", "slot"])
+def test_a_shape_is_recognised_and_its_size_lies_within_two_errors(
+    per_px_m: np.ndarray, shape: Shape
+) -> None:
+    truth = numbers_of(shape)
+    blank = patch_of(per_px_m)
+    draws = np.random.default_rng(7).standard_normal(blank.used.shape)
+    noise_m = cv2.blur(draws, (5, 3)) * math.sqrt(15.0) * 1e-4
+    seen_m = pictures(blank, truth[None], shape)[0] + noise_m
+    start = Start(
+        u_px=19.0,
+        v_px=18.0,
+        radius_m=9e-3,
+        depth_m=4.5e-3,
+        offset_m=0.0,
+        stretch=truth[5],
+        angle_rad=0.5,
+    )
+    patch = replace(blank, residual_m=seen_m)
+    size = sized(patch, start, ("disc", "cap", "bowl", "slot"), BLURS[:1])
+    assert size is not None and size.shape == shape
+    area = 4.0 / math.pi * math.exp(truth[5]) if shape == "slot" else 1.0
+    diameter_m = 2.0 * truth[2] * math.sqrt(area)
+    assert abs(size.diameter_m - diameter_m) < 2.0 * size.diameter_se_m < 0.2 * diameter_m
+    assert abs(size.depth_m - truth[3]) < 2.0 * size.depth_se_m < 0.3 * truth[3]
+    assert sum(size.weights.values()) == pytest.approx(1.0)
+
+
+def test_where_the_blur_hides_the_shape_the_error_contains_all() -> None:
+    """A hole as wide as the blur, in noise: a disc of 5.6 mm may be a bowl of 9."""
+    blank = patch_of(FRONTAL_PX_M, noise_m=3e-4)
+    truth = np.array([19.3, 17.6, 2.8e-3, 4e-3, 0.5, 0.0, 0.0])
+    draws = np.random.default_rng(3).standard_normal(blank.used.shape)
+    seen_m = pictures(blank, truth[None])[0] + cv2.blur(draws, (5, 3)) * math.sqrt(15.0) * 3e-4
+    start = Start(19.0, 18.0, 2.5e-3, 3e-3, 0.0, 0.0, 0.0)
+    patch = replace(blank, residual_m=seen_m)
+    size = sized(patch, start, ("disc", "cap", "bowl"), BLURS[:1])
+    assert size is not None
+    assert sum(weight > 0.05 for weight in size.weights.values()) >= 2
+    alone = sized(patch, start, ("disc",), BLURS[:1])
+    assert alone is not None
+    assert size.diameter_se_m > 1.5 * alone.diameter_se_m
+
+
+def test_a_mixture_has_the_variance_within_and_between() -> None:
+    mean, deviation = mixture(np.array([0.75, 0.25]), np.array([4.0, 8.0]), np.array([1.0, 2.0]))
+    assert mean == pytest.approx(5.0)
+    assert deviation**2 == pytest.approx(0.75 * (1.0 + 1.0) + 0.25 * (2.0 + 9.0))
+
+
+def fit_of(shape: Shape, chi_square: float, **changes: float) -> HoleFit:
+    covariance = np.zeros((8, 8))
+    covariance[2, 2] = 1e-8
+    covariance[3, 3] = 4e-8
+    covariance[6, 6] = 1e-4
+    fit = HoleFit(
+        u_px=0.0,
+        v_px=0.0,
+        radius_m=6e-3,
+        depth_m=4e-3,
+        offset_m=0.0,
+        wall=0.5,
+        covariance=covariance,
+        converged=True,
+        shape=shape,
+        chi_square=chi_square,
+        independent=50.0,
+    )
+    return replace(fit, **changes)
+
+
+def test_weights_are_priors_times_the_evidence() -> None:
+    """Equal numbers of parameters: exp(-BIC / 2) is chi square to the power -n / 2."""
+    patch = patch_of(FRONTAL_PX_M)
+    disc = ShapeFit(fit_of("disc", 52.0), patch)
+    cap = ShapeFit(fit_of("cap", 50.0), patch, loss=2.0)
+    size = averaged([disc, cap])
+    ratio = 0.7 / 0.15 * (50.0 / 52.0) ** 25.0 * math.e
+    assert size.weights["disc"] / size.weights["cap"] == pytest.approx(ratio)
+
+
+def test_errors_are_those_of_the_fit_of_what_it_leaves_and_of_the_model() -> None:
+    patch = replace(patch_of(FRONTAL_PX_M), metric_m2=np.diag([1e-6, 4e-6]), blur_px=(2.0, 1.5))
+    # residuals have twice the noise's variance; pi 36 / 2 pixels lie inside, a third independent
+    slack = ShapeFit(fit_of("disc", 100.0), patch)
+    inside = math.pi * 36.0 / 2.0 / 3.0
+    raised = 1.0 + inside * 0.5
+    assert slack.raised == pytest.approx(raised)
+    edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * 2.5e-6
+    expected_m2 = raised * 4e-8 + edge_m2 + (DIAMETER_ERROR["disc"] * 12e-3) ** 2
+    assert slack.diameter_variance_m2 == pytest.approx(expected_m2)
+    assert slack.depth_variance_m2 == pytest.approx(raised * 4e-8 + (DEPTH_ERROR * 4e-3) ** 2)
+    assert ShapeFit(fit_of("disc", 40.0), patch).raised == 1.0
+
+
+def test_a_slot_s_diameter_is_that_of_the_circle_with_its_area() -> None:
+    patch = patch_of(FRONTAL_PX_M)
+    slot = ShapeFit(fit_of("slot", 50.0, stretch=math.log(3.0)), patch)
+    size = averaged([slot])
+    diameter_m = math.sqrt(4.0 / math.pi * 12e-3 * 36e-3)
+    assert size.diameter_m == pytest.approx(diameter_m)
+    edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * np.trace(patch.metric_m2) / 2.0
+    fitted_m2 = (diameter_m / 6e-3) ** 2 * 1e-8 + (diameter_m / 2.0) ** 2 * 1e-4
+    expected_m2 = fitted_m2 + edge_m2 + (DIAMETER_ERROR["slot"] * diameter_m) ** 2
+    assert size.diameter_se_m**2 == pytest.approx(expected_m2)
+
+
+def test_a_slot_s_angle_and_length_are_fitted() -> None:
+    patch = patch_of(FRONTAL_PX_M)
+    truth = numbers_of("slot")
+    seen_m = pictures(patch, truth[None], "slot")[0]
+    fit = fit_hole(
+        replace(patch, residual_m=seen_m),
+        19.0,
+        18.0,
+        4e-3,
+        4e-3,
+        0.0,
+        shape="slot",
+        stretch=0.5,
+        angle_rad=0.4,
+    )
+    assert fit.converged
+    np.testing.assert_allclose(fit.numbers[[0, 1, 6]], truth[[0, 1, 6]], atol=0.02)
+    np.testing.assert_allclose(fit.numbers[[2, 3, 5]], truth[[2, 3, 5]], rtol=0.02)
