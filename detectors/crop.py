@@ -188,6 +188,9 @@ class Choice:
     """(h, w) bool: valid pixels inside its outline."""
     grid: Cloud
     """The cloud, or its raster."""
+    part: np.ndarray | None = None
+    """(h, w) bool: valid pixels of the whole target, its rim and its faces included; None for a
+    cloud without a pixel grid."""
     warnings: tuple[str, ...] = ()
     """Doubts about the choice."""
 
@@ -204,6 +207,11 @@ def described_text(candidate: Candidate) -> str:
         f" {length_m / MM:.0f} x {width_m / MM:.0f} mm, {share} % of the view,"
         f" tilted by {candidate.tilt_deg:.0f} degrees"
     )
+
+
+def _size_text(candidate: Candidate) -> str:
+    length_m, width_m = candidate.extent_m
+    return f"{length_m / MM:.0f} x {width_m / MM:.0f} mm at {candidate.depths_m[1]:.2f} m"
 
 
 # --- the comparison of candidates ---
@@ -289,7 +297,8 @@ class _Comparison:
         facing = cosine / max(math.cos(math.radians(that.tilt_deg)), 1e-2)
         nearness = that.depths_m[1] / max(this.depths_m[1], 1e-6)
         probability = _probability(weight**0.5 * facing**2 * nearness)
-        return probability, "two surfaces are about as large and as near"
+        why = f"a surface of {_size_text(that)} may be the target instead of that of {_size_text(this)}"
+        return probability, why
 
     def _in_front(self, front: int, back: int) -> tuple[float, str] | None:
         """Return the probability that ``front`` rather than ``back`` is the target, and the reason
@@ -325,9 +334,12 @@ class _Comparison:
         That is a surface which is a better target, or too far away to lie on it, with all nearer
         pixels that join it (fingers of a hand); an object on it stays."""
         surfaces = self.surfaces
-        outline = self.described[number].outline
-        for radius_px in NOTCHES_PX:
-            outline = notches_filled(outline, radius_px)
+        outline = np.zeros(surfaces.own[number].shape, dtype=bool)
+        # what stands between two pieces of a surface is no notch
+        for piece in _pieces(self.described[number].outline):
+            for radius_px in NOTCHES_PX:
+                piece = notches_filled(piece, radius_px)
+            outline |= piece
         for neighbour in self.numbers:
             border = self.borders[neighbour].get(number)
             if border is None or not border.is_step or not self.encloses(number, neighbour):
@@ -341,6 +353,12 @@ class _Comparison:
                 standing = parts_with(joined, surfaces.own[neighbour])
                 outline = outline & ~grown(standing, surfaces.reach_px)
         return outline
+
+
+def _pieces(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the connected parts of a mask (h, w)."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    return [labels == label for label in range(1, count)]
 
 
 def _probability(odds_base: float) -> float:
@@ -538,12 +556,14 @@ def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
 
 
 def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
+    part = None
     if cloud.organised:
         surfaces = smooth_surfaces(cloud, config.crease_deg, config.smooth_px)
         candidates, doubts = _candidates(surfaces, cloud)
         taken = _taken(candidates, config.target)
         grid = cloud
-        mask = inset(_inside(candidates, taken, cloud), config.inset_px)
+        part = _inside(candidates, taken, cloud)
+        mask = inset(part, config.inset_px)
     else:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
         smooth_px = max(3, 2 * round(config.smooth_px / spacings / 2) - 1)
@@ -561,6 +581,7 @@ def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
         taken=taken,
         mask=mask,
         grid=grid,
+        part=part,
         warnings=() if config.target else tuple(doubts),
     )
 

@@ -166,7 +166,14 @@ def test_two_surfaces_apart_are_compared_by_weight_tilt_and_nearness() -> None:
     assert probability == pytest.approx(odds / (1 + odds), rel=1e-6)
     assert facing > 1.1
     assert this.weight < 0.9 * that.weight
-    assert why == "two surfaces are about as large and as near"
+    sizes = [
+        f"{candidate.extent_m[0] * 1e3:.0f} x {candidate.extent_m[1] * 1e3:.0f} mm"
+        for candidate in (that, this)
+    ]
+    expected = (
+        f"a surface of {sizes[0]} at 0.90 m is about as likely as that of {sizes[1]} at 0.60 m"
+    )
+    assert why == expected
 
 
 # ---------------------------------------------------------------- scenes of all kinds
