@@ -36,6 +36,7 @@ import numpy as np
 
 from detectors.findings import templates, whitening
 from detectors.findings.missing import missing_evidence
+from detectors.interface import Evidence
 from detectors.methods import local
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.methods.scatter import FAINT, WIDE_PX, evened, tail_of, zones_of

@@ -133,7 +133,8 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
         return noted(compared[0], "as only its number of false calls is known")
     reach_px = cloud.noise_reach_px
     if reach_px == 0.0:
-        reach_px = reach_of_one(first.evidence.residual_m, cloud.z_step_m)
+        # a map, or frames that do not show it: what residuals share, with contours of rounding
+        reach_px = reach_of_one(first.evidence.residual_m, 0.0)
     sought = _sought(compared, cloud, reach_px)
     if sought is None:
         return noted(first, "as the target has no place for implanted holes")

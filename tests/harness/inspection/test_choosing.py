@@ -11,6 +11,8 @@ import pytest
 from detectors import load_detector
 from detectors.interface import Detection, Evidence
 from detectors.methods.part import part_of_cloud, part_of_evidence
+from detectors.surfaces.background import Background, background
+from detectors.surfaces.surface import SurfaceConfig
 from harness.inspection import arguments as cli
 from harness.inspection.choosing import Contender, _is_better, candidate_of, chosen
 from harness.testing.synthetic_clouds import plane
@@ -43,6 +45,23 @@ def test_the_same_residuals_have_the_same_scores(name: str, cloud: Cloud) -> Non
     deeper = detector.rescored(cloud, evidence, deeper_m)
     inside = np.s_[row : row + 6, column : column + 6]
     assert np.nanmin(deeper.score[inside]) > 3.0 * np.nanmax(evidence.score[inside])
+
+
+def test_candidates_share_one_fit_of_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    fits = []
+
+    def counted(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
+        fits.append(config)
+        return background(cloud, mask, config)
+
+    monkeypatch.setattr("detectors.surfaces.shared.background", counted)
+    fresh = plane(seed=6)
+    for name in cli.CANDIDATES:
+        load_detector(name, SETTINGS).analyse(fresh)
+    assert len(fits) == 1
+    other = {**SETTINGS, "surface": {"shape": "polynomial", "degree": 2}}
+    load_detector("local", other).analyse(fresh)
+    assert len(fits) == 2
 
 
 @pytest.mark.parametrize("name", cli.CANDIDATES)
