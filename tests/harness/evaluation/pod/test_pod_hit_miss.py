@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from harness.evaluation.pod import hit_miss
 from harness.evaluation.pod.curve import LINKS, HitsAndMisses, link_cdf, link_ppf, profile
 from harness.evaluation.pod.hit_miss import (
     _metric_root,
+    _rising_curves,
     _search,
     band,
     bound,
@@ -23,6 +25,8 @@ from harness.evaluation.pod.hit_miss import (
     criterion,
     fit_hit_miss,
     floor_ceiling_tests,
+    largest_bound,
+    rows_of_target,
     value_and_gradient,
 )
 from harness.vocabulary.errors import UserError
@@ -227,6 +231,25 @@ def test_the_band_of_a_small_study_holds_all_curves_of_the_likelihood_ratio_set(
     assert high == pytest.approx(link_cdf(link, predictors.max(axis=0)), abs=0.02)
 
 
+def test_the_largest_bound_is_over_models_with_their_effects() -> None:
+    sizes, hits = simulated(60, seed=5)
+    fits = [fit_hit_miss(sizes, hits, link=link) for link in ("logit", "cloglog", "loglog")]
+    alone = [bound(fit).value for fit in fits]
+    assert largest_bound(fits).value == max(alone)
+    narrow = int(np.argmin(alone))
+    effects = [6.0 if number == narrow else 1.0 for number in range(3)]
+    widened = bound(fits[narrow], design_effect=6.0).value
+    assert largest_bound(fits, effects).value == max(widened, *alone)
+    assert widened > max(alone)
+
+
+def test_rows_of_a_target_are_counted_wherever_they_stand() -> None:
+    sizes = np.array([1.0, 2.0, 1.0, 3.0, 1.0])
+    assert rows_of_target(sizes, ["a", "b", "a", "c", "a"]).tolist() == [3, 1, 3, 1, 3]
+    assert rows_of_target(sizes, [7, 8, 7, 9, 7]).tolist() == [3, 1, 3, 1, 3]
+    assert rows_of_target(sizes, None).tolist() == [1] * 5
+
+
 def test_a_band_in_blocks_of_curves_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory for less than one curve is memory for one curve at a time."""
     fit = fit_hit_miss(*simulated(60, seed=5))
@@ -425,6 +448,63 @@ def test_the_search_finds_the_best_of_many_random_starts(seed: int) -> None:
     plain = fit_hit_miss(sizes, hits).maximum
     likelihood = _search(data, plain, (0.0, 0.5), (0.5, 1.0))[1]
     assert -likelihood <= min(losses) + 5e-5
+
+
+@pytest.mark.parametrize(("seed", "repeats"), [(12, 1), (8, 3), (13, 1)])
+def test_p_values_of_floor_and_ceiling_are_those_of_the_mixtures(seed: int, repeats: int) -> None:
+    """The likeliest four-parameter curves by a search of their own; repeats of a target that all
+    agree change nothing."""
+    sizes, hits = simulated(120, seed, floor=0.1, ceiling=0.88)
+    names = np.repeat(np.arange(120), repeats)
+    fit = fit_hit_miss(np.repeat(sizes, repeats), np.repeat(hits, repeats), inspections=names)
+    data = standardised(sizes, hits, "logit")
+    ranges = {
+        "floor": ((0.0, 0.5), (1.0, 1.0)),
+        "ceiling": ((0.0, 0.0), (0.5, 1.0)),
+        "both": ((0.0, 0.5), (0.5, 1.0)),
+    }
+    needed = []
+    for test in floor_ceiling_tests(fit):
+        floor, ceiling = ranges[test.beyond]
+        losses = []
+        for start in product((-1.0, 0.0, 1.0), (2.0, 10.0, 50.0), (0.0, 0.1), (0.9, 1.0)):
+            begin = np.array(start)
+            begin[0] *= begin[1]
+            begin[2:] = np.clip(begin[2:], [floor[0], ceiling[0]], [floor[1], ceiling[1]])
+            end = optimize.minimize(
+                lambda curve: tuple(-part for part in value_and_gradient(data, curve)),
+                begin,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=((-1e3, 1e3), (1e-6, 1e3), floor, ceiling),
+                options={"ftol": 1e-14, "gtol": 1e-9},
+            )
+            losses.append(end.fun)
+        statistic = 2 * (-min(losses) - fit.log_likelihood / repeats)
+        one, two = stats.chi2.sf(statistic, [1, 2])
+        expected = 0.5 * one + 0.25 * two if test.beyond == "both" else 0.5 * one
+        if statistic < 1e-6:  # neither fits better
+            expected = 1.0
+        else:
+            needed.append(test.beyond)
+        assert test.p_value == pytest.approx(expected, rel=2e-3)
+    assert needed == {12: ["floor", "both"]}.get(seed, ["ceiling", "both"])
+
+
+def test_rising_curves_cover_quantiles_the_middle_and_steps() -> None:
+    """Four widths about 16 quantiles and about the plain curve's middle, and a step between
+    neighbours that rises by 6 from one to the other; none is steeper than a thousand."""
+    z = np.array([0.0, 1.0, 3.0, 3.001, 1.0])
+    curves = _rising_curves(z, np.array([-5.0, 2.0]))
+    assert len(curves) == 17 * 4 + 3
+    slopes = curves[:, 1]
+    middles = -curves[:, 0] / np.array([*np.tile([2.0, 6.0, 24.0, 100.0], 17), 6.0, 3.0, 6000.0])
+    quantiles = np.quantile(z, np.linspace(0.04, 0.96, 16))
+    assert middles[:64:4] == pytest.approx(quantiles)
+    assert middles[64:68] == pytest.approx([2.5] * 4)
+    assert slopes[:8].tolist() == [2.0, 6.0, 24.0, 100.0] * 2
+    assert middles[68:] == pytest.approx([0.5, 2.0, 3.0005])
+    assert slopes[68:].tolist() == [6.0, 3.0, 1000.0]
 
 
 @pytest.mark.slow
