@@ -546,3 +546,28 @@ def test_views_need_a_tenth_of_overlap(columns_apart: float, share: int) -> None
     judged = register.judge(registration, reference, view)
     too_few = f"the views do not overlap: {share} % of the view lies beside"
     assert judged.failure.startswith(too_few) == (share < 10)
+
+
+def test_a_judged_view_s_covariance_gains_what_it_does_not_explain_across() -> None:
+    """Two planes 1.5 mm apart, with 0.1 mm of noise; the covariance states 0.2 mm across and 1 mm
+    within each axis of the surface."""
+    grid = np.stack(np.meshgrid(np.arange(60), np.arange(50)), axis=-1).reshape(-1, 2) * 1e-3
+    points = np.column_stack([grid, np.full(len(grid), 0.8)])
+    random = np.random.default_rng(17)
+    reference = view_of(points + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
+    apart = np.array([0.0, 0.0, 1.5e-3])
+    view = view_of(points + apart + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
+    covariance = np.diag([0.0, 0.0, 0.0, 1e-6, 1e-6, 4e-8])
+    registration = registered.Registration(
+        "v", "icp", np.eye(4), covariance=covariance, centre_m=points.mean(axis=0)
+    )
+    judged = register.judge(registration, reference, view)
+    assert judged.failure == ""
+    assert judged.overlap < 0.1
+    # the median size over 0.6745
+    apart_m2 = (1.5e-3 / 0.6745) ** 2
+    noise_m2 = registered.sampling_of(reference).noise_m ** 2
+    noise_m2 += registered.sampling_of(view).noise_m ** 2
+    gained_m2 = (judged.covariance - covariance)[5, 5]
+    assert gained_m2 == pytest.approx(apart_m2 - noise_m2 - 4e-8, rel=0.02)
+    np.testing.assert_allclose((judged.covariance - covariance)[:5, :5], 0.0, atol=1e-9)
