@@ -321,7 +321,9 @@ def ply_text(points: int) -> str:
     return f"ply\nformat ascii 1.0\nelement vertex {points}\n{properties}end_header\n"
 
 
-@pytest.mark.parametrize(("suffix", "header"), [(".pcd", pcd_text(50)), (".ply", ply_text(50))])
+@pytest.mark.parametrize(
+    ("suffix", "header"), [(".pcd", pcd_text(50)), (".ply", ply_text(50))], ids=["pcd", "ply"]
+)
 def test_a_text_cloud_has_a_digit_and_a_separator_for_each_number(tmp_path, suffix, header) -> None:
     """The shortest file of 50 points ends without a separator; one byte less is a truncated one."""
     lines = "\n".join(f"{i % 2} {i // 25} 5" for i in range(50))

@@ -121,6 +121,28 @@ def test_two_spots_of_a_weak_colour_are_no_measure_for_the_others() -> None:
     assert all("fewer than 3" in mark.doubt for mark in marks.marks if mark.doubt)
 
 
+@pytest.mark.parametrize(("hole", "is_kept"), [((36, 23), True), ((44, 33), False)])
+def test_a_colour_most_of_whose_area_lies_behind_is_that_of_holes(hole, is_kept) -> None:
+    """Four flat spots of 1092 pixels in all, and a hole of the same colour, 10 mm deep, with 43 or
+    57 % of their area."""
+    flat = [within(u, v, 22, 14) for u, v in FOUR]
+    deep = within(100, 80, *hole)
+    rgb = plain_board()
+    coloured = np.zeros(deep.shape, bool)
+    for mask in (*flat, deep):
+        rgb[mask] = (200.0, 60.0, 60.0)
+        coloured |= mask
+    cloud = pictured(rgb)
+    points = cloud.points_m.copy()
+    points[deep] *= 0.71 / 0.7
+    marks = _marks(replace(cloud, points_m=points), cloud.valid, coloured, "")
+    assert len(marks.marks) == (4 if is_kept else 0)
+    count = 1 if is_kept else 5
+    assert marks.notes == (
+        f"{count} spots of another colour lie behind the surface and count as holes, not marks",
+    )
+
+
 BLOB = Blob(
     pixels=np.arange(300),
     weights=np.r_[np.ones(250), np.full(50, 0.4)],

@@ -3,11 +3,16 @@ colour."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
+from scipy import stats
 
 from detectors.views.marks.blobs import (
+    CORE,
+    CORE_SHRINKS,
     FALSE_RATE,
+    GAUSSIAN_LIMITS,
     above_half,
     centroid_covariance_px2,
     chromaticity,
@@ -175,3 +180,79 @@ def test_what_is_smeared_around_a_mark_is_not_of_it():
     expected = np.zeros((40, 40), bool)
     expected[15:25, 15:25] = True
     np.testing.assert_array_equal(kept, expected)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2])
+def test_the_bulk_and_the_limit_are_those_of_a_gaussian(dimensions: int) -> None:
+    """Squared distances are chi square; its innermost part has a smaller mean."""
+    innermost = stats.chi2.ppf(CORE, dimensions)
+    shrinks = stats.chi2.cdf(innermost, dimensions + 2) / CORE
+    assert CORE_SHRINKS[dimensions] == pytest.approx(shrinks, rel=1e-3)
+    limit = stats.chi.isf(FALSE_RATE, dimensions)
+    assert GAUSSIAN_LIMITS[dimensions] == pytest.approx(limit, rel=1e-4)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2])
+def test_the_contrast_is_in_deviations_and_the_margin_in_limits(dimensions: int) -> None:
+    """Of correlated Gaussian colours over a bend of the light: squared contrasts are chi square,
+    and the margin is their root over the limit. 4096 pixels tell a deviation to 2 %."""
+    random = np.random.default_rng(6)
+    xy = random.uniform(-1.0, 1.0, (40_000, 2))
+    root = np.array([[0.02, 0.0], [0.015, 0.01]])[:dimensions, :dimensions]
+    own = random.standard_normal((40_000, dimensions)) @ root.T
+    features = own + 0.3 + 0.1 * xy[:, :1] - 0.2 * xy[:, :1] * xy[:, 1:]
+    contrast, margin = stand_out(features, np.full(40_000, 1e-9), xy)
+    for share in (0.25, 0.5, 0.9):
+        expected = stats.chi.ppf(share, dimensions)
+        assert np.quantile(contrast, share) == pytest.approx(expected, rel=0.05)
+    ratio = margin / contrast
+    np.testing.assert_allclose(ratio, ratio[0])
+    # the tail's shape is extrapolated from quantiles, and never below the Gaussian's
+    assert 0.7 / GAUSSIAN_LIMITS[dimensions] < ratio[0] <= 1.0001 / GAUSSIAN_LIMITS[dimensions]
+    # where whole counts make four times the variance, twice the deviation is needed
+    rounding = np.where(xy[:, 0] > 0.5, 4e-9, 1e-9)
+    dark_contrast, dark_margin = stand_out(features, rounding, xy)
+    dark = dark_contrast / dark_margin
+    assert np.median(dark[xy[:, 0] > 0.5]) == pytest.approx(
+        2.0 * np.median(dark[xy[:, 0] < 0.5]), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("kind", ["turned rectangle", "rectangle", "ellipse"])
+def test_a_region_s_error_is_the_mean_over_outlines_and_shifts(kind: str) -> None:
+    """Beside the points of the lattice within each outline, counted one by one: outlines of five
+    sizes up to a pixel larger, turned by a third of a pixel over their length."""
+    if kind == "ellipse":
+        v, u = np.mgrid[-12:13, -12:13]
+        pixels = np.stack([u, v], axis=-1)[(u / 11.3) ** 2 + (v / 6.2) ** 2 < 1].astype(float)
+        outline = cv2.convexHull(pixels.astype(np.float32))[:, 0].astype(float)
+    else:
+        turn_deg = 20.0 if kind == "turned rectangle" else 0.0
+        pixels = lattice_within(rectangle(23.2, 8.4, turn_deg))
+        middle, size, angle = cv2.minAreaRect(pixels.astype(np.float32))
+        outline = cv2.boxPoints((middle, (size[0] + 1, size[1] + 1), angle)).astype(float)
+    following = np.roll(outline, -1, axis=0)
+    cross = outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]
+    if cross.sum() < 0:
+        outline = outline[::-1]
+    area = abs(cross.sum()) / 2
+    outline = outline * np.sqrt(len(pixels) / area)
+    outline -= (outline.max(axis=0) + outline.min(axis=0)) / 2
+    extent = np.ptp(outline, axis=0)
+    errors = []
+    for step in range(5):
+        larger = 1.0 + np.array([step, 2 * step % 5]) / 5 / extent
+        for turn in (-1 / 3, 0.0, 1 / 3):
+            angle = turn / extent.max()
+            axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            polygon = outline * larger @ axes
+            ahead = np.roll(polygon, -1, axis=0)
+            products = polygon[:, 0] * ahead[:, 1] - polygon[:, 1] * ahead[:, 0]
+            centre = ((polygon + ahead) * products[:, None]).sum(axis=0) / (3 * products.sum())
+            for across in range(0, 12, 3):
+                for down in range(0, 12, 3):
+                    shift = (np.array([across, down]) + 0.5) / 12
+                    errors.append(lattice_within(polygon - centre + shift).mean(axis=0) - shift)
+    # every third shift along each axis; all shifts differ from these by some per cent
+    expected = np.mean(np.square(errors), axis=0)
+    np.testing.assert_allclose(np.diag(region_covariance_px2(pixels)), expected, rtol=0.2)

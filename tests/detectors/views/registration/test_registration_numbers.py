@@ -270,6 +270,9 @@ def test_a_plane_through_points_faces_the_camera() -> None:
     centre, found_normal = registered.plane_through(plane[:2])
     np.testing.assert_allclose(found_normal, [0.0, 0.0, -1.0])
     np.testing.assert_allclose(centre, plane[:2].mean(axis=0))
+    centre, found_normal = registered.plane_through(np.empty((0, 3)))
+    np.testing.assert_array_equal(centre, np.zeros(3))
+    np.testing.assert_array_equal(found_normal, [0.0, 0.0, -1.0])
 
 
 def gridded(noise_m: float, tilt: float, lens: Lens, step_m: float = 0.0) -> PreparedView:
@@ -526,3 +529,45 @@ def test_the_normal_equations_are_those_of_numerical_derivatives() -> None:
     np.testing.assert_allclose(matrix / size, expected / size, atol=1e-5)
     slope = -jacobian.T @ weight @ residuals
     np.testing.assert_allclose(right, slope, atol=1e-4 * np.abs(slope).max(), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("columns_apart", "share"), [(91.5, 9), (89.5, 11)])
+def test_views_need_a_tenth_of_overlap(columns_apart: float, share: int) -> None:
+    """Views of 100 x 20 points in steps of 1 mm: so many columns of one lie within a step of the
+    other."""
+    grid = np.stack(np.meshgrid(np.arange(100), np.arange(20)), axis=-1).reshape(-1, 2) * 1e-3
+    points = np.column_stack([grid, np.full(len(grid), 0.8)])
+    points[:, 2] += 1e-4 * np.random.default_rng(16).standard_normal(len(points))
+    reference = view_of(points)
+    view = view_of(points + np.array([1e-3 * columns_apart, 0.0, 0.0]))
+    registration = registered.Registration(
+        "v", "icp", np.eye(4), covariance=1e-10 * np.eye(6), centre_m=points.mean(axis=0)
+    )
+    judged = register.judge(registration, reference, view)
+    too_few = f"the views do not overlap: {share} % of the view lies beside"
+    assert judged.failure.startswith(too_few) == (share < 10)
+
+
+def test_a_judged_view_s_covariance_gains_what_it_does_not_explain_across() -> None:
+    """Two planes 1.5 mm apart, with 0.1 mm of noise; the covariance states 0.2 mm across and 1 mm
+    within each axis of the surface."""
+    grid = np.stack(np.meshgrid(np.arange(60), np.arange(50)), axis=-1).reshape(-1, 2) * 1e-3
+    points = np.column_stack([grid, np.full(len(grid), 0.8)])
+    random = np.random.default_rng(17)
+    reference = view_of(points + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
+    apart = np.array([0.0, 0.0, 1.5e-3])
+    view = view_of(points + apart + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
+    covariance = np.diag([0.0, 0.0, 0.0, 1e-6, 1e-6, 4e-8])
+    registration = registered.Registration(
+        "v", "icp", np.eye(4), covariance=covariance, centre_m=points.mean(axis=0)
+    )
+    judged = register.judge(registration, reference, view)
+    assert judged.failure == ""
+    assert judged.overlap < 0.1
+    # the median size over 0.6745
+    apart_m2 = (1.5e-3 / 0.6745) ** 2
+    noise_m2 = registered.sampling_of(reference).noise_m ** 2
+    noise_m2 += registered.sampling_of(view).noise_m ** 2
+    gained_m2 = (judged.covariance - covariance)[5, 5]
+    assert gained_m2 == pytest.approx(apart_m2 - noise_m2 - 4e-8, rel=0.02)
+    np.testing.assert_allclose((judged.covariance - covariance)[:5, :5], 0.0, atol=1e-9)
