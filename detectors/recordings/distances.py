@@ -146,7 +146,7 @@ def _is_beyond(stored: np.ndarray, scale_m: float) -> np.ndarray:
     # where most are aside, the cloud is in another frame, which `refuse_far_aside` says
     seen = is_aside[np.isfinite(across) & (points[..., 2] > 0)]
     is_other_frame = seen.size > 0 and seen.mean() > 0.5
-    return is_large if is_other_frame else np.asarray(is_large | is_aside)
+    return np.asarray(is_large if is_other_frame else is_large | is_aside)
 
 
 SHARED_CODE = 20  # pixels that must share a number before it can be a full scale

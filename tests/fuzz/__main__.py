@@ -7,6 +7,7 @@ import argparse
 import sys
 import tempfile
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 from tests.fuzz.bases import written_bases
@@ -46,11 +47,13 @@ def main() -> int:
     numbers = range(arguments.first, arguments.first + arguments.count)
     with tempfile.TemporaryDirectory() as home:
         base = written_bases(arguments.bases or Path(home) / "bases")
-        for end in tried(base, numbers, arguments.seed, arguments.only):
-            ends.append(end)
-            if end.state == "traceback":
-                print(f"input {end.number}: tofpod {end.program} {' '.join(end.words)}")
-                print(end.text, flush=True)
+        # Ctrl-C ends the run, and what was counted until then is printed
+        with suppress(KeyboardInterrupt):
+            for end in tried(base, numbers, arguments.seed, arguments.only):
+                ends.append(end)
+                if end.state == "traceback":
+                    print(f"input {end.number}: tofpod {end.program} {' '.join(end.words)}")
+                    print(end.text, flush=True)
     print(table(ends))
     return int(any(end.state == "traceback" for end in ends))
 
