@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Each of the many processes that tests start would compile all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: sweep test test-all lint smoke validate check benchmarks strangers mutants docs lock clean
+.PHONY: sweep test test-all lint smoke validate check benchmarks strangers fuzz mutants docs lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
@@ -36,6 +36,10 @@ benchmarks: .venv/.ready
 # Recordings of many kinds of scene with known truth, answered by the default command: right, warned or wrong.
 strangers: .venv/.ready
 	OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m tests.strangers
+
+# Malformed inputs for all programs: each is refused with one message or answered, and none ends in a traceback.
+fuzz: .venv/.ready
+	OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m tests.fuzz --count 2000 --seed 1
 
 # Small faults of the numeric modules, which the tests of their rooms must notice; hours. `python -m tests.mutants --help`.
 mutants: .venv/.ready

@@ -1,5 +1,5 @@
-"""Whether a flat field belongs to a capture: not if it was made from the capture's own frames, and
-not if it holds no pattern of this camera.
+"""The test of a flat field against a capture. They do not belong together if it was made from the
+capture's own frames, or if it holds no pattern of this camera.
 
 A capture is the unit's pattern, the surface's shape and noise of its own; a flat field is the
 pattern and noise of other frames. After the correction at least the capture's own noise remains,

@@ -292,7 +292,7 @@ def _read_list(path: Path, lens: Lens | None) -> Points:
     # a first line of one or two whole numbers states how many points follow
     first = (_numbers(lines[skipped]) or []) if skipped < len(lines) else []
     size = []
-    if len(first) in (1, 2) and all(value == int(value) >= 1 for value in first):
+    if len(first) in (1, 2) and all(value >= 1 and value.is_integer() for value in first):
         size = [int(value) for value in first]
     names_end = skipped
     skipped += bool(size)

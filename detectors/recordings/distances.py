@@ -20,6 +20,11 @@ FARTHEST_M = 20.0
 """Bounds of a plausible median distance: no time-of-flight camera works nearer or sees farther."""
 FARTHEST_ASIDE = 4.0
 """Largest ratio of the median point's distance from the axis to its z: 76 degrees."""
+LARGEST_M = 1e7
+"""Largest number, as metres, that is a distance in any unit; larger ones overflow later."""
+SIDEMOST = 20.0
+"""The same ratio for a single point: no lens sees 87 degrees aside, and few such points would
+stretch the picture until it does not fit into memory."""
 RAYS_TELL = 3.0
 """Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a
 pipe's up to 2."""
@@ -81,6 +86,11 @@ def frame_of(
         is_code = stored_z == code
         reason[is_code] = Reason.NO_RETURN
         notes.append(f"{code:.10g} is read as no return, {100 * is_code.mean():.2g} % of pixels")
+    is_beyond = _is_beyond(stored, scale_m) & (reason == Reason.VALID)
+    if is_beyond.any():
+        reason[is_beyond] = Reason.OUT_OF_RANGE
+        share = f"{100 * is_beyond.mean():.2g} % of pixels"
+        notes.append(f"numbers that are no place before a camera are left out, {share}")
     valid = reason == Reason.VALID
     behind = (stored_z < 0) & valid
     behind_count = behind.sum()
@@ -121,6 +131,22 @@ def frame_of(
         amplitude=amplitude,
         notes=tuple(notes),
     )
+
+
+def _is_beyond(stored: np.ndarray, scale_m: float) -> np.ndarray:
+    """Return where depth (h, w) or points (h, w, 3) are too large for a distance, or too far aside
+    for any lens."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        if stored.ndim == 2:
+            return np.abs(stored.astype(np.float64)) > LARGEST_M / scale_m
+        points = np.abs(stored.astype(np.float64))
+        across = np.hypot(points[..., 0], points[..., 1])
+        is_large = (points > LARGEST_M / scale_m).any(axis=-1)
+        is_aside = across > SIDEMOST * points[..., 2]
+    # where most are aside, the cloud is in another frame, which `refuse_far_aside` says
+    seen = is_aside[np.isfinite(across) & (points[..., 2] > 0)]
+    is_other_frame = seen.size > 0 and seen.mean() > 0.5
+    return np.asarray(is_large if is_other_frame else is_large | is_aside)
 
 
 SHARED_CODE = 20  # pixels that must share a number before it can be a full scale

@@ -1,6 +1,7 @@
 """The user's mistakes: one clear message and exit code 2. Any other exception is a bug and keeps
 its traceback."""
 
+import errno
 import io
 import os
 import select
@@ -10,6 +11,8 @@ import threading
 from collections.abc import Callable
 from functools import partial
 
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Error numbers of a place that takes no more: a full disk or device, a quota, a file's limit."""
 CLOSED_PIPE = 141  # Exit code that a shell reports when SIGPIPE ends a program: 128 + 13
 
 
@@ -39,8 +42,8 @@ class DiskFull(UserError):
 
 def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body and return its exit code. A UserError gives one message on stderr and
-    code 2, Ctrl-C gives 130, and a closed output pipe (``| head``) silently gives 141. Further
-    Ctrl-C are ignored during the shutdown."""
+    code 2, as does a standard output that is full. Ctrl-C gives 130, and a closed output pipe
+    (``| head``) silently gives 141. Further Ctrl-C are ignored during the shutdown."""
     owns_interrupt = threading.current_thread() is threading.main_thread()
     owns_interrupt = (
         owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -65,6 +68,14 @@ def exit_code_of(program: Callable[[], int]) -> int:
         if not _nobody_reads():
             raise
         return CLOSED_PIPE
+    except OSError as error:
+        if error.errno not in FULL or not _is_output_full():
+            raise
+        reason = os.strerror(error.errno).lower()
+        problem = f"the standard output cannot be written ({reason})"
+        fix = "free some space, or send the output elsewhere; files of --out may be missing"
+        print(f"error: {UserError(problem, fix=fix)}", file=sys.stderr)
+        return 2
     except UserError as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         return 2
@@ -74,6 +85,30 @@ def exit_code_of(program: Callable[[], int]) -> int:
     finally:
         if owns_interrupt:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _is_output_full() -> bool:
+    """Return whether the standard output takes no more, not even a line's end. Then it goes
+    nowhere, since Python would fail on it once more at the end."""
+    try:
+        output = sys.stdout.fileno()
+    except (OSError, ValueError):
+        return False
+    try:
+        sys.stdout.flush()
+        os.write(output, b"\n")
+    except OSError as error:
+        if error.errno not in FULL:
+            return False
+        _send_nowhere(output)
+        return True
+    return False
+
+
+def _send_nowhere(output: int) -> None:
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, output)
+    os.close(nowhere)
 
 
 def _nobody_reads() -> bool:
@@ -86,7 +121,5 @@ def _nobody_reads() -> bool:
     poll.register(output, 0)
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
         return False
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, output)
-    os.close(nowhere)
+    _send_nowhere(output)
     return True

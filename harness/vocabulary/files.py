@@ -285,6 +285,11 @@ def explained(error: OSError, path: Path) -> Exception:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         fix = "free some space and run the same command again; finished work is kept"
         return DiskFull(f"{path}: the disk is full", fix=fix)
+    if error.errno == errno.EFBIG:
+        problem = f"{path}: becomes larger than this system lets a file be"
+        return UserError(
+            problem, fix="raise the limit (ulimit -f), or name another disk with --out"
+        )
     if error.errno is not None and error.errno in NOT_WRITABLE:
         reason = os.strerror(error.errno).lower()
         return UserError(

@@ -2,6 +2,7 @@
 camera."""
 
 import io
+import logging
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +13,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import bounded_bytes, limited_memory
 
 MOST_BYTES = 1 << 29
+LARGEST = 1e9
+"""Largest coordinate, in any unit."""
 FILES = ".stl, .ply, .obj or .glb"
 FrontAxis = Annotated[
     Literal["+x", "-x", "+y", "-y", "+z", "-z"],
@@ -44,17 +47,37 @@ def read_mesh(file: str) -> Any:
         raise UserError(f"{file}: holds CAD surfaces, not triangles", legal=FILES, fix=fix)
     try:
         content = bounded_bytes(path, MOST_BYTES)
-        with limited_memory():
-            mesh: Any = trimesh.load(
-                io.BytesIO(content), file_type=path.suffix.lower().removeprefix("."), force="mesh"
-            )
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:
-        raise UserError(f"{file}: is not a readable mesh ({error})", legal=FILES) from error
+    kind = path.suffix.lower().removeprefix(".")
+    # without a handler, the library prints the tracebacks of its own attempts
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
+    try:
+        with limited_memory():
+            mesh: Any = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
+            corners = np.asarray(mesh.vertices, float).reshape(-1, 3)
+            faces = np.asarray(mesh.faces).reshape(-1, 3)
+    except Exception as error:  # the library raises errors of any kind on a damaged file
+        reason = str(error)[:200] or type(error).__name__
+        raise UserError(f"{file}: is not a readable mesh ({reason})", legal=FILES) from error
+    _refuse_odd(file, corners, faces)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     return mesh
+
+
+def _refuse_odd(file: str, corners: np.ndarray, faces: np.ndarray) -> None:
+    """Raise UserError if faces (m, 3) are not of these corners (n, 3), or corners have no place."""
+    fix = "export it again"
+    if not len(faces):
+        raise UserError(f"{file}: holds no triangles", legal=FILES, fix=fix)
+    if faces.min() < 0 or faces.max() >= len(corners):
+        problem = f"{file}: its triangles name corner {faces.max()} of {len(corners)}"
+        raise UserError(problem, legal=f"corners from 0 to {len(corners) - 1}", fix=fix)
+    used = corners[np.unique(faces)]
+    if not (np.abs(used) < LARGEST).all():
+        problem = f"{file}: a corner of its triangles is not a place"
+        raise UserError(problem, legal=f"coordinates within {LARGEST:g}", fix=fix)
 
 
 def front_first(mesh: Any, unit: str, front: str) -> np.ndarray:

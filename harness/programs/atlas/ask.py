@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.records.outputs import ATLAS_PAGE, ATLAS_PICTURE
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import shipped, write_text
+from harness.vocabulary.files import shipped, strict_json, write_text
 from harness.vocabulary.program import length_m, program
 
 if TYPE_CHECKING:
@@ -30,6 +30,10 @@ KINDS = {
     "crack": "slot",
 }
 """Kinds of damage by words that users may say instead."""
+LEGAL = "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
+NEEDED_AXES = ("source.target.distance_m", "frames")
+NUMBERS = ("a90_mm", "a90_low_mm", "a90_high_mm", "largest_mm", "hits")
+IS_AT_MOST = "is_at_most"
 BEST = "matched"
 """The detector that is asked for if the atlas has it."""
 
@@ -133,36 +137,73 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    from harness.programs.atlas.limits import AXES, CAMERA, DAMAGE
-
     file = path / "limits.parquet" if path.is_dir() else path
-    legal = (
-        "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
-    )
     if not file.is_file():
         raise UserError(
-            f"{file}: there is no such table of limits", legal=legal, fix="run tofpod sweep atlas"
+            f"{file}: there is no such table of limits", legal=LEGAL, fix="run tofpod sweep atlas"
         )
     try:
         table = pq.read_table(file)
-    except (OSError, pa.ArrowException) as error:
+        limits = table.to_pandas()
+    except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
         raise UserError(
-            f"{file}: cannot be read as a table of limits: {error}", legal=legal
+            f"{file}: cannot be read as a table of limits: {error}", legal=LEGAL
         ) from error
-    needed = (
-        CAMERA,
-        DAMAGE,
-        AXES["distance_m"],
-        "frames",
-        "a90_mm",
-        "a90_low_mm",
-        "largest_mm",
-    )
-    missing = [name for name in needed if name not in table.column_names]
-    if missing:
-        raise UserError(f"{file}: lacks the columns {', '.join(missing)}", legal=legal)
+    _refuse_odd(file, limits)
     metadata = table.schema.metadata or {}
-    return table.to_pandas(), json.loads(metadata.get(b"tofpod", b"{}"))
+    try:
+        about = strict_json(metadata.get(b"tofpod", b"{}"), nan=True)
+        if not isinstance(about, dict) or not isinstance(about.get("experiment", ""), str):
+            raise ValueError("it is not a mapping that names an experiment")
+    except ValueError as error:
+        problem = f"{file}: the data beside the table cannot be read ({error})"
+        raise UserError(problem, legal=LEGAL) from error
+    return limits, about
+
+
+def _refuse_odd(file: Path, limits: Any) -> None:
+    """Raise UserError if a table lacks rows or columns, or holds other values than limits."""
+    import numpy as np
+    from pandas.api.types import is_bool_dtype, is_numeric_dtype
+
+    from harness.programs.atlas.limits import AXES, CAMERA, DAMAGE, DETECTOR, damage_of
+
+    if limits.columns.duplicated().any():
+        raise UserError(f"{file}: has two columns of one name", legal=LEGAL)
+    detector = DETECTOR if DETECTOR in limits else "detector"
+    names = (CAMERA, DAMAGE, detector)
+    axes = [column for column in AXES.values() if column in (*NEEDED_AXES, *limits.columns)]
+    needed = (*names, *axes, *NUMBERS, IS_AT_MOST)
+    missing = [name for name in needed if name not in limits]
+    if missing:
+        raise UserError(f"{file}: lacks the columns {', '.join(missing)}", legal=LEGAL)
+    if limits.empty:
+        raise UserError(f"{file}: has no row", legal=LEGAL)
+    for name in names:
+        if not all(isinstance(value, str) for value in limits[name]):
+            raise UserError(f"{file}: {name} holds a value that is no text", legal=LEGAL)
+    for name in (*axes, *NUMBERS):
+        if is_bool_dtype(limits[name]) or not is_numeric_dtype(limits[name]):
+            raise UserError(f"{file}: {name} holds a value that is no number", legal=LEGAL)
+    for name in axes:
+        values = limits[name].to_numpy(float)
+        if not ((values > 0) & (values < np.inf) | np.isnan(values)).all():
+            raise UserError(f"{file}: {name} holds a number that is not above 0", legal=LEGAL)
+    for name in NEEDED_AXES:
+        if limits[name].isna().any():
+            raise UserError(f"{file}: {name} lacks a number", legal=LEGAL)
+    if not is_bool_dtype(limits[IS_AT_MOST]):
+        raise UserError(
+            f"{file}: {IS_AT_MOST} holds a value that is not true or false", legal=LEGAL
+        )
+    if (limits["a90_mm"] <= 0).any():
+        raise UserError(f"{file}: a90_mm holds a size that is not above 0", legal=LEGAL)
+    for text in limits[DAMAGE].unique():
+        try:
+            damage_of(text)
+        except ValueError as error:
+            problem = f"{file}: {DAMAGE} holds {text[:60]!r}, which declares no damage ({error})"
+            raise UserError(problem, legal=LEGAL) from error
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:

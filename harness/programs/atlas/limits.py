@@ -6,7 +6,6 @@ The surface is a quadratic of ln a90 in the logarithms of the axes, by least squ
 each limit's own interval. Its stated error is the root mean square error of ln a90 at each set-up
 when the others predict it."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -16,6 +15,7 @@ import pandas as pd
 from scipy import special
 
 from harness.evaluation.intervals import UPPER
+from harness.vocabulary.files import strict_json
 
 CAMERA = "source.camera.name"
 DETECTOR = "detector.name"
@@ -34,6 +34,8 @@ LEAST_VARIANCE = 1e-4
 LEAST_FREE = 0.05
 """Least share of a set-up's residual that the fit leaves, which divides it."""
 TOLERANCE = 1e-9
+DEEPEST_MM = 1e6
+"""Largest depth of damage in a table that is read."""
 
 
 class Outside(Exception):
@@ -164,15 +166,31 @@ def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
     """Return the surfaces of a table of `LIMITS` by camera, kind and detector. Raises KeyError if
     it lacks an axis."""
     rows = limits.copy()
-    damages = [json.loads(text) for text in rows[DAMAGE]]
-    rows["kind"] = [damage["kind"] for damage in damages]
-    rows["depth_mm"] = [float(np.mean(damage.get("depth_mm") or [np.nan])) for damage in damages]
+    damages = [damage_of(text) for text in rows[DAMAGE]]
+    rows["kind"] = [kind for kind, _ in damages]
+    rows["depth_mm"] = [depth_mm for _, depth_mm in damages]
     if DETECTOR not in rows:
         rows[DETECTOR] = rows["detector"]
     axes = [axis for axis, column in AXES.items() if column in rows]
     rows = rows.rename(columns={AXES[axis]: axis for axis in axes})
     groups = rows.groupby([CAMERA, "kind", DETECTOR], sort=False)
     return [_surface(group, axes) for _, group in groups]
+
+
+def damage_of(text: str) -> tuple[str, float]:
+    """Return the kind and the mean depth in mm, NaN without one, that a declaration of damage in
+    JSON states. Raises ValueError if it states no kind, or a depth that is no possible number."""
+    damage = strict_json(text, nan=True)
+    if not isinstance(damage, dict) or not isinstance(damage.get("kind"), str):
+        raise ValueError("it states no kind")
+    depths_mm = damage.get("depth_mm") or [np.nan]
+    if not isinstance(depths_mm, list):
+        raise ValueError("its depth_mm is not a list")
+    for depth_mm in depths_mm:
+        is_number = isinstance(depth_mm, int | float) and not isinstance(depth_mm, bool)
+        if not is_number or not (0 < depth_mm < DEEPEST_MM or depth_mm != depth_mm):
+            raise ValueError(f"its depth_mm is no number between 0 and {DEEPEST_MM:g}")
+    return damage["kind"], float(np.mean(depths_mm))
 
 
 def _surface(rows: pd.DataFrame, axes: Sequence[str]) -> LimitSurface:

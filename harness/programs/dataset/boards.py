@@ -17,6 +17,12 @@ from detectors.pixels.masks import shrunk
 from detectors.recordings.arrays import load_npz
 from harness.experiment.schema import Experiment, Point
 from harness.programs.dataset.exchange import depth_units, on_window, picture_bytes, run_lengths
+from harness.programs.dataset.stored import (
+    IndexFacts,
+    TruthFacts,
+    refuse_odd_arrays,
+    refuse_odd_facts,
+)
 from harness.records.rows import Role
 from harness.runs.plan import RenderJob, batch_of, trial_point, unit_of
 from harness.trials.board import load_board
@@ -257,12 +263,16 @@ def read_index(folder: Path) -> dict[str, Any]:
     Raises UserError."""
     data = _read_json(folder / INDEX, RECORD_BYTES, "name a folder that tofpod dataset wrote")
     check_version(data.get("dataset_version"), DATASET_VERSION, folder / INDEX, "a data set")
+    refuse_odd_facts(folder / INDEX, data, IndexFacts)
     return data
 
 
 def read_truth(folder: Path, name: str) -> dict[str, Any]:
     """Read the truth of a board by its name. Raises UserError."""
-    return _read_json(folder / "boards" / name / TRUTH, TEXT_BYTES, AGAIN)
+    file = folder / "boards" / name / TRUTH
+    truth = _read_json(file, TEXT_BYTES, AGAIN)
+    refuse_odd_facts(file, truth, TruthFacts)
+    return truth
 
 
 def _read_json(file: Path, most_bytes: int, fix: str) -> dict[str, Any]:
@@ -278,4 +288,5 @@ def read_arrays(folder: Path, name: str, *wanted: str) -> list[np.ndarray]:
     stored = load_npz(file)
     if missing := set(wanted) - stored.keys():
         raise UserError(f"{file}: lacks {', '.join(sorted(missing))}", fix=AGAIN)
+    refuse_odd_arrays(file, {array_name: stored[array_name] for array_name in wanted})
     return [stored[array_name] for array_name in wanted]

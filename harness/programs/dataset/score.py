@@ -220,6 +220,8 @@ def _judged(
             area_m2 = float(np.nansum(pixel_areas(places_m)[inspected]))
             yield sample, scores, places_m, damage, area_m2
 
+    if not any(name.startswith(f"{category}/validation/") for name in maps):
+        raise UserError(f"{options.dataset}: {category} has no board of validation")
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
     highest, areas_m2 = np.array(quiet, float).T
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value

@@ -18,6 +18,7 @@ from detectors.open3d_library import load_open3d
 from detectors.recordings import open_capture
 from detectors.recordings.intrinsics import read_lens
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import Reason
 from tests.support import bag_of_a_plane as bags
 from tests.support import recorded_plane as plane
 
@@ -502,3 +503,26 @@ def test_a_missing_system_library_is_named_with_its_package(
     with pytest.raises(UserError, match="needs Open3D") as caught:
         load_open3d()
     assert "apt install libgl1" in str(caught.value)
+
+
+def test_points_that_are_no_place_before_a_camera_are_left_out(tmp_path: Path) -> None:
+    """Such numbers would overflow when the picture is divided into cells."""
+    points = plane.points_m(plane.depth_mm(noise_mm=0.6))
+    points[10, 10, 0] = 1e30
+    points[30, 30] = (25.0, 0.0, 0.5)
+    points[40, 40] = (9.0, 0.0, 0.5)
+    path = plane.write_pcd(tmp_path / "a.pcd", points)
+    recording = open_capture([path])
+    (frame,) = recording.frames()
+    for place in ((10, 10), (30, 30)):
+        assert frame.reason[place] == Reason.OUT_OF_RANGE and np.isnan(frame.z_m[place])
+    assert frame.reason[40, 40] == Reason.VALID, "86.8 degrees aside"
+    assert any("no place before a camera are left out" in note for note in recording.notes)
+
+
+def test_a_list_whose_first_line_is_no_count_is_read(tmp_path: Path) -> None:
+    """Of two numbers that are not whole, none states how many points follow."""
+    points = plane.points_m(plane.depth_mm())[:20, :20]
+    for head in ("nan 3\n", "inf 3\n", "2.5 3\n"):
+        path = plane.write_points(tmp_path / "a.xyz", points, head=head)
+        assert "cannot be read as points" in refusal(path)

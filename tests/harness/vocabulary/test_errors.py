@@ -3,9 +3,11 @@ its traceback."""
 
 from __future__ import annotations
 
+import errno
 import io
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -54,6 +56,26 @@ def test_a_reader_that_leaves_ends_the_program_silently(lines: int, option: str)
     with program.stderr as stream:
         printed = stream.read()
     assert (program.wait(), printed) == (141, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("option", ("-c", "-uc"))
+@pytest.mark.parametrize("lines", (3, 100_000))
+def test_a_full_standard_output_is_one_message(lines: int, option: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, option, PROGRAM % lines], stdout=full, stderr=subprocess.PIPE
+        )
+    message = done.stderr.decode()
+    assert done.returncode == 2
+    assert message.startswith("error: the standard output cannot be written (no space left")
+    assert len(message.splitlines()) == 2
+
+
+def test_a_full_place_that_is_not_the_output_is_a_bug() -> None:
+    for number in (errno.ENOSPC, errno.EFBIG, errno.EIO):
+        with pytest.raises(OSError):
+            raising(OSError(number, "full"))
 
 
 def test_another_pipe_that_breaks_is_a_bug() -> None:

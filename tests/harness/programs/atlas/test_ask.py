@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from harness.programs.atlas.ask import main
@@ -304,3 +306,63 @@ def test_other_tables_are_refused(stored: Path, capsys: pytest.CaptureFixture[st
     ):
         assert main([*question, "--atlas", str(stored / f"{name}.parquet")]) == 2
         assert message in capsys.readouterr().err
+
+
+def written_atlas(path: Path, table: pd.DataFrame, about: bytes = b"{}") -> list[str]:
+    """The arguments that ask a table of limits."""
+    stored = pa.Table.from_pandas(table, preserve_index=False)
+    pq.write_table(stored.replace_schema_metadata({b"tofpod": about}), path)
+    return ["--size", "5mm", "--distance", "1m", "--atlas", str(path)]
+
+
+DAMAGE = "source.target.damage"
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("a90_mm", "x", "a90_mm holds a value that is no number"),
+        ("a90_mm", 0.0, "a90_mm holds a size that is not above 0"),
+        ("hits", True, "hits holds a value that is no number"),
+        ("source.target.distance_m", -1.0, "distance_m holds a number that is not above 0"),
+        ("source.target.distance_m", np.nan, "distance_m lacks a number"),
+        ("frames", 0, "frames holds a number that is not above 0"),
+        ("source.camera.name", 3.0, "source.camera.name holds a value that is no text"),
+        ("detector", None, "detector holds a value that is no text"),
+        ("is_at_most", 0.5, "is_at_most holds a value that is not true or false"),
+        (DAMAGE, "{", "which declares no damage"),
+        (DAMAGE, "[]", "it states no kind"),
+        (DAMAGE, '{"kind": 3}', "it states no kind"),
+        (DAMAGE, '{"kind": "blind", "depth_mm": ["a"]}', "its depth_mm is no number between"),
+        (DAMAGE, '{"kind": "blind", "depth_mm": 3}', "its depth_mm is not a list"),
+    ],
+)
+def test_an_odd_atlas_is_refused(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    column: str,
+    value: object,
+    message: str,
+):
+    table = limits()
+    table[column] = [value] * len(table)
+    assert main(written_atlas(tmp_path / "odd.parquet", table)) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("about", [b"{", b"[]", b'{"experiment": 3}'])
+def test_odd_data_beside_an_atlas_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], about: bytes
+):
+    assert main(written_atlas(tmp_path / "odd.parquet", limits(), about)) == 2
+    assert "the data beside the table cannot be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("column", ["a90_high_mm", "hits", "is_at_most", "largest_mm", "frames"])
+def test_an_atlas_without_a_column_or_row_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str
+):
+    assert main(written_atlas(tmp_path / "odd.parquet", limits().drop(columns=column))) == 2
+    assert f"lacks the columns {column}" in capsys.readouterr().err
+    assert main(written_atlas(tmp_path / "odd.parquet", limits()[:0])) == 2
+    assert "has no row" in capsys.readouterr().err

@@ -13,7 +13,10 @@ import numpy as np
 import pytest
 
 from harness.programs.dataset import dataset
+from harness.programs.dataset.boards import INSET_PX
 from harness.programs.dataset.exchange import run_lengths
+from harness.report.blocks import template
+from harness.vocabulary.path_names import camera_title
 from tests.support.tiny_dataset import arrays_of, names_in, truth_of, write
 
 
@@ -180,6 +183,17 @@ def test_no_unit_and_no_board_is_in_two_splits(home):
     assert (
         "No unit of the camera captures boards of two splits" in (folder / "README.md").read_text()
     )
+
+
+def test_the_card_shows_its_command_as_text(home, monkeypatch):
+    """The command may hold anything, and its page must not run it."""
+    folder = home / "set"
+    about = json.loads((folder / "dataset.json").read_text())
+    about["provenance"]["command"] = "tofpod dataset '`<script>alert(1)</script>`'"
+    card = template("dataset_card.md", Path(dataset.__file__).parent)
+    text = card.render(about=about, inset=INSET_PX, title=camera_title)
+    assert "<script>" not in text
+    assert "<pre><code>tofpod dataset &#39;`&lt;script&gt;alert(1)" in text
 
 
 def test_a_killed_run_goes_on_and_writes_equal_bytes(home, tmp_path, capsys):
