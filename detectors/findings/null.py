@@ -213,6 +213,23 @@ def own_threshold(
     )
 
 
+def calls_at(tails: Mapping[str, Tail], threshold: float) -> float:
+    """Return the number of false calls that all laws together expect above a threshold, on both
+    sides of the surface."""
+    return 2.0 * sum(tail.expected(threshold) for tail in tails.values())
+
+
+def threshold_at(tails: Mapping[str, Tail], calls: float, least: float) -> float:
+    """Return the threshold, at least ``least``, above which all laws together expect so many false
+    calls (above 0), on both sides of the surface."""
+    if calls_at(tails, least) <= calls:
+        return least
+    high = 2.0 * least
+    while calls_at(tails, high) > calls:
+        high *= 2.0
+    return float(optimize.brentq(lambda at: np.log(calls_at(tails, at) / calls), least, high))
+
+
 def interval_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
     """Return the central 95 % of the expected number of false calls above a threshold, on both
     sides of the surface and by all laws together."""

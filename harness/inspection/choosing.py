@@ -1,9 +1,10 @@
 """Chooses the detector of `tofpod detect` by evidence on the capture itself: each candidate seeks
-virtual holes at random places of the judged target, at its own threshold.
+virtual holes at random places of the judged target, at thresholds with equal false calls.
 
 The holes are as wide as the capture's blur and up to two and a half times wider, and so deep that
 some are found and some are not. They lie far apart and away from what the candidates find without
-them. All candidates see the same holes in the same residuals. Only the scores are computed again,
+them. Where tags, print or objects raise the number of false calls of one candidate above that of
+another, its threshold is raised for the comparison until both expect as many. All candidates see the same holes in the same residuals. Only the scores are computed again,
 the fitted surface and the thresholds are those of the capture; a large target is represented by
 the part with most free places. Deterministic.
 
@@ -24,7 +25,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 import cv2
 import numpy as np
 
-from detectors.findings.null import behind
+from detectors.findings.null import Tail, behind, threshold_at
 from detectors.findings.virtual_holes import (
     VirtualHoles,
     places_apart,
@@ -86,6 +87,20 @@ class Contender:
     is_known: bool
     """Whether its number of false calls is known."""
 
+    @property
+    def expected(self) -> float:
+        """Number of false calls expected at the threshold, with those at tags, print and objects;
+        NaN if the capture did not set the threshold."""
+        null = self.evidence.notes.get("own_null", {})
+        return float(null.get("expected", np.nan))
+
+    def with_calls(self, calls: float) -> Contender:
+        """Return the candidate at the threshold at which so many false calls are expected, which
+        are no more than at its own."""
+        null = self.evidence.notes["own_null"]
+        tails = {name: Tail.from_facts(facts) for name, facts in null["tails"].items()}
+        return replace(self, threshold=threshold_at(tails, calls, self.threshold))
+
 
 @dataclass(frozen=True)
 class _Sought:
@@ -135,7 +150,7 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
     if reach_px == 0.0:
         # a map, or frames that do not show it: what residuals share, with contours of rounding
         reach_px = reach_of_one(first.evidence.residual_m, 0.0)
-    sought = _sought(compared, cloud, reach_px)
+    sought = _sought(_with_equal_calls(compared), cloud, reach_px)
     if sought is None:
         return noted(first, "as the target has no place for implanted holes")
     preferred = sorted(compared, key=lambda c: _rank(c.detector.name, reach_px))
@@ -153,6 +168,15 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
     }
     pixels = "upsampled pixels" if reach_px > WIDEST_NATIVE_PX else "a camera's own pixels"
     return noted(best, _reason(best.detector.name, sought, calls, pixels), facts)
+
+
+def _with_equal_calls(candidates: Sequence[Contender]) -> list[Contender]:
+    """Return the candidates at thresholds with as many expected false calls as the one that
+    expects fewest; as they are if these numbers are not known."""
+    fewest = min(candidate.expected for candidate in candidates)
+    if not all(np.isfinite(candidate.expected) for candidate in candidates):
+        return list(candidates)
+    return [candidate.with_calls(fewest) for candidate in candidates]
 
 
 def noted(candidate: Contender, why: str, facts: Mapping[str, Any] | None = None) -> Contender:
