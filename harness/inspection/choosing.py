@@ -4,9 +4,10 @@ virtual holes at random places of the judged target, at thresholds with equal fa
 The holes are as wide as the capture's blur and up to two and a half times wider, and so deep that
 some are found and some are not. They lie far apart and away from what the candidates find without
 them. Where tags, print or objects raise the number of false calls of one candidate above that of
-another, its threshold is raised for the comparison until both expect as many. All candidates see the same holes in the same residuals. Only the scores are computed again,
-the fitted surface and the thresholds are those of the capture; a large target is represented by
-the part with most free places. Deterministic.
+another, its threshold is raised for the comparison until both expect as many. All candidates see
+the same holes in the same residuals. Only the scores are computed again, the fitted surface and the
+thresholds are those of the capture; a large target is represented by the part with most free
+places. Deterministic.
 
 Where two candidates find as many but for chance, the one whose model of the camera fits is taken:
 `matched` for a camera's own pixels, `local`, which has none, for upsampled ones.
