@@ -436,6 +436,53 @@ def test_the_weight_of_a_unit(unit, size, foreground_m, median_m, divisor, expec
     assert weight == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("size", "farthest_m"),
+    [
+        ((640, 576), 4.5),
+        ((320, 288), 6.0),
+        ((512, 512), 3.5),
+        ((1024, 1024), 3.0),
+        ((512, 424), 8.0),
+        ((256, 192), 8.0),
+    ],
+)
+def test_cameras_that_all_store_millimetres_do_so_within_their_range(size, farthest_m) -> None:
+    """Ten times as probable as millimetres elsewhere, and impossible beyond; other sizes and units
+    are as usual."""
+    usual = 0.867 * 1.05
+    for median_m, expected in ((farthest_m - 0.01, 10 * usual), (farthest_m + 0.01, 0.0)):
+        assert _weight("mm", 800.0, 1e3 * median_m, size, 1) == pytest.approx(expected)
+    other = (size[0] + 1, size[1])
+    assert _weight("mm", 800.0, 1e3 * farthest_m, other, 1) == pytest.approx(usual)
+    quarter = _weight("4000/m", 3200.0, 4e3 * farthest_m, size, 1)
+    assert quarter == pytest.approx(0.08 * 1.05)
+
+
+@pytest.mark.parametrize(
+    ("size", "factor"),
+    [((1024, 768), 20.0), ((640, 480), 2.0), ((1280, 720), 2.0), ((1920, 1080), 2.0)],
+)
+def test_sizes_of_the_l515_and_its_colour_favour_a_quarter_of_a_millimetre(size, factor) -> None:
+    usual = 0.08 * 1.05
+    assert _weight("4000/m", 3200.0, 4000.0, size, 1) == pytest.approx(factor * usual)
+    other = (size[0], size[1] + 1)
+    assert _weight("4000/m", 3200.0, 4000.0, other, 1) == pytest.approx(usual)
+    assert _weight("mm", 800.0, 1000.0, size, 1) == pytest.approx(0.867 * 1.05)
+
+
+def test_a_doubtful_unit_is_warned_of_with_the_others() -> None:
+    """Whole numbers around 1.8 m in millimetres: 0.45 m in quarters is possible."""
+    stored = 1797.0 + np.arange(2000) % 7
+    unit = decided_unit("x", stored, 1e-3, (96, 72))
+    assert unit.scale_m == 1e-3
+    assert "1 mm is taken, which puts the median at 1.8 m" in unit.warning
+    assert "others are possible: --unit 4000/m (0.45 m), --unit tum (0.36 m)" in unit.warning
+    sure = decided_unit("x", 800.0 + np.arange(2000) % 7, 1e-3, (640, 576))
+    assert sure.warning == ""
+    assert sure.origin == "what is usual for integers"
+
+
 def test_units_of_names_and_types() -> None:
     assert metres_per_unit("in") == 0.0254
     assert metres_per_unit("tum") == 0.0002
@@ -539,6 +586,8 @@ def with_codes(values: Sequence[float], repeats: int, base: np.ndarray) -> np.nd
         (with_codes([176], 3, surface().astype(np.uint16)), ()),
         (with_codes([1.0], 3, surface() * 1.0), ()),
         (with_codes([3600.0], 3, surface() * 1.0), (3600.0,)),
+        (with_codes([1.25], 3, surface(4000, 100) * 1e-3), (1.25,)),
+        (with_codes([1.15], 3, surface(4000, 100) * 1e-3), ()),
         # at most three different negative numbers of at least 20 pixels
         (with_codes([-1, -2, -3], 7, surface().astype(np.int16)), (-3.0, -2.0, -1.0)),
         (with_codes([-1], 19, surface().astype(np.int16)), ()),
