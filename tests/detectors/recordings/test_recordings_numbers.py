@@ -126,6 +126,58 @@ def test_every_colour_mode_sees_along_the_rays_of_the_sensor(width, height, top)
     assert colour_camera("test", CAMERAS, width, height + 1) is None
 
 
+@pytest.mark.parametrize("is_wide", [False, True])
+def test_the_colour_lens_by_hand(is_wide: bool) -> None:
+    """Shares of the sides of a 4 : 3 sensor, or of the 16 : 9 part of it on which early units were
+    calibrated: 2304 of 3072 rows, from row 384 on."""
+    calibration = json.loads(plane.calibration().rstrip(b"\0"))
+    camera = calibration["CalibrationInformation"]["Cameras"][1]
+    numbers = camera["Intrinsics"]["ModelParameters"]
+    numbers[:4] = [0.51, 0.47, 0.6, 0.8]
+    camera["SensorWidth"] = 4096
+    camera["SensorHeight"] = 2304 if is_wide else 3072
+    cameras = parse_calibration("test", json.dumps(calibration).encode())
+    rows_on_sensor = 2304 if is_wide else 3072
+    first_row = 384 if is_wide else 0
+    fy_px = 0.8 * rows_on_sensor
+    cy_px = 0.47 * rows_on_sensor + first_row
+    for width, height in ((1280, 720), (2048, 1536)):
+        colour = colour_camera("test", cameras, width, height)
+        assert colour is not None
+        scale = width / 4096
+        top = (3072 * scale - height) / 2
+        lens = colour.lens
+        assert (lens.fx, lens.fy) == pytest.approx((0.6 * width, fy_px * scale))
+        assert (lens.cx, lens.cy) == pytest.approx((0.51 * width - 0.5, cy_px * scale - top - 0.5))
+    expected = np.eye(4)
+    expected[:3, :3] = np.reshape(camera["Rt"]["Rotation"], (3, 3))
+    expected[:3, 3] = camera["Rt"]["Translation"]
+    assert colour is not None
+    np.testing.assert_array_equal(colour.T_colour_depth, expected)
+
+
+@pytest.mark.parametrize("key", ["size", "name"])
+def test_of_several_lenses_that_of_the_size_or_of_depth_is_taken(tmp_path: Path, key: str) -> None:
+    lens = {"fx": 100.0, "fy": 101.0, "cx": 47.0, "cy": 35.0}
+    other = {"fx": 130.0, "fy": 131.0, "cx": 48.0, "cy": 36.0}
+    if key == "size":
+        content = {
+            "a": {**other, "width": 192, "height": 144},
+            "b": {**lens, "width": 96, "height": 72},
+        }
+    else:
+        content = {"colour": other, "depth_camera": lens}
+    path = tmp_path / "lenses.json"
+    path.write_text(json.dumps(content))
+    result = read_lens(path, 96, 72)
+    assert (result.fx, result.fy, result.cx, result.cy) == (100.0, 101.0, 47.0, 35.0)
+    path.write_text(json.dumps({"left": other, "right": lens}))
+    with pytest.raises(UserError, match=r"holds 2 different lenses \(left, right\)"):
+        read_lens(path, 96, 72)
+    path.write_text(json.dumps({"left": lens, "right": lens}))
+    assert read_lens(path, 96, 72).fx == 100.0
+
+
 def test_depth_modes_are_known_by_their_sizes() -> None:
     modes = {
         (320, 288): "NFOV_2X2BINNED",
