@@ -126,6 +126,58 @@ def test_every_colour_mode_sees_along_the_rays_of_the_sensor(width, height, top)
     assert colour_camera("test", CAMERAS, width, height + 1) is None
 
 
+@pytest.mark.parametrize("is_wide", [False, True])
+def test_the_colour_lens_by_hand(is_wide: bool) -> None:
+    """Shares of the sides of a 4 : 3 sensor, or of the 16 : 9 part of it on which early units were
+    calibrated: 2304 of 3072 rows, from row 384 on."""
+    calibration = json.loads(plane.calibration().rstrip(b"\0"))
+    camera = calibration["CalibrationInformation"]["Cameras"][1]
+    numbers = camera["Intrinsics"]["ModelParameters"]
+    numbers[:4] = [0.51, 0.47, 0.6, 0.8]
+    camera["SensorWidth"] = 4096
+    camera["SensorHeight"] = 2304 if is_wide else 3072
+    cameras = parse_calibration("test", json.dumps(calibration).encode())
+    rows_on_sensor = 2304 if is_wide else 3072
+    first_row = 384 if is_wide else 0
+    fy_px = 0.8 * rows_on_sensor
+    cy_px = 0.47 * rows_on_sensor + first_row
+    for width, height in ((1280, 720), (2048, 1536)):
+        colour = colour_camera("test", cameras, width, height)
+        assert colour is not None
+        scale = width / 4096
+        top = (3072 * scale - height) / 2
+        lens = colour.lens
+        assert (lens.fx, lens.fy) == pytest.approx((0.6 * width, fy_px * scale))
+        assert (lens.cx, lens.cy) == pytest.approx((0.51 * width - 0.5, cy_px * scale - top - 0.5))
+    expected = np.eye(4)
+    expected[:3, :3] = np.reshape(camera["Rt"]["Rotation"], (3, 3))
+    expected[:3, 3] = camera["Rt"]["Translation"]
+    assert colour is not None
+    np.testing.assert_array_equal(colour.T_colour_depth, expected)
+
+
+@pytest.mark.parametrize("key", ["size", "name"])
+def test_of_several_lenses_that_of_the_size_or_of_depth_is_taken(tmp_path: Path, key: str) -> None:
+    lens = {"fx": 100.0, "fy": 101.0, "cx": 47.0, "cy": 35.0}
+    other = {"fx": 130.0, "fy": 131.0, "cx": 48.0, "cy": 36.0}
+    if key == "size":
+        content = {
+            "a": {**other, "width": 192, "height": 144},
+            "b": {**lens, "width": 96, "height": 72},
+        }
+    else:
+        content = {"colour": other, "depth_camera": lens}
+    path = tmp_path / "lenses.json"
+    path.write_text(json.dumps(content))
+    result = read_lens(path, 96, 72)
+    assert (result.fx, result.fy, result.cx, result.cy) == (100.0, 101.0, 47.0, 35.0)
+    path.write_text(json.dumps({"left": other, "right": lens}))
+    with pytest.raises(UserError, match=r"holds 2 different lenses \(left, right\)"):
+        read_lens(path, 96, 72)
+    path.write_text(json.dumps({"left": lens, "right": lens}))
+    assert read_lens(path, 96, 72).fx == 100.0
+
+
 def test_depth_modes_are_known_by_their_sizes() -> None:
     modes = {
         (320, 288): "NFOV_2X2BINNED",
@@ -436,6 +488,53 @@ def test_the_weight_of_a_unit(unit, size, foreground_m, median_m, divisor, expec
     assert weight == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("size", "farthest_m"),
+    [
+        ((640, 576), 4.5),
+        ((320, 288), 6.0),
+        ((512, 512), 3.5),
+        ((1024, 1024), 3.0),
+        ((512, 424), 8.0),
+        ((256, 192), 8.0),
+    ],
+)
+def test_cameras_that_all_store_millimetres_do_so_within_their_range(size, farthest_m) -> None:
+    """Ten times as probable as millimetres elsewhere, and impossible beyond; other sizes and units
+    are as usual."""
+    usual = 0.867 * 1.05
+    for median_m, expected in ((farthest_m - 0.01, 10 * usual), (farthest_m + 0.01, 0.0)):
+        assert _weight("mm", 800.0, 1e3 * median_m, size, 1) == pytest.approx(expected)
+    other = (size[0] + 1, size[1])
+    assert _weight("mm", 800.0, 1e3 * farthest_m, other, 1) == pytest.approx(usual)
+    quarter = _weight("4000/m", 3200.0, 4e3 * farthest_m, size, 1)
+    assert quarter == pytest.approx(0.08 * 1.05)
+
+
+@pytest.mark.parametrize(
+    ("size", "factor"),
+    [((1024, 768), 20.0), ((640, 480), 2.0), ((1280, 720), 2.0), ((1920, 1080), 2.0)],
+)
+def test_sizes_of_the_l515_and_its_colour_favour_a_quarter_of_a_millimetre(size, factor) -> None:
+    usual = 0.08 * 1.05
+    assert _weight("4000/m", 3200.0, 4000.0, size, 1) == pytest.approx(factor * usual)
+    other = (size[0], size[1] + 1)
+    assert _weight("4000/m", 3200.0, 4000.0, other, 1) == pytest.approx(usual)
+    assert _weight("mm", 800.0, 1000.0, size, 1) == pytest.approx(0.867 * 1.05)
+
+
+def test_a_doubtful_unit_is_warned_of_with_the_others() -> None:
+    """Whole numbers around 1.8 m in millimetres: 0.45 m in quarters is possible."""
+    stored = 1797.0 + np.arange(2000) % 7
+    unit = decided_unit("x", stored, 1e-3, (96, 72))
+    assert unit.scale_m == 1e-3
+    assert "1 mm is taken, which puts the median at 1.8 m" in unit.warning
+    assert "others are possible: --unit 4000/m (0.45 m), --unit tum (0.36 m)" in unit.warning
+    sure = decided_unit("x", 800.0 + np.arange(2000) % 7, 1e-3, (640, 576))
+    assert sure.warning == ""
+    assert sure.origin == "what is usual for integers"
+
+
 def test_units_of_names_and_types() -> None:
     assert metres_per_unit("in") == 0.0254
     assert metres_per_unit("tum") == 0.0002
@@ -539,6 +638,8 @@ def with_codes(values: Sequence[float], repeats: int, base: np.ndarray) -> np.nd
         (with_codes([176], 3, surface().astype(np.uint16)), ()),
         (with_codes([1.0], 3, surface() * 1.0), ()),
         (with_codes([3600.0], 3, surface() * 1.0), (3600.0,)),
+        (with_codes([1.25], 3, surface(4000, 100) * 1e-3), (1.25,)),
+        (with_codes([1.15], 3, surface(4000, 100) * 1e-3), ()),
         # at most three different negative numbers of at least 20 pixels
         (with_codes([-1, -2, -3], 7, surface().astype(np.int16)), (-3.0, -2.0, -1.0)),
         (with_codes([-1], 19, surface().astype(np.int16)), ()),

@@ -246,6 +246,19 @@ def test_a_jackknife_without_a_number_has_no_interval() -> None:
     assert not only_whole.interval.known
 
 
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_too_few_frames_are_not_divided(frames: int) -> None:
+    """A statistic is never asked for the value of no frame."""
+
+    def mean(part: np.ndarray) -> float:
+        assert len(part) == frames
+        return float(part.mean())
+
+    reading = jackknifed(np.arange(1.0, 1.0 + frames), mean)
+    assert reading.value == (1.0 + frames) / 2
+    assert not reading.interval.known
+
+
 def test_the_interval_of_a_mean_is_students() -> None:
     values = np.array([2.0, 3.5, np.nan, 5.0, 4.0])
     reading = mean_of(values)
