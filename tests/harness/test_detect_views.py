@@ -131,6 +131,17 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
 
 
 @pytest.mark.usefixtures("unpictured")
+def test_holes_are_implanted_in_a_map_to_choose_the_detector(
+    views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert detect.main([*views, "--register", "marks", "--out", str(tmp_path)]) == 0
+    choice = json.loads((tmp_path / "findings.json").read_text())["surface"]["choice"]
+    assert f"detector: {choice['text']}" in capsys.readouterr().out
+    assert choice["implanted"] >= 12
+    assert max(choice["found"].values()) > 0.1 * choice["implanted"]
+
+
+@pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize("merge", ["grid", pytest.param("volume", marks=pytest.mark.slow)])
 def test_every_merge_finds_the_hole(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], merge: str

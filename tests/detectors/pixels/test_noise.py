@@ -10,6 +10,7 @@ import pytest
 
 from detectors.pixels.noise import (
     LEAST_FRAMES,
+    _side_of_tent,
     average_variance_m2,
     median_of,
     noise_reach_px,
@@ -213,3 +214,9 @@ def test_one_frame_tells_upsampled_noise_from_a_pattern_under_native_noise() -> 
     # the fine noise's own reach, or none: never that of the pattern
     assert reach_of(fine + 1.5 * pattern) == 0.0
     assert reach_of(fine + 0.3 * pattern) == 1.0
+
+
+def test_the_side_of_a_square_is_the_sum_of_its_correlation() -> None:
+    white = np.random.default_rng(8).standard_normal((900, 900))
+    noise = cv2.blur(white, (9, 9))[10:-10, 10:-10]
+    assert _side_of_tent(noise, np.ones(noise.shape, bool)) == pytest.approx(9.0, abs=0.4)
