@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from detectors import load_detector
+from detectors.findings.null import Tail, calls_at, threshold_at
 from detectors.interface import Detection, Evidence
 from detectors.methods.part import part_of_cloud, part_of_evidence
 from detectors.surfaces.background import Background, background
@@ -91,7 +92,7 @@ class Seeing:
         return replace(evidence, residual_m=residual_m, score=np.abs(residual_m) * 1e3)
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        pixels = np.flatnonzero(np.nan_to_num(evidence.score) > self.least_mm)
+        pixels = np.flatnonzero(np.nan_to_num(evidence.score) > max(self.least_mm, threshold))
         return tuple(Detection(1.0, np.array([pixel]), np.zeros(3)) for pixel in pixels)
 
 
@@ -116,6 +117,36 @@ def test_the_one_that_finds_most_holes_is_chosen_and_says_so(cloud: Cloud) -> No
     )
     again = chosen([blunt, sharp], cloud, "1 expected false call")
     assert again.evidence.notes == best.evidence.notes
+
+
+def with_laws(contender: Contender, at_marks: int) -> Contender:
+    """Return the candidate with a law of 100 peaks above a score of 3, and of some at marks."""
+    scores = 3.0 + np.random.default_rng(2).exponential(0.5, 100)
+    tails = {"plain": Tail.of(scores, 3.0), "marks": Tail.of(scores[:at_marks], 3.0)}
+    null = {
+        "expected": calls_at(tails, contender.threshold),
+        "tails": {name: tail.facts for name, tail in tails.items()},
+    }
+    evidence = replace(contender.evidence, notes={"own_null": null})
+    return replace(contender, evidence=evidence)
+
+
+def test_one_with_more_false_calls_at_marks_is_compared_at_as_many(cloud: Cloud) -> None:
+    sharp = replace(seeing("thesis", 5.0, cloud), threshold=5.0)
+    blunt = replace(seeing("matched", 8.0, cloud), threshold=9.0)
+    assert chosen([blunt, sharp], cloud, "").detector.name == "thesis"
+    few_calls = with_laws(blunt, at_marks=1)
+    many_calls = with_laws(sharp, at_marks=90)
+    raised = many_calls.with_calls(few_calls.expected)
+    assert raised.threshold > 5.0
+    tails = {n: Tail.from_facts(f) for n, f in raised.evidence.notes["own_null"]["tails"].items()}
+    assert calls_at(tails, raised.threshold) == pytest.approx(few_calls.expected)
+    best = chosen([few_calls, many_calls], cloud, "")
+    at_its_own = chosen([blunt, sharp], cloud, "")
+    # the holes found at the raised threshold are fewer than at its own
+    found = best.evidence.notes["choice"]["found"]["thesis"]
+    assert found < at_its_own.evidence.notes["choice"]["found"]["thesis"]
+    assert best.threshold in (few_calls.threshold, many_calls.threshold)
 
 
 def test_equal_ones_are_told_by_the_pixels(cloud: Cloud) -> None:
@@ -192,3 +223,13 @@ def test_the_rate_is_stated() -> None:
     assert cli.rate_text(options()) == "1 expected false call"
     assert cli.rate_text(options("--false-calls", "0.5")) == "0.5 expected false calls"
     assert "silent" in cli.rate_text(options("--quiet-capture", "x"))
+
+
+def test_a_threshold_for_all_laws_together_expects_that_many_calls() -> None:
+    scores = 3.0 + np.random.default_rng(4).exponential(0.5, 60)
+    tails = {"plain": Tail.of(scores, 3.0), "marks": Tail.of(scores[:30], 3.5)}
+    both_sides = 2.0 * (tails["plain"].expected(4.0) + tails["marks"].expected(4.0))
+    assert calls_at(tails, 4.0) == pytest.approx(both_sides)
+    for calls in (10.0, 1.0, 0.01):
+        assert calls_at(tails, threshold_at(tails, calls, 3.5)) == pytest.approx(calls)
+    assert threshold_at(tails, 1e3, 3.5) == 3.5
