@@ -297,7 +297,9 @@ class _Comparison:
         facing = cosine / max(math.cos(math.radians(that.tilt_deg)), 1e-2)
         nearness = that.depths_m[1] / max(this.depths_m[1], 1e-6)
         probability = _probability(weight**0.5 * facing**2 * nearness)
-        why = f"a surface of {_size_text(that)} may be the target instead of that of {_size_text(this)}"
+        first = _size_text(this)
+        other = _size_text(that)
+        why = f"a surface of {other} may be the target instead of that of {first}"
         return probability, why
 
     def _in_front(self, front: int, back: int) -> tuple[float, str] | None:

@@ -16,8 +16,9 @@ import numpy as np
 from detectors.averages.average import RECORDED, average, unsteadiness
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
 from detectors.crop import Choice
-from detectors.interface import Detector
+from detectors.interface import Detector, Evidence
 from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
+from detectors.surfaces.pieces import part_text, piece_facts
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
@@ -121,6 +122,8 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         return threshold, f"the lowest that is silent on {quiet}"
 
     evidence = analysed(detector, cloud)
+    if mapped is None:
+        evidence = _with_pieces(evidence, cloud, choices[0])
     capture_doubts = _capture_doubts(arguments, views, flat_field)
     evidence = replace(evidence, warnings=(*capture_doubts, *evidence.warnings))
     threshold, threshold_origin, evidence = threshold_of(
@@ -144,6 +147,15 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         threshold=threshold,
         threshold_origin=threshold_origin,
     )
+
+
+def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evidence:
+    """Note the pieces of the chosen part, and how much of each was judged."""
+    if choice is None or choice.part is None:
+        return evidence
+    fit = str(evidence.notes.get("shape", evidence.notes.get("surface", "")))
+    pieces = piece_facts(choice.part, cloud, evidence.residual_m, fit)
+    return replace(evidence, notes={**evidence.notes, "pieces": pieces})
 
 
 def _detector_of(
@@ -226,6 +238,9 @@ def _print_capture(run: Inspection) -> None:
     cloud = run.result.cloud
     crop = run.arguments.crop
     is_judged = np.isfinite(run.result.evidence.residual_m)
+    pieces = run.result.evidence.notes.get("pieces")
+    if pieces:
+        print(part_text(pieces))
     output.print_choice(run.choices[0])
     output.print_capture(recording, cloud, recording.name, is_judged, crop)
     off_count = cloud.valid.sum() - is_judged.sum()
