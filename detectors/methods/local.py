@@ -116,7 +116,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 3
+    version = 4
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings
