@@ -24,7 +24,7 @@ from detectors.pixels.masks import (
     notches_filled,
     parts_with,
 )
-from detectors.surfaces.smooth_surfaces import Surfaces, raster, smooth_surfaces
+from detectors.surfaces.smooth_surfaces import LEAST_PX, Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
@@ -336,12 +336,14 @@ class _Comparison:
         That is a surface which is a better target, or too far away to lie on it, with all nearer
         pixels that join it (fingers of a hand); an object on it stays."""
         surfaces = self.surfaces
-        outline = np.zeros(surfaces.own[number].shape, dtype=bool)
+        filled = self.described[number].outline
+        outline = filled.copy()
         # what stands between two pieces of a surface is no notch
-        for piece in _pieces(self.described[number].outline):
+        for piece in _large_pieces(filled):
+            notchless = piece
             for radius_px in NOTCHES_PX:
-                piece = notches_filled(piece, radius_px)
-            outline |= piece
+                notchless = notches_filled(notchless, radius_px)
+            outline |= notchless
         for neighbour in self.numbers:
             border = self.borders[neighbour].get(number)
             if border is None or not border.is_step or not self.encloses(number, neighbour):
@@ -357,10 +359,11 @@ class _Comparison:
         return outline
 
 
-def _pieces(mask: np.ndarray) -> list[np.ndarray]:
-    """Return the connected parts of a mask (h, w)."""
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    return [labels == label for label in range(1, count)]
+def _large_pieces(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the connected parts of a mask (h, w) that are large enough for a surface."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    return [labels == 1 + number for number in np.flatnonzero(areas >= LEAST_PX)]
 
 
 def _probability(odds_base: float) -> float:

@@ -39,7 +39,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 6
+    version = 7
 
     @property
     def default_threshold(self) -> float | None:

@@ -126,11 +126,11 @@ class Profile:
         count = len(self.curve)
         number = np.bincount(knots, minlength=count)
         # the visible length: the number of points, each a knot's distance long
-        distance_m = np.abs(1.0 / self.curve) if self.central else 1.0
+        distance_m = np.abs(1.0 / self.curve) if self.central else np.ones(count)
         visible_m = number * self.step * distance_m
         unknown = (visible_m < LEAST_LENGTH_M) | (number < LEAST_POINTS)
         steps = np.abs(np.diff(1.0 / self.curve if self.central else self.curve))
-        width_m = self.step * (distance_m[1:] if self.central else 1.0)
+        width_m = self.step * distance_m[1:]
         is_step = steps > STEEP * width_m
         for shift in range(1 - RIM_PX, RIM_PX + 1):
             index = np.flatnonzero(is_step) + shift

@@ -197,7 +197,7 @@ def _areas_of(masks: np.ndarray, unbroken: np.ndarray) -> list[int]:
 
 
 def _lies_in(surface: np.ndarray, area: np.ndarray) -> bool:
-    return np.count_nonzero(surface & area) > 0.5 * np.count_nonzero(surface)
+    return bool(np.count_nonzero(surface & area) > 0.5 * np.count_nonzero(surface))
 
 
 def _bridged(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
