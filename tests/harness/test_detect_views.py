@@ -68,7 +68,9 @@ def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def findings_of(out: Path) -> list[dict[str, float]]:
     with (out / "findings.csv").open(newline="") as stream:
-        rows = [{k: v for k, v in row.items() if k != "kind"} for row in csv.DictReader(stream)]
+        rows = list(csv.DictReader(stream))
+    for row in rows:
+        del row["kind"], row["shape"]
     return [{k: float(v) if v else float("nan") for k, v in row.items()} for row in rows]
 
 
