@@ -417,7 +417,8 @@ def _surroundings(
 def _means(picture: np.ndarray, side: int) -> np.ndarray:
     """Return the means (h // side, w // side) of a picture's known pixels over squares; NaN where
     fewer than half are known."""
-    height, width = (length // side for length in picture.shape)
+    height = picture.shape[0] // side
+    width = picture.shape[1] // side
     squares = picture[: height * side, : width * side].reshape(height, side, width, side)
     known = np.isfinite(squares)
     counts = known.sum(axis=(1, 3))
@@ -646,8 +647,10 @@ def _by_contour(
     u = float((columns.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
     v = float((rows.mean() + 0.5) / CONTOUR_ZOOM - 0.5)
     diameter_m = _diameter_m(around, inside)
-    low, high = (_contour(around, residual_m, share * top_m) for share in FLANK)
-    flank_m = 0.5 * (_diameter_m(around, low) - _diameter_m(around, high))
+    low_share, high_share = FLANK
+    foot = _contour(around, residual_m, low_share * top_m)
+    summit = _contour(around, residual_m, high_share * top_m)
+    flank_m = 0.5 * (_diameter_m(around, foot) - _diameter_m(around, summit))
     blur_m2 = math.prod(around.patch.blur_px) * around.area_m2
     moved_m = min(blur_m2 / (6.0 * diameter_m), 0.5 * diameter_m)
     if doubt == AMBIGUOUS:

@@ -116,15 +116,18 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
         return None
     candidates = []
     for n, area in enumerate(choice.candidates, start=1):
-        nearest, distance, farthest = (m / MM for m in area.depths_m)
+        nearest_m, distance_m, farthest_m = area.depths_m
         facts: dict[str, Any] = {
             "number": n,
-            "nearest_mm": nearest,
-            "distance_mm": distance,
-            "farthest_mm": farthest,
+            "nearest_mm": nearest_m / MM,
+            "distance_mm": distance_m / MM,
+            "farthest_mm": farthest_m / MM,
+            "extent_mm": [side / MM for side in area.extent_m],
+            "share_of_view": area.share,
+            "tilt_deg": area.tilt_deg,
+            "pixels": int(area.own.sum()),
         }
-        facts |= {"extent_mm": [side / MM for side in area.extent_m], "share_of_view": area.share}
-        candidates.append({**facts, "tilt_deg": area.tilt_deg, "pixels": int(area.own.sum())})
+        candidates.append(facts)
     return {"taken": choice.taken, "warnings": choice.warnings, "candidates": candidates}
 
 
