@@ -23,8 +23,10 @@ out nor are visible in a picture."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -150,7 +152,6 @@ def own_threshold(
     judged = np.isfinite(evidence.score)
     marks = marks_of(cloud, evidence)
     covered = marks.covered
-    n_objects = int(ndimage.label(covered)[1])
     before = _only(evidence, ~behind(evidence))
     peaks = _peaks(detector, cloud, before, marks)
     doubts = _doubts_about_symmetry(evidence)
@@ -167,7 +168,7 @@ def own_threshold(
             high=float("nan"),
             peaks=len(peaks.scores),
             floor=peaks.floor,
-            objects=n_objects,
+            objects=marks.regions,
             rim_pixels=0,
             rim_scale=1.0,
             evidence=evidence,
@@ -204,7 +205,7 @@ def own_threshold(
         high=high,
         peaks=tail.peaks,
         floor=tail.floor,
-        objects=n_objects,
+        objects=marks.regions,
         rim_pixels=int(rim.sum()),
         rim_scale=rim_scale,
         evidence=_only(evidence, ~rim),
@@ -313,9 +314,8 @@ def _area_ratio(judged: np.ndarray, marks: Marks) -> float:
     """Return the judged area away from long marks over the area where peaks count as noise.
 
     ``judged`` (h, w) bool. Peaks at small marks do not count, but noise is as frequent there."""
-    near_long = grown(marks.labels > 0, marks.margin_px, cv2.MORPH_ELLIPSE)
     counted = int((judged & ~marks.covered).sum())
-    return float((judged & ~near_long).sum()) / max(counted, 1)
+    return float((judged & ~marks.beside_long).sum()) / max(counted, 1)
 
 
 def _fitting_tail(
@@ -639,6 +639,16 @@ class Marks:
         """Number of long marks."""
         return len(self.areas) - 1
 
+    @cached_property
+    def regions(self) -> int:
+        """Number of connected regions that are covered."""
+        return int(ndimage.label(self.covered)[1])
+
+    @cached_property
+    def beside_long(self) -> np.ndarray:
+        """(h, w) bool: long marks, with their margin."""
+        return grown(self.labels > 0, self.margin_px, cv2.MORPH_ELLIPSE)
+
     def hold(self, detection: Detection) -> bool:
         """Return whether a finding is at a long mark, most of which lies beyond the finding."""
         if not self.count:
@@ -658,7 +668,20 @@ class Marks:
 
 
 def marks_of(cloud: Cloud, evidence: Evidence) -> Marks:
-    """Return the objects, print and edges of a cloud; none without a pixel grid."""
+    """Return the objects, print and edges of a cloud; none without a pixel grid.
+
+    A cloud keeps them by the pixels that are judged and by their residuals, which detectors
+    share."""
+    digest = hashlib.blake2b(np.isfinite(evidence.score).tobytes())
+    digest.update(np.ascontiguousarray(evidence.residual_m))
+    key = digest.digest()
+    if key not in cloud.marks:
+        cloud.marks[key] = _marks(cloud, evidence)
+    return cloud.marks[key]
+
+
+def _marks(cloud: Cloud, evidence: Evidence) -> Marks:
+    """Find the `marks_of` a cloud."""
     shape = evidence.score.shape
     nowhere = np.zeros(shape, bool)
     margin_px = _margin(cloud)
