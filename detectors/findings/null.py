@@ -24,7 +24,7 @@ out nor are visible in a picture."""
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -62,6 +62,7 @@ FEWEST_PEAKS = 8  # above the floor: their mean excess is known to 35 %
 CROWDED = 0.6
 """Share of the largest number of findings at any threshold that the floor may have at most: at
 more, findings still join."""
+SPARSE = 0.05  # share of the judged pixels that exceed the thresholds that are tried first
 LADDER = 1.06  # ratio of thresholds tried for the floor
 LEAST = 3.0
 """Lowest threshold in units of score: bounded errors end so near that peaks in front predict
@@ -579,9 +580,7 @@ def _peaks(
     least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
     steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
-    findings = findings_at(detector, cloud, evidence, thresholds)
-    counts = [len(at_threshold.scores) for at_threshold in findings]
-    floor = thresholds[_floor_among(counts)]
+    floor = _floor_of(detector, cloud, evidence, thresholds)
     hidden = marks.covered.reshape(-1)
     proud = marks.proud.reshape(-1)
     rim = np.zeros(hidden.shape, bool)
@@ -602,6 +601,39 @@ def _peaks(
         is_at_rim=np.array(at_rim, bool),
         at_marks=np.array(scores_at_marks),
     )
+
+
+def _floor_of(
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    thresholds: Sequence[float],
+) -> float:
+    """Return which of rising thresholds is the floor of the peaks.
+
+    Only few pixels exceed the higher thresholds, so these are tried first. They decide if more than
+    enough findings join at the highest threshold with enough of them: lower ones can only have
+    more."""
+    judged = evidence.score[np.isfinite(evidence.score)]
+    start = int(np.searchsorted(thresholds, np.quantile(judged, 1.0 - SPARSE)))
+    counts = _counts(detector, cloud, evidence, thresholds[start:])
+    enough = [n for n in range(len(counts)) if counts[n] >= WANTED_PEAKS]
+    if enough and counts[enough[-1]] <= CROWDED * max(counts):
+        return thresholds[start + enough[-1]]
+    return thresholds[_floor_among(_counts(detector, cloud, evidence, thresholds))]
+
+
+def _counts(
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    thresholds: Sequence[float],
+) -> list[int]:
+    """Return the number of findings at each of rising thresholds."""
+    if not thresholds:
+        return []
+    findings = findings_at(detector, cloud, evidence, thresholds)
+    return [len(at_threshold.scores) for at_threshold in findings]
 
 
 def _floor_among(counts: list[int]) -> int:

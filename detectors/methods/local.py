@@ -222,7 +222,12 @@ class LocalDetector:
         assert isinstance(evidence, LocalEvidence)
         pixels = above(evidence, thresholds[0])
         scores = evidence.score.reshape(-1)[pixels]
-        peaks = _peak_of_cells(evidence.signed, thresholds[0])[evidence.cell.reshape(-1)[pixels]]
+        places = evidence.cell.reshape(-1)[pixels]
+        signed = evidence.signed
+        # peaks join cells of their own sign only
+        if not (signed.reshape(-1)[places] > 0).any():
+            signed = np.minimum(signed, 0.0)
+        peaks = _peak_of_cells(signed, thresholds[0])[places]
         # number the peaks that have pixels in the order of their heights
         _, labels = np.unique(peaks, return_inverse=True)
         strengths = np.zeros(int(labels.max(initial=-1)) + 1)
