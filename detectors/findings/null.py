@@ -24,14 +24,14 @@ out nor are visible in a picture."""
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import ndimage, special
 
 from detectors.findings.measure import extents
 from detectors.interface import Detection, Detector, Evidence
@@ -52,6 +52,7 @@ as much."""
 THEORY_AT_MARKS = 1.0
 """The same at marks: what print and edges make of the distance is no normal noise."""
 DRAWS = 4000  # of the interval
+HALVINGS = 48  # of the interval that holds a threshold: to rounding error
 CONTRADICTED = 0.1
 """A tail is rejected if the probability of the number of peaks above the threshold is lower."""
 
@@ -226,10 +227,24 @@ def threshold_at(tails: Mapping[str, Tail], calls: float, least: float) -> float
     calls (above 0), on both sides of the surface."""
     if calls_at(tails, least) <= calls:
         return least
+    return _falls_to(calls, lambda threshold: calls_at(tails, threshold), least)
+
+
+def _falls_to(number: float, expected: Callable[[float], float], least: float) -> float:
+    """Return the threshold above ``least`` (above 0) at which a falling expectation is this
+    number."""
+    low = least
     high = 2.0 * least
-    while calls_at(tails, high) > calls:
+    while expected(high) > number:
+        low = high
         high *= 2.0
-    return float(optimize.brentq(lambda at: np.log(calls_at(tails, at) / calls), least, high))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if expected(middle) > number:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 def interval_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
@@ -499,15 +514,7 @@ class Tail:
         if number >= self.number:
             return floor
 
-        def surplus(log_ratio: float) -> float:
-            threshold = float(np.exp(log_ratio)) * floor
-            return float(np.log(self.expected(threshold) / number))
-
-        high = 2.0
-        while self.expected(high * floor) > number:
-            high *= 2.0
-        log_ratio = optimize.brentq(surplus, 0.0, np.log(high))
-        return float(np.exp(log_ratio)) * floor
+        return _falls_to(number, self.expected, floor)
 
     def interval(self, threshold: float) -> tuple[float, float]:
         """Return the central 95 % of the expected number of peaks above a threshold."""

@@ -36,7 +36,9 @@ SLOT = SHAPES.index("slot")
 PARAMETERS = 7
 """Numbers of a damage: u, v (px), radius (m), depth along the optical axis (m), wall, logarithm of
 length over width, angle (rad) from the rows' direction on the surface."""
-COSINE_SERIES = tuple((-1) ** k * (0.5 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in range(10))
+COSINE_SERIES = tuple(
+    (-1) ** k * (0.5 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in range(10)
+)
 """Coefficients of cos(pi p / 2) by powers of the square of p; the next is 3e-14."""
 FINER = 2  # points between pixels along each axis: volumes within 0.3 % from 3 px of radius
 MOST_STEPS = 12  # of the search for where a line of sight meets a relief
