@@ -24,7 +24,7 @@ from detectors.pixels.masks import (
     notches_filled,
     parts_with,
 )
-from detectors.surfaces.smooth_surfaces import Surfaces, raster, smooth_surfaces
+from detectors.surfaces.smooth_surfaces import LEAST_PX, Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
@@ -297,8 +297,9 @@ class _Comparison:
         facing = cosine / max(math.cos(math.radians(that.tilt_deg)), 1e-2)
         nearness = that.depths_m[1] / max(this.depths_m[1], 1e-6)
         probability = _probability(weight**0.5 * facing**2 * nearness)
-        sizes = (_size_text(that), _size_text(this))
-        why = f"a surface of {sizes[0]} may be the target instead of that of {sizes[1]}"
+        first = _size_text(this)
+        other = _size_text(that)
+        why = f"a surface of {other} may be the target instead of that of {first}"
         return probability, why
 
     def _in_front(self, front: int, back: int) -> tuple[float, str] | None:
@@ -335,12 +336,14 @@ class _Comparison:
         That is a surface which is a better target, or too far away to lie on it, with all nearer
         pixels that join it (fingers of a hand); an object on it stays."""
         surfaces = self.surfaces
-        outline = np.zeros(surfaces.own[number].shape, dtype=bool)
+        filled = self.described[number].outline
+        outline = filled.copy()
         # what stands between two pieces of a surface is no notch
-        for piece in _pieces(self.described[number].outline):
+        for piece in _large_pieces(filled):
+            notchless = piece
             for radius_px in NOTCHES_PX:
-                piece = notches_filled(piece, radius_px)
-            outline |= piece
+                notchless = notches_filled(notchless, radius_px)
+            outline |= notchless
         for neighbour in self.numbers:
             border = self.borders[neighbour].get(number)
             if border is None or not border.is_step or not self.encloses(number, neighbour):
@@ -356,10 +359,11 @@ class _Comparison:
         return outline
 
 
-def _pieces(mask: np.ndarray) -> list[np.ndarray]:
-    """Return the connected parts of a mask (h, w)."""
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    return [labels == label for label in range(1, count)]
+def _large_pieces(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the connected parts of a mask (h, w) that are large enough for a surface."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    return [labels == 1 + number for number in np.flatnonzero(areas >= LEAST_PX)]
 
 
 def _probability(odds_base: float) -> float:

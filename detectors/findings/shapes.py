@@ -41,6 +41,7 @@ COSINE_SERIES = tuple(
 )
 """Coefficients of cos(pi p / 2) by powers of the square of p; the next is 3e-14."""
 FINER = 2  # points between pixels along each axis: volumes within 0.3 % from 3 px of radius
+SMOOTH_PX = 3.0  # side of a blur from which a smooth relief needs but one
 MOST_STEPS = 12  # of the search for where a line of sight meets a relief
 CLOSE = 1e-3  # error of that depth, as a share of the deepest
 
@@ -100,19 +101,22 @@ def reliefs(
 ) -> np.ndarray:
     """Return the residuals (m, h, w) along the optical axis, without offset, of damages (m,
     `PARAMETERS`) of one shape; of ``sights`` (s, 8), each view counts with its share."""
+    finer = FINER
+    if shape != SLOT and min(blur_u, blur_v) >= SMOOTH_PX:
+        finer = 1
     images = np.zeros((len(holes), h, w))
     # points between pixels: the patch and half of the blur on each side
     margin_u = math.ceil(0.5 * blur_u) + 1
     margin_v = math.ceil(0.5 * blur_v) + 1
-    fine_h = FINER * (h + 2 * margin_v)
-    fine_w = FINER * (w + 2 * margin_u)
+    fine_h = finer * (h + 2 * margin_v)
+    fine_w = finer * (w + 2 * margin_u)
     line = np.empty(fine_w + 1)
     rows = np.zeros((fine_h + 1, w))  # sums over the points above, of means along a row
     root = math.sqrt(metric[0, 0])
     skew = metric[0, 1] / root
     area = math.sqrt(metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2)
     down = area / root
-    edge = math.sqrt(area) / FINER
+    edge = math.sqrt(area) / finer
     for n in range(len(holes)):
         u = holes[n, 0]
         v = holes[n, 1]
@@ -123,20 +127,20 @@ def reliefs(
         reach = radius * math.sqrt(1.0 + stretch * stretch) if shape == SLOT else radius
         reach_u = (reach + edge) * math.sqrt(metric[1, 1]) / area
         reach_v = (reach + edge) * root / area
-        first_column = max(0, math.floor(FINER * (u - reach_u + 0.5 + margin_u)))
-        last_column = min(fine_w, math.ceil(FINER * (u + reach_u + 0.5 + margin_u)))
-        first_row = max(0, math.floor(FINER * (v - reach_v + 0.5 + margin_v)))
-        last_row = min(fine_h, math.ceil(FINER * (v + reach_v + 0.5 + margin_v)))
+        first_column = max(0, math.floor(finer * (u - reach_u + 0.5 + margin_u)))
+        last_column = min(fine_w, math.ceil(finer * (u + reach_u + 0.5 + margin_u)))
+        first_row = max(0, math.floor(finer * (v - reach_v + 0.5 + margin_v)))
+        last_row = min(fine_h, math.ceil(finer * (v + reach_v + 0.5 + margin_v)))
         for i in range(fine_h):
             if i < first_row or i >= last_row or last_column <= first_column:
                 for c in range(w):
                     rows[i + 1, c] = rows[i, c]
                 continue
-            dv = (i + 0.5) / FINER - 0.5 - margin_v - v
+            dv = (i + 0.5) / finer - 0.5 - margin_v - v
             for j in range(first_column + 1):
                 line[j] = 0.0
             for j in range(first_column, last_column):
-                du = (j + 0.5) / FINER - 0.5 - margin_u - u
+                du = (j + 0.5) / finer - 0.5 - margin_u - u
                 total = 0.0
                 for k in range(len(sights)):
                     cosine = sights[k, 0]
@@ -161,15 +165,15 @@ def reliefs(
             for j in range(last_column, fine_w):
                 line[j + 1] = line[j]
             for c in range(w):
-                middle = FINER * (c + 0.5 + margin_u)
-                low = _sum_before(line, middle - 0.5 * FINER * blur_u)
-                high = _sum_before(line, middle + 0.5 * FINER * blur_u)
+                middle = finer * (c + 0.5 + margin_u)
+                low = _sum_before(line, middle - 0.5 * finer * blur_u)
+                high = _sum_before(line, middle + 0.5 * finer * blur_u)
                 rows[i + 1, c] = rows[i, c] + (high - low)
-        per_points = 1.0 / (FINER * FINER * blur_u * blur_v)
+        per_points = 1.0 / (finer * finer * blur_u * blur_v)
         for r in range(h):
-            middle = FINER * (r + 0.5 + margin_v)
-            above = middle - 0.5 * FINER * blur_v
-            below = middle + 0.5 * FINER * blur_v
+            middle = finer * (r + 0.5 + margin_v)
+            above = middle - 0.5 * finer * blur_v
+            below = middle + 0.5 * finer * blur_v
             top = int(above)
             bottom = int(below)
             to_top = above - top

@@ -60,23 +60,23 @@ class Profile:
     central: bool
     """Whether rays leave the origin, else they run along z."""
     twist: Fit | None = None
-    """z that is added, from a polynomial."""
+    """Distance ahead, metres, by which a polynomial moves the surface."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return z (n,) of the surface on the rays of points (n, 3); NaN where it is unknown."""
-        slopes, ahead = self.slopes(points)
-        z = self._z(points, self._curve_at(slopes), ahead)
-        if self.twist is not None:
-            z = z + self.twist(points)
-        return z
+        curve = self._curve_at(self.slopes(points))
+        if not self.central:
+            beside_m = points[:, :2] @ self.ahead[:2]
+            return (curve + self._twisted_m(points) - beside_m) / self.ahead[2]
+        rays = points / points[:, 2:]
+        return (1.0 / curve + self._twisted_m(points)) / (rays @ self.ahead)
 
-    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return each ray's place (n,) across the direction, and its share ahead (n,)."""
-        if self.central:
-            rays = points / points[:, 2:]
-            ahead = rays @ self.ahead
-            return (rays @ self.across) / ahead, ahead
-        return points @ self.across, np.full(len(points), self.ahead[2])
+    def slopes(self, points: np.ndarray) -> np.ndarray:
+        """Return the place (n,) of points (n, 3) across the direction, as the knots count it."""
+        across_m = points @ self.across
+        if not self.central:
+            return across_m
+        return across_m / (points @ self.ahead - self._twisted_m(points))
 
     def lengths(self, points: np.ndarray) -> np.ndarray:
         """Return each point's place (n,) along the direction, as `slopes` across it."""
@@ -94,29 +94,22 @@ class Profile:
         share = position - left
         return self.curve[left] * (1.0 - share) + self.curve[left + 1] * share
 
-    def _z(self, points: np.ndarray, curve: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-        if self.central:
-            return 1.0 / (curve * ahead)
-        beside = points[:, :2] @ self.ahead[:2]
-        return (curve - beside) / ahead
-
-    def _curve_of(self, points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    def _curve_of(self, points: np.ndarray) -> np.ndarray:
         """Return the curve's value (n,) that puts the surface through each point."""
-        z = points[:, 2]
-        if self.twist is not None:
-            z = z - self.twist(points)
-        if self.central:
-            return 1.0 / (z * ahead)
-        return points[:, :2] @ self.ahead[:2] + z * ahead
+        ahead_m = points @ self.ahead - self._twisted_m(points)
+        return 1.0 / ahead_m if self.central else ahead_m
+
+    def _twisted_m(self, points: np.ndarray) -> np.ndarray:
+        return np.zeros(len(points)) if self.twist is None else self.twist(points)
 
     def fitted(self, points: np.ndarray) -> Profile:
         """Return the profile with the curve of medians of points (n, 3)."""
-        slopes, ahead = self.slopes(points)
+        slopes = self.slopes(points)
         low = float(slopes.min())
         count = max(math.ceil((float(slopes.max()) - low) / self.step) + 1, 2)
         result = replace(self, first=low, curve=np.zeros(count))
         knots = result.knots(slopes)
-        values = self._curve_of(points, ahead)
+        values = self._curve_of(points)
         curve = group_medians(values, knots, count)[0]
         curve = _filled(curve)
         # on a slope, values beside a knot differ from it by the slope itself
@@ -127,7 +120,7 @@ class Profile:
     def trusted(self, points: np.ndarray) -> Profile:
         """Return the profile, unknown where points (n, 3) show less than `LEAST_LENGTH_M` of it,
         and beside steps."""
-        slopes, _ = self.slopes(points)
+        slopes = self.slopes(points)
         knots = self.knots(slopes)
         count = len(self.curve)
         number = np.bincount(knots, minlength=count)
@@ -172,9 +165,9 @@ def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> 
     on_base[:, 2] = base(sample)
     if central:
         on_base[:, :2] *= (on_base[:, 2] / sample[:, 2])[:, None]
-    across, ahead = frame.slopes(sample)
+    across = frame.slopes(sample)
     along = frame.lengths(sample)
-    values = frame._curve_of(sample, ahead) - frame._curve_of(on_base, ahead)
+    values = frame._curve_of(sample) - frame._curve_of(on_base)
     turns = math.pi / TURNS * np.arange(TURNS)
     blocks = _block_means(across, along, values, COARSE_PX * pitch)
     explained = _explained(blocks, turns, COARSE_PX * pitch)
@@ -286,16 +279,18 @@ def _refined(
 
 
 def with_twist(profile: Profile, points: np.ndarray) -> Profile:
-    """Return the profile fitted to points (n, 3), plus the polynomial of degree 2 that their
-    residuals follow."""
+    """Return the profile fitted to points (n, 3), moved ahead by the polynomial of degree 3 that
+    their residuals follow."""
     fitted = profile.fitted(points)
     sample = picked(points, SEARCHED)
-    for _ in range(2):
-        residuals = sample[:, 2] - replace(fitted, twist=None)(sample)
+    for _ in range(3):
+        residuals = sample[:, 2] - fitted(sample)
         scale = max(float(np.median(np.abs(residuals))) / 0.6745, 1e-9)
         weights = bisquare_weights(residuals, 6.0 * scale)
-        flat = np.column_stack([sample[:, :2], residuals])
-        fitted = replace(profile, twist=polynomial(flat, weights, degree=2)).fitted(points)
+        share = sample @ profile.ahead / sample[:, 2] if profile.central else profile.ahead[2]
+        moved = sample.copy()
+        moved[:, 2] = fitted._twisted_m(sample) + residuals * share
+        fitted = replace(profile, twist=polynomial(moved, weights, degree=3)).fitted(points)
     return fitted
 
 
@@ -320,7 +315,7 @@ def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
         noise = float(np.nanmedian(errors)) / 0.6745
         limit = CLIP_SIGMAS * noise
         sizes = np.abs(departures[inside])
-        knots = other.knots(other.slopes(points)[0]).clip(0, len(other.curve) - 1)
+        knots = other.knots(other.slopes(points)).clip(0, len(other.curve) - 1)
         medians, _ = group_medians(departures[~inside], knots[~inside], len(other.curve))
         departs = np.abs(np.nan_to_num(medians)) > SEEN * noise
         gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise

@@ -73,7 +73,7 @@ def _paraboloid(points: np.ndarray) -> Fit:
 
 def _held(profile: Profile, points: np.ndarray, near: np.ndarray) -> bool:
     """Return whether the profile is near the points (n, 3) in nearly all strips along it."""
-    knots = profile.knots(profile.slopes(points)[0]).clip(0, len(profile.curve) - 1)
+    knots = profile.knots(profile.slopes(points)).clip(0, len(profile.curve) - 1)
     strips = knots // CHORD_KNOTS
     counts = np.bincount(strips)
     shares = np.bincount(strips, near)[counts > 0] / counts[counts > 0]

@@ -8,16 +8,21 @@ limit."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
 import numpy as np
 
 from detectors.pixels.masks import nearest_pixel
 from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
+from harness.vocabulary.geometry import Cloud
 
 MOST_SAMPLES = 4000  # points from which a piece's surface is fitted
 HELD = 0.9  # share of a piece's points within the limit of a surface that holds it
 FACING = 0.1  # share of a piece's pixels, nearest to the other piece, from which one looks across
 MOST_LINES = 200
 PLACES = 12  # places at which a line between two pieces is looked at
+LEAST_PX = 100  # fewest pixels of a piece that is counted
 BEHIND = 0.5  # share of the lines that show a background from which pieces are separate parts
 
 
@@ -99,3 +104,55 @@ def _background_between(
     line_m = 1.0 / (near + share * (1.0 / flat[ends] - near))
     behind = flat[places] > line_m + apart_m
     return bool(behind.any(axis=0).mean() >= BEHIND)
+
+
+def piece_facts(
+    part: np.ndarray, cloud: Cloud, residual_m: np.ndarray, fit: str
+) -> list[dict[str, Any]]:
+    """Return the facts about each piece of a part, largest first: its area in m2, on its mean
+    plane; the share of it that was judged; and the surface that was fitted to it.
+
+    Args:
+        part: (h, w) bool, the valid pixels of the part.
+        cloud: organised.
+        residual_m: (h, w), metres, NaN where nothing is judged.
+        fit: name of the surface, which is common to all pieces."""
+    _, labels = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
+    labels = labels.ravel()
+    counts = np.bincount(labels)
+    judged = np.bincount(labels, np.isfinite(residual_m).ravel())
+    facts = []
+    for number in 1 + np.argsort(-counts[1:], kind="stable"):
+        if counts[number] < LEAST_PX:
+            break
+        area_m2 = _area_m2(cloud, np.flatnonzero(labels == number))
+        share = float(judged[number] / counts[number])
+        facts.append({"area_m2": area_m2, "share": share, "fit": fit})
+    return facts
+
+
+def _area_m2(cloud: Cloud, pixels: np.ndarray) -> float:
+    """Return the area of pixels (n,), given by their flat indices, on their mean plane."""
+    points = cloud.points_m.reshape(-1, 3)[pixels]
+    central = cloud.projection == "central"
+    places = cloud.points_m[::4, ::4, :2]
+    if central:
+        places = places / cloud.points_m[::4, ::4, 2:]
+    across = float(np.nanmedian(np.abs(np.diff(places[..., 0], axis=1)))) / 4.0
+    down = float(np.nanmedian(np.abs(np.diff(places[..., 1], axis=0)))) / 4.0
+    centred = points - points.mean(axis=0)
+    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
+    if not central:
+        return len(points) * across * down / max(abs(float(normal[2])), 1e-3)
+    # a pixel covers z^2 of the unit plane, and more where the ray is oblique
+    cosines = np.abs(points @ normal) / points[:, 2]
+    return across * down * float((points[:, 2] ** 2 / np.maximum(cosines, 1e-3)).sum())
+
+
+def part_text(pieces: list[dict[str, Any]]) -> str:
+    """Return how many pieces a part has, and the share of it that was judged."""
+    area_m2 = sum(piece["area_m2"] for piece in pieces)
+    judged_m2 = sum(piece["area_m2"] * piece["share"] for piece in pieces)
+    plural = "" if len(pieces) == 1 else "s"
+    share = 100.0 * judged_m2 / max(area_m2, 1e-12)
+    return f"part: {len(pieces)} piece{plural}, {area_m2:.2g} m2, {share:.0f} % of it judged"

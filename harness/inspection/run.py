@@ -18,8 +18,9 @@ from detectors.averages.average import RECORDED, average, unsteadiness
 from detectors.averages.flat_agreement import places_doubt, refuse_unfit
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
 from detectors.crop import Choice, described_text
-from detectors.interface import Detector
+from detectors.interface import Detector, Evidence
 from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
+from detectors.surfaces.pieces import part_text, piece_facts
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
@@ -142,6 +143,9 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         candidate = chosen(candidates, cloud, cli.rate_text(arguments))
     detector = candidate.detector
     threshold = candidate.threshold
+    if mapped is None:
+        noted_evidence = _with_pieces(candidate.evidence, cloud, choices[0])
+        candidate = replace(candidate, evidence=noted_evidence)
     capture_doubts = _capture_doubts(arguments, views, flat_field)
     warnings = (*capture_doubts, *candidate.evidence.warnings)
     evidence = replace(candidate.evidence, warnings=warnings)
@@ -170,6 +174,8 @@ def _outline(choices: Sequence[Choice | None], mapped: Mapped | None) -> np.ndar
     choice = choices[0]
     if mapped is not None or choice is None or not choice.candidates:
         return None
+    if choice.part is not None:
+        return choice.part
     return choice.candidates[choice.taken - 1].outline
 
 
@@ -180,6 +186,15 @@ def _limit(
     if arguments.limit is None:
         return None
     return limit_of(detector, result, threshold, cli.limit_depth_m(arguments))
+
+
+def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evidence:
+    """Note the pieces of the chosen part, and how much of each was judged."""
+    if choice is None or choice.part is None:
+        return evidence
+    fit = str(evidence.notes.get("shape", evidence.notes.get("surface", "")))
+    pieces = piece_facts(choice.part, cloud, evidence.residual_m, fit)
+    return replace(evidence, notes={**evidence.notes, "pieces": pieces})
 
 
 def _detectors_of(
@@ -290,6 +305,9 @@ def _print_capture(run: Inspection) -> None:
     cloud = run.result.cloud
     crop = run.arguments.crop
     is_judged = np.isfinite(run.result.evidence.residual_m)
+    pieces = run.result.evidence.notes.get("pieces")
+    if pieces:
+        print(part_text(pieces))
     output.print_choice(run.choices[0])
     output.print_capture(recording, cloud, recording.name, is_judged, crop)
     off_count = cloud.valid.sum() - is_judged.sum()

@@ -171,7 +171,8 @@ def test_two_surfaces_apart_are_compared_by_weight_tilt_and_nearness() -> None:
         for candidate in (that, this)
     ]
     expected = (
-        f"a surface of {sizes[0]} at 0.90 m is about as likely as that of {sizes[1]} at 0.60 m"
+        f"a surface of {sizes[0]} at 0.90 m may be the target instead of that of {sizes[1]} at"
+        " 0.60 m"
     )
     assert why == expected
 

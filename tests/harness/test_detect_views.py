@@ -69,8 +69,10 @@ def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def findings_of(out: Path) -> list[dict[str, float]]:
     with (out / "findings.csv").open(newline="") as stream:
-        words = ("kind", "shape", "certainty", "flags", "term")
-        rows = [{k: v for k, v in row.items() if k not in words} for row in csv.DictReader(stream)]
+        rows = list(csv.DictReader(stream))
+    for row in rows:
+        for word in ("kind", "shape", "certainty", "flags", "term"):
+            del row[word]
     return [{k: float(v) if v else float("nan") for k, v in row.items()} for row in rows]
 
 

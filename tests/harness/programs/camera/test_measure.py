@@ -52,7 +52,7 @@ def variance_after_rounding(sigma_steps: float) -> float:
     return float((probability @ integers**2 - mean**2).mean())
 
 
-@pytest.mark.parametrize("sigma_steps", [0.25, 0.4, 0.7, 1.5])
+@pytest.mark.parametrize("sigma_steps", [0.12, 0.25, 0.4, 0.7, 1.5])
 def test_rounding_is_taken_out_of_a_variance(sigma_steps: float) -> None:
     after_m2 = variance_after_rounding(sigma_steps) * STEP_M**2
     before_m2 = measure.before_rounding_m2(after_m2, STEP_M)

@@ -205,6 +205,13 @@ def test_without_ranges_there_is_no_number(monkeypatch: pytest.MonkeyPatch) -> N
     assert nothing is NOTHING
 
 
+def test_the_unit_of_a_quantity_is_the_ending_of_its_name() -> None:
+    units = {name: quantity.unit for name, quantity in QUANTITIES.items()}
+    assert units["temporal_sigma_mm"] == units["step_height_mm"] == "mm"
+    assert units["edge_gap_px"] == units["flying_pixels_px"] == "px"
+    assert units["valid_fraction"] == units["noise_correlation"] == units["flying_share"] == ""
+
+
 def test_conditions_in_words_and_as_scenes() -> None:
     assert in_words(PlaneConditions()) == "1.5 m, albedo 0.8"
     dim = PlaneConditions(distance_m=0.5, amplitude_units=20.0, angle_deg=30.0)

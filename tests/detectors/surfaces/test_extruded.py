@@ -1,0 +1,70 @@
+"""Extruded profiles: what they explain, what they do not swallow, and when faces are one part."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from detectors.surfaces.background import background
+from detectors.surfaces.extruded import direction_of, explains_better, with_twist
+from detectors.surfaces.faces import turns_back
+from detectors.surfaces.pieces import part_text
+from detectors.surfaces.surface import SurfaceConfig, polynomial
+from tests.detectors.test_crop import cloud_of
+
+NOISE_M = 3e-4
+
+
+def grooved(depth_m: float, seed: int = 0) -> np.ndarray:
+    """z (150, 200) of a plane at 0.8 m with grooves of 12 mm every 64 mm along the columns."""
+    columns = np.arange(200)
+    groove = (columns % 20) < 4
+    z_m = np.broadcast_to(0.8 + depth_m * groove, (150, 200)).copy()
+    return z_m + NOISE_M * np.random.default_rng(seed).standard_normal(z_m.shape)
+
+
+def test_grooves_are_fitted_and_a_hole_between_them_is_not() -> None:
+    z_m = grooved(2e-3)
+    z_m[70:76, 88:94] += 5e-3
+    cloud = cloud_of(z_m)
+    ground = background(cloud, cloud.valid, SurfaceConfig(shape="auto"))
+    assert ground.notes["shape"] == "extruded profile along 90 degrees"
+    rest_m = ground.residual_m
+    assert abs(np.nanmedian(rest_m[:60, 100:104])) < 2e-4
+    assert np.nanmedian(rest_m[71:75, 89:93]) > 4e-3
+    assert np.isfinite(rest_m).mean() > 0.95
+
+
+def test_a_plane_is_no_profile() -> None:
+    points = cloud_of(grooved(0.0)).points_m.reshape(-1, 3)
+    plane = polynomial(points, np.ones(len(points)), degree=2)
+    directed = direction_of(points, plane, 1 / 250, True)
+    assert directed is None or not explains_better(with_twist(directed, points), plane, points)
+
+
+def test_the_direction_of_grooves_is_found() -> None:
+    points = cloud_of(grooved(2e-3)).points_m.reshape(-1, 3)
+    plane = polynomial(points, np.ones(len(points)), degree=2)
+    directed = direction_of(points, plane, 1 / 250, True)
+    assert directed is not None
+    assert abs(directed.along[1]) > np.cos(np.radians(0.2))
+    assert explains_better(with_twist(directed, points), plane, points)
+
+
+def test_a_trapezoid_turns_back_and_a_corner_does_not() -> None:
+    columns = np.arange(200)
+    web = 0.04 * (np.clip((columns - 60) / 10, 0, 1) - np.clip((columns - 130) / 10, 0, 1))
+    corner = np.maximum(columns - 100, 0) * 0.0032
+    for z_m, expected in ((0.8 + web, True), (0.8 + corner, False)):
+        points = cloud_of(np.broadcast_to(z_m, (150, 200)).copy()).points_m.reshape(-1, 3)
+        base = polynomial(points, np.ones(len(points)), degree=2)
+        directed = direction_of(points, base, 1 / 250, True)
+        assert directed is not None
+        assert turns_back(directed.fitted(points), 35.0) == expected
+
+
+def test_the_share_of_a_part_is_weighted_by_area() -> None:
+    pieces = [
+        {"area_m2": 0.3, "share": 1.0, "fit": "plane"},
+        {"area_m2": 0.1, "share": 0.6, "fit": "plane"},
+    ]
+    assert part_text(pieces) == "part: 2 pieces, 0.4 m2, 90 % of it judged"
