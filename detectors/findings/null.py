@@ -712,7 +712,7 @@ def marks_of(cloud: Cloud, evidence: Evidence) -> Marks:
     A cloud keeps them by the pixels that are judged and by their residuals, which detectors
     share."""
     digest = hashlib.blake2b(np.isfinite(evidence.score).tobytes())
-    digest.update(np.ascontiguousarray(evidence.residual_m))
+    digest.update(evidence.residual_m.tobytes())
     key = digest.digest()
     if key not in cloud.marks:
         cloud.marks[key] = _marks(cloud, evidence)
