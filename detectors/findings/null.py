@@ -23,13 +23,15 @@ out nor are visible in a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import ndimage, special
 
 from detectors.findings.measure import extents
 from detectors.interface import Detection, Detector, Evidence
@@ -50,6 +52,7 @@ as much."""
 THEORY_AT_MARKS = 1.0
 """The same at marks: what print and edges make of the distance is no normal noise."""
 DRAWS = 4000  # of the interval
+HALVINGS = 48  # of the interval that holds a threshold: to rounding error
 CONTRADICTED = 0.1
 """A tail is rejected if the probability of the number of peaks above the threshold is lower."""
 
@@ -60,6 +63,7 @@ FEWEST_PEAKS = 8  # above the floor: their mean excess is known to 35 %
 CROWDED = 0.6
 """Share of the largest number of findings at any threshold that the floor may have at most: at
 more, findings still join."""
+SPARSE = 0.05  # share of the judged pixels that exceed the thresholds that are tried first
 LADDER = 1.06  # ratio of thresholds tried for the floor
 LEAST = 3.0
 """Lowest threshold in units of score: bounded errors end so near that peaks in front predict
@@ -150,7 +154,6 @@ def own_threshold(
     judged = np.isfinite(evidence.score)
     marks = marks_of(cloud, evidence)
     covered = marks.covered
-    n_objects = int(ndimage.label(covered)[1])
     before = _only(evidence, ~behind(evidence))
     peaks = _peaks(detector, cloud, before, marks)
     doubts = _doubts_about_symmetry(evidence)
@@ -167,7 +170,7 @@ def own_threshold(
             high=float("nan"),
             peaks=len(peaks.scores),
             floor=peaks.floor,
-            objects=n_objects,
+            objects=marks.regions,
             rim_pixels=0,
             rim_scale=1.0,
             evidence=evidence,
@@ -204,7 +207,7 @@ def own_threshold(
         high=high,
         peaks=tail.peaks,
         floor=tail.floor,
-        objects=n_objects,
+        objects=marks.regions,
         rim_pixels=int(rim.sum()),
         rim_scale=rim_scale,
         evidence=_only(evidence, ~rim),
@@ -224,10 +227,24 @@ def threshold_at(tails: Mapping[str, Tail], calls: float, least: float) -> float
     calls (above 0), on both sides of the surface."""
     if calls_at(tails, least) <= calls:
         return least
+    return _falls_to(calls, lambda threshold: calls_at(tails, threshold), least)
+
+
+def _falls_to(number: float, expected: Callable[[float], float], least: float) -> float:
+    """Return the threshold above ``least`` (above 0) at which a falling expectation is this
+    number."""
+    low = least
     high = 2.0 * least
-    while calls_at(tails, high) > calls:
+    while expected(high) > number:
+        low = high
         high *= 2.0
-    return float(optimize.brentq(lambda at: np.log(calls_at(tails, at) / calls), least, high))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if expected(middle) > number:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 def interval_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
@@ -313,9 +330,8 @@ def _area_ratio(judged: np.ndarray, marks: Marks) -> float:
     """Return the judged area away from long marks over the area where peaks count as noise.
 
     ``judged`` (h, w) bool. Peaks at small marks do not count, but noise is as frequent there."""
-    near_long = grown(marks.labels > 0, marks.margin_px, cv2.MORPH_ELLIPSE)
     counted = int((judged & ~marks.covered).sum())
-    return float((judged & ~near_long).sum()) / max(counted, 1)
+    return float((judged & ~marks.beside_long).sum()) / max(counted, 1)
 
 
 def _fitting_tail(
@@ -498,15 +514,7 @@ class Tail:
         if number >= self.number:
             return floor
 
-        def surplus(log_ratio: float) -> float:
-            threshold = float(np.exp(log_ratio)) * floor
-            return float(np.log(self.expected(threshold) / number))
-
-        high = 2.0
-        while self.expected(high * floor) > number:
-            high *= 2.0
-        log_ratio = optimize.brentq(surplus, 0.0, np.log(high))
-        return float(np.exp(log_ratio)) * floor
+        return _falls_to(number, self.expected, floor)
 
     def interval(self, threshold: float) -> tuple[float, float]:
         """Return the central 95 % of the expected number of peaks above a threshold."""
@@ -579,9 +587,7 @@ def _peaks(
     least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
     steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
-    findings = findings_at(detector, cloud, evidence, thresholds)
-    counts = [len(at_threshold.scores) for at_threshold in findings]
-    floor = thresholds[_floor_among(counts)]
+    floor = _floor_of(detector, cloud, evidence, thresholds)
     hidden = marks.covered.reshape(-1)
     proud = marks.proud.reshape(-1)
     rim = np.zeros(hidden.shape, bool)
@@ -602,6 +608,39 @@ def _peaks(
         is_at_rim=np.array(at_rim, bool),
         at_marks=np.array(scores_at_marks),
     )
+
+
+def _floor_of(
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    thresholds: Sequence[float],
+) -> float:
+    """Return which of rising thresholds is the floor of the peaks.
+
+    Only few pixels exceed the higher thresholds, so these are tried first. They decide if more than
+    enough findings join at the highest threshold with enough of them: lower ones can only have
+    more."""
+    judged = evidence.score[np.isfinite(evidence.score)]
+    start = int(np.searchsorted(thresholds, np.quantile(judged, 1.0 - SPARSE)))
+    counts = _counts(detector, cloud, evidence, thresholds[start:])
+    enough = [n for n in range(len(counts)) if counts[n] >= WANTED_PEAKS]
+    if enough and counts[enough[-1]] <= CROWDED * max(counts):
+        return thresholds[start + enough[-1]]
+    return thresholds[_floor_among(_counts(detector, cloud, evidence, thresholds))]
+
+
+def _counts(
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    thresholds: Sequence[float],
+) -> list[int]:
+    """Return the number of findings at each of rising thresholds."""
+    if not thresholds:
+        return []
+    findings = findings_at(detector, cloud, evidence, thresholds)
+    return [len(at_threshold.scores) for at_threshold in findings]
 
 
 def _floor_among(counts: list[int]) -> int:
@@ -639,6 +678,16 @@ class Marks:
         """Number of long marks."""
         return len(self.areas) - 1
 
+    @cached_property
+    def regions(self) -> int:
+        """Number of connected regions that are covered."""
+        return int(ndimage.label(self.covered)[1])
+
+    @cached_property
+    def beside_long(self) -> np.ndarray:
+        """(h, w) bool: long marks, with their margin."""
+        return grown(self.labels > 0, self.margin_px, cv2.MORPH_ELLIPSE)
+
     def hold(self, detection: Detection) -> bool:
         """Return whether a finding is at a long mark, most of which lies beyond the finding."""
         if not self.count:
@@ -658,7 +707,20 @@ class Marks:
 
 
 def marks_of(cloud: Cloud, evidence: Evidence) -> Marks:
-    """Return the objects, print and edges of a cloud; none without a pixel grid."""
+    """Return the objects, print and edges of a cloud; none without a pixel grid.
+
+    A cloud keeps them by the pixels that are judged and by their residuals, which detectors
+    share."""
+    digest = hashlib.blake2b(np.isfinite(evidence.score).tobytes())
+    digest.update(evidence.residual_m.tobytes())
+    key = digest.digest()
+    if key not in cloud.marks:
+        cloud.marks[key] = _marks(cloud, evidence)
+    return cloud.marks[key]
+
+
+def _marks(cloud: Cloud, evidence: Evidence) -> Marks:
+    """Find the `marks_of` a cloud."""
     shape = evidence.score.shape
     nowhere = np.zeros(shape, bool)
     margin_px = _margin(cloud)

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from detectors.findings.null import MARKS, PLAIN, RIM, Tail, behind, is_at_rim, marks_of
 from detectors.interface import Detection, Evidence, MissingReturns
@@ -133,15 +133,16 @@ class ChanceLaws:
 
     def expected(self, threshold: float) -> np.ndarray:
         """Return the expected number (1,) of chance clusters above a score."""
-        return np.array([stats.norm.sf(threshold)])
+        return np.array([special.ndtr(-threshold)])
 
     def densities(self, scores: np.ndarray) -> np.ndarray:
         """Return the expected number (1, n) per unit of score."""
-        return np.asarray(stats.norm.pdf(scores))[None, :]
+        densities = np.exp(-0.5 * scores**2) / np.sqrt(2.0 * np.pi)
+        return np.asarray(densities)[None, :]
 
 
 def chance_laws(missing: MissingReturns) -> tuple[float, ChanceLaws]:
     """Return the lowest score of a finding without return, and the law of chance above it."""
     lowest = min((detection.score for detection in missing.detections), default=np.inf)
-    threshold = float(stats.norm.isf(min(max(missing.expected, 1e-300), 0.5)))
+    threshold = -float(special.ndtri(min(max(missing.expected, 1e-300), 0.5)))
     return min(threshold, lowest), ChanceLaws()

@@ -36,6 +36,10 @@ SLOT = SHAPES.index("slot")
 PARAMETERS = 7
 """Numbers of a damage: u, v (px), radius (m), depth along the optical axis (m), wall, logarithm of
 length over width, angle (rad) from the rows' direction on the surface."""
+COSINE_SERIES = tuple(
+    (-1) ** k * (0.5 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in range(10)
+)
+"""Coefficients of cos(pi p / 2) by powers of the square of p; the next is 3e-14."""
 FINER = 2  # points between pixels along each axis: volumes within 0.3 % from 3 px of radius
 SMOOTH_PX = 3.0  # side of a blur from which a smooth relief needs but one
 MOST_STEPS = 12  # of the search for where a line of sight meets a relief
@@ -69,7 +73,19 @@ def profile(  # type: ignore[no-untyped-def]
         ball = (radius * radius + height * height) / (2.0 * height)
         centre = ball - height
         return depth / height * (math.sqrt(ball * ball - square * radius * radius) - centre)
-    return 0.5 * depth * (1.0 + math.cos(math.pi * math.sqrt(square)))
+    return depth * _raised_cosine(square)
+
+
+@numba.njit(**PLAIN)
+def _raised_cosine(square):  # type: ignore[no-untyped-def]
+    """Return (1 + cos(pi p)) / 2 for the ``square`` of p, from 0 to 1, within 1e-12.
+
+    It is the square of cos(pi p / 2), a short power series in the square of p. Most of the time of
+    a fit of a bowl is spent here; without root and cosine it takes half of it."""
+    total = COSINE_SERIES[-1]
+    for k in range(len(COSINE_SERIES) - 2, -1, -1):
+        total = COSINE_SERIES[k] + square * total
+    return total * total
 
 
 @numba.njit(**PLAIN)

@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
 
 from detectors.pixels.medians import group_medians
 from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
@@ -257,6 +256,8 @@ def _refined(
     points: np.ndarray, normal: np.ndarray, turn: float, pitch: float, central: bool
 ) -> Profile:
     """Return the profile whose turn and tilt leave the least residuals, searched from ``turn``."""
+    from scipy.optimize import minimize
+
     sample = picked(points, SEARCHED)
 
     def of(change: np.ndarray) -> Profile:

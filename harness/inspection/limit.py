@@ -19,7 +19,6 @@ import numpy as np
 from detectors.interface import Detector
 from detectors.pixels.masks import grown
 from harness.evaluation import intervals
-from harness.evaluation.pod import hit_miss
 from harness.inspection.verdict import pitch_mm, surface_points_m, surface_steps_m
 from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
@@ -258,6 +257,8 @@ def places_for(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
 
 def fitted(sizes: Sequence[SizeCount], depth_m: float | None) -> Limit:
     """Fit the share that is found as a function of size."""
+    from harness.evaluation.pod import hit_miss
+
     diameters = np.concatenate([np.full(size.places, size.diameter_mm) for size in sizes])
     hits = np.concatenate([np.arange(size.places) < size.hits for size in sizes])
     depth = "half as deep as wide" if depth_m is None else f"{depth_m / MM:.3g} mm deep"

@@ -552,7 +552,7 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
     from matplotlib.patches import Circle
 
     if cloud.organised:
-        rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+        rows, columns = np.unravel_index(detection.pixels, cloud.reason.shape)
         u = columns + cloud.region.col0
         v = rows + cloud.region.row0
         margin = 3.0
@@ -562,9 +562,10 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
     u_centre = 0.5 * float(u.min() + u.max())
     v_centre = 0.5 * float(v.min() + v.max())
     radius = 0.5 * float(max(np.ptp(u), np.ptp(v))) + margin
-    axes.add_patch(Circle((u_centre, v_centre), radius, fill=False, color=TAKEN, linewidth=0.9))
+    circle = Circle((u_centre, v_centre), radius, fill=False, color=TAKEN, linewidth=0.9)
+    axes.add_patch(circle)
     corner = (u_centre + 0.71 * radius, v_centre - 0.71 * radius)
-    axes.annotate(
+    label = axes.annotate(
         str(number),
         corner,
         (1, 1),
@@ -578,6 +579,9 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
         fontsize=7,
         annotation_clip=True,
     )
+    # both lie inside the axes: measuring hundreds of them takes longer than drawing them
+    circle.set_in_layout(False)
+    label.set_in_layout(False)
 
 
 def _bytes(rgb: Any) -> np.ndarray:

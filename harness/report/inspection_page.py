@@ -235,7 +235,7 @@ def positions(cloud: Cloud, detection: Detection) -> tuple[np.ndarray, np.ndarra
     """Return columns and rows (n,) of a detection's points: pixels of the sensor, or x and y in mm
     without a grid."""
     if cloud.organised:
-        rows, columns = np.unravel_index(detection.pixels, cloud.valid.shape)
+        rows, columns = np.unravel_index(detection.pixels, cloud.reason.shape)
         return columns + float(cloud.region.col0), rows + float(cloud.region.row0)
     points_mm = cloud.points_m.reshape(-1, 3)[detection.pixels] / MM
     return points_mm[:, 0], points_mm[:, 1]

@@ -333,6 +333,11 @@ class Cloud:
         """Its fitted surfaces by mask and settings: several detectors share them."""
         return {}
 
+    @cached_property
+    def marks(self) -> dict[Any, Any]:
+        """Objects and print on it by what is judged: several detectors share them."""
+        return {}
+
     @property
     def valid(self) -> np.ndarray:
         """The pixels that have a point, (h, w) bool."""

@@ -22,6 +22,7 @@ from detectors.findings.null import (
     Tail,
     _fitting_tail,
     _floor_among,
+    _floor_of,
     behind,
     each_object_once,
     own_threshold,
@@ -220,6 +221,28 @@ def test_the_exponents_are_weighed_by_their_likelihood() -> None:
 )
 def test_the_floor_has_enough_peaks_that_do_not_join(counts: list[int], floor: int) -> None:
     assert _floor_among(counts) == floor
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        [10, 90, 150, 100, 85, 70, 61, 50, 20],
+        [10, 62, 64, 61, 40],  # as many at the highest with enough: the high ones do not decide
+        [10, 40, 50, 45, 29, 12],
+    ],
+)
+def test_the_floor_is_the_same_if_high_thresholds_are_tried_first(
+    counts: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thresholds = [1.0 + 0.1 * n for n in range(len(counts))]
+    number_at = dict(zip(thresholds, counts, strict=True))
+    monkeypatch.setattr(null, "_counts", lambda _d, _c, _e, asked: [number_at[t] for t in asked])
+    cloud = plane(np.zeros((4, 4)))
+    for first in thresholds:
+        scores = np.full((4, 4), first)
+        evidence = Evidence(scores, np.zeros((4, 4)), np.ones((4, 4)), 1.0)
+        floor = _floor_of(DETECTOR, cloud, evidence, thresholds)
+        assert floor == thresholds[_floor_among(counts)]
 
 
 def test_a_tail_that_too_many_peaks_exceed_is_that_of_the_higher_half() -> None:

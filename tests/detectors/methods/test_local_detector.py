@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection
-from detectors.methods.local import LocalConfig, LocalDetector, _scored, _strongest
+from detectors.methods import local_reference
+from detectors.methods.local import (
+    LocalConfig,
+    LocalDetector,
+    _scored,
+    _strongest,
+    tent_squares,
+)
 from detectors.methods.matched import MatchedDetector
 from harness.testing import check_detector
 from harness.testing.synthetic_clouds import LENS, plane, with_gaps
@@ -318,3 +325,11 @@ def test_the_narrowest_mean_needs_no_confirmation() -> None:
     around = np.array([[1.0, -1.0], [2.9, -2.9]])
     deviations = np.full((2, 2), 0.25)
     np.testing.assert_allclose(_strongest(means, around, deviations), [8.0, -8.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("width", [3, 7, 55])
+def test_squared_tents_are_summed_as_their_definition_says(width: int) -> None:
+    """Also where the tent is wider than the picture."""
+    image = np.random.default_rng(width).random((40, 57))
+    expected = local_reference.tent_squares(image, width)
+    np.testing.assert_allclose(tent_squares(image, width), expected, rtol=1e-10)
