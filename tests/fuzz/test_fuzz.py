@@ -17,6 +17,12 @@ from tests.support import recorded_plane as plane
 SAMPLE = 12
 
 
+@pytest.fixture(autouse=True)
+def enough_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow machine must not stop an input that a run of the whole campaign would finish."""
+    monkeypatch.setattr("tests.fuzz.trying.SECONDS", 600.0)
+
+
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two captures and a lens, as `tests.fuzz.bases` writes them."""

@@ -93,7 +93,6 @@ def _run_all(pipe: Connection, base: Path, numbers: Sequence[int], seed: int, on
 
     load_mitsuba()  # before Open3D, whose C++ library LLVM cannot use
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, resource.RLIM_INFINITY))
-    signal.signal(signal.SIGPROF, _stop)
     for number in numbers:
         given = prepared(base, number, seed, only)
         pipe.send(given)
@@ -112,6 +111,7 @@ def run_one(given: Input) -> End:
     printed = io.StringIO()
     state = "answered"
     text = ""
+    handler_before = signal.signal(signal.SIGPROF, _stop)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(printed):
@@ -129,6 +129,7 @@ def run_one(given: Input) -> End:
         text = traceback.format_exc()
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, handler_before)
         os.chdir(before)
     if "Traceback (most recent call last)" in printed.getvalue():
         state = "traceback"
