@@ -6,7 +6,7 @@ whatever the perspective. The function is the median over all rays of a slope, s
 less than half of the visible length along the direction does not move it.
 
 Not modelled: damage that runs through the whole view along the direction, which is taken for a
-joint; a profile that changes along the direction other than by a move, of a polynomial of degree 3."""
+joint; a profile that changes along the direction in other ways than by a move of degree 3."""
 
 from __future__ import annotations
 
