@@ -148,7 +148,7 @@ def test_it_finds_the_hole_and_writes_everything(
         header = stream.readline()
     columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,diameter_se_mm,depth_mm,depth_se_mm"
     columns += ",sight_depth_mm,shape,volume_mm3,points,score,length_mm,width_mm"
-    said = "noise_probability,certainty,flags,term"
+    said = "noise_probability,certainty,flags,term,count"
     assert header == f"{columns},angle_deg,{said},findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     assert row["kind"] == "hole"

@@ -1,0 +1,314 @@
+"""Joins slots that repeat: the joints of a brick wall, the vents of a grille.
+
+Long findings of equal direction, width and depth that a move across the surface carries onto one
+another are one feature and not as many damages. That they repeat must be significant: the first
+pair gives the move, and the others follow it far more often than places at random would. Round
+findings are never joined, because drilled holes are what is sought.
+
+Not modelled: slots whose distances vary, such as boards of different widths, and slots on surfaces
+that are bent strongly; they remain findings of their own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from detectors.interface import Detection, Evidence, Measurement
+from detectors.pixels.masks import grown
+from harness.vocabulary.geometry import MM, Cloud
+
+LONG = 2.0
+"""Least ratio of length to width of a slot."""
+ALIKE = 1.5
+"""Most ratio of lengths, widths and depths of slots that may belong together, before their scatter
+is known."""
+FEWEST = 4  # slots of a feature
+CHANCE = 1e-3
+"""Most probability that slots at random places follow one of the moves that were tried."""
+FOLLOWED = 0.5
+"""Least share of the places to which a move leads, where they are seen, that hold a slot."""
+MOVES = 2  # that carry a lattice onto itself: along its rows and from row to row
+STARTS = 12  # strongest slots from which moves are tried
+SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
+LEAST_SCATTER = 0.03
+"""Least scatter of widths and depths, as a share of their median."""
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Slots that repeat."""
+
+    members: tuple[int, ...]
+    """Numbers of the detections that are alike, strongest first."""
+    differing: tuple[int, ...]
+    """Numbers of those in the same rows that depart in width or depth."""
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """The long findings, n of them."""
+
+    numbers: np.ndarray
+    """(n,): of their detections."""
+    centres_m: np.ndarray
+    """(n, 3)."""
+    along: np.ndarray
+    """(n, 3): unit vectors of any sign."""
+    lengths_m: np.ndarray
+    """(n,)."""
+    widths_m: np.ndarray
+    """(n,)."""
+    depths_m: np.ndarray
+    """(n,): positive behind the surface."""
+    errors: np.ndarray
+    """(n, 2): standard errors of width and depth, metres; 0 if unknown."""
+    cut: np.ndarray
+    """(n,) bool: reaches the rim of the judged area, so that its length is not known."""
+    pixels: np.ndarray
+    """(n, 2): columns and rows of their centres in the cloud's grid."""
+
+
+def joints_of(
+    cloud: Cloud,
+    evidence: Evidence,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+) -> tuple[Joints, ...]:
+    """Return the features that long findings form, each finding in one of them at most. There are
+    none without a pixel grid."""
+    if not cloud.organised:
+        return ()
+    slots = _slots(cloud, evidence, detections, measurements)
+    judged = np.isfinite(evidence.residual_m)
+    free = np.ones(len(slots.numbers), bool)
+    features = []
+    for seed in range(len(slots.numbers)):
+        if not free[seed]:
+            continue
+        parallel = _parallel(slots, seed) & free
+        alike = parallel & _alike(slots, seed)
+        if alike.sum() < FEWEST:
+            continue
+        on_lattice = _on_lattice(slots, alike, parallel, judged)
+        members = on_lattice & alike
+        members &= ~_departing(slots, members)
+        if members.sum() < FEWEST:
+            continue
+        free &= ~on_lattice
+        differing = tuple(slots.numbers[on_lattice & ~members].tolist())
+        features.append(Joints(tuple(slots.numbers[members].tolist()), differing))
+    return tuple(features)
+
+
+def joined(
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+    features: Sequence[Joints],
+) -> tuple[tuple[Detection, ...], tuple[Measurement, ...]]:
+    """Return the findings, strongest first, with each feature as one finding. It has the place and
+    the sizes of its strongest member and the pixels of all of them."""
+    in_feature = {number for feature in features for number in feature.members}
+    pairs = []
+    for number, pair in enumerate(zip(detections, measurements, strict=True)):
+        if number not in in_feature:
+            pairs.append(pair)
+    for feature in features:
+        members = [detections[number] for number in feature.members]
+        strongest = feature.members[0]
+        pixels = np.unique(np.concatenate([member.pixels for member in members]))
+        detection = replace(detections[strongest], pixels=pixels, count=len(members))
+        points = sum(measurements[number].points for number in feature.members)
+        pairs.append((detection, replace(measurements[strongest], points=points)))
+    pairs.sort(key=lambda pair: -pair[0].score)
+    return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
+
+
+def joints_facts(
+    features: Sequence[Joints], measurements: Sequence[Measurement]
+) -> list[dict[str, Any]]:
+    """Return plain data on each feature: its sizes (medians) and the places of its members."""
+    facts = []
+    for feature in features:
+        members = [measurements[number] for number in feature.members]
+        facts.append(
+            {
+                "count": len(members),
+                "differing": len(feature.differing),
+                "length_mm": float(np.median([member.length_m for member in members])) / MM,
+                "width_mm": float(np.median([member.width_m for member in members])) / MM,
+                "depth_mm": float(np.median([member.normal_depth_m for member in members])) / MM,
+                "places_px": [[member.u_px, member.v_px] for member in members],
+            }
+        )
+    return facts
+
+
+def _slots(
+    cloud: Cloud,
+    evidence: Evidence,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+) -> _Slots:
+    """Return the long findings by depth whose sizes are known, strongest first."""
+    rim = _rim(evidence).ravel()
+    numbers = []
+    for number, (detection, measured) in enumerate(zip(detections, measurements, strict=True)):
+        sizes = (measured.length_m, measured.width_m, measured.normal_depth_m)
+        is_known = all(math.isfinite(size) for size in sizes)
+        is_long = measured.length_m > LONG * max(measured.width_m, 1.0 * MM)
+        if detection.kind == "depth" and is_known and is_long:
+            numbers.append(number)
+    chosen = [measurements[number] for number in numbers]
+    widths_m = np.array([max(measured.width_m, 1.0 * MM) for measured in chosen])
+    diameters_m = np.array([measured.model_diameter_m for measured in chosen])
+    diameter_errors_m = np.array([measured.model_diameter_se_m for measured in chosen])
+    depth_errors_m = np.array([measured.normal_depth_se_m for measured in chosen])
+    width_errors_m = widths_m * diameter_errors_m / diameters_m
+    columns = np.array([measured.u_px - cloud.region.col0 for measured in chosen])
+    rows = np.array([measured.v_px - cloud.region.row0 for measured in chosen])
+    return _Slots(
+        numbers=np.array(numbers, np.int64),
+        centres_m=np.array([_centre(measured) for measured in chosen]).reshape(-1, 3),
+        along=np.array([measured.along for measured in chosen]).reshape(-1, 3),
+        lengths_m=np.array([measured.length_m for measured in chosen]),
+        widths_m=widths_m,
+        depths_m=np.array([measured.normal_depth_m for measured in chosen]),
+        errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
+        cut=np.array([bool(rim[detections[number].pixels].any()) for number in numbers], bool),
+        pixels=np.column_stack([columns, rows]),
+    )
+
+
+def _centre(measured: Measurement) -> np.ndarray:
+    if np.isfinite(measured.model_centre_m).all():
+        return measured.model_centre_m
+    return measured.extent_centre_m
+
+
+def _rim(evidence: Evidence) -> np.ndarray:
+    """Return (h, w) bool: the pixels beside those that are not judged or not in the picture."""
+    outside = np.pad(~np.isfinite(evidence.residual_m), 1, constant_values=True)
+    return grown(outside, 1)[1:-1, 1:-1]
+
+
+def _parallel(slots: _Slots, seed: int) -> np.ndarray:
+    """Return which slots (n,) run along a seed, as far as its width lets one tell, and are on the
+    same side of the surface, and about as long or cut by the rim."""
+    cosines = np.abs(slots.along @ slots.along[seed])
+    angle = math.atan(slots.widths_m[seed] / slots.lengths_m[seed])
+    same_side = np.sign(slots.depths_m) == np.sign(slots.depths_m[seed])
+    ratio = slots.lengths_m / slots.lengths_m[seed]
+    as_long = (ratio < ALIKE) & ((ratio > 1.0 / ALIKE) | slots.cut)
+    return (cosines >= math.cos(angle)) & same_side & as_long
+
+
+def _alike(slots: _Slots, seed: int) -> np.ndarray:
+    """Return which slots (n,) have about the width and depth of a seed."""
+    result = np.ones(len(slots.numbers), bool)
+    for sizes in (slots.widths_m, slots.depths_m):
+        ratio = sizes / sizes[seed]
+        result &= (ratio < ALIKE) & (ratio > 1.0 / ALIKE)
+    return result
+
+
+def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
+    """Return which slots (n,) depart from the members (n,) in width or depth by more than these
+    scatter and than what is less certain about them, as about a slot that the rim cuts."""
+    result = np.zeros(len(slots.numbers), bool)
+    if not members.any():
+        return result
+    for sizes, errors in zip((slots.widths_m, slots.depths_m), slots.errors.T, strict=True):
+        middle = float(np.median(sizes[members]))
+        scatter = float(np.median(np.abs(sizes[members] - middle))) / 0.6745
+        usual_error = float(np.median(errors[members]))
+        further = np.sqrt(np.maximum(errors**2 - usual_error**2, 0.0))
+        limit = SCATTERS * np.hypot(max(scatter, LEAST_SCATTER * abs(middle)), further)
+        result |= np.abs(sizes - middle) > limit
+    return result
+
+
+def _on_lattice(
+    slots: _Slots, alike: np.ndarray, parallel: np.ndarray, judged: np.ndarray
+) -> np.ndarray:
+    """Return which ``parallel`` slots (n,) a move carries onto an ``alike`` one, if these moves are
+    significant. ``judged`` (h, w) bool: the pixels at which a slot could be seen."""
+    first = int(np.flatnonzero(alike)[0])
+    along = slots.along[first]
+    across = np.cross(along, slots.centres_m[alike].mean(axis=0))
+    across = across / np.linalg.norm(across)
+    places = np.column_stack([slots.centres_m @ along, slots.centres_m @ across])
+    pixel_of = _pixel_map(places[alike], slots.pixels[alike])
+    result = np.zeros(len(alike), bool)
+    if pixel_of is None:
+        return result
+    near_m = np.full(places.shape, float(np.median(slots.widths_m[alike])))
+    # the centre of a slot that the rim cuts lies up to half its length from the middle
+    near_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[alike].max())
+    area_m2 = float(judged.sum()) / max(abs(float(np.linalg.det(pixel_of[:2]))), 1e-12)
+    chance = min(float(4.0 * near_m[alike].prod(axis=1).sum()) / area_m2, 1.0)
+    tried = np.flatnonzero(alike)[:STARTS]
+    number = len(tried) * (int(alike.sum()) - 1)
+    moves: list[np.ndarray] = []
+    for _ in range(MOVES):
+        best = None
+        for start in tried:
+            for end in np.flatnonzero(alike):
+                move = places[end] - places[start]
+                if start == end or _is_multiple(move, moves, near_m[first, 0]):
+                    continue
+                linked = _linked(places, near_m, alike, move)
+                seen = _seen(places[alike] + move, pixel_of, judged)
+                hits = int(linked[alike].sum())
+                trials = max(int((seen | linked[alike]).sum()), 1)
+                probability = float(stats.binom.sf(hits - 2, trials - 1, chance)) * number
+                if hits < FOLLOWED * trials or probability > CHANCE:
+                    continue
+                if best is None or hits > best[0]:
+                    best = (hits, move)
+        if best is None:
+            break
+        moves.append(best[1])
+    for move in moves:
+        for sign in (1.0, -1.0):
+            result |= _linked(places, near_m, alike, sign * move)
+    return result & parallel
+
+
+def _is_multiple(move: np.ndarray, moves: Sequence[np.ndarray], near_m: float) -> bool:
+    """Return whether a move runs along one that is already known."""
+    for known in moves:
+        off_m = abs(float(move[0] * known[1] - move[1] * known[0])) / float(np.linalg.norm(known))
+        if off_m <= near_m:
+            return True
+    return False
+
+
+def _linked(
+    places: np.ndarray, near_m: np.ndarray, alike: np.ndarray, move: np.ndarray
+) -> np.ndarray:
+    """Return which places (n, 2) a move (2,) carries near an ``alike`` one (n,)."""
+    off_m = np.abs(places[:, None] + move - places[None, alike])
+    limit_m = np.maximum(near_m[:, None], near_m[None, alike])
+    return np.asarray((off_m <= limit_m).all(axis=2).any(axis=1))
+
+
+def _pixel_map(places: np.ndarray, pixels: np.ndarray) -> np.ndarray | None:
+    """Return the affine map (3, 2) from places (n, 2) to columns and rows; None if the places lie
+    on one line, which determines no map."""
+    design = np.column_stack([places, np.ones(len(places))])
+    result, _, rank, _ = np.linalg.lstsq(design, pixels, rcond=1e-6)
+    return result if rank == 3 else None
+
+
+def _seen(places: np.ndarray, pixel_of: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return which places (n, 2) are judged."""
+    pixels = np.rint(places @ pixel_of[:2] + pixel_of[2]).astype(int)
+    inside = ((pixels >= 0) & (pixels < judged.shape[::-1])).all(axis=1)
+    result = np.zeros(len(places), bool)
+    result[inside] = judged[pixels[inside, 1], pixels[inside, 0]]
+    return result
