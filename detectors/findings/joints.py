@@ -51,7 +51,7 @@ class Joints:
 
 @dataclass(frozen=True)
 class _Slots:
-    """The long findings, n of them."""
+    """The long findings and the ends of slots, n of them."""
 
     numbers: np.ndarray
     """(n,): of their detections."""
@@ -69,8 +69,8 @@ class _Slots:
     """(n, 2): standard errors of width and depth, metres; 0 if unknown."""
     cut: np.ndarray
     """(n,) bool: reaches the rim of the judged area, so that its length is not known."""
-    pixels: np.ndarray
-    """(n, 2): columns and rows of their centres in the cloud's grid."""
+    whole: np.ndarray
+    """(n,) bool: is long; else it may be the end of a slot that the rim cuts."""
 
 
 def joints_of(
@@ -83,21 +83,20 @@ def joints_of(
     none without a pixel grid."""
     if not cloud.organised:
         return ()
-    slots = _slots(cloud, evidence, detections, measurements)
-    judged = np.isfinite(evidence.residual_m)
+    slots = _slots(evidence, detections, measurements)
     free = np.ones(len(slots.numbers), bool)
     features = []
     for seed in range(len(slots.numbers)):
-        if not free[seed]:
+        if not free[seed] or not slots.whole[seed]:
             continue
         parallel = _parallel(slots, seed) & free
         alike = parallel & _alike(slots, seed)
-        if alike.sum() < FEWEST:
+        if (alike & slots.whole).sum() < FEWEST:
             continue
-        on_lattice = _on_lattice(slots, alike, parallel, judged)
+        on_lattice = parallel & _on_lattice(cloud, evidence, slots, alike)
         members = on_lattice & alike
         members &= ~_departing(slots, members)
-        if members.sum() < FEWEST:
+        if (members & slots.whole).sum() < FEWEST:
             continue
         free &= ~on_lattice
         differing = tuple(slots.numbers[on_lattice & ~members].tolist())
@@ -149,28 +148,29 @@ def joints_facts(
 
 
 def _slots(
-    cloud: Cloud,
     evidence: Evidence,
     detections: Sequence[Detection],
     measurements: Sequence[Measurement],
 ) -> _Slots:
-    """Return the long findings by depth whose sizes are known, strongest first."""
+    """Return the findings by depth whose sizes are known, strongest first, that are long or
+    reach the rim."""
     rim = _rim(evidence).ravel()
     numbers = []
+    whole = []
     for number, (detection, measured) in enumerate(zip(detections, measurements, strict=True)):
         sizes = (measured.length_m, measured.width_m, measured.normal_depth_m)
         is_known = all(math.isfinite(size) for size in sizes)
         is_long = measured.length_m > LONG * max(measured.width_m, 1.0 * MM)
-        if detection.kind == "depth" and is_known and is_long:
+        is_cut = bool(rim[detection.pixels].any())
+        if detection.kind == "depth" and is_known and (is_long or is_cut):
             numbers.append(number)
+            whole.append(is_long)
     chosen = [measurements[number] for number in numbers]
     widths_m = np.array([max(measured.width_m, 1.0 * MM) for measured in chosen])
     diameters_m = np.array([measured.model_diameter_m for measured in chosen])
     diameter_errors_m = np.array([measured.model_diameter_se_m for measured in chosen])
     depth_errors_m = np.array([measured.normal_depth_se_m for measured in chosen])
     width_errors_m = widths_m * diameter_errors_m / diameters_m
-    columns = np.array([measured.u_px - cloud.region.col0 for measured in chosen])
-    rows = np.array([measured.v_px - cloud.region.row0 for measured in chosen])
     return _Slots(
         numbers=np.array(numbers, np.int64),
         centres_m=np.array([_centre(measured) for measured in chosen]).reshape(-1, 3),
@@ -180,7 +180,7 @@ def _slots(
         depths_m=np.array([measured.normal_depth_m for measured in chosen]),
         errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
         cut=np.array([bool(rim[detections[number].pixels].any()) for number in numbers], bool),
-        pixels=np.column_stack([columns, rows]),
+        whole=np.array(whole, bool),
     )
 
 
@@ -198,88 +198,103 @@ def _rim(evidence: Evidence) -> np.ndarray:
 
 def _parallel(slots: _Slots, seed: int) -> np.ndarray:
     """Return which slots (n,) run along a seed, as far as its width lets one tell, and are on the
-    same side of the surface, and about as long or cut by the rim."""
+    same side of the surface, and about as long or cut by the rim. An end has no direction."""
     cosines = np.abs(slots.along @ slots.along[seed])
     angle = math.atan(slots.widths_m[seed] / slots.lengths_m[seed])
     same_side = np.sign(slots.depths_m) == np.sign(slots.depths_m[seed])
     ratio = slots.lengths_m / slots.lengths_m[seed]
     as_long = (ratio < ALIKE) & ((ratio > 1.0 / ALIKE) | slots.cut)
-    return (cosines >= math.cos(angle)) & same_side & as_long
+    runs_along = (cosines >= math.cos(angle)) | ~slots.whole
+    return runs_along & same_side & as_long
 
 
 def _alike(slots: _Slots, seed: int) -> np.ndarray:
-    """Return which slots (n,) have about the width and depth of a seed."""
-    result = np.ones(len(slots.numbers), bool)
-    for sizes in (slots.widths_m, slots.depths_m):
-        ratio = sizes / sizes[seed]
-        result &= (ratio < ALIKE) & (ratio > 1.0 / ALIKE)
-    return result
+    """Return which slots (n,) have about the width and depth of a seed. An end has no width."""
+    widths = slots.widths_m / slots.widths_m[seed]
+    depths = slots.depths_m / slots.depths_m[seed]
+    as_wide = (widths < ALIKE) & (widths > 1.0 / ALIKE)
+    as_deep = (depths < ALIKE) & (depths > 1.0 / ALIKE)
+    return (as_wide | ~slots.whole) & as_deep
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
     """Return which slots (n,) depart from the members (n,) in width or depth by more than these
-    scatter and than what is less certain about them, as about a slot that the rim cuts."""
+    scatter and than what is less certain about them, as about a slot that the rim cuts. An end
+    has no width."""
     result = np.zeros(len(slots.numbers), bool)
-    if not members.any():
+    certain = members & slots.whole
+    if not certain.any():
         return result
-    for sizes, errors in zip((slots.widths_m, slots.depths_m), slots.errors.T, strict=True):
-        middle = float(np.median(sizes[members]))
-        scatter = float(np.median(np.abs(sizes[members] - middle))) / 0.6745
-        usual_error = float(np.median(errors[members]))
+    for column, sizes in enumerate((slots.widths_m, slots.depths_m)):
+        errors = slots.errors[:, column]
+        middle = float(np.median(sizes[certain]))
+        scatter = float(np.median(np.abs(sizes[certain] - middle))) / 0.6745
+        usual_error = float(np.median(errors[certain]))
         further = np.sqrt(np.maximum(errors**2 - usual_error**2, 0.0))
         limit = SCATTERS * np.hypot(max(scatter, LEAST_SCATTER * abs(middle)), further)
-        result |= np.abs(sizes - middle) > limit
+        departs = np.abs(sizes - middle) > limit
+        result |= departs & slots.whole if sizes is slots.widths_m else departs
     return result
 
 
 def _on_lattice(
-    slots: _Slots, alike: np.ndarray, parallel: np.ndarray, judged: np.ndarray
+    cloud: Cloud,
+    evidence: Evidence,
+    slots: _Slots,
+    alike: np.ndarray,
 ) -> np.ndarray:
-    """Return which ``parallel`` slots (n,) a move carries onto an ``alike`` one, if these moves are
-    significant. ``judged`` (h, w) bool: the pixels at which a slot could be seen."""
+    """Return which slots (n,) the significant moves between ``alike`` slots carry onto one."""
+    alike = alike & slots.whole
     first = int(np.flatnonzero(alike)[0])
     along = slots.along[first]
     across = np.cross(along, slots.centres_m[alike].mean(axis=0))
-    across = across / np.linalg.norm(across)
-    places = np.column_stack([slots.centres_m @ along, slots.centres_m @ across])
-    pixel_of = _pixel_map(places[alike], slots.pixels[alike])
-    result = np.zeros(len(alike), bool)
-    if pixel_of is None:
-        return result
+    plane = np.column_stack([along, across / np.linalg.norm(across)])
+    places = slots.centres_m @ plane
     near_m = np.full(places.shape, float(np.median(slots.widths_m[alike])))
     # the centre of a slot that the rim cuts lies up to half its length from the middle
     near_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[alike].max())
+
+    judged = np.isfinite(evidence.residual_m)
+    pixel_of = _pixel_map(cloud.points_m[judged] @ plane, judged)
     area_m2 = float(judged.sum()) / max(abs(float(np.linalg.det(pixel_of[:2]))), 1e-12)
     chance = min(float(4.0 * near_m[alike].prod(axis=1).sum()) / area_m2, 1.0)
-    tried = np.flatnonzero(alike)[:STARTS]
-    number = len(tried) * (int(alike.sum()) - 1)
+    pairs = _pairs(alike)
     moves: list[np.ndarray] = []
     for _ in range(MOVES):
+        most = 0
         best = None
-        for start in tried:
-            for end in np.flatnonzero(alike):
-                move = places[end] - places[start]
-                if start == end or _is_multiple(move, moves, near_m[first, 0]):
-                    continue
-                linked = _linked(places, near_m, alike, move)
-                seen = _seen(places[alike] + move, pixel_of, judged)
-                hits = int(linked[alike].sum())
-                trials = max(int((seen | linked[alike]).sum()), 1)
-                probability = float(stats.binom.sf(hits - 2, trials - 1, chance)) * number
-                if hits < FOLLOWED * trials or probability > CHANCE:
-                    continue
-                if best is None or hits > best[0]:
-                    best = (hits, move)
+        for start, end in pairs:
+            move = places[end] - places[start]
+            linked = _linked(places, near_m, alike, move)[alike]
+            hits = int(linked.sum())
+            if hits <= most or _is_along(move, moves, float(near_m[first, 1])):
+                continue
+            seen = _seen(places[alike] + move, pixel_of, judged)
+            trials = int((seen | linked).sum())
+            # the first pair gives the move and proves nothing
+            probability = float(stats.binom.sf(hits - 2, trials - 1, chance))
+            if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
+                most = hits
+                best = move
         if best is None:
             break
-        moves.append(best[1])
+        moves.append(best)
+    if len(moves) == 2:
+        moves += [moves[0] + moves[1], moves[0] - moves[1]]
+    result = np.zeros(len(alike), bool)
     for move in moves:
-        for sign in (1.0, -1.0):
-            result |= _linked(places, near_m, alike, sign * move)
-    return result & parallel
+        result |= _linked(places, near_m, alike, move)
+        result |= _linked(places, near_m, alike, -move)
+    return result
 
 
-def _is_multiple(move: np.ndarray, moves: Sequence[np.ndarray], near_m: float) -> bool:
+def _pairs(alike: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs between which moves are tried: from the strongest of the slots (n,)."""
+    ends = np.flatnonzero(alike).tolist()
+    return [(start, end) for start in ends[:STARTS] for end in ends if start != end]
+
+
+def _is_along(move: np.ndarray, moves: Sequence[np.ndarray], near_m: float) -> bool:
     """Return whether a move runs along one that is already known."""
     for known in moves:
         off_m = abs(float(move[0] * known[1] - move[1] * known[0])) / float(np.linalg.norm(known))
@@ -297,12 +312,12 @@ def _linked(
     return np.asarray((off_m <= limit_m).all(axis=2).any(axis=1))
 
 
-def _pixel_map(places: np.ndarray, pixels: np.ndarray) -> np.ndarray | None:
-    """Return the affine map (3, 2) from places (n, 2) to columns and rows; None if the places lie
-    on one line, which determines no map."""
+def _pixel_map(places: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return the affine map (3, 2) from places (n, 2) of the ``judged`` pixels (h, w) to columns
+    and rows: enough to tell whether a place is in the picture."""
+    rows, columns = np.nonzero(judged)
     design = np.column_stack([places, np.ones(len(places))])
-    result, _, rank, _ = np.linalg.lstsq(design, pixels, rcond=1e-6)
-    return result if rank == 3 else None
+    return np.linalg.lstsq(design, np.column_stack([columns, rows]), rcond=None)[0]
 
 
 def _seen(places: np.ndarray, pixel_of: np.ndarray, judged: np.ndarray) -> np.ndarray:
