@@ -36,7 +36,7 @@ MOVES = 2  # that carry a lattice onto itself: along its rows and from row to ro
 STARTS = 12  # strongest slots from which moves are tried
 SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
 LEAST_SCATTER = 0.03
-"""Least scatter of widths and depths, as a share of their median."""
+"""Least scatter of widths, depths and areas, as a share of their median."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Joints:
     members: tuple[int, ...]
     """Numbers of the detections that are alike, strongest first."""
     differing: tuple[int, ...]
-    """Numbers of those in the same rows that depart in width or depth."""
+    """Numbers of those in the same rows that depart in width, depth or area."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,8 @@ class _Slots:
     """(n,)."""
     depths_m: np.ndarray
     """(n,): positive behind the surface."""
+    areas_m2: np.ndarray
+    """(n,): across the line of sight, but for a factor common to all of them."""
     errors: np.ndarray
     """(n, 2): standard errors of width and depth, metres; 0 if unknown."""
     cut: np.ndarray
@@ -178,6 +180,7 @@ def _slots(
         lengths_m=np.array([measured.length_m for measured in chosen]),
         widths_m=widths_m,
         depths_m=np.array([measured.normal_depth_m for measured in chosen]),
+        areas_m2=np.array([measured.points * _centre(measured)[2] ** 2 for measured in chosen]),
         errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
         cut=np.array([bool(rim[detections[number].pixels].any()) for number in numbers], bool),
         whole=np.array(whole, bool),
@@ -218,9 +221,9 @@ def _alike(slots: _Slots, seed: int) -> np.ndarray:
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
-    """Return which slots (n,) depart from the members (n,) in width or depth by more than these
-    scatter and than what is less certain about them, as about a slot that the rim cuts. An end
-    has no width."""
+    """Return which slots (n,) depart from the members (n,) in width, depth or area by more than
+    these scatter and than what is less certain about them, as about a slot that the rim cuts. An
+    end has no width."""
     result = np.zeros(len(slots.numbers), bool)
     certain = members & slots.whole
     if not certain.any():
@@ -234,6 +237,11 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
         limit = SCATTERS * np.hypot(max(scatter, LEAST_SCATTER * abs(middle)), further)
         departs = np.abs(sizes - middle) > limit
         result |= departs & slots.whole if sizes is slots.widths_m else departs
+    # damage that touches a joint is found with it, and shows in its area alone
+    middle_m2 = float(np.median(slots.areas_m2[certain]))
+    scatter_m2 = float(np.median(np.abs(slots.areas_m2[certain] - middle_m2))) / 0.6745
+    limit_m2 = SCATTERS * max(scatter_m2, LEAST_SCATTER * middle_m2)
+    result |= slots.areas_m2 > middle_m2 + limit_m2
     return result
 
 

@@ -353,7 +353,8 @@ def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
         departs = np.abs(np.nan_to_num(medians)) > SEEN * noise
         gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise
         gain[inside] = np.where(departs[knots[inside]], gains, np.nan)
-    known = np.isfinite(gain)
+    # where the surface is too steep to be judged, no smooth fit is good, and it does not matter
+    known = np.isfinite(gain) & np.isfinite(profile.trusted(points)(points))
     counts = np.bincount(band[known], minlength=BANDS)
     enough = counts >= LEAST_POINTS
     if enough.sum() <= BANDS / 2:

@@ -70,10 +70,10 @@ def test_head_joints_are_one_feature() -> None:
     assert len(facts["places_px"]) == len(BRICKS)
 
 
-@pytest.mark.parametrize("field", ["model_depth_m", "width_m"])
+@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points"])
 def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
     detections, measurements = wall()
-    larger = 1.3 * getattr(measurements[7], field)
+    larger = type(getattr(measurements[7], field))(1.3 * getattr(measurements[7], field))
     measurements[7] = replace(measurements[7], **{field: larger})
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
     assert feature.differing == (7,)
