@@ -38,6 +38,10 @@ SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
 LEAST_SCATTER = 0.03
 """Least scatter of widths, depths and areas, as a share of their median."""
 
+ERROR_SCATTER = 0.1
+"""Least scatter of the errors of widths, which contain what no shape explains, as a share of their
+median."""
+
 
 @dataclass(frozen=True)
 class Joints:
@@ -46,7 +50,7 @@ class Joints:
     members: tuple[int, ...]
     """Numbers of the detections that are alike, strongest first."""
     differing: tuple[int, ...]
-    """Numbers of those in the same rows that depart in width, depth or area."""
+    """Numbers of those in the same rows that depart in width, depth, area or shape."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +225,7 @@ def _alike(slots: _Slots, seed: int) -> np.ndarray:
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
-    """Return which slots (n,) depart from the members (n,) in width, depth or area by more than
+    """Return which slots (n,) depart from the members (n,) in width, depth, area or fit by more than
     these scatter and than what is less certain about them, as about a slot that the rim cuts. An
     end has no width."""
     result = np.zeros(len(slots.numbers), bool)
@@ -237,11 +241,16 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
         limit = SCATTERS * np.hypot(max(scatter, LEAST_SCATTER * abs(middle)), further)
         departs = np.abs(sizes - middle) > limit
         result |= departs & slots.whole if sizes is slots.widths_m else departs
-    # damage that touches a joint is found with it, and shows in its area alone
+    # damage that touches a joint is found with it: it shows in the area, and no slot explains it
     middle_m2 = float(np.median(slots.areas_m2[certain]))
     scatter_m2 = float(np.median(np.abs(slots.areas_m2[certain] - middle_m2))) / 0.6745
     limit_m2 = SCATTERS * max(scatter_m2, LEAST_SCATTER * middle_m2)
     result |= slots.areas_m2 > middle_m2 + limit_m2
+    unexplained_m = slots.errors[:, 0]
+    middle_m = float(np.median(unexplained_m[certain]))
+    scatter_m = float(np.median(np.abs(unexplained_m[certain] - middle_m))) / 0.6745
+    limit_m = SCATTERS * max(scatter_m, ERROR_SCATTER * middle_m)
+    result |= ~slots.cut & (unexplained_m > middle_m + limit_m)
     return result
 
 

@@ -70,10 +70,12 @@ def test_head_joints_are_one_feature() -> None:
     assert len(facts["places_px"]) == len(BRICKS)
 
 
-@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points"])
+@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points", "model_diameter_se_m"])
 def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
     detections, measurements = wall()
-    larger = type(getattr(measurements[7], field))(1.3 * getattr(measurements[7], field))
+    usual = getattr(measurements[7], field)
+    factor = 2.0 if field == "model_diameter_se_m" else 1.3
+    larger = type(usual)(factor * usual)
     measurements[7] = replace(measurements[7], **{field: larger})
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
     assert feature.differing == (7,)
