@@ -225,9 +225,9 @@ def _alike(slots: _Slots, seed: int) -> np.ndarray:
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
-    """Return which slots (n,) depart from the members (n,) in width, depth, area or fit by more than
-    these scatter and than what is less certain about them, as about a slot that the rim cuts. An
-    end has no width."""
+    """Return which slots (n,) depart from the members (n,) in width, depth, area or fit by more
+    than these scatter and than what is less certain about them, as about a slot that the rim cuts.
+    An end has no width."""
     result = np.zeros(len(slots.numbers), bool)
     certain = members & slots.whole
     if not certain.any():
