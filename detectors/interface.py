@@ -52,6 +52,9 @@ class Detection:
     """Kinds: "depth" for points that depart from the surface; "no return" for connected pixels
     without return (then invalid) inside the target's outline; "object" for an object on the
     target."""
+    count: int = 1
+    """Number of places: more than 1 for slots that repeat (`detectors.findings.joints`), which are
+    one finding."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ whatever the perspective. The function is the median over all rays of a slope, s
 less than half of the visible length along the direction does not move it.
 
 Not modelled: damage that runs through the whole view along the direction, which is taken for a
-joint; a profile that changes along the direction by more than a polynomial of degree 2."""
+joint; a profile that changes along the direction in other ways than by a move of degree 3."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from detectors.pixels.medians import group_medians
 from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
 
 SEARCHED = 8_000  # points from which a tilt and a twist are found
+TWIST_SEARCHED = 6_000  # points from which the frame of a twist is found
+TWIST_STEPS = (3e-3, 1e-2, 3e-2)  # first steps of its angles, radians
 COARSE_SEARCHED = 60_000  # points from which a direction is searched
 FINE_PX = 1.5  # width of the strips in the fine search
 COARSE_PX = 4.0  # side of the blocks whose means show a direction
@@ -49,7 +51,7 @@ class Profile:
     across: np.ndarray
     """(3,): unit vector across it, in the surface's mean plane."""
     ahead: np.ndarray
-    """(3,): unit vector normal to both, away from the camera."""
+    """(3,): unit vector normal to both, away from the camera; the twist moves along it."""
     first: float
     """Slope (or, with parallel rays, place in metres) of the first knot."""
     step: float
@@ -159,12 +161,13 @@ def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> 
 
     ``pitch``: distance of neighbouring pixels in x/z, or in metres where rays are parallel."""
     sample = picked(points, COARSE_SEARCHED)
-    normal = _normal(sample, central)
-    frame = _frame(normal, 0.0, pitch, central)
     on_base = sample.copy()
     on_base[:, 2] = base(sample)
     if central:
         on_base[:, :2] *= (on_base[:, 2] / sample[:, 2])[:, None]
+    # on the surface: what shows far behind through a hole would turn the mean plane
+    normal = _normal(on_base, central)
+    frame = _frame(normal, 0.0, pitch, central)
     across = frame.slopes(sample)
     along = frame.lengths(sample)
     values = frame._curve_of(sample) - frame._curve_of(on_base)
@@ -280,18 +283,52 @@ def _refined(
 
 def with_twist(profile: Profile, points: np.ndarray) -> Profile:
     """Return the profile fitted to points (n, 3), moved ahead by the polynomial of degree 3 that
-    their residuals follow."""
+    their residuals follow, with the frame in which they are least.
+
+    A sheet that is bent along its crease moves along its own normal. If ``ahead`` is another
+    direction, the crease leaves its place across by the bend times the angle between both."""
+    from scipy.optimize import minimize
+
+    sample = picked(points, TWIST_SEARCHED)
+    size = np.abs(sample[:, 2] - _twisted(profile, sample, rounds=3)(sample))
+    limit = max(CLIP_SIGMAS * float(np.median(size)), 1e-6)
+
+    def remaining(angles: np.ndarray) -> float:
+        twisted = _twisted(_turned(profile, angles), sample, rounds=2)
+        residuals = np.abs(sample[:, 2] - twisted(sample))
+        return float(np.minimum(residuals, limit).mean())
+
+    simplex = np.zeros((4, 3))
+    simplex[1:] = np.diag(TWIST_STEPS)
+    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-3 * limit, "maxfev": 100}
+    found = minimize(remaining, np.zeros(3), method="Nelder-Mead", options=options)
+    turned = _turned(profile, found.x)
+    return _twisted(turned, picked(points, SEARCHED), rounds=3).fitted(points)
+
+
+def _twisted(profile: Profile, points: np.ndarray, rounds: int) -> Profile:
+    """Return the profile with the twist that points (n, 3) follow, found in this many rounds."""
     fitted = profile.fitted(points)
-    sample = picked(points, SEARCHED)
-    for _ in range(3):
-        residuals = sample[:, 2] - fitted(sample)
+    for _ in range(rounds):
+        residuals = points[:, 2] - fitted(points)
         scale = max(float(np.median(np.abs(residuals))) / 0.6745, 1e-9)
         weights = bisquare_weights(residuals, 6.0 * scale)
-        share = sample @ profile.ahead / sample[:, 2] if profile.central else profile.ahead[2]
-        moved = sample.copy()
-        moved[:, 2] = fitted._twisted_m(sample) + residuals * share
+        share = points @ profile.ahead / points[:, 2] if profile.central else profile.ahead[2]
+        moved = points.copy()
+        moved[:, 2] = fitted._twisted_m(points) + residuals * share
         fitted = replace(profile, twist=polynomial(moved, weights, degree=3)).fitted(points)
     return fitted
+
+
+def _turned(profile: Profile, angles: np.ndarray) -> Profile:
+    """Return the profile, whose curve is no longer valid, turned by small angles (3,): about
+    ``ahead``, about ``across`` and about ``along``."""
+    along = profile.along + angles[0] * profile.across + angles[1] * profile.ahead
+    along = along / np.linalg.norm(along)
+    ahead = profile.ahead + angles[2] * profile.across
+    ahead = ahead - (ahead @ along) * along
+    ahead = ahead / np.linalg.norm(ahead)
+    return replace(profile, along=along, across=np.cross(along, ahead), ahead=ahead)
 
 
 def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
@@ -320,7 +357,8 @@ def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
         departs = np.abs(np.nan_to_num(medians)) > SEEN * noise
         gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise
         gain[inside] = np.where(departs[knots[inside]], gains, np.nan)
-    known = np.isfinite(gain)
+    # where the surface is too steep to be judged, no smooth fit is good, and it does not matter
+    known = np.isfinite(gain) & np.isfinite(profile.trusted(points)(points))
     counts = np.bincount(band[known], minlength=BANDS)
     enough = counts >= LEAST_POINTS
     if enough.sum() <= BANDS / 2:

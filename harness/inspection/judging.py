@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from detectors.findings.joints import joined, joints_facts, joints_of
 from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
 from detectors.findings.null import RIM_PX, OwnThreshold, each_object_once, own_threshold
@@ -35,8 +36,8 @@ LEAST_AT_MARKS = 0.05
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage above a threshold and missing returns, each damage and each object once, measure
-    them, and say how certain each is."""
+    """Find damage above a threshold and missing returns, each damage, each object and each set of
+    joints once, measure them, and say how certain each is."""
     missing = missing_returns(cloud, evidence)
     without_return = () if missing is None else missing.detections
     above_threshold = detector.find(cloud, evidence, threshold)
@@ -45,6 +46,11 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     measurements = tuple(
         _measured(detector, cloud, evidence, detection) for detection in detections
     )
+    joints = joints_of(cloud, evidence, detections, measurements)
+    if joints:
+        notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
+        evidence = replace(evidence, notes=notes)
+        detections, measurements = joined(detections, measurements, joints)
     probabilities = noise_probabilities(cloud, evidence, detections, missing)
     result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)

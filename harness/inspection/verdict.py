@@ -68,6 +68,8 @@ def with_remarks(result: Judged, threshold: float) -> Judged:
     floor_mm = least_floor_mm(result.cloud, result.evidence)
     remarks = []
     for finding, is_cut in zip(bare.findings, cut, strict=True):
+        # the sizes of joints are those of one of them, which the rim need not cut
+        is_cut = is_cut and finding.count == 1
         flags = flags_of(finding, is_cut=is_cut, least_score=least_score)
         term = term_of(finding, floor_mm)
         remarks.append(Remark(certainty=class_of(finding, flags), flags=" ".join(flags), term=term))
@@ -107,6 +109,8 @@ def class_of(finding: Finding, flags: Sequence[str]) -> str:
 
 def term_of(finding: Finding, floor_mm: float) -> str:
     """Return the name of what was found. ``floor_mm``: the least width at which a floor is seen."""
+    if finding.count > 1:
+        return JOINTS
     if finding.kind != "hole":
         return finding.kind
     if finding.is_long or finding.shape == "slot":
@@ -268,6 +272,8 @@ PLURALS = {
 }
 """Terms of findings that can be sure, in the order of the sentence."""
 SINGULARS = {"hole or dent": "small hole or dent"}
+JOINTS = "joints"
+"""Term of slots that repeat: a feature of the part and no damage."""
 
 
 @dataclass(frozen=True)
@@ -312,13 +318,15 @@ def verdict_of(
     false_sure = 0.0
     for finding in findings:
         counts[finding.certainty] += 1
-        if finding.certainty == SURE:
+        if finding.certainty == SURE and finding.term != JOINTS:
             terms[finding.term] = terms.get(finding.term, 0) + 1
             false_sure += finding.noise_probability
     extent = extent_of(result, outline)
     expected = expected_calls(result.evidence, threshold)
-    clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not findings)]
-    clauses += _other_clauses(findings, is_further=bool(terms))
+    damage = [finding for finding in findings if finding.term != JOINTS]
+    clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not damage)]
+    clauses += _other_clauses(damage, is_further=bool(terms))
+    clauses += _joints_clauses(result.evidence.notes.get("joints", ()))
     clauses.append(_calls_clause(expected, false_sure if terms else math.nan))
     return InspectionVerdict(
         sentence="; ".join(clauses) + ".",
@@ -397,6 +405,21 @@ def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str
             further = " further" if is_further and not clauses else ""
             place = "place" if count == 1 else "places"
             clauses.append(f"{word}{further} {place} {one if count == 1 else several}")
+    return clauses
+
+
+def _joints_clauses(joints: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a clause for each set of joints (`detectors.findings.joints.joints_facts`)."""
+    clauses = []
+    for facts in joints:
+        size = f"{facts['length_mm']:.0f} x {facts['width_mm']:.0f} mm"
+        clause = f"{facts['count']} alike slots of {size} in rows are joints"
+        differing = facts["differing"]
+        if differing:
+            word = WORDS[differing] if differing < len(WORDS) else str(differing)
+            verb = "differs" if differing == 1 else "differ"
+            clause += f", from which {word} {verb}"
+        clauses.append(clause)
     return clauses
 
 

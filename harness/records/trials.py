@@ -663,8 +663,10 @@ FINDINGS_OF_CAPTURE = Table(
             "",
             "term",
             "hole; dent (a floor was seen, less deep than a quarter of the width); hole or dent"
-            " (too narrow to see a floor); slot (long); bump; no return",
+            " (too narrow to see a floor); slot (long); joints (slots that repeat); bump; no"
+            " return",
         ),
+        Column("count", "", "count", "number of places: of joints, all that are alike; else 1"),
         Column(
             "findings_version",
             "",

@@ -95,7 +95,9 @@ class Finding:
     flags: str = ""
     """Remarks on it, as words separated by spaces (`harness.inspection.verdict.FLAGS`)."""
     term: str = ""
-    """``hole``, ``dent``, ``hole or dent``, ``slot``, ``bump`` or ``no return``."""
+    """``hole``, ``dent``, ``hole or dent``, ``slot``, ``joints``, ``bump`` or ``no return``."""
+    count: int = 1
+    """Number of places; more than 1 for joints, whose sizes and place are those of one of them."""
 
     @property
     def is_long(self) -> bool:
@@ -212,6 +214,7 @@ def finding_of(
         size_from=size_from,
         depth_from=depth_from,
         noise_probability=noise_probability,
+        count=detection.count,
     )
 
 

@@ -50,6 +50,25 @@ def test_the_direction_of_grooves_is_found() -> None:
     assert explains_better(with_twist(directed, points), plane, points)
 
 
+def test_a_crease_of_a_bent_sheet_is_fitted_to_its_ends() -> None:
+    # the sheet is bent by 24 mm along its crease, into a direction 14 degrees off its mean normal
+    rng = np.random.default_rng(3)
+    along_m = rng.uniform(-0.4, 0.4, 40_000)
+    across_m = rng.uniform(-0.3, 0.3, 40_000)
+    height_m = 0.5 * np.maximum(across_m - 0.1 * along_m, 0.0)
+    height_m += 0.15 * along_m**2 + 0.3 * across_m**2
+    points = np.column_stack([along_m, across_m, 0.9 + height_m])
+    points *= 1.0 + 2e-4 * rng.standard_normal((40_000, 1))
+    base = polynomial(points, np.ones(len(points)), degree=2)
+    directed = direction_of(points, base, 1 / 300, True)
+    assert directed is not None
+    residuals_m = points[:, 2] - with_twist(directed, points)(points)
+    is_end = np.abs(along_m) > 0.32
+    is_crease = np.abs(across_m - 0.1 * along_m) < 0.02
+    at_crease_m = float(np.sqrt(np.mean(residuals_m[is_end & is_crease] ** 2)))
+    assert at_crease_m < 1.5 * 2e-4
+
+
 def test_a_trapezoid_turns_back_and_a_corner_does_not() -> None:
     columns = np.arange(200)
     web = 0.04 * (np.clip((columns - 60) / 10, 0, 1) - np.clip((columns - 130) / 10, 0, 1))
@@ -68,3 +87,18 @@ def test_the_share_of_a_part_is_weighted_by_area() -> None:
         {"area_m2": 0.1, "share": 0.6, "fit": "plane"},
     ]
     assert part_text(pieces) == "part: 2 pieces, 0.4 m2, 90 % of it judged"
+
+
+def test_what_shows_far_behind_through_a_hole_does_not_turn_the_frame() -> None:
+    """A plane with a tenth of its points four times as far away: the mean plane of all points
+    would be seen edge on, and its places would not fit into the memory."""
+    rng = np.random.default_rng(1)
+    slopes = rng.uniform(-0.2, 0.2, (20_000, 2))
+    z_m = 0.7 + 1e-3 * rng.standard_normal(20_000)
+    z_m[np.hypot(slopes[:, 0] - 0.05, slopes[:, 1]) < 0.07] = 2.8
+    points = np.column_stack([slopes * z_m[:, None], z_m])
+
+    def base(points_m: np.ndarray) -> np.ndarray:
+        return np.full(len(points_m), 0.7)
+
+    assert direction_of(points, base, 0.0025, central=True) is None

@@ -1,0 +1,346 @@
+"""Joins slots that repeat: the joints of a brick wall, the vents of a grille.
+
+Long findings of equal direction, width and depth that a move across the surface carries onto one
+another are one feature and not as many damages. That they repeat must be significant: the first
+pair gives the move, and the others follow it far more often than places at random would. Round
+findings are never joined, because drilled holes are what is sought.
+
+Not modelled: slots whose distances vary, such as boards of different widths, and slots on surfaces
+that are bent strongly; they remain findings of their own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from detectors.interface import Detection, Evidence, Measurement
+from detectors.pixels.masks import grown
+from harness.vocabulary.geometry import MM, Cloud
+
+LONG = 2.0
+"""Least ratio of length to width of a slot."""
+ALIKE = 1.5
+"""Most ratio of lengths, widths and depths of slots that may belong together, before their scatter
+is known."""
+FEWEST = 4  # slots of a feature
+CHANCE = 1e-3
+"""Most probability that slots at random places follow one of the moves that were tried."""
+FOLLOWED = 0.5
+"""Least share of the places to which a move leads, where they are seen, that hold a slot."""
+MOVES = 2  # that carry a lattice onto itself: along its rows and from row to row
+STARTS = 12  # strongest slots from which moves are tried
+SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
+LEAST_SCATTER = 0.03
+"""Least scatter of widths, depths and areas, as a share of their median."""
+
+ERROR_SCATTER = 0.1
+"""Least scatter of the errors of widths, which contain what no shape explains, as a share of their
+median."""
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Slots that repeat."""
+
+    members: tuple[int, ...]
+    """Numbers of the detections that are alike, strongest first."""
+    differing: tuple[int, ...]
+    """Numbers of those in the same rows that depart in width, depth, area or shape."""
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """The long findings and the ends of slots, n of them."""
+
+    numbers: np.ndarray
+    """(n,): of their detections."""
+    centres_m: np.ndarray
+    """(n, 3)."""
+    along: np.ndarray
+    """(n, 3): unit vectors of any sign."""
+    lengths_m: np.ndarray
+    """(n,)."""
+    widths_m: np.ndarray
+    """(n,)."""
+    depths_m: np.ndarray
+    """(n,): positive behind the surface."""
+    areas_m2: np.ndarray
+    """(n,): across the line of sight, but for a factor common to all of them."""
+    errors: np.ndarray
+    """(n, 2): standard errors of width and depth, metres; 0 if unknown."""
+    cut: np.ndarray
+    """(n,) bool: reaches the rim of the judged area, so that its length is not known."""
+    whole: np.ndarray
+    """(n,) bool: is long; else it may be the end of a slot that the rim cuts."""
+
+
+def joints_of(
+    cloud: Cloud,
+    evidence: Evidence,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+) -> tuple[Joints, ...]:
+    """Return the features that long findings form, each finding in one of them at most. There are
+    none without a pixel grid."""
+    if not cloud.organised:
+        return ()
+    slots = _slots(evidence, detections, measurements)
+    free = np.ones(len(slots.numbers), bool)
+    features = []
+    for seed in range(len(slots.numbers)):
+        if not free[seed] or not slots.whole[seed]:
+            continue
+        parallel = _parallel(slots, seed) & free
+        alike = parallel & _alike(slots, seed)
+        if (alike & slots.whole).sum() < FEWEST:
+            continue
+        on_lattice = parallel & _on_lattice(cloud, evidence, slots, alike)
+        members = on_lattice & alike
+        members &= ~_departing(slots, members)
+        if (members & slots.whole).sum() < FEWEST:
+            continue
+        free &= ~on_lattice
+        differing = tuple(slots.numbers[on_lattice & ~members].tolist())
+        features.append(Joints(tuple(slots.numbers[members].tolist()), differing))
+    return tuple(features)
+
+
+def joined(
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+    features: Sequence[Joints],
+) -> tuple[tuple[Detection, ...], tuple[Measurement, ...]]:
+    """Return the findings, strongest first, with each feature as one finding. It has the place and
+    the sizes of its strongest member and the pixels of all of them."""
+    in_feature = {number for feature in features for number in feature.members}
+    pairs = []
+    for number, pair in enumerate(zip(detections, measurements, strict=True)):
+        if number not in in_feature:
+            pairs.append(pair)
+    for feature in features:
+        members = [detections[number] for number in feature.members]
+        strongest = feature.members[0]
+        pixels = np.unique(np.concatenate([member.pixels for member in members]))
+        detection = replace(detections[strongest], pixels=pixels, count=len(members))
+        points = sum(measurements[number].points for number in feature.members)
+        pairs.append((detection, replace(measurements[strongest], points=points)))
+    pairs.sort(key=lambda pair: -pair[0].score)
+    return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
+
+
+def joints_facts(
+    features: Sequence[Joints], measurements: Sequence[Measurement]
+) -> list[dict[str, Any]]:
+    """Return plain data on each feature: its sizes (medians) and the places of its members."""
+    facts = []
+    for feature in features:
+        members = [measurements[number] for number in feature.members]
+        facts.append(
+            {
+                "count": len(members),
+                "differing": len(feature.differing),
+                "length_mm": float(np.median([member.length_m for member in members])) / MM,
+                "width_mm": float(np.median([member.width_m for member in members])) / MM,
+                "depth_mm": float(np.median([member.normal_depth_m for member in members])) / MM,
+                "places_px": [[member.u_px, member.v_px] for member in members],
+            }
+        )
+    return facts
+
+
+def _slots(
+    evidence: Evidence,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+) -> _Slots:
+    """Return the findings by depth whose sizes are known, strongest first, that are long or
+    reach the rim."""
+    rim = _rim(evidence).ravel()
+    numbers = []
+    whole = []
+    for number, (detection, measured) in enumerate(zip(detections, measurements, strict=True)):
+        sizes = (measured.length_m, measured.width_m, measured.normal_depth_m)
+        is_known = all(math.isfinite(size) for size in sizes)
+        is_long = measured.length_m > LONG * max(measured.width_m, 1.0 * MM)
+        is_cut = bool(rim[detection.pixels].any())
+        if detection.kind == "depth" and is_known and (is_long or is_cut):
+            numbers.append(number)
+            whole.append(is_long)
+    chosen = [measurements[number] for number in numbers]
+    widths_m = np.array([max(measured.width_m, 1.0 * MM) for measured in chosen])
+    diameters_m = np.array([measured.model_diameter_m for measured in chosen])
+    diameter_errors_m = np.array([measured.model_diameter_se_m for measured in chosen])
+    depth_errors_m = np.array([measured.normal_depth_se_m for measured in chosen])
+    width_errors_m = widths_m * diameter_errors_m / diameters_m
+    return _Slots(
+        numbers=np.array(numbers, np.int64),
+        centres_m=np.array([_centre(measured) for measured in chosen]).reshape(-1, 3),
+        along=np.array([measured.along for measured in chosen]).reshape(-1, 3),
+        lengths_m=np.array([measured.length_m for measured in chosen]),
+        widths_m=widths_m,
+        depths_m=np.array([measured.normal_depth_m for measured in chosen]),
+        areas_m2=np.array([measured.points * _centre(measured)[2] ** 2 for measured in chosen]),
+        errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
+        cut=np.array([bool(rim[detections[number].pixels].any()) for number in numbers], bool),
+        whole=np.array(whole, bool),
+    )
+
+
+def _centre(measured: Measurement) -> np.ndarray:
+    if np.isfinite(measured.model_centre_m).all():
+        return measured.model_centre_m
+    return measured.extent_centre_m
+
+
+def _rim(evidence: Evidence) -> np.ndarray:
+    """Return (h, w) bool: the pixels beside those that are not judged or not in the picture."""
+    outside = np.pad(~np.isfinite(evidence.residual_m), 1, constant_values=True)
+    return grown(outside, 1)[1:-1, 1:-1]
+
+
+def _parallel(slots: _Slots, seed: int) -> np.ndarray:
+    """Return which slots (n,) run along a seed, as far as its width lets one tell, and are on the
+    same side of the surface, and about as long or cut by the rim. An end has no direction."""
+    cosines = np.abs(slots.along @ slots.along[seed])
+    angle = math.atan(slots.widths_m[seed] / slots.lengths_m[seed])
+    same_side = np.sign(slots.depths_m) == np.sign(slots.depths_m[seed])
+    ratio = slots.lengths_m / slots.lengths_m[seed]
+    as_long = (ratio < ALIKE) & ((ratio > 1.0 / ALIKE) | slots.cut)
+    runs_along = (cosines >= math.cos(angle)) | ~slots.whole
+    return runs_along & same_side & as_long
+
+
+def _alike(slots: _Slots, seed: int) -> np.ndarray:
+    """Return which slots (n,) have about the width and depth of a seed. An end has no width."""
+    widths = slots.widths_m / slots.widths_m[seed]
+    depths = slots.depths_m / slots.depths_m[seed]
+    as_wide = (widths < ALIKE) & (widths > 1.0 / ALIKE)
+    as_deep = (depths < ALIKE) & (depths > 1.0 / ALIKE)
+    return (as_wide | ~slots.whole) & as_deep
+
+
+def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
+    """Return which slots (n,) depart from the members (n,) in width, depth, area or fit by more
+    than these scatter and than what is less certain about them, as about a slot that the rim cuts.
+    An end has no width."""
+    result = np.zeros(len(slots.numbers), bool)
+    certain = members & slots.whole
+    if not certain.any():
+        return result
+    for column, sizes in enumerate((slots.widths_m, slots.depths_m)):
+        errors = slots.errors[:, column]
+        middle = float(np.median(sizes[certain]))
+        scatter = float(np.median(np.abs(sizes[certain] - middle))) / 0.6745
+        usual_error = float(np.median(errors[certain]))
+        further = np.sqrt(np.maximum(errors**2 - usual_error**2, 0.0))
+        limit = SCATTERS * np.hypot(max(scatter, LEAST_SCATTER * abs(middle)), further)
+        departs = np.abs(sizes - middle) > limit
+        result |= departs & slots.whole if sizes is slots.widths_m else departs
+    # damage that touches a joint is found with it: it shows in the area, and no slot explains it
+    middle_m2 = float(np.median(slots.areas_m2[certain]))
+    scatter_m2 = float(np.median(np.abs(slots.areas_m2[certain] - middle_m2))) / 0.6745
+    limit_m2 = SCATTERS * max(scatter_m2, LEAST_SCATTER * middle_m2)
+    result |= slots.areas_m2 > middle_m2 + limit_m2
+    unexplained_m = slots.errors[:, 0]
+    middle_m = float(np.median(unexplained_m[certain]))
+    scatter_m = float(np.median(np.abs(unexplained_m[certain] - middle_m))) / 0.6745
+    limit_m = SCATTERS * max(scatter_m, ERROR_SCATTER * middle_m)
+    result |= ~slots.cut & (unexplained_m > middle_m + limit_m)
+    return result
+
+
+def _on_lattice(
+    cloud: Cloud,
+    evidence: Evidence,
+    slots: _Slots,
+    alike: np.ndarray,
+) -> np.ndarray:
+    """Return which slots (n,) the significant moves between ``alike`` slots carry onto one."""
+    alike = alike & slots.whole
+    first = int(np.flatnonzero(alike)[0])
+    along = slots.along[first]
+    across = np.cross(along, slots.centres_m[alike].mean(axis=0))
+    plane = np.column_stack([along, across / np.linalg.norm(across)])
+    places = slots.centres_m @ plane
+    near_m = np.full(places.shape, float(np.median(slots.widths_m[alike])))
+    # the centre of a slot that the rim cuts lies up to half its length from the middle
+    near_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[alike].max())
+
+    judged = np.isfinite(evidence.residual_m)
+    pixel_of = _pixel_map(cloud.points_m[judged] @ plane, judged)
+    area_m2 = float(judged.sum()) / max(abs(float(np.linalg.det(pixel_of[:2]))), 1e-12)
+    chance = min(float(4.0 * near_m[alike].prod(axis=1).sum()) / area_m2, 1.0)
+    pairs = _pairs(alike)
+    moves: list[np.ndarray] = []
+    for _ in range(MOVES):
+        most = 0
+        best = None
+        for start, end in pairs:
+            move = places[end] - places[start]
+            linked = _linked(places, near_m, alike, move)[alike]
+            hits = int(linked.sum())
+            if hits <= most or _is_along(move, moves, float(near_m[first, 1])):
+                continue
+            seen = _seen(places[alike] + move, pixel_of, judged)
+            trials = int((seen | linked).sum())
+            # the first pair gives the move and proves nothing
+            probability = float(stats.binom.sf(hits - 2, trials - 1, chance))
+            if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
+                most = hits
+                best = move
+        if best is None:
+            break
+        moves.append(best)
+    if len(moves) == 2:
+        moves += [moves[0] + moves[1], moves[0] - moves[1]]
+    result = np.zeros(len(alike), bool)
+    for move in moves:
+        result |= _linked(places, near_m, alike, move)
+        result |= _linked(places, near_m, alike, -move)
+    return result
+
+
+def _pairs(alike: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs between which moves are tried: from the strongest of the slots (n,)."""
+    ends = np.flatnonzero(alike).tolist()
+    return [(start, end) for start in ends[:STARTS] for end in ends if start != end]
+
+
+def _is_along(move: np.ndarray, moves: Sequence[np.ndarray], near_m: float) -> bool:
+    """Return whether a move runs along one that is already known."""
+    for known in moves:
+        off_m = abs(float(move[0] * known[1] - move[1] * known[0])) / float(np.linalg.norm(known))
+        if off_m <= near_m:
+            return True
+    return False
+
+
+def _linked(
+    places: np.ndarray, near_m: np.ndarray, alike: np.ndarray, move: np.ndarray
+) -> np.ndarray:
+    """Return which places (n, 2) a move (2,) carries near an ``alike`` one (n,)."""
+    off_m = np.abs(places[:, None] + move - places[None, alike])
+    limit_m = np.maximum(near_m[:, None], near_m[None, alike])
+    return np.asarray((off_m <= limit_m).all(axis=2).any(axis=1))
+
+
+def _pixel_map(places: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return the affine map (3, 2) from places (n, 2) of the ``judged`` pixels (h, w) to columns
+    and rows: enough to tell whether a place is in the picture."""
+    rows, columns = np.nonzero(judged)
+    design = np.column_stack([places, np.ones(len(places))])
+    return np.linalg.lstsq(design, np.column_stack([columns, rows]), rcond=None)[0]
+
+
+def _seen(places: np.ndarray, pixel_of: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return which places (n, 2) are judged."""
+    pixels = np.rint(places @ pixel_of[:2] + pixel_of[2]).astype(int)
+    inside = ((pixels >= 0) & (pixels < judged.shape[::-1])).all(axis=1)
+    result = np.zeros(len(places), bool)
+    result[inside] = judged[pixels[inside, 1], pixels[inside, 0]]
+    return result

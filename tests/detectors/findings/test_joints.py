@@ -1,0 +1,137 @@
+"""Slots that repeat: which findings are one feature, and which stay damage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from detectors.findings.joints import joined, joints_facts, joints_of
+from detectors.interface import Detection, Evidence, Measurement
+from harness.vocabulary.geometry import Cloud
+from tests.detectors.test_crop import cloud_of
+
+SHAPE = (200, 300)
+PITCH_M = 0.8 / 250
+CLOUD: Cloud = cloud_of(np.full(SHAPE, 0.8))
+EVIDENCE = Evidence(
+    score=np.zeros(SHAPE), residual_m=np.zeros(SHAPE), surface_z_m=np.full(SHAPE, 0.8), scale_m=1e-3
+)
+BRICKS = [(row, column) for row in range(30, 180, 30) for column in range(20 + row % 60, 280, 60)]
+
+
+def slot(row: int, column: int, number: int = 0) -> tuple[Detection, Measurement]:
+    """A slot along the columns, 20 x 3 pixels, 5 mm deep; its scatter is that of its number."""
+    rows, columns = np.mgrid[max(row - 10, 0) : min(row + 10, SHAPE[0]), column - 1 : column + 2]
+    pixels = np.sort((rows * SHAPE[1] + columns).ravel())
+    centre_m = CLOUD.points_m[row, column]
+    scatter = 1.0 + 0.005 * (number % 5 - 2)
+    measured = Measurement(
+        u_px=float(column + CLOUD.region.col0),
+        v_px=float(row + CLOUD.region.row0),
+        points=len(pixels),
+        score=60.0 - number,
+        extent_diameter_m=0.03,
+        extent_centre_m=centre_m,
+        model_diameter_m=0.03,
+        model_diameter_se_m=5e-4,
+        model_depth_m=5e-3 * scatter,
+        model_depth_se_m=3e-4,
+        length_m=20 * PITCH_M,
+        width_m=3 * PITCH_M * scatter,
+        along=np.array([0.0, 1.0, 0.0]),
+        normal_share=1.0,
+    )
+    return Detection(60.0 - number, pixels, centre_m), measured
+
+
+def wall(
+    places: list[tuple[int, int]] = BRICKS,
+) -> tuple[list[Detection], list[Measurement]]:
+    pairs = [slot(row, column, number) for number, (row, column) in enumerate(places)]
+    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+
+
+def test_head_joints_are_one_feature() -> None:
+    detections, measurements = wall()
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert sorted(feature.members) == list(range(len(BRICKS)))
+    assert feature.differing == ()
+    (finding,), (measured,) = joined(detections, measurements, [feature])
+    assert finding.count == len(BRICKS)
+    assert len(finding.pixels) == measured.points == 60 * len(BRICKS)
+    assert finding.score == 60.0
+    assert finding.centre_m == pytest.approx(detections[0].centre_m)
+    (facts,) = joints_facts([feature], measurements)
+    assert (facts["count"], facts["differing"]) == (len(BRICKS), 0)
+    assert facts["length_mm"] == pytest.approx(64.0)
+    assert facts["depth_mm"] == pytest.approx(5.0)
+    assert len(facts["places_px"]) == len(BRICKS)
+
+
+@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points", "model_diameter_se_m"])
+def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
+    detections, measurements = wall()
+    usual = getattr(measurements[7], field)
+    factor = 2.0 if field == "model_diameter_se_m" else 1.3
+    larger = type(usual)(factor * usual)
+    measurements[7] = replace(measurements[7], **{field: larger})
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert feature.differing == (7,)
+    assert 7 not in feature.members
+    assert len(joined(detections, measurements, [feature])[0]) == 2
+
+
+def test_a_slot_between_the_rows_stays_a_finding() -> None:
+    detections, measurements = wall([*BRICKS, (45, 67)])
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert len(BRICKS) not in (*feature.members, *feature.differing)
+
+
+def test_a_slot_across_the_others_stays_a_finding() -> None:
+    detections, measurements = wall()
+    measurements[7] = replace(measurements[7], along=np.array([1.0, 0.0, 0.0]))
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert 7 not in (*feature.members, *feature.differing)
+
+
+def test_drilled_holes_in_a_lattice_stay_findings() -> None:
+    detections, measurements = wall()
+    width_m = 3 * PITCH_M
+    measurements = [replace(measured, length_m=1.9 * width_m) for measured in measurements]
+    assert joints_of(CLOUD, EVIDENCE, detections, measurements) == ()
+
+
+def test_alike_slots_at_random_places_stay_findings() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        rows = rng.integers(20, 180, 8).tolist()
+        columns = rng.integers(10, 290, 8).tolist()
+        detections, measurements = wall(list(zip(rows, columns, strict=True)))
+        assert joints_of(CLOUD, EVIDENCE, detections, measurements) == ()
+
+
+def test_three_slots_stay_findings_and_a_row_of_six_is_one() -> None:
+    for count, features in ((3, 0), (6, 1)):
+        places = [(100, 40 + 40 * number) for number in range(count)]
+        assert len(joints_of(CLOUD, EVIDENCE, *wall(places))) == features
+
+
+def test_the_end_of_a_joint_at_the_rim_belongs_to_it() -> None:
+    # the rim cuts all but the last four pixels of a joint whose middle is outside the picture
+    detections, measurements = wall([*BRICKS, (2, 20)])
+    last = len(BRICKS)
+    rows, columns = np.mgrid[0:4, 19:22]
+    pixels = np.sort((rows * SHAPE[1] + columns).ravel())
+    detections[last] = replace(detections[last], pixels=pixels)
+    short = replace(
+        measurements[last], length_m=4 * PITCH_M, along=np.array([0.7, 0.7, 0.0]), width_m=0.008
+    )
+    measurements[last] = short
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert last in feature.members
+    # a hole at the same place inside the picture does not
+    detections[last] = replace(detections[last], pixels=pixels + 5 * SHAPE[1])
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert last not in feature.members
