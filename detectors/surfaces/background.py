@@ -19,7 +19,7 @@ import numpy as np
 
 from detectors.pixels.masks import grown, on_grid
 from detectors.pixels.medians import group_medians
-from detectors.pixels.noise import median_of, sigma_of
+from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.surfaces.extruded import Profile, direction_of, profiled
 from detectors.surfaces.free_form import free_form, picture_places
 from detectors.surfaces.reference import laid_on
@@ -169,7 +169,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     if config.shape in STATED:
         name, fit = _stated(points, config, central)
     else:
-        shape, cells = _shape_of(points, cells, config)
+        shape, cells = _shape_of(points, cells, config, rounding_floor(cloud, mask))
         name = shape.name
         fit = shape.fit
         wavelength = shape.wavelength
@@ -232,9 +232,11 @@ def _of_few_points(
     )
 
 
-def _shape_of(points: np.ndarray, cells: _Cells, config: SurfaceConfig) -> tuple[_Shape, _Cells]:
+def _shape_of(
+    points: np.ndarray, cells: _Cells, config: SurfaceConfig, rounding_m: float
+) -> tuple[_Shape, _Cells]:
     """Choose the shape of points (n, 3), refine its fit with cells centred on it, and return
-    both."""
+    both. ``rounding_m``: deviation that rounding leaves in the points."""
     sample = points[:: max(1, len(points) // 8192)]
     _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"))
     cells = cells.refreshed(points[:, 2] - start(points), start)
@@ -242,7 +244,9 @@ def _shape_of(points: np.ndarray, cells: _Cells, config: SurfaceConfig) -> tuple
     worth = WORTH * cells.pixel_noise
     best = shapes[_simplest(errors, worth)]
     base = shapes[int(np.argmin([tile_errors.mean() for tile_errors in errors]))]
-    profile = _profile(points, cells, start, best) if config.shape == "auto" else None
+    profile = None
+    if config.shape == "auto":
+        profile = _profile(points, cells, start, best, rounding_m)
     if profile is not None:
         cells = cells.refreshed(points[:, 2] - profile(points), profile)
         best = _extruded_shape(profile, cells)
@@ -251,16 +255,19 @@ def _shape_of(points: np.ndarray, cells: _Cells, config: SurfaceConfig) -> tuple
     return _refined(points, cells, shape)
 
 
-def _profile(points: np.ndarray, cells: _Cells, start: Fit, best: _Shape) -> Profile | None:
+def _profile(
+    points: np.ndarray, cells: _Cells, start: Fit, best: _Shape, rounding_m: float
+) -> Profile | None:
     """Return the extruded surface of points (n, 3), if it explains them better than the ``best``
-    smooth shape; ``start`` is a surface of degree 2."""
+    smooth shape; ``start`` is a surface of degree 2. ``rounding_m``: deviation that rounding
+    leaves."""
     in_cells = cells.cell_of_point[cells.cell_of_point >= 0]
     pitch = cells.side / float(np.sqrt(np.median(np.bincount(in_cells))))
     directed = direction_of(points, start, pitch, cells.central)
     if directed is None:
         return None
     smooth, _ = _refined(points, cells, best)
-    return profiled(directed, smooth.fit, points)
+    return profiled(directed, smooth.fit, points, rounding_m)
 
 
 def _refined(points: np.ndarray, cells: _Cells, shape: _Shape) -> tuple[_Shape, _Cells]:

@@ -23,6 +23,9 @@ TWIST_SEARCHED = 6_000  # points from which the frame of a twist is found
 TWIST_STEPS = (3e-3, 1e-2, 3e-2)  # first steps of its angles, radians
 COARSE_SEARCHED = 60_000  # points from which a direction is searched
 FINE_PX = 1.5  # width of the strips in the fine search
+MOST_STRIPS = 20_000
+"""Extent of a picture in such strips, beyond which its points belong to no surface: a ray that
+grazes the plane meets it anywhere."""
 COARSE_PX = 4.0  # side of the blocks whose means show a direction
 TURNS = 180
 """Number of directions tried: a joint 4 pixels wide and 250 long is blurred by one degree."""
@@ -170,6 +173,8 @@ def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> 
     frame = _frame(normal, 0.0, pitch, central)
     across = frame.slopes(sample)
     along = frame.lengths(sample)
+    if max(np.ptp(across), np.ptp(along)) > MOST_STRIPS * FINE_PX * pitch:
+        return None
     values = frame._curve_of(sample) - frame._curve_of(on_base)
     turns = math.pi / TURNS * np.arange(TURNS)
     blocks = _block_means(across, along, values, COARSE_PX * pitch)
@@ -331,12 +336,17 @@ def _turned(profile: Profile, angles: np.ndarray) -> Profile:
     return replace(profile, along=along, across=np.cross(along, ahead), ahead=ahead)
 
 
-def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
+def explains_better(
+    profile: Profile, smooth: Fit, points: np.ndarray, rounding_m: float = 0.0
+) -> bool:
     """Return whether an extruded surface explains points (n, 3) better than a ``smooth`` one.
 
     Every other band along the direction shows where the profile departs from the smooth surface by
     more than `SEEN` of the noise, and predicts the other bands there: the errors must be smaller in
-    the bands on average, significantly, because what is extruded is in each of them."""
+    the bands on average, significantly, because what is extruded is in each of them.
+
+    ``rounding_m``: deviation that rounding leaves, which counts as noise at least: the steps of a
+    rounded plane without noise are extruded, too."""
     lengths = profile.lengths(points)
     extent = max(float(np.ptp(lengths)), 1e-12)
     band = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
@@ -349,7 +359,7 @@ def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
             return False
         other = profile.fitted(points[~inside])
         errors = np.abs(points[inside, 2] - other(points[inside]))
-        noise = float(np.nanmedian(errors)) / 0.6745
+        noise = max(float(np.nanmedian(errors)) / 0.6745, rounding_m)
         limit = CLIP_SIGMAS * noise
         sizes = np.abs(departures[inside])
         knots = other.knots(other.slopes(points)).clip(0, len(other.curve) - 1)
@@ -368,11 +378,13 @@ def explains_better(profile: Profile, smooth: Fit, points: np.ndarray) -> bool:
     return float(means.mean()) > GAIN_SIGMAS * standard_error
 
 
-def profiled(profile: Profile, smooth: Fit, points: np.ndarray) -> Profile | None:
+def profiled(
+    profile: Profile, smooth: Fit, points: np.ndarray, rounding_m: float
+) -> Profile | None:
     """Return the profile of `direction_of` fitted to points (n, 3), if it explains them better than
-    a ``smooth`` surface."""
+    a ``smooth`` surface. ``rounding_m``: deviation that rounding leaves."""
     sample = picked(points, COARSE_SEARCHED)
     profile = with_twist(profile, sample)
-    if not explains_better(profile, smooth, sample):
+    if not explains_better(profile, smooth, sample, rounding_m):
         return None
     return profile.fitted(points).trusted(points)

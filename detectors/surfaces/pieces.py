@@ -15,7 +15,6 @@ import numpy as np
 
 from detectors.pixels.masks import nearest_pixel
 from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
-from harness.vocabulary.geometry import Cloud
 
 MOST_SAMPLES = 4000  # points from which a piece's surface is fitted
 HELD = 0.9  # share of a piece's points within the limit of a surface that holds it
@@ -107,46 +106,29 @@ def _background_between(
 
 
 def piece_facts(
-    part: np.ndarray, cloud: Cloud, residual_m: np.ndarray, fit: str
+    part: np.ndarray, pixel_m2: np.ndarray, residual_m: np.ndarray, fit: str
 ) -> list[dict[str, Any]]:
-    """Return the facts about each piece of a part, largest first: its area in m2, on its mean
-    plane; the share of it that was judged; and the surface that was fitted to it.
+    """Return the facts about each piece of a part, largest first: its area in m2, the share of it
+    that was judged, and the surface that was fitted to it.
 
     Args:
         part: (h, w) bool, the valid pixels of the part.
-        cloud: organised.
+        pixel_m2: (h, w), area of the fitted surface that each pixel sees, m2.
         residual_m: (h, w), metres, NaN where nothing is judged.
         fit: name of the surface, which is common to all pieces."""
     _, labels = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
     labels = labels.ravel()
     counts = np.bincount(labels)
-    judged = np.bincount(labels, np.isfinite(residual_m).ravel())
+    areas_m2 = np.bincount(labels, pixel_m2.ravel())
+    judged_m2 = np.bincount(labels, np.where(np.isfinite(residual_m), pixel_m2, 0.0).ravel())
     facts = []
     for number in 1 + np.argsort(-counts[1:], kind="stable"):
         if counts[number] < LEAST_PX:
             break
-        area_m2 = _area_m2(cloud, np.flatnonzero(labels == number))
-        share = float(judged[number] / counts[number])
+        area_m2 = float(areas_m2[number])
+        share = float(judged_m2[number]) / max(area_m2, 1e-12)
         facts.append({"area_m2": area_m2, "share": share, "fit": fit})
     return facts
-
-
-def _area_m2(cloud: Cloud, pixels: np.ndarray) -> float:
-    """Return the area of pixels (n,), given by their flat indices, on their mean plane."""
-    points = cloud.points_m.reshape(-1, 3)[pixels]
-    central = cloud.projection == "central"
-    places = cloud.points_m[::4, ::4, :2]
-    if central:
-        places = places / cloud.points_m[::4, ::4, 2:]
-    across = float(np.nanmedian(np.abs(np.diff(places[..., 0], axis=1)))) / 4.0
-    down = float(np.nanmedian(np.abs(np.diff(places[..., 1], axis=0)))) / 4.0
-    centred = points - points.mean(axis=0)
-    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
-    if not central:
-        return len(points) * across * down / max(abs(float(normal[2])), 1e-3)
-    # a pixel covers z^2 of the unit plane, and more where the ray is oblique
-    cosines = np.abs(points @ normal) / points[:, 2]
-    return across * down * float((points[:, 2] ** 2 / np.maximum(cosines, 1e-3)).sum())
 
 
 def part_text(pieces: list[dict[str, Any]]) -> str:

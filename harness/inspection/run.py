@@ -28,7 +28,14 @@ from harness.inspection.choosing import candidate_of, chosen, noted
 from harness.inspection.judging import judged, refuse_thresholds
 from harness.inspection.limit import Limit, limit_of
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
-from harness.inspection.verdict import CLASSES, FLAGS, InspectionVerdict, calls_text, verdict_of
+from harness.inspection.verdict import (
+    CLASSES,
+    FLAGS,
+    InspectionVerdict,
+    calls_text,
+    known_areas_m2,
+    verdict_of,
+)
 from harness.records import outputs
 from harness.report.blocks import joined, paragraph, plain
 from harness.report.findings import Judged, write_findings
@@ -193,7 +200,8 @@ def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evi
     if choice is None or choice.part is None:
         return evidence
     fit = str(evidence.notes.get("shape", evidence.notes.get("surface", "")))
-    pieces = piece_facts(choice.part, cloud, evidence.residual_m, fit)
+    pixel_m2, _ = known_areas_m2(cloud, evidence)
+    pieces = piece_facts(choice.part, pixel_m2, evidence.residual_m, fit)
     return replace(evidence, notes={**evidence.notes, "pieces": pieces})
 
 

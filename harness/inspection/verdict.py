@@ -170,12 +170,8 @@ class Extent:
 def extent_of(result: Judged, outline: np.ndarray | None) -> Extent:
     """Return how much was judged. ``outline`` (h, w) bool: the part, or None if it was not sought;
     then the outline of the judged area takes its place."""
-    areas_m2 = pixel_areas_m2(result.cloud, result.evidence.surface_z_m)
+    known_m2, typical_m2 = known_areas_m2(result.cloud, result.evidence)
     is_judged = np.isfinite(result.evidence.residual_m)
-    typical_m2 = math.nan
-    if np.isfinite(areas_m2[is_judged]).any():
-        typical_m2 = float(np.nanmedian(areas_m2[is_judged]))
-    known_m2 = np.where(np.isfinite(areas_m2), areas_m2, typical_m2)
     judged_m2 = float(known_m2[is_judged].sum())
     part = outline
     if part is None and result.missing is not None:
@@ -184,6 +180,15 @@ def extent_of(result: Judged, outline: np.ndarray | None) -> Extent:
     if part is not None and part.shape == is_judged.shape:
         share = float((is_judged & part).sum() / max(part.sum(), 1))
     return Extent(judged_m2, share, _blind_m2(result.missing, typical_m2))
+
+
+def known_areas_m2(cloud: Cloud, evidence: Evidence) -> tuple[np.ndarray, float]:
+    """Return (h, w): the area of the surface that each pixel sees, and that of a typical judged
+    pixel, which stands for pixels where the surface is not known; NaN if nothing is judged."""
+    areas_m2 = pixel_areas_m2(cloud, evidence.surface_z_m)
+    is_known = np.isfinite(areas_m2) & np.isfinite(evidence.residual_m)
+    typical_m2 = float(np.median(areas_m2[is_known])) if is_known.any() else math.nan
+    return np.where(np.isfinite(areas_m2), areas_m2, typical_m2), typical_m2
 
 
 def _blind_m2(missing: MissingReturns | None, pixel_m2: float) -> float:

@@ -92,8 +92,9 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     assert (
         detect.main([str(before_wall), "--out", str(tmp_path / "out"), "--false-calls", "0.1"]) == 0
     )
-    verdict, first, second = capsys.readouterr().out.splitlines()[:3]
+    verdict, part, first, second = capsys.readouterr().out.splitlines()[:4]
     assert verdict.startswith("One hole found on 0.0")
+    assert part.startswith("part: 1 piece, 0.07")
     assert (
         first.startswith("target 1 of 2: 0.50 m away (0.49 to 0.51 m), 30")
         and " % of the view, tilted by 6" in first
@@ -106,7 +107,7 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     assert (picture == (255, 0, 255)).all(axis=-1).sum() > 1000
     assert [row["kind"] for row in rows_of(tmp_path / "out" / "findings.csv")] == ["hole"]
     assert detect.main([str(before_wall), "--target", "2"]) == 0
-    _, first, second = capsys.readouterr().out.splitlines()[:3]
+    _, _, first, second = capsys.readouterr().out.splitlines()[:4]
     assert first.startswith("target 2 of 2: 1.20 m away") and second.startswith(
         "  instead, with --target 1: 0.50 m"
     )
@@ -265,11 +266,10 @@ def test_a_cloud_without_a_grid_works_too(
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
     row, *remaining = rows_of(tmp_path / "out" / "findings.csv")
     # rounding is all the noise: too few peaks stand out to set the threshold, as a warning says
-    assert (
-        float(row["score"]) > 100
-        and all(float(other["score"]) < 10 for other in remaining)
-        and len(remaining) < 5
-    )
+    # steps of a rounded plane without noise are taken for a profile, whose ends stand out a little
+    assert float(row["score"]) > 1000
+    assert all(float(other["score"]) < 30 for other in remaining)
+    assert len(remaining) < 8
     assert row["u_px"] == "" and row["volume_mm3"] == ""
     # The thesis' centre is the mean of four extreme points, of which rounding picks some: good to
     # a part of the hole.
@@ -383,7 +383,8 @@ def test_a_hole_to_the_room_behind_is_flagged(
     lens = ["--intrinsics", str(tmp_path / "lens.json")]
     out = ["--out", str(tmp_path / "out"), "--false-calls", "0.01"]
     assert detect.main([str(tmp_path / "depth.npy"), *lens, *out]) == 0
-    through, pit = rows_of(tmp_path / "out" / "findings.csv")[:2]
+    rows = rows_of(tmp_path / "out" / "findings.csv")[:2]
+    pit, through = sorted(rows, key=lambda row: float(row["u_px"]))
     assert "open_behind" in through["flags"].split()
     assert "open_behind" not in pit["flags"].split()
     assert capsys.readouterr().out.startswith("Two holes found on 0.059 m2 of the part; ")
