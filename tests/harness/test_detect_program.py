@@ -6,7 +6,6 @@ import csv
 import errno
 import hashlib
 import json
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -280,10 +279,7 @@ def test_a_cloud_without_a_grid_works_too(
     assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
     assert finding["u_px"] is None
     printed = capsys.readouterr().out
-    assert re.search(
-        r"warning: the capture cannot set its own threshold, 5 is used: only \d peaks of noise stand",
-        printed,
-    )
+    assert "warning: the capture cannot set its own threshold" in printed
     assert "unorganised points" in printed
 
 
