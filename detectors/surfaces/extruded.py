@@ -108,8 +108,13 @@ class Profile:
         return np.zeros(len(points)) if self.twist is None else self.twist(points)
 
     def fitted(self, points: np.ndarray) -> Profile:
-        """Return the profile with the curve of medians of points (n, 3)."""
+        """Return the profile with the curve of medians of points (n, 3).
+
+        Points so far across that their rays graze the profile count at the ends of the curve."""
         slopes = self.slopes(points)
+        middle = float(np.median(slopes))
+        reach = 0.5 * MOST_STRIPS * self.step
+        slopes = np.clip(slopes, middle - reach, middle + reach)
         low = float(slopes.min())
         count = max(math.ceil((float(slopes.max()) - low) / self.step) + 1, 2)
         result = replace(self, first=low, curve=np.zeros(count))
@@ -126,8 +131,8 @@ class Profile:
         """Return the profile, unknown where points (n, 3) show less than `LEAST_LENGTH_M` of it,
         and beside steps."""
         slopes = self.slopes(points)
-        knots = self.knots(slopes)
         count = len(self.curve)
+        knots = self.knots(slopes).clip(0, count - 1)
         number = np.bincount(knots, minlength=count)
         # the visible length: the number of points, each a knot's distance long
         # at each knot; a parallel projection has no distance, and steps are metres
