@@ -87,6 +87,8 @@ def frame_of(
         reason[is_code] = Reason.NO_RETURN
         notes.append(f"{code:.10g} is read as no return, {100 * is_code.mean():.2g} % of pixels")
     is_beyond = _is_beyond(stored, scale_m) & (reason == Reason.VALID)
+    if not is_depth:
+        is_beyond &= np.isfinite(stored[..., :2]).all(axis=-1)
     if is_beyond.any():
         reason[is_beyond] = Reason.OUT_OF_RANGE
         share = f"{100 * is_beyond.mean():.2g} % of pixels"
