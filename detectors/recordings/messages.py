@@ -26,6 +26,8 @@ LEGAL_IMAGE = (
     "CompressedImage as compressedDepth (PNG or RVL) of these"
 )
 CONFIG_BYTES = 12
+RVL_HEADER_BYTES = 8  # width and height
+ENDS_EARLY = "its RVL stream is damaged or ends too early"
 
 
 def encoding_of(message: Any) -> str:
@@ -91,7 +93,9 @@ def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
 
 def _rvl(name: str, content: bytes) -> np.ndarray:
     """Unpack width and height, then runs of zeros and differences."""
-    width, height = struct.unpack_from("<II", content.ljust(8, b"\0"))
+    if len(content) < RVL_HEADER_BYTES:
+        raise UserError(f"{name}: {ENDS_EARLY}", legal=LEGAL_IMAGE, fix="record it again")
+    width, height = struct.unpack_from("<II", content)
     refuse_pixels(name, width, height)
     numbers = _rvl_numbers(content)
     filled = np.zeros(width * height, bool)
@@ -107,8 +111,7 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
             zeros = int(numbers[index])
             run = int(numbers[index + 1])
         if run > numbers.size - start or pixel + zeros + run > filled.size or run + zeros == 0:
-            problem = f"{name}: its RVL stream is damaged or ends too early"
-            raise UserError(problem, legal=LEGAL_IMAGE, fix="record it again")
+            raise UserError(f"{name}: {ENDS_EARLY}", legal=LEGAL_IMAGE, fix="record it again")
         pixel += zeros
         filled[pixel : pixel + run] = True
         folded.append(numbers[start : start + run])
@@ -123,7 +126,8 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
 def _rvl_numbers(content: bytes) -> np.ndarray:
     """Return the numbers of an RVL stream: three bits in each nibble, the lowest first; the
     fourth bit says that another nibble follows."""
-    words = np.frombuffer(content, "<u4", (len(content) - 8) // 4, 8)
+    count = (len(content) - RVL_HEADER_BYTES) // 4
+    words = np.frombuffer(content, "<u4", count, RVL_HEADER_BYTES)
     nibbles = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32) & 15).ravel()
     last = np.flatnonzero(nibbles < 8)
     if not last.size:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionMode
 
@@ -395,6 +395,7 @@ def test_depth_images_without_their_lens_are_refused(tmp_path: Path) -> None:
 
 
 @settings(max_examples=40, deadline=None)
+@example(form="rvl", cut=0.005, share=0.0, byte=0)  # ends within the width
 @given(
     form=st.sampled_from(("png", "rvl")),
     cut=st.floats(0, 1),
