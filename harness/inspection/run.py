@@ -24,7 +24,7 @@ from detectors.surfaces.pieces import part_text, piece_facts
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
-from harness.inspection.choosing import candidate_of, chosen, noted
+from harness.inspection.choosing import Contender, candidate_of, chosen, noted
 from harness.inspection.judging import judged, refuse_thresholds
 from harness.inspection.limit import Limit, limit_of
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
@@ -94,6 +94,28 @@ class Inspection:
         return surface_map.cell_m if surface_map else None
 
 
+@dataclass(frozen=True)
+class _Captured:
+    """The recordings and their averages, before any detector judges them."""
+
+    recordings: Sequence[Recording]
+    """The captures: one, or one for each view."""
+    quiet_recordings: Sequence[Recording]
+    """The capture of an undamaged target, if there is one."""
+    flat_field: FlatField | None
+    """The unit's fixed pattern, which is subtracted."""
+    views: Sequence[View]
+    """The average of each capture."""
+    choices: Sequence[Choice | None]
+    """The chosen target of each view; None if none was sought."""
+    mapped: Mapped | None
+    """The views and their map; None for one capture."""
+    registrations: Mapping[str, Any]
+    """The content of registrations.json; empty for one capture."""
+    cloud: Cloud
+    """What is judged: the average, or the map."""
+
+
 def inspected(arguments: argparse.Namespace) -> Inspection:
     """Open, average, register and merge views, and judge. Raises UserError."""
     config = cli.mapping_of(arguments) if arguments.register is not None else None
@@ -102,24 +124,59 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     refuse_thresholds(arguments)
     cli.limit_depth_m(arguments)
     detectors = _detectors_of(arguments, config)
+    capture = _captured(arguments, paths, config, detectors[0][0])
+    candidate = _chosen(arguments, detectors, capture)
+    evidence = candidate.evidence
+    if capture.mapped is None:
+        evidence = _with_pieces(evidence, capture.cloud, capture.choices[0])
+    capture_doubts = _capture_doubts(arguments, capture.views, capture.flat_field)
+    evidence = replace(evidence, warnings=(*capture_doubts, *evidence.warnings))
+    result = judged(candidate.detector, capture.cloud, evidence, candidate.threshold)
+    outline = _outline(capture.choices, capture.mapped)
+    return Inspection(
+        arguments=arguments,
+        recordings=capture.recordings,
+        quiet_recordings=capture.quiet_recordings,
+        choices=capture.choices,
+        config=config,
+        mapped=capture.mapped,
+        registrations=capture.registrations,
+        detector=candidate.detector,
+        settings=candidate.settings,
+        result=result,
+        threshold=candidate.threshold,
+        threshold_origin=candidate.origin,
+        verdict=verdict_of(result, candidate.threshold, outline),
+        limit=_limit(arguments, candidate.detector, result, candidate.threshold),
+    )
+
+
+def _captured(
+    arguments: argparse.Namespace,
+    paths: Sequence[Path],
+    config: MappingConfig | None,
+    detector: Detector,
+) -> _Captured:
+    """Open and average the capture, or each view and merge them. ``detector`` states the crop of
+    one capture."""
     flat_field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
-    guesses: Sequence[np.ndarray | None] = (None,) * len(paths)
+    poses: Sequence[np.ndarray | None] = (None,) * len(paths)
     if arguments.poses:
-        guesses = cli.read_poses(arguments.poses, len(paths))
-    captures = [[path] for path in paths] if config else [paths]
-    recordings = [_opened(arguments, capture) for capture in captures]
+        poses = cli.read_poses(arguments.poses, len(paths))
+    files_of_views = [[path] for path in paths] if config else [paths]
+    recordings = [_opened(arguments, files) for files in files_of_views]
     quiet_recordings = []
     if arguments.quiet_capture is not None:
         quiet_recordings.append(_opened(arguments, [arguments.quiet_capture]))
 
     names = _names(paths) if config else [recordings[0].name]
     views = []
-    for name, recording, guess in zip(names, recordings, guesses, strict=False):
-        views.append(View(name, _averaged(arguments, recording, flat_field), guess))
+    for name, recording, pose in zip(names, recordings, poses, strict=False):
+        views.append(View(name, _averaged(arguments, recording, flat_field), pose))
     choices = []
     for view in views:
         with mistakes_named(view if config else None):
-            target_settings = config or getattr(detectors[0][0], "settings", None)
+            target_settings = config or getattr(detector, "settings", None)
             choices.append(output.choice_by(target_settings, view.cloud))
     mapped = None
     registrations: Mapping[str, Any] = {}
@@ -128,51 +185,46 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         mapped = merged_views(arguments, config, recordings, views, choices)
         registrations = registration_data(mapped)
         cloud = mapped.merged.cloud
+    return _Captured(
+        recordings=recordings,
+        quiet_recordings=quiet_recordings,
+        flat_field=flat_field,
+        views=views,
+        choices=choices,
+        mapped=mapped,
+        registrations=registrations,
+        cloud=cloud,
+    )
+
+
+def _chosen(
+    arguments: argparse.Namespace,
+    detectors: Sequence[tuple[Detector, dict[str, Any]]],
+    capture: _Captured,
+) -> Contender:
+    """Let the detectors judge the capture, and choose one."""
 
     @cache
     def quiet_cloud() -> Cloud:
-        return _averaged(arguments, quiet_recordings[0], flat_field)
+        return _averaged(arguments, capture.quiet_recordings[0], capture.flat_field)
 
     def silent_threshold(detector: Detector) -> tuple[float, str]:
         """Return a detector's lowest threshold that is silent on the quiet capture, and its
         origin."""
         undamaged = quiet_cloud()
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
-        frames = f"{undamaged.n_frames} frames, here {cloud.n_frames}"
+        frames = f"{undamaged.n_frames} frames, here {capture.cloud.n_frames}"
         quiet = f"{arguments.quiet_capture}, one repeat of {frames}"
         return threshold, f"the lowest that is silent on {quiet}"
 
-    candidates = [candidate_of(arguments, loaded, cloud, silent_threshold) for loaded in detectors]
-    candidate = candidates[0]
-    if arguments.detector == cli.DEFAULT_DETECTOR and arguments.threshold is not None:
-        candidate = noted(candidate, "as --threshold is in units of its score")
-    elif arguments.detector == cli.DEFAULT_DETECTOR:
-        candidate = chosen(candidates, cloud, cli.rate_text(arguments))
-    detector = candidate.detector
-    threshold = candidate.threshold
-    if mapped is None:
-        noted_evidence = _with_pieces(candidate.evidence, cloud, choices[0])
-        candidate = replace(candidate, evidence=noted_evidence)
-    capture_doubts = _capture_doubts(arguments, views, flat_field)
-    warnings = (*capture_doubts, *candidate.evidence.warnings)
-    evidence = replace(candidate.evidence, warnings=warnings)
-    result = judged(detector, cloud, evidence, threshold)
-    return Inspection(
-        arguments=arguments,
-        recordings=recordings,
-        quiet_recordings=quiet_recordings,
-        choices=choices,
-        config=config,
-        mapped=mapped,
-        registrations=registrations,
-        detector=detector,
-        settings=candidate.settings,
-        result=result,
-        threshold=threshold,
-        threshold_origin=candidate.origin,
-        verdict=verdict_of(result, threshold, _outline(choices, mapped)),
-        limit=_limit(arguments, detector, result, threshold),
-    )
+    candidates = [
+        candidate_of(arguments, loaded, capture.cloud, silent_threshold) for loaded in detectors
+    ]
+    if arguments.detector != cli.DEFAULT_DETECTOR:
+        return candidates[0]
+    if arguments.threshold is not None:
+        return noted(candidates[0], "as --threshold is in units of its score")
+    return chosen(candidates, capture.cloud, cli.rate_text(arguments))
 
 
 def _outline(choices: Sequence[Choice | None], mapped: Mapped | None) -> np.ndarray | None:
@@ -249,16 +301,12 @@ def _capture_doubts(
     arguments: argparse.Namespace, views: Sequence[View], flat_field: FlatField | None
 ) -> list[str]:
     """Return doubts about the frames of the views and about the flat field, each once."""
-    found: list[str] = []
-    for view in views:
-        unsteady = unsteadiness(view.cloud)
-        if unsteady:
-            found.append(unsteady)
+    texts = [unsteadiness(view.cloud) for view in views]
     if flat_field is not None:
         for view in views:
-            found += doubts(view.cloud, flat_field, arguments.flat_field)
-            found.append(places_doubt(view.cloud, flat_field, arguments.flat_field))
-    return list(filter(None, dict.fromkeys(found)))
+            texts += doubts(view.cloud, flat_field, arguments.flat_field)
+            texts.append(places_doubt(view.cloud, flat_field, arguments.flat_field))
+    return [text for text in dict.fromkeys(texts) if text]
 
 
 def warnings_of(run: Inspection) -> tuple[str, ...]:
