@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown
@@ -289,7 +289,7 @@ def _on_lattice(
             seen = _seen(places[alike] + move, pixel_of, judged)
             trials = int((seen | linked).sum())
             # the first pair gives the move and proves nothing
-            probability = float(stats.binom.sf(hits - 2, trials - 1, chance))
+            probability = float(special.bdtrc(hits - 2, trials - 1, chance))
             if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
                 most = hits
                 best = move
