@@ -373,7 +373,7 @@ def fit_hole(
     """Fit a damage of one shape to at least eight used pixels by least squares (Levenberg and
     Marquardt) from start values. Its covariance is that of `sandwich_covariance`.
 
-    Fitted are q = (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2),
+    The parameters are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2),
     which has `WALL_PRIOR`; of a slot, its stretch and angle instead of the wall. The fourth is the
     hole's volume. The blur preserves it, so that only the radius of a small hole is
     ill-determined."""
@@ -396,8 +396,8 @@ def fit_hole(
         width,
     )
     derivatives = rows[:8]
-    left = rows[8]
-    square = float(left @ left)
+    misfit = rows[8]
+    square = float(misfit @ misfit)
     u, v, radius, depth, wall, stretch, angle = hole.tolist()
     sharing = math.prod(patch.noise_px)
     return HoleFit(
@@ -413,7 +413,7 @@ def fit_hole(
         stretch=stretch,
         angle_rad=angle,
         chi_square=square / max(patch.noise_m, LEAST_M) ** 2 / sharing,
-        independent=len(left) / sharing,
+        independent=len(misfit) / sharing,
     )
 
 
@@ -532,7 +532,7 @@ def _descent(  # type: ignore[no-untyped-def]
     radius, depth, offset, wall, stretch, angle), 0 for those that the shape lacks; the ninth is the
     damage minus ``data`` (n,); the tenth is that of the last trial. ``weight``: of the prior."""
     n = len(data)
-    q = start
+    parameters = start
     step = np.zeros(8)
     damping = 10.0 * DAMPING
     converged = False
@@ -542,41 +542,41 @@ def _descent(  # type: ignore[no-untyped-def]
     rows[4] = 1.0
     products = np.eye(9)
     best = np.zeros(7)
-    holes = np.zeros((8, 7))  # the damage, and seven with one parameter changed
+    holes = np.zeros((8, 7))  # the damage, and seven with one parameter varied
     sizes = np.zeros(7)  # of these changes
-    left = rows[9:]
-    turn = np.eye(9)
+    misfit = rows[9:]  # damage minus data of the trial, a view of the last row
+    by_parameters = np.eye(9)  # derivatives of the hole by the parameters
     # the parameters of the damage that vary, and their rows
     if shape == SLOT:
-        changed = np.array([0, 1, 2, 3, 5, 6])
+        varied = np.array([0, 1, 2, 3, 5, 6])
     elif shape == DISC:
-        changed = np.array([0, 1, 2, 3, 4])
+        varied = np.array([0, 1, 2, 3, 4])
     else:
-        changed = np.array([0, 1, 2, 3])
+        varied = np.array([0, 1, 2, 3])
     # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
-        trial_q = q + step
-        radius = math.exp(min(max(trial_q[2], -20.0), widest))
+        trial_parameters = parameters + step
+        radius = math.exp(min(max(trial_parameters[2], -20.0), widest))
         for k in range(8):
-            holes[k, 0] = min(max(trial_q[0], -10.0 * w), 10.0 * w)
-            holes[k, 1] = min(max(trial_q[1], -10.0 * h), 10.0 * h)
+            holes[k, 0] = min(max(trial_parameters[0], -10.0 * w), 10.0 * w)
+            holes[k, 1] = min(max(trial_parameters[1], -10.0 * h), 10.0 * h)
             holes[k, 2] = radius
-            holes[k, 3] = trial_q[3] / radius**2
-            holes[k, 4] = math.sin(0.5 * math.pi * trial_q[5]) ** 2
-            holes[k, 5] = min(max(trial_q[6], -LONGEST), LONGEST)
-            holes[k, 6] = trial_q[7]
+            holes[k, 3] = trial_parameters[3] / radius**2
+            holes[k, 4] = math.sin(0.5 * math.pi * trial_parameters[5]) ** 2
+            holes[k, 5] = min(max(trial_parameters[6], -LONGEST), LONGEST)
+            holes[k, 6] = trial_parameters[7]
         image = _drawn(shape, holes[:1], sights, metric, blur_u, blur_v, soft, h, w).ravel()
         for i in range(n):
-            left[0, i] = image[pixels[i]] + trial_q[4] - data[i]
+            misfit[0, i] = image[pixels[i]] + trial_parameters[4] - data[i]
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
         new_square = prior**2
         for i in range(n):
-            new_square += left[0, i] ** 2
+            new_square += misfit[0, i] ** 2
         enough = TOLERANCE * square + SMALLEST
         converged = promised < enough or 0.0 <= square - new_square < enough
         if trial == 0 or new_square < square:
-            q = trial_q
+            parameters = trial_parameters
             square = new_square
             damping = 0.1 * damping
             for k in range(7):
@@ -589,26 +589,26 @@ def _descent(  # type: ignore[no-untyped-def]
             sizes[4] = -STEP if best[4] >= 0.5 else STEP
             sizes[5] = STEP
             sizes[6] = STEP
-            count = len(changed)
+            count = len(varied)
             for k in range(count):
-                holes[k + 1, changed[k]] += sizes[changed[k]]
-            others = holes[1 : 1 + count]
-            drawn = _drawn(shape, others, sights, metric, blur_u, blur_v, soft, h, w)
+                holes[k + 1, varied[k]] += sizes[varied[k]]
+            varied_holes = holes[1 : 1 + count]
+            drawn = _drawn(shape, varied_holes, sights, metric, blur_u, blur_v, soft, h, w)
             images = drawn.ravel()
             for k in range(count):
-                row = changed[k] if changed[k] < 4 else changed[k] + 1
-                per_step = 1.0 / sizes[changed[k]]
+                row = varied[k] if varied[k] < 4 else varied[k] + 1
+                per_step = 1.0 / sizes[varied[k]]
                 for i in range(n):
                     rows[row, i] = (images[k * h * w + pixels[i]] - image[pixels[i]]) * per_step
             for i in range(n):
-                rows[8, i] = left[0, i]
-            # derivatives by q from those by the hole's parameters
-            bend = 0.5 * math.pi * math.sin(math.pi * trial_q[5])
-            turn[2, 2] = radius
-            turn[2, 3] = -2.0 * depth
-            turn[3, 3] = radius**-2.0
-            turn[5, 5] = bend
-            products = np.dot(np.dot(turn, np.dot(rows[:9], rows[:9].T)), turn.T)
+                rows[8, i] = misfit[0, i]
+            # derivatives by the unbounded parameters, from those by the hole's own numbers
+            bend = 0.5 * math.pi * math.sin(math.pi * trial_parameters[5])
+            by_parameters[2, 2] = radius
+            by_parameters[2, 3] = -2.0 * depth
+            by_parameters[3, 3] = radius**-2.0
+            by_parameters[5, 5] = bend
+            products = np.dot(np.dot(by_parameters, np.dot(rows[:9], rows[:9].T)), by_parameters.T)
             products[5, 5] += (weight * bend) ** 2
             products[5, 8] += weight * bend * prior
             if shape != SLOT:
@@ -619,7 +619,7 @@ def _descent(  # type: ignore[no-untyped-def]
         if converged:
             break
         step, promised = _damped(products, damping)
-    return best, q[4], rows, converged
+    return best, parameters[4], rows, converged
 
 
 @numba.njit(**PLAIN)
