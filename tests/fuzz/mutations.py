@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -196,7 +197,7 @@ def _spoil_arrays(path: Path, rng: Rng) -> None:
             return
         with np.load(path) as stored:
             arrays = dict(stored)
-    except (ValueError, OSError, EOFError):
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
         _spoil_bytes(path, rng)
         return
     name = list(arrays)[int(rng.integers(len(arrays)))]
