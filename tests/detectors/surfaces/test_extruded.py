@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from detectors.surfaces.background import background
-from detectors.surfaces.extruded import direction_of, explains_better, with_twist
+from detectors.surfaces.extruded import (
+    MOST_STRIPS,
+    Profile,
+    direction_of,
+    explains_better,
+    with_twist,
+)
 from detectors.surfaces.faces import turns_back
-from detectors.surfaces.pieces import part_text
+from detectors.surfaces.pieces import LEAST_PX, part_text, piece_facts
 from detectors.surfaces.surface import SurfaceConfig, polynomial
 from tests.detectors.test_crop import cloud_of
 
@@ -102,3 +109,42 @@ def test_what_shows_far_behind_through_a_hole_does_not_turn_the_frame() -> None:
         return np.full(len(points_m), 0.7)
 
     assert direction_of(points, base, 0.0025, central=True) is None
+
+
+def test_pieces_have_the_area_of_their_pixels_and_the_share_of_it_that_was_judged() -> None:
+    """Pixels of the right half see twice as much; a row of each piece was not judged."""
+    part = np.zeros((60, 100), bool)
+    part[5:25, 10:30] = True
+    part[5:35, 60:90] = True
+    part[50, 50] = True
+
+    assert 1 < LEAST_PX <= 400
+    pixel_m2 = np.where(np.arange(100) < 50, 1e-6, 2e-6) * np.ones((60, 1))
+    residual_m = np.zeros((60, 100))
+    residual_m[5] = np.nan
+    large, small = piece_facts(part, pixel_m2, residual_m, "plane")
+    assert large["area_m2"] == pytest.approx(900 * 2e-6)
+    assert large["share"] == pytest.approx(29 / 30)
+    assert small["area_m2"] == pytest.approx(400 * 1e-6)
+    assert small["share"] == pytest.approx(19 / 20)
+    assert {large["fit"], small["fit"]} == {"plane"}
+
+
+def test_a_grazing_view_of_a_profile_does_not_need_an_endless_curve() -> None:
+    """One point whose ray is nearly parallel to the profile's plane lies a million steps across;
+    the curve stays short, and the others keep their places."""
+    profile = Profile(
+        along=np.array([0.0, 1.0, 0.0]),
+        across=np.array([1.0, 0.0, 0.0]),
+        ahead=np.array([0.0, 0.0, 1.0]),
+        first=0.0,
+        step=0.001,
+        curve=np.zeros(2),
+        central=True,
+    )
+    slopes = np.linspace(-0.2, 0.2, 4001)
+    points = np.column_stack([slopes * 0.7, np.zeros_like(slopes), np.full_like(slopes, 0.7)])
+    grazing = np.array([[7e5 * 0.001, 0.0, 0.0007]])
+    fitted = profile.fitted(np.vstack([points, grazing]))
+    assert len(fitted.curve) <= MOST_STRIPS + 1
+    np.testing.assert_allclose(fitted(points), 0.7, rtol=1e-9)
