@@ -38,6 +38,8 @@ LEAST_LENGTH_M = 0.04
 LEAST_POINTS = 12
 STEEP = 3.7  # tan(75 degrees): a steeper place is a step, beside which pixels mix both of its sides
 RIM_PX = 3  # knots on either side of a step that mix both of its sides, as at a target's rim
+ROUNDED = 2.0
+"""Deviations of rounding beyond which no rounding error lies: half a step is 1.73 of them."""
 SEEN = 0.5  # least departure from a smooth surface, as a share of a pixel's noise
 GAIN_SIGMAS = 4.0
 """Least significance of a profile's gain over a smooth surface."""
@@ -350,8 +352,8 @@ def explains_better(
     more than `SEEN` of the noise, and predicts the other bands there: the errors must be smaller in
     the bands on average, significantly, because what is extruded is in each of them.
 
-    ``rounding_m``: deviation that rounding leaves, which counts as noise at least: the steps of a
-    rounded plane without noise are extruded, too."""
+    ``rounding_m``: deviation that rounding leaves. Departures within `ROUNDED` of these do not
+    count: the steps of a rounded plane without noise are extruded, too."""
     lengths = profile.lengths(points)
     extent = max(float(np.ptp(lengths)), 1e-12)
     band = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
@@ -364,12 +366,13 @@ def explains_better(
             return False
         other = profile.fitted(points[~inside])
         errors = np.abs(points[inside, 2] - other(points[inside]))
-        noise = max(float(np.nanmedian(errors)) / 0.6745, rounding_m)
+        noise = float(np.nanmedian(errors)) / 0.6745
         limit = CLIP_SIGMAS * noise
         sizes = np.abs(departures[inside])
         knots = other.knots(other.slopes(points)).clip(0, len(other.curve) - 1)
         medians, _ = group_medians(departures[~inside], knots[~inside], len(other.curve))
-        departs = np.abs(np.nan_to_num(medians)) > SEEN * noise
+        least_m = max(SEEN * noise, ROUNDED * rounding_m)
+        departs = np.abs(np.nan_to_num(medians)) > least_m
         gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise
         gain[inside] = np.where(departs[knots[inside]], gains, np.nan)
     # where the surface is too steep to be judged, no smooth fit is good, and it does not matter

@@ -148,3 +148,16 @@ def test_a_grazing_view_of_a_profile_does_not_need_an_endless_curve() -> None:
     fitted = profile.fitted(np.vstack([points, grazing]))
     assert len(fitted.curve) <= MOST_STRIPS + 1
     np.testing.assert_allclose(fitted(points), 0.7, rtol=1e-9)
+
+
+def test_the_steps_of_a_rounded_plane_are_no_profile_where_rounding_is_known() -> None:
+    rows = np.indices((150, 200))[0]
+    z_m = np.round(0.8 + 1.5e-5 * rows, 3)
+    points = cloud_of(z_m).points_m.reshape(-1, 3)
+    points = points + 1e-6 * np.random.default_rng(0).standard_normal(points.shape)
+    plane = polynomial(points, np.ones(len(points)), degree=2)
+    directed = direction_of(points, plane, 1 / 250, True)
+    assert directed is not None
+    profile = with_twist(directed, points)
+    assert explains_better(profile, plane, points)
+    assert not explains_better(profile, plane, points, rounding_m=1e-3 / np.sqrt(12))
