@@ -254,6 +254,13 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
     return result
 
 
+def chance_of_following(hits: int, trials: int, chance: float) -> float:
+    """Return the probability that so many slots or more hold a slot where a move leads, of
+    ``trials`` places of which each holds one by ``chance``. The first pair gives the move and
+    proves nothing, so it is left out of both numbers."""
+    return float(special.bdtrc(hits - 2, trials - 1, chance))
+
+
 def _on_lattice(
     cloud: Cloud,
     evidence: Evidence,
@@ -288,8 +295,7 @@ def _on_lattice(
                 continue
             seen = _seen(places[alike] + move, pixel_of, judged)
             trials = int((seen | linked).sum())
-            # the first pair gives the move and proves nothing
-            probability = float(special.bdtrc(hits - 2, trials - 1, chance))
+            probability = chance_of_following(hits, trials, chance)
             if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
                 most = hits
                 best = move

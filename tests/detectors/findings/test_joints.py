@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detectors.findings.joints import joined, joints_facts, joints_of
+from detectors.findings.joints import chance_of_following, joined, joints_facts, joints_of
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.geometry import Cloud
 from tests.detectors.test_crop import cloud_of
@@ -135,3 +135,10 @@ def test_the_end_of_a_joint_at_the_rim_belongs_to_it() -> None:
     detections[last] = replace(detections[last], pixels=pixels + 5 * SHAPE[1])
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
     assert last not in feature.members
+
+
+def test_the_first_pair_of_slots_proves_nothing() -> None:
+    """Of five places, one gives the move; of the four others, one or more hold a slot by chance."""
+    assert chance_of_following(2, 5, 0.1) == pytest.approx(1.0 - 0.9**4)
+    assert chance_of_following(5, 5, 0.1) == pytest.approx(0.1**4)
+    assert chance_of_following(1, 5, 0.1) == 1.0
