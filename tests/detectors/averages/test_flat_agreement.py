@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from detectors.averages.flat_agreement import (
+    _is_surely_rougher,
+    _Maps,
     frame_digests,
     places_doubt,
     refuse_unfit,
@@ -170,3 +172,24 @@ def test_frames_and_movement_are_stored(field: FlatField, tmp_path):
         early = {name: arrays[name] for name in arrays if name not in ("frames", "moved")}
     np.savez(path, **early)
     assert load_flat_field(path).frames == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("shared", "variance_of_noise", "is_rougher"),
+    [(1.0, 1.0, False), (0.0, 1.0, False), (0.0, 0.25, True)],
+)
+def test_a_correction_is_rough_beyond_the_noise_of_its_map(
+    shared: float, variance_of_noise: float, is_rougher: bool
+) -> None:
+    """The map is the capture's pattern, noise alone, or a pattern that the capture lacks."""
+    rng = np.random.default_rng(8)
+    capture_m = 1e-3 * rng.standard_normal(16_000)
+    noise_m = 1e-3 * rng.standard_normal(16_000)
+    maps = _Maps(
+        capture_m=capture_m,
+        field_m=shared * capture_m + noise_m,
+        variance_m2=np.full(16_000, variance_of_noise * 1e-6),
+        block=np.arange(16_000) % 16,
+        counts=np.ones((160, 100), bool),
+    )
+    assert _is_surely_rougher(maps) == is_rougher
