@@ -608,16 +608,18 @@ def test_a_part_of_the_drilled_plate(
 def test_the_drilled_plate_as_it_stands(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The default command, with no setting of its own."""
-    assert detect.main([str(shared_data / "azure_drilled_board"), "--out", str(tmp_path)]) == 0
+    """The default command, with no setting of its own, and `matched`, which calls at tags."""
+    plate = str(shared_data / "azure_drilled_board")
+    assert detect.main([plate, "--out", str(tmp_path / "default")]) == 0
     printed = capsys.readouterr().out
-    assert (
-        "17 frames averaged" in printed
-        and "left out: depth/00003.png: the whole range jumps" in printed
-    )
+    assert "17 frames averaged" in printed
+    assert "left out: depth/00003.png: the whole range jumps" in printed
     assert "cannot set its own" not in printed
     assert "noise explains" not in printed
     assert "detector: local, as it found" in printed
+    missed, false = missed_and_false(rows_of(tmp_path / "default" / "findings.csv"), MOUTHS)
+    assert missed <= 1 and false <= 2
+    assert detect.main([plate, "--detector", "matched", "--out", str(tmp_path)]) == 0
     findings = rows_of(tmp_path / "findings.csv")
     # The object on the plate stands 30 mm before the surface, and is a bump.
     assert any(row["kind"] == "bump" and float(row["depth_mm"]) < -10 for row in findings)
@@ -648,5 +650,5 @@ def test_the_recording_as_it_stands(
         detect.main([str(shared_data / "azure_mkv" / "recording.mkv"), "--out", str(tmp_path)]) == 0
     )
     printed = capsys.readouterr().out
-    assert "1 frames averaged" in printed
+    assert "1 frame averaged" in printed
     assert printed.startswith("warning: it is doubtful which surface is the target")
