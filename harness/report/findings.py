@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
@@ -352,7 +353,7 @@ def findings_figure(
         for panel in axes:
             _frame(panel, cloud, box)
             for number, detection in enumerate(detections, start=1):
-                _circle(panel, cloud, number, detection)
+                _circles(panel, cloud, number, detection)
 
     return _figure(title, panels * _height_in(box), draw)
 
@@ -411,7 +412,7 @@ def save_blind_map(
         _frame(axes, cloud, box)
         for number, detection in enumerate(detections, start=1):
             if detection.kind == "no return":
-                _circle(axes, cloud, number, detection)
+                _circles(axes, cloud, number, detection)
 
     title = f"{100 * missing.blind:.2g} % of the target's pixels returned nothing"
     _save(path, _figure(title, _height_in(box), draw))
@@ -550,8 +551,32 @@ def _frame(axes: Axes, cloud: Cloud, box: Box) -> None:
     )
 
 
-def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None:
-    """Draw a circle around a cluster, with its number at the upper right."""
+def parts_of(cloud: Cloud, detection: Detection) -> list[Detection]:
+    """Return the connected parts of a finding that has several places, such as joints, largest
+    first; any other finding as it is."""
+    if detection.count == 1 or not cloud.organised:
+        return [detection]
+    mask = np.zeros(cloud.valid.shape, np.uint8)
+    mask.reshape(-1)[detection.pixels] = 1
+    count, labels = cv2.connectedComponents(mask, connectivity=8)
+    part_of_pixel = labels.reshape(-1)[detection.pixels]
+    parts = [
+        replace(detection, pixels=detection.pixels[part_of_pixel == part], count=1)
+        for part in range(1, count)
+    ]
+    return sorted(parts, key=lambda part: -len(part.pixels))
+
+
+def _circles(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None:
+    """Draw a circle around each part of a finding, with its number beside the first."""
+    first, *further = parts_of(cloud, detection)
+    _circle(axes, cloud, str(number), first)
+    for part in further:
+        _circle(axes, cloud, "", part)
+
+
+def _circle(axes: Axes, cloud: Cloud, label: str, detection: Detection) -> None:
+    """Draw a circle around a cluster, with its label at the upper right."""
     from matplotlib.patches import Circle
 
     if cloud.organised:
@@ -568,8 +593,8 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
     circle = Circle((u_centre, v_centre), radius, fill=False, color=TAKEN, linewidth=0.9)
     axes.add_patch(circle)
     corner = (u_centre + 0.71 * radius, v_centre - 0.71 * radius)
-    label = axes.annotate(
-        str(number),
+    annotation = axes.annotate(
+        label,
         corner,
         (1, 1),
         textcoords="offset points",
@@ -584,7 +609,7 @@ def _circle(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None
     )
     # both lie inside the axes: measuring hundreds of them takes longer than drawing them
     circle.set_in_layout(False)
-    label.set_in_layout(False)
+    annotation.set_in_layout(False)
 
 
 def _bytes(rgb: Any) -> np.ndarray:

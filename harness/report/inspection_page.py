@@ -15,7 +15,14 @@ from detectors.interface import Detection
 from harness.records.examples import Scene3d
 from harness.report.blocks import command_of, fold, joined, origin_table, tag, template
 from harness.report.clouds import residual_norm
-from harness.report.findings import Finding, Judged, part_box, probability, view_of_grid
+from harness.report.findings import (
+    Finding,
+    Judged,
+    part_box,
+    parts_of,
+    probability,
+    view_of_grid,
+)
 from harness.report.view3d import view3d_html
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.text import UNKNOWN_TEXT, Grid
@@ -187,7 +194,10 @@ def numbered_picture(judged: Judged, picture: Picture, name: str) -> Markup:
     font = share * max(width, height)
     marks = []
     for finding, detection in zip(findings, judged.detections, strict=True):
-        marks.append(_mark(judged.cloud, picture, finding, detection, font=font))
+        first, *further = parts_of(judged.cloud, detection)
+        marks.append(_mark(judged.cloud, picture, finding, first, font=font))
+        for part in further:
+            marks.append({**_mark(judged.cloud, picture, finding, part, font=font), "id": ""})
     return Markup(
         template("findings.svg").render(
             width=width,
@@ -196,6 +206,7 @@ def numbered_picture(judged: Judged, picture: Picture, name: str) -> Markup:
             image=data_url(picture.rgb),
             sharp=max(width, height) <= SMALL_PX,
             kind="" if len(findings) <= FEW else " many",
+            count=len(findings),
             marks=marks,
             name=name,
         )

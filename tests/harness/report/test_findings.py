@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection, Evidence, Measurement
-from harness.report.findings import finding_of
+from harness.report.findings import finding_of, parts_of
+from harness.testing.synthetic_clouds import plane
 
 EVIDENCE = Evidence(
     score=np.full((2, 2), 9.0),
@@ -50,3 +51,15 @@ def test_without_a_model_the_extreme_residual_is_turned_alike() -> None:
     assert finding.depth_mm == pytest.approx(0.8 * 4.0)
     assert finding.sight_depth_mm == pytest.approx(1.25 * 4.0)
     assert finding.depth_from == "extreme residual"
+
+
+def test_joints_have_a_mark_at_each_place_and_other_findings_one() -> None:
+    cloud = plane(seed=1)
+    width = cloud.valid.shape[1]
+    places = np.array([2 * width + 3, 2 * width + 4, 3 * width + 5, 20 * width + 30])
+    joints = Detection(9.0, places, np.zeros(3), count=2)
+    large, small = parts_of(cloud, joints)
+    assert large.pixels.tolist() == places[:3].tolist()
+    assert small.pixels.tolist() == places[3:].tolist()
+    (whole,) = parts_of(cloud, Detection(9.0, places, np.zeros(3)))
+    assert whole.pixels.tolist() == places.tolist()
