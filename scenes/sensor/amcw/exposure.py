@@ -1,8 +1,12 @@
-"""The light of a view at the imager's converter."""
+"""The light of a view at the imager's converter, and the time for which it is collected."""
 
 from typing import NamedTuple
 
 import numpy as np
+
+from scenes.sensor.amcw.facts import ExposuresFacts
+
+DARKEST = 1e-9  # fullness below which light is taken as dark
 
 
 class AmcwExposure(NamedTuple):
@@ -15,5 +19,33 @@ class AmcwExposure(NamedTuple):
     limit: np.ndarray
     """(n,) float32: largest sample that wells and converter hold; infinite if saturation is off.
     """
+    time_share: np.ndarray
+    """(n,) float32: exposure time over the longest."""
     shape: tuple[int, int]
     """(h, w) of the view."""
+
+
+def time_shares(facts: ExposuresFacts, fullness: np.ndarray) -> np.ndarray:
+    """Return the exposure times (h, w) of a view's pixels over the longest.
+
+    The choice is made once for a view, from its light without noise, so that all frames of a scene
+    share it, and a scene gets the same times again. A whole frame's time is chosen from the
+    rendered part of the image only. Not modelled: a control that needs several frames to settle,
+    or that looks at a part of the image; the lower frame rate where several exposures are combined.
+
+    Args:
+        facts: the times that can be chosen, and the rule.
+        fullness: (h, w), the share of the wells' and the converter's capacity that light takes in
+            the longest exposure.
+    """
+    deciding = fullness
+    if facts.bright_share is not None:
+        brightest = np.quantile(fullness, 1 - facts.bright_share.value)
+        deciding = np.full_like(fullness, brightest)
+    longest_fit = facts.fill.value / np.maximum(deciding, DARKEST)
+    shares = np.array(facts.shares.value)
+    if facts.continuous.value:
+        return np.clip(longest_fit, shares[-1], shares[0])
+    rising = shares[::-1]
+    number = np.searchsorted(rising, longest_fit, side="right") - 1
+    return np.asarray(rising[np.maximum(number, 0)])

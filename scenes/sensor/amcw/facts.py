@@ -4,7 +4,7 @@ frequencies allow."""
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
-from itertools import product
+from itertools import pairwise, product
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -257,6 +257,42 @@ class PhotonFacts(Config):
     """Width of the filter's band, for ambient light."""
 
 
+class ExposuresFacts(Config):
+    """Exposure control: shorter exposures before bright surfaces. They are chosen once for a scene,
+    from its light without noise (`scenes.sensor.amcw.exposure.time_shares`)."""
+
+    shares: Fact[tuple[float, ...]]
+    """Times that can be chosen, over the longest, to which all other numbers of the file refer."""
+    continuous: Fact[bool]
+    """True if all times between them can be chosen too."""
+    chosen_for: Fact[Literal["frame", "pixel"]]
+    """frame: all pixels expose equally long, and samples are not scaled. pixel: each pixel takes
+    the longest time that fits, and its samples are scaled to the longest of all."""
+    fill: Share
+    """Largest share of the wells' and the converter's capacity that light should take."""
+    bright_share: Share | None = None
+    """Share of a frame's pixels that may take more; they may saturate."""
+
+    @model_validator(mode="after")
+    def _times_can_be_chosen(self) -> ExposuresFacts:
+        shares = self.shares.value
+        falling = all(longer > shorter > 0 for longer, shorter in pairwise(shares))
+        if len(shares) < 2 or shares[0] != 1 or not falling:
+            raise ValueError("shares must be two numbers or more that fall from 1 and are above 0")
+        if self.fill.value == 0:
+            raise ValueError("fill must be above 0")
+        if self.for_frame != (self.bright_share is not None):
+            raise ValueError(
+                "bright_share is needed if times are chosen_for a frame, and only then"
+            )
+        return self
+
+    @property
+    def for_frame(self) -> bool:
+        """True if all pixels expose equally long."""
+        return self.chosen_for.value == "frame"
+
+
 class ConverterFacts(Config):
     """A companding converter, with unit steps below twice the knee that double per octave above."""
 
@@ -367,6 +403,8 @@ class AmcwCamera(CameraFacts):
     """Frequencies and phases."""
     photons: PhotonFacts
     """The photon budget."""
+    exposures: ExposuresFacts | None = None
+    """Exposure control; None: all exposures are equally long."""
     converter: ConverterFacts
     """The companding converter."""
     fixed_pattern: FixedPatternFacts
@@ -385,7 +423,21 @@ class AmcwCamera(CameraFacts):
             raise ValueError(
                 "engine.amplitude_gains needs one value for each of modulation.frequencies_hz"
             )
+        if self.exposures is not None:
+            self._exposures_fit(self.exposures)
         return self
+
+    def _exposures_fit(self, exposures: ExposuresFacts) -> None:
+        if self.photons.exposure_ends_electrons is not None:
+            raise ValueError(
+                "exposures and photons.exposure_ends_electrons are two rules for one thing; "
+                "remove one of them with null"
+            )
+        if exposures.for_frame and self.engine.min_reflectivity_units_mm2 is not None:
+            raise ValueError(
+                "engine.min_reflectivity_units_mm2 would reject dark surfaces whenever the "
+                "exposures of a frame are shortened: remove it with null"
+            )
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:

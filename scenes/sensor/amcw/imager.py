@@ -20,7 +20,7 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Lens, Region
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw import kernels, ranging
-from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.amcw.exposure import AmcwExposure, time_shares
 from scenes.sensor.amcw.facts import (
     AmcwCamera,
     EngineFacts,
@@ -165,23 +165,44 @@ class AmcwImager(UnitModel[AmcwCamera]):
         electrons = photons.signal_electrons.value * self.gathered
         signal = self._demodulated(phasor, electrons)
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
-        # an exposure that ends early is scaled to the full length, with its noise
-        share: float | np.ndarray = 1.0
-        if photons.exposure_ends_electrons is not None:
-            ends = photons.exposure_ends_electrons.value
-            share = np.minimum(1.0, ends / np.maximum(both_wells, 1e-9))
+        times = self._time_shares(signal, both_wells)
+        scaled = times
+        if self.camera.exposures is not None and self.camera.exposures.for_frame:
+            # these samples are not scaled: the engine sees the amplitudes of the shorter exposure
+            signal = signal * times
+            both_wells = both_wells * times
+            scaled = np.ones_like(times)
         # shot noise of both wells, and the read noise of each
-        read_noise = photons.read_noise_electrons.value / share
-        variance = both_wells / share + 2 * read_noise**2
+        read_noise = photons.read_noise_electrons.value / scaled
+        variance = both_wells / scaled + 2 * read_noise**2
         sigma = np.sqrt(variance) if effects.noise else np.zeros_like(variance)
-        limit = self._largest_sample(both_wells, share)
+        limit = self._largest_sample(both_wells, scaled)
         per_unit = photons.electrons_per_unit.value
         return AmcwExposure(
             means=self._samples(signal / per_unit),
             sigma=(sigma / per_unit).ravel().astype(f4),
             limit=limit.ravel().astype(f4),
+            time_share=times.ravel().astype(f4),
             shape=intensity.shape,
         )
+
+    def _time_shares(self, signal: np.ndarray, both_wells: np.ndarray) -> np.ndarray:
+        """Return the exposure times (h, w) over the longest, in which the demodulated signal is
+        ``signal`` (f, h, w) and both wells collect ``both_wells`` (h, w) electrons."""
+        photons = self.camera.photons
+        if photons.exposure_ends_electrons is not None:
+            ends = photons.exposure_ends_electrons.value
+            return np.minimum(1.0, ends / np.maximum(both_wells, 1e-9))
+        if self.camera.exposures is None:
+            return np.ones_like(both_wells)
+        largest = np.abs(signal).max(axis=0)
+        full_scale = self.camera.converter.full_scale_units.value
+        fullness = largest / (photons.electrons_per_unit.value * full_scale)
+        if photons.full_well_electrons is not None:
+            # the fuller well holds half of both wells' electrons and half the sample
+            fuller_well = (both_wells + largest) / 2
+            fullness = np.maximum(fullness, fuller_well / photons.full_well_electrons.value)
+        return time_shares(self.camera.exposures, fullness)
 
     def _demodulated(self, phasor: np.ndarray, electrons: np.ndarray) -> np.ndarray:
         """Return the demodulated signal (f, h, w) in electrons of light ``phasor`` (f, h, w), with
@@ -209,17 +230,18 @@ class AmcwImager(UnitModel[AmcwCamera]):
             samples[:, k] = flat.real * np.cos(step) + flat.imag * np.sin(step)
         return samples
 
-    def _largest_sample(self, both_wells: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+    def _largest_sample(self, both_wells: np.ndarray, scaled: np.ndarray) -> np.ndarray:
         """Return the largest sample (h, w) that fits, in converter units; infinite if saturation
-        is off. ``both_wells`` (h, w): electrons. ``share``: of the exposure, before it ends."""
+        is off. ``both_wells`` (h, w): electrons of the longest exposure, to which samples of
+        ``scaled`` (h, w) times that exposure are scaled after conversion."""
         if not self.config.effects.saturation:
             return np.full(both_wells.shape, np.inf)
         photons = self.camera.photons
-        limit = np.full(both_wells.shape, float(self.camera.converter.full_scale_units.value))
+        limit = self.camera.converter.full_scale_units.value / scaled
         if photons.full_well_electrons is None:
-            return limit
+            return np.asarray(limit)
         # the fuller well holds half of both wells' electrons and half the sample
-        room = 2 * photons.full_well_electrons.value / share - both_wells
+        room = 2 * photons.full_well_electrons.value / scaled - both_wells
         return np.clip(room / photons.electrons_per_unit.value, 0, limit)
 
     def ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:

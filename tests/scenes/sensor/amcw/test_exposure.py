@@ -147,6 +147,7 @@ def exposure_without_limit(means: np.ndarray, sigma: np.ndarray) -> AmcwExposure
         means=means[None].astype(f4),
         sigma=sigma,
         limit=np.full(n, np.inf, f4),
+        time_share=np.ones(n, f4),
         shape=(1, n),
     )
 
