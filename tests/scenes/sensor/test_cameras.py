@@ -450,5 +450,11 @@ def test_what_a_guessed_gain_means_is_told(tmp_path):
             "s}}\n"
         )
     )
-    assert guessed_precision(load_camera(str(path))).endswith("which may be 0.5 to 2 times as much")
+    warning = guessed_precision(load_camera(str(path)))
+    assert "is not published: its noise is a guess" in warning
+    assert warning.endswith("which may be 0.5 to 2 times as much")
+    of_blaze = guessed_precision(load_camera("basler_blaze101_short"))
+    assert "is published only roughly" in of_blaze
+    assert of_blaze.endswith("which may be 0.5 to 3 times as much")
+    assert guessed_precision(load_camera("vzense_ds86")) == ""
     assert guessed_precision(load_camera("azure_kinect_nfov")) == ""
