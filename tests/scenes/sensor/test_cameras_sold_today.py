@@ -11,6 +11,7 @@ from harness.programs.scorecard.bench import Bench, Effort
 from harness.programs.scorecard.figures import Figure, read_figures
 from harness.programs.scorecard.quantities import PlaneConditions, temporal_sigma_mm
 from harness.vocabulary.geometry import MM
+from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m
 from scenes.sensor.camera import load_camera
 
@@ -32,6 +33,7 @@ EFFORT = Effort(noise_frames=40, few_frames=4, whole_frames=40, units=2)
 )
 def test_the_gain_gives_the_noise_of_the_calibration_point(name: str) -> None:
     camera = load_camera(name)
+    assert isinstance(camera, AmcwCamera)
     electrons = calibrated_signal_electrons(camera, frames=60, seed=5)
     assert camera.photons.signal_electrons.value == pytest.approx(electrons, rel=0.03)
 
@@ -57,6 +59,7 @@ def test_the_long_mode_of_the_o3r222_is_twice_as_noisy_as_the_short_one() -> Non
 def test_the_blaze_is_6_times_noisier_with_15_mhz_than_with_100() -> None:
     """The maker states less than 1 mm for both frequencies and less than 6 mm for 15 MHz alone."""
     both = load_camera("basler_blaze101_long")
+    assert isinstance(both, AmcwCamera)
     modulation = both.modulation
     slow = modulation.model_copy(
         update={
