@@ -49,12 +49,23 @@ REACH_PX = 44.0
 # pixels across per pixel along the edge: all positions of an edge in a pixel occur, as in ISO
 # 12233
 SLANT = 0.1
+# share of pixels that must have a range for a distance to count as within a camera's range
+IN_RANGE = 0.95
+# the search for the least range: its limits, the steps outwards, and halvings of the last step
+NEAREST_M = 0.1
+FARTHEST_M = 20.0
+STEP_OUT = 1.25
+HALVINGS = 5
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
-Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
+Distance = Annotated[
+    float,
+    Field(ge=NEAREST_M, le=FARTHEST_M, description="along the optical axis, in metres"),
+]
 Albedo = Annotated[
     float, Field(gt=0.0, le=1.0, description="diffuse reflectance, above 0 and up to 1")
 ]
+Ambient = Annotated[float, Field(ge=0.0, le=200.0, description="0 to 200 uW/(cm2 nm)")]
 Lag = Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")]
 
 
@@ -67,9 +78,7 @@ class PlaneConditions(Config):
     angle_deg: Annotated[
         float, Field(ge=0.0, le=80.0, description="angle of incidence, 0 to 80 degrees")
     ] = 0.0
-    ambient_uw_cm2_nm: Annotated[
-        float, Field(ge=0.0, le=200.0, description="0 to 200 uW/(cm2 nm)")
-    ] = ROOM_LIGHT
+    ambient_uw_cm2_nm: Ambient = ROOM_LIGHT
     amplitude_units: (
         Annotated[float, Field(gt=0.0, description="sum over frequencies, in ADC units")] | None
     ) = None
@@ -96,6 +105,13 @@ class PatchConditions(PlaneConditions):
     rounded_mm: Annotated[
         float, Field(ge=0.0, le=10.0, description="step of the stored depth, 0 to 10 mm")
     ] = 0.0
+
+
+class NearConditions(Config):
+    """A nearly frontal matte plane that comes nearer; ambient light is as in `CameraConfig`."""
+
+    albedo: Albedo = 0.8
+    ambient_uw_cm2_nm: Ambient = ROOM_LIGHT
 
 
 class StepConditions(Config):
@@ -261,6 +277,29 @@ def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
     pixels_each = (2 * bench.camera.optics.margin_px + 1) ** 2
     stack = plane_stack(bench, c, NOISE, bench.effort.few_frames)
     return share_of(np.isfinite(stack.z_m), pixels_each)
+
+
+@_quantity("least range", NearConditions)
+def least_range_mm(bench: Bench, c: NearConditions) -> Reading:
+    """Nearest distance at which 95 % of the pixels about the axis have a range, to 1 %."""
+
+    def in_range(distance_m: float) -> bool:
+        plane = PlaneConditions(distance_m=distance_m, **c.to_data())
+        return valid_fraction(bench, plane).value >= IN_RANGE
+
+    far_m = max(bench.camera.optics.nearest_m, NEAREST_M)
+    while not in_range(far_m):
+        far_m *= STEP_OUT
+        if far_m > min(bench.camera.optics.farthest_m, FARTHEST_M):
+            return Reading(float("nan"))
+    near_m = far_m / STEP_OUT
+    for _ in range(HALVINGS):
+        middle_m = max((near_m + far_m) / 2, NEAREST_M)
+        if in_range(middle_m):
+            far_m = middle_m
+        else:
+            near_m = middle_m
+    return Reading(far_m / MM)
 
 
 def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:

@@ -99,6 +99,16 @@ def test_impossible_frequencies_are_named(tmp_path):
 OWN = "name: own\ntitle: my own\nlike: azure_kinect_nfov\n"
 
 
+def exposures(chosen_for: str, shares: str, *others: str) -> str:
+    """The block of a file, with 0.1 for the ``others``."""
+    values = {"shares": shares, "continuous": "false", "chosen_for": chosen_for, "fill": "0.9"}
+    values |= dict.fromkeys(others, "0.1")
+    lines = ["exposures:"]
+    for key, value in values.items():
+        lines.append(f"  {key}: {{value: {value}, tag: M, source: guess}}")
+    return "\n".join(lines) + "\n"
+
+
 def test_a_camera_like_another_states_only_what_differs(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(
@@ -134,6 +144,17 @@ def test_a_camera_like_another_states_only_what_differs(tmp_path):
         (
             OWN + "modulation: {frequencies_hz: {value: [2.0e+7], tag: M, source: guess}}\n",
             "own.yaml:4:13: `modulation`: contrast needs one value for each",
+        ),
+        (OWN + exposures("pixel", "[1.0, 0.5, 0.6]"), "shares must be two numbers or more"),
+        (OWN + exposures("pixel", "[0.5, 0.25]"), "shares must be two numbers or more"),
+        (OWN + exposures("frame", "[1.0, 0.5]"), "bright_share is needed if times are chosen_for"),
+        (
+            OWN + exposures("frame", "[1.0, 0.5]", "bright_share"),
+            "min_reflectivity_units_mm2 would reject dark surfaces",
+        ),
+        (
+            OWN.replace("azure_kinect_nfov", "kinect_v2") + exposures("pixel", "[1.0, 0.5]"),
+            "are two rules for one thing",
         ),
     ],
 )

@@ -25,9 +25,8 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Region
 
 EFFORT = Effort(noise_frames=80, few_frames=3, whole_frames=40, units=3)
-BENCH: Any = SimpleNamespace(
-    effort=EFFORT, camera=SimpleNamespace(optics=SimpleNamespace(margin_px=1))
-)
+OPTICS = SimpleNamespace(margin_px=1, nearest_m=0.2, farthest_m=5.0)
+BENCH: Any = SimpleNamespace(effort=EFFORT, camera=SimpleNamespace(optics=OPTICS))
 
 
 def stack_of(z_m: np.ndarray, true_z_m: np.ndarray | float = 1.0) -> FrameStack:
@@ -108,6 +107,34 @@ def test_the_share_of_valid_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = quantities.share_of(np.isfinite(z_m), 9)
     assert reading == expected
     assert reading.value == pytest.approx(0.8)
+
+
+def test_the_least_range_is_where_the_pixels_come_into_range(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From 700 mm on all but 4 % of the pixels have a range; nearer, all but 6 %."""
+    taken: list[PlaneConditions] = []
+
+    def frames_of(bench: Bench, plane: PlaneConditions, *_: Any) -> FrameStack:
+        taken.append(plane)
+        z_m = np.ones((1, 10, 10))
+        lost = 4 if plane.distance_m >= 0.7 else 6
+        z_m[:, 0, :lost] = np.nan
+        return stack_of(z_m)
+
+    monkeypatch.setattr(quantities, "plane_stack", frames_of)
+    least_mm = value("least_range_mm", albedo=0.3, ambient_uw_cm2_nm=2.0)
+    assert 700.0 <= least_mm < 707.0
+    assert {(plane.albedo, plane.ambient_uw_cm2_nm) for plane in taken} == {(0.3, 2.0)}
+
+
+def test_a_camera_that_is_nowhere_in_range_has_no_least_range(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        quantities, "plane_stack", lambda *_: stack_of(np.full((1, 10, 10), np.nan))
+    )
+    assert np.isnan(value("least_range_mm"))
 
 
 def test_patches_are_taken_without_their_planes() -> None:

@@ -26,7 +26,7 @@ from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import at_once as sums_of_frames
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.facts import AmcwCamera
+from scenes.sensor.amcw.facts import AmcwCamera, ExposuresFacts
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
 from scenes.sensor.amcw.light import light_of_samples
@@ -45,6 +45,8 @@ FRONT = Plane(0.7, 0.08, 0.05)
 NOTHING_BEHIND_M = 8.0
 """So far behind that what comes back is less than the noise."""
 PLAIN = AverageConfig()
+BRIGHT_ELECTRONS = 9000.0
+"""At which the plate would fill the Azure Kinect's wells, and a plane 200 mm behind it would not."""
 FEWEST_FRAMES = 6
 """For these tests; as many as `averages.FEWEST_FRAMES` would only take longer."""
 CAPTURES = 60
@@ -83,16 +85,25 @@ def numbers_of(name: str) -> dict[str, float]:
 
 
 @lru_cache
-def unit_before_hole(name: str, behind_mm: float, jump_rate: float | None = None) -> SimulatedUnit:
+def unit_before_hole(
+    name: str,
+    behind_mm: float,
+    jump_rate: float | None = None,
+    exposures: ExposuresFacts | None = None,
+) -> SimulatedUnit:
     """A unit before a plate with a round hole of 24 mm, one of 8 mm and a straight edge, and a
-    plane behind it."""
+    plane behind it. With ``exposures``, the light is so bright that the plate's are shortened."""
     numbers = numbers_of(name)
+    if exposures is not None:
+        numbers["photons.signal_electrons"] = BRIGHT_ELECTRONS
     effects = STILL
     if jump_rate is not None:
         numbers["unit.jump_rate"] = jump_rate
         effects = EffectsConfig()
     config = CameraConfig(name=name, effects=effects, numbers=numbers)
     camera = camera_of(config)
+    assert isinstance(camera, AmcwCamera)
+    camera = camera.model_copy(update={"exposures": exposures})
     outer = REGIONS[name].grown(
         camera.optics.margin_px, camera.nominal_lens.height, camera.nominal_lens.width
     )
@@ -249,6 +260,32 @@ def test_averages_drawn_at_once_have_the_distribution_of_those_of_frames(
 ):
     """Dents and blind holes (2 and 9.5 mm), and through-holes with a backing near, far and none."""
     assert_alike(unit_before_hole(name, behind_mm), *clouds_of(name, behind_mm))
+
+
+@pytest.mark.parametrize("chosen_for", ["frame", "pixel"])
+def test_so_have_those_of_shortened_exposures(chosen_for: str):
+    """One time for all pixels, or a quarter for those of the plate and the longest for those 200
+    mm behind it."""
+
+    def fact(value: object) -> dict[str, object]:
+        return {"value": value, "tag": "M", "source": "test"}
+
+    exposures = ExposuresFacts.from_data(
+        {
+            "shares": fact([1.0, 0.25]),
+            "continuous": fact(chosen_for == "frame"),
+            "chosen_for": fact(chosen_for),
+            "fill": fact(0.9),
+            "bright_share": fact(0.01) if chosen_for == "frame" else None,
+        }
+    )
+    unit = unit_before_hole("azure_kinect_nfov", 200.0, exposures=exposures)
+    shares = unit.exposure.time_share.reshape(unit.exposure.shape)[unit.cut]
+    groups = groups_of(unit)
+    assert shares[groups["face"]].max() < 0.8
+    assert (shares[groups["floor"]] == 1).all() == (chosen_for == "pixel")
+    assert unit.at_once is not None
+    assert_alike(unit, *clouds_before(unit))
 
 
 @pytest.mark.parametrize(
