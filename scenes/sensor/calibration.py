@@ -27,7 +27,7 @@ from scenes.sensor.source import SimulatedUnit
 ONLY_NOISE = CameraConfig(effects=NO_EFFECTS.model_copy(update={"noise": True, "ambient": True}))
 # half the plane's height and width
 HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}
-RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 200_000.0), "scanned_lidar": (1e3, 1e5)}
+RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 10_000_000.0), "scanned_lidar": (1e3, 1e5)}
 # with some 3,000 pixels that share their noise: a gain to 0.5 %
 FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}
 

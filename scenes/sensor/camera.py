@@ -130,18 +130,20 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 
 
 def guessed_precision(camera: AnyCamera) -> str:
-    """Return a warning for a camera whose precision is not published (shot noise by its gain);
-    empty for others."""
+    """Return a warning for a camera whose precision is a guess (shot noise by its gain), because
+    its maker publishes none, or a limit without conditions; empty for others."""
     if isinstance(camera, EmpiricalCamera):
         return ""
     gain = camera.photons.signal_electrons
-    if gain.range is None:
+    if gain.tag != "G" or gain.range is None:
         return ""
     least_gain, greatest_gain = gain.range
     least_noise = float(np.sqrt(gain.value / greatest_gain))
     greatest_noise = float(np.sqrt(gain.value / least_gain))
+    is_published = camera.photons.calibration_sigma_mm.tag != "M"
+    state = "is published only roughly" if is_published else "is not published"
     return (
-        f"the precision of {camera.title} is not published: its noise is a guess, which may be "
+        f"the precision of {camera.title} {state}: its noise is a guess, which may be "
         f"{least_noise:.2g} to {greatest_noise:.2g} times as much"
     )
 
@@ -171,7 +173,7 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             raise UserError(
                 f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal
             )
-        fact.update(value=value, tag="U", source="set by the experiment")
+        fact.update(value=value, tag="U", source="set by the experiment", range=None)
     return settings_of(
         KINDS[data["kind"]],
         data,

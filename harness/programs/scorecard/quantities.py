@@ -82,6 +82,9 @@ class PlaneConditions(Config):
     amplitude_units: (
         Annotated[float, Field(gt=0.0, description="sum over frequencies, in ADC units")] | None
     ) = None
+    exposure: Annotated[
+        float, Field(gt=0.0, le=100.0, description="length of the exposure over the file's")
+    ] = 1.0
 
 
 class LagConditions(PlaneConditions):
@@ -131,6 +134,7 @@ _WORDS: dict[str, Callable[[Any], str]] = {
     "angle_deg": lambda v: f"{v:g}°" if v else "",
     "ambient_uw_cm2_nm": lambda v: "" if v == ROOM_LIGHT else f"ambient {v:g} µW/(cm² nm)",
     "amplitude_units": lambda v: "" if v is None else f"amplitudes {v:g}",
+    "exposure": lambda v: "" if v == 1 else f"{v:g} times the exposure",
     "step_mm": "step {:g} mm".format,
     "across": "across {}".format,
     "shadow": lambda v: "shadowed" if v else "",
@@ -223,6 +227,11 @@ def plane_stack(
         electrons = c.amplitude_units * photons.electrons_per_unit.value * c.distance_m**2
         contrast = sum(camera.modulation.contrast.value)
         albedo = electrons / (photons.signal_electrons.value * contrast)
+    # on a plane, light and ambient light are proportional to the albedo and to the exposure
+    albedo *= c.exposure
+    # exposures of a scene share their random numbers
+    scene = c.to_data()
+    del scene["exposure"]
     region = bench.patch(*patch)
     view = plane_view(bench.camera, region, c.distance_m, albedo, slope_x, LEAST_TILT[1])
     return bench.taken(
@@ -230,7 +239,7 @@ def plane_stack(
         effects,
         frames or bench.effort.noise_frames,
         "plane",
-        digest([c.to_data(), effects.to_data()]),
+        digest([scene, effects.to_data()]),
         unit,
         unit_seed=unit,
         ambient_uw_cm2_nm=c.ambient_uw_cm2_nm,

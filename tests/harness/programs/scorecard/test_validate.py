@@ -90,6 +90,7 @@ def test_defaults_fill_what_an_entry_leaves_out(tmp_path):
         "angle_deg": 0.0,
         "ambient_uw_cm2_nm": 0.04,
         "amplitude_units": None,
+        "exposure": 1.0,
         "lag_x_px": 1,
         "lag_y_px": 0,
     }
