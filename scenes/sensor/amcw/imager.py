@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Lens, Region
 from scenes.optics import NoiseFreeView
@@ -79,11 +79,20 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
 
 
 def _spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Return light (..., h, w) after a Gaussian blur."""
+    """Return light (..., h, w) after a blur of this deviation.
+
+    The weights are those of the discrete Gaussian, exp(-s^2) I_n(s^2) at n pixels (Lindeberg,
+    Scale-space for discrete signals, 1990), whose deviation is s at any width. Samples of a
+    Gaussian of 0.45 pixels have a deviation of 0.38 pixels, and those of 0.3 pixels 0.09.
+    """
     if sigma_px == 0:
         return light
-    blurred = ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1))
-    return np.asarray(blurred)
+    reach_px = int(np.ceil(4 * sigma_px))
+    distances_px = np.abs(np.arange(-reach_px, reach_px + 1))
+    weights = special.ive(distances_px, sigma_px**2)
+    weights /= weights.sum()
+    along_rows = ndimage.correlate1d(light, weights, axis=-1, mode="nearest")
+    return np.asarray(ndimage.correlate1d(along_rows, weights, axis=-2, mode="nearest"))
 
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
