@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -170,14 +171,14 @@ def photon_transfer(image: np.ndarray) -> np.ndarray:
     height = len(image) // PATCH_PX
     width = image.shape[1] // PATCH_PX
     cut = image[: height * PATCH_PX, : width * PATCH_PX]
-    patches = cut.reshape(height, PATCH_PX, width, PATCH_PX).swapaxes(1, 2)
-    patches = patches.reshape(height * width, PATCH_PX**2)
+    squares = cut.reshape(height, PATCH_PX, width, PATCH_PX).swapaxes(1, 2)
+    patches = squares.reshape(height * width, PATCH_PX**2)
     lit = patches[(patches.min(axis=1) > LIT_UNITS) & (patches.max(axis=1) < BRIGHT_UNITS)]
     brightness = lit.mean(axis=1)
     freedom = len(u) - quadratic.shape[1]
     variance = ((lit @ off_quadratic) ** 2).sum(axis=1) / freedom
     middles = []
-    for low, high in zip(LEVELS, LEVELS[1:], strict=False):
+    for low, high in pairwise(LEVELS):
         inside = (brightness >= low) & (brightness < high)
         # the median of chi-square over its mean; edges and texture are in the upper tail
         noise = np.median(variance[inside]) / (1 - 2 / (9 * freedom)) ** 3
