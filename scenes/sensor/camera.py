@@ -135,7 +135,7 @@ def guessed_precision(camera: AnyCamera) -> str:
     if isinstance(camera, EmpiricalCamera):
         return ""
     gain = camera.photons.signal_electrons
-    if gain.range is None:
+    if gain.tag != "G" or gain.range is None:
         return ""
     least_gain, greatest_gain = gain.range
     least_noise = float(np.sqrt(gain.value / greatest_gain))
@@ -171,7 +171,7 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             raise UserError(
                 f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal
             )
-        fact.update(value=value, tag="U", source="set by the experiment")
+        fact.update(value=value, tag="U", source="set by the experiment", range=None)
     return settings_of(
         KINDS[data["kind"]],
         data,

@@ -35,19 +35,25 @@ class Fact(Config, Generic[T]):
     source: str
     """The document or measurement that says so."""
     range: tuple[float, float] | None = None
-    """Least and greatest value of a guess of the precision."""
+    """Least and greatest value that the evidence allows, of each of the values if there are
+    several; None: not stated, which the tag G does not permit."""
 
     @model_validator(mode="after")
-    def _guess_has_a_range(self) -> Fact[T]:
-        message = "a number with the tag G, and no other, states the `range` that it may lie in"
-        if (self.tag == "G") != (self.range is not None):
-            raise ValueError(message)
-        if self.range is not None:
-            low, high = self.range
-            value: Any = self.value
-            if not low <= value <= high:
-                raise ValueError(message)
+    def _lies_in_its_range(self) -> Fact[T]:
+        if self.range is None:
+            if self.tag == "G":
+                raise ValueError("a number with the tag G states the `range` that it may lie in")
+            return self
+        least, greatest = self.range
+        for value in values_of(self):
+            if not least <= value <= greatest:
+                raise ValueError(f"the value is {value}; its `range` is {least} to {greatest}")
         return self
+
+
+def values_of(fact: Fact[Any]) -> tuple[Any, ...]:
+    """Return the values of a fact that has one or several."""
+    return fact.value if isinstance(fact.value, tuple) else (fact.value,)
 
 
 def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
@@ -55,8 +61,7 @@ def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
     states."""
 
     def check(fact: Fact[Any]) -> Fact[Any]:
-        values = fact.value if isinstance(fact.value, tuple) else (fact.value,)
-        for value in values:
+        for value in values_of(fact):
             if not holds(value):
                 raise ValueError(f"the value is {value}; it must be {legal}")
         return fact

@@ -197,8 +197,37 @@ def test_a_guess_of_the_precision_states_its_range(tmp_path):
         if legal:
             assert read_camera(path).photons.signal_electrons.range is not None
         else:
-            with pytest.raises(UserError, match="states the `range`"):
+            with pytest.raises(UserError, match="`range`"):
                 read_camera(path)
+
+
+@pytest.mark.parametrize("tag", ["R", "D", "S", "W", "O", "C", "M", "U"])
+def test_a_number_with_any_tag_may_state_its_range(tmp_path, tag):
+    path = tmp_path / "own.yaml"
+    fact = f"{{value: 600.0, tag: {tag}, range: [300.0, 1200.0], source: test}}"
+    path.write_text(OWN + f"photons: {{signal_electrons: {fact}}}\n")
+    camera = read_camera(path)
+    assert camera.photons.signal_electrons.range == (300.0, 1200.0)
+    assert guessed_precision(camera) == ""
+
+
+def test_each_of_several_values_lies_in_the_range(tmp_path):
+    path = tmp_path / "own.yaml"
+    for least, legal in ((0.4, True), (0.6, False)):
+        fact = f"{{value: [0.5, 0.7, 0.9], tag: M, range: [{least}, 1.0], source: test}}"
+        path.write_text(OWN + f"modulation: {{contrast: {fact}}}\n")
+        if legal:
+            read_camera(path)
+        else:
+            with pytest.raises(UserError, match="the value is 0.5; its `range` is 0.6 to 1.0"):
+                read_camera(path)
+
+
+def test_an_experiment_may_leave_the_range_of_a_number():
+    config = CameraConfig(name="femto_bolt_nfov", numbers={"photons.signal_electrons": 9999.0})
+    gain = camera_of(config).photons.signal_electrons
+    assert gain.value == 9999.0
+    assert gain.range is None
 
 
 def test_a_lens_may_fold_outside_its_field(tmp_path):
