@@ -19,6 +19,7 @@ from harness.programs.scorecard.bench import Effort
 from harness.programs.scorecard.figures import (
     SCORES,
     Published,
+    Request,
     Score,
     measured,
     number,
@@ -74,7 +75,7 @@ def refusal(folder: Path, old: str, new: str) -> str:
 
 
 def test_the_projects_figures_are_legal_and_every_camera_has_blind_figures():
-    figures = read_figures()
+    figures = read_figures().figures
     assert len({figure.name for figure in figures}) == len(figures)
     blind = {figure.camera for figure in figures if figure.use == "blind"}
     assert blind == {figure.camera for figure in figures}
@@ -83,8 +84,8 @@ def test_the_projects_figures_are_legal_and_every_camera_has_blind_figures():
 
 
 def test_defaults_fill_what_an_entry_leaves_out(tmp_path):
-    _, neighbours = read_figures(written(tmp_path))
-    assert neighbours.request[2].to_data() == {
+    _, neighbours = read_figures(written(tmp_path)).figures
+    assert neighbours.request.conditions.to_data() == {
         "distance_m": 1.5,
         "albedo": 0.8,
         "angle_deg": 0.0,
@@ -173,7 +174,7 @@ def test_a_negative_tolerance_is_refused():
 
 
 def test_verdicts(tmp_path):
-    wall, neighbours = read_figures(written(tmp_path))
+    wall, neighbours = read_figures(written(tmp_path)).figures
     failing = wall.model_copy(update={"fails": "the wall is not known"})
     for figure, simulated, verdict in (
         (wall, Reading(1.11), "pass"),
@@ -191,25 +192,27 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
     path = written(
         tmp_path, GOOD.replace("calibration: true", "calibration: false\n    kind: code", 1)
     )
-    check, reality = read_figures(path)
+    check, reality = read_figures(path).figures
     assert check.limits == pytest.approx((0.83, 0.95))
     assert check.use == "code"
     value = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.2}", 1)
-    _, wide = read_figures(written(tmp_path, value))
+    _, wide = read_figures(written(tmp_path, value)).figures
     assert wide.limits == pytest.approx((0.3, 0.7))
     assert wide.use == "blind"
     assert reality.limits == (0.5, float("inf"))
     assert Score(reality, Reading(0.4)).ratio == pytest.approx(0.8)
     score = Score(wide, Reading(0.35))
     assert score.verdict == "pass (tolerance)"
-    assert "1 of 1 values within 25 % (1 by a wider tolerance" in program._answer([score])
+    assert "0 of 1 values within 25 %, 1 by a wider tolerance of the source" in program._answer(
+        [score]
+    )
     answer = program._answer([Score(check, Reading(0.9)), Score(reality, Reading(0.4))])
     assert answer.startswith("0 of 1 blind figures pass: ")
     assert "1 of 1 checks of the code pass. Failures without a stated reason: neighbours." in answer
 
 
 def test_the_table_tells_value_interval_published_and_source(tmp_path):
-    figures = read_figures(written(tmp_path))
+    figures = read_figures(written(tmp_path)).figures
     readings = Reading(0.9, Interval(0.88, 0.92)), Reading(0.7)
     lines = SCORES.grid(list(map(Score, figures, readings))).lines()
     assert len(lines) == 3
@@ -248,7 +251,7 @@ def test_numbers_have_three_digits(value, text):
 
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
-    assert {figure.quantity for figure in read_figures()} == set(QUANTITIES)
+    assert {figure.quantity for figure in read_figures().figures} == set(QUANTITIES)
     for name, quantity in QUANTITIES.items():
         assert not quantity.unit or name.endswith(f"_{quantity.unit}")
         assert in_words(quantity.conditions())
@@ -257,8 +260,10 @@ def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
 @pytest.mark.slow  # processes of their own; the engine's tests compare them too
 def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
     quantity = QUANTITIES["temporal_sigma_mm"]
-    requests = [(AZURE, quantity.name, quantity.conditions(albedo=albedo)) for albedo in (0.1, 0.3)]
-    requests += [figure.request for figure in read_figures(written(tmp_path))]
+    requests = [
+        Request(AZURE, quantity.name, quantity.conditions(albedo=albedo)) for albedo in (0.1, 0.3)
+    ]
+    requests += [figure.request for figure in read_figures(written(tmp_path)).figures]
     in_one_process = measured(requests, QUICK, jobs=1)
     two = measured(tuple(reversed(requests)), QUICK, jobs=2)
     assert set(in_one_process) == set(two) == set(requests)
