@@ -101,7 +101,7 @@ class FamilyScore:
 
     @property
     def verdict(self) -> str:
-        """What is wrong with it, with ``(new)`` if the file gives no reason."""
+        """The faults, with ``(new)`` if the file gives no reason; ``agrees`` without any."""
         faults = []
         if self.is_off:
             faults.append("off")

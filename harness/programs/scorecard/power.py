@@ -1,10 +1,9 @@
-"""Which published figures notice that a camera's number is wrong: each constant is moved both ways,
-and the blind figures and families whose verdict changes are listed.
+"""Moves each constant of a camera both ways, and lists the blind figures and families that notice.
 
 A constant is a number that a camera's file states itself, with a tag other than R and D (read in a
 public source, or derived from such), and that the simulation of a plane or an edge reads. It is
-moved to the ends of its `range`, or by 30 % where none is stated; in the cameras that inherit it
-(`like`) as well. A figure notices if its value leaves or enters a band: that of the source's own
+moved to the ends of its `range`, or by 30 % where none is stated, in all cameras that inherit it
+(`like`). A figure notices if its value leaves or enters a band: that of the source's own
 tolerance, that of 25 %, or that in which the figure passes; a family, if its verdict changes. The
 change must exceed 2 % and the reading's 95 % interval. Camera and moved camera are measured with
 the same noise, in fewer frames than the scorecard's, so verdicts near a limit may differ from it.
@@ -43,7 +42,7 @@ from scenes.sensor.common.config import CameraConfig
 
 SHARE = 0.3  # of a constant without a range
 LEAST_CHANGE = 0.02  # share by which a value must change, lest noise near a limit counts
-EVIDENT = ("R", "D")
+EVIDENT = ("R", "D")  # tags of numbers that are not moved
 NOT_MOVED = (
     "lens.",
     "colour.",

@@ -1,5 +1,5 @@
-"""How many blind figures of each camera agree, with values strictly within 25 % counted apart from
-wider tolerances and from bounds."""
+"""Counts the blind figures of each camera that agree: values strictly within 25 % apart from wider
+tolerances and from bounds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from harness.vocabulary.path_names import camera_title
 
 @dataclass(frozen=True)
 class Standing:
-    """How many of a camera's blind figures agree."""
+    """Numbers of a camera's blind figures that agree."""
 
     camera: str
     """Name of the camera."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from harness.evaluation.intervals import Interval
-from harness.programs.scorecard import program
+from harness.programs.scorecard import power, program
 from harness.programs.scorecard.bench import Effort
 from harness.programs.scorecard.figures import (
     SCORES,
@@ -26,6 +26,7 @@ from harness.programs.scorecard.figures import (
     read_figures,
 )
 from harness.programs.scorecard.quantities import QUANTITIES, in_words
+from harness.programs.scorecard.standings import standings
 from harness.programs.scorecard.validate import main
 from harness.stills.statistics import NOTHING, Reading
 from harness.vocabulary.errors import UserError
@@ -320,6 +321,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
         (["--figures", "absent.yaml"], "absent.yaml"),
         (["--mask", "m.png"], "--mask belongs to a capture"),
         (["--capture", "x", "--figures", "own.yaml"], "--figures belongs to the scorecard"),
+        (["--capture", "x", "--power"], "--power belongs to the scorecard"),
         (["--capture", "absent"], "absent: no such file or folder"),
         (
             ["--capture", "x", "--camera", "a", "--camera", "b"],
@@ -346,3 +348,54 @@ def test_help_is_instant():
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "usage: tofpod validate" in done.stdout
+
+
+# ---- strict values
+# -----------------------------------------------------------------------------------------------
+
+
+def test_strict_is_within_25_percent_whatever_the_tolerance(tmp_path):
+    value = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.2}", 1)
+    _, wide = read_figures(written(tmp_path, value)).figures
+    _, bound = read_figures(written(tmp_path)).figures
+    assert [Score(wide, Reading(x)).strict for x in (0.374, 0.376, 0.624, 0.626)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert Score(bound, Reading(0.7)).strict is None
+    assert [Score(wide, Reading(x)).grade for x in (0.31, 0.29)] == [3, 0]
+    narrow = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.05}", 1)
+    _, narrow_figure = read_figures(written(tmp_path, narrow)).figures
+    assert [Score(narrow_figure, Reading(x)).grade for x in (0.54, 0.56, 0.63)] == [3, 2, 0]
+    assert [Score(bound, Reading(x)).grade for x in (0.7, 0.3)] == [1, 0]
+    (standing,) = standings([Score(wide, Reading(0.35)), Score(bound, Reading(0.7))])
+    assert (standing.values, standing.strict, standing.by_tolerance) == (1, 0, 1)
+    assert (standing.bounds, standing.bounds_hold) == (1, 1)
+
+
+def test_power_compares_the_untested_constants_with_those_on_file(tmp_path, capsys, monkeypatch):
+    """Constants of one camera, readings that nothing changes: all are untested."""
+    stored = tmp_path / "untested.yaml"
+    stored.write_text("{}\n")
+    monkeypatch.setattr(power, "UNTESTED_FILE", stored)
+    monkeypatch.setattr(program, "FULL", QUICK)
+    monkeypatch.setattr(program.scoring, "FIGURES_FILE", written(tmp_path))
+    same = {"value": 0.89, "interval": Interval(0.88, 0.9)}
+    monkeypatch.setattr(
+        power, "measured", lambda requests, *_: dict.fromkeys(requests, Reading(**same))
+    )
+    out = tmp_path / "out"
+    options = ["--jobs", "1", "--power", "--out", str(out)]
+    assert main(options) == 1
+    printed = capsys.readouterr()
+    assert f"{AZURE}: photons.read_noise_electrons is untested now" in printed.err
+    assert "0 of " in printed.out
+    stored.write_text((out / "untested.yaml").read_text())
+    assert main(options) == 0
+    page = (out / "scorecard.html").read_text()
+    assert "Untested constants" in page
+    rows = list(csv.DictReader((out / "power.csv").open()))
+    assert {row["verdict"] for row in rows} == {"untested", "not moved"}
+    assert {row["camera"] for row in rows} == {AZURE}
