@@ -2,11 +2,12 @@
 
 A constant is a number that a camera's file states itself, with a tag other than R and D (read in a
 public source, or derived from such), and that the simulation of a plane or an edge reads. It is
-moved to the ends of its `range`, or by 30 % where none is stated, in all cameras that inherit it
-(`like`). A figure notices if its value leaves or enters a band: that of the source's own
-tolerance, that of 25 %, or that in which the figure passes; a family, if its verdict changes. The
-change must exceed 2 % and the reading's 95 % interval. Camera and moved camera are measured with
-the same noise, in fewer frames than the scorecard's, so verdicts near a limit may differ from it.
+moved to the ends of its `range`, or by 30 % where none is stated; where no figure of the camera
+notices, also in the cameras that inherit it (`like`). A figure notices if its value leaves or
+enters a band: that of the source's own tolerance, that of 25 %, or that in which the figure passes;
+a family, if its verdict changes. The change must exceed 2 % and the reading's 95 % interval. Camera
+and moved camera are measured with the same noise, in fewer frames than the scorecard's, so verdicts
+near a limit may differ from it.
 
 Not moved: the lens, the places and cones of lights, choices of a rule, and numbers that are 0 and
 state no range."""
@@ -30,6 +31,7 @@ from harness.programs.scorecard.figures import (
     Score,
     measured,
 )
+from harness.programs.scorecard.quantities import Quantity
 from harness.records.schema import Column, Table
 from harness.stills.statistics import Reading
 from harness.vocabulary.declaration.yaml_source import read_yaml
@@ -55,6 +57,14 @@ NOT_MOVED = (
     "photons.calibration_",
 )
 """Beginnings of the keys of geometry, and of numbers that only solve for the gain."""
+EFFECT_OF = {
+    "modulation.wiggling_residual": "wiggling",
+    "fixed_pattern.": "fixed_pattern",
+    "unit.offset_mm": "unit_offset",
+    "unit.drift": "warm_up_drift",
+    "unit.j": "frame_jumps",
+}
+"""Effects without which a constant acts on nothing, by the beginning of its key."""
 HALVINGS = 4  # of a step that leads to an illegal number, such as a contrast above 1
 UNTESTED_FILE = Path(__file__).with_name("untested.yaml")
 
@@ -224,34 +234,62 @@ def _differ(old: Score, new: Score) -> bool:
 
 
 def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved]:
-    """Move each constant of the cameras both ways and measure the blind figures of the cameras
-    that use it, ``jobs`` scenes at a time."""
-    blind = [figure for figure in file.figures if figure.use == "blind"]
-    owners = {camera: stated_in(camera) for camera in cameras}
+    """Move each constant of the cameras both ways and measure blind figures, ``jobs`` scenes at a
+    time: those of the camera itself, and where none notices either move those of the cameras that
+    inherit the constant."""
     constants = [constant for camera in cameras for constant in constants_of(camera)]
-    moves: list[tuple[_Move | None, _Move | None]] = []
-    requests = {figure.request for figure in blind if figure.camera in owners}
+    moves = {}
     for constant in constants:
-        users = {name for name in cameras if owners[name].get(constant.key) == constant.camera}
-        figures = tuple(figure for figure in blind if figure.camera in users)
-        both = [constant.moved(upwards) for upwards in (False, True)]
-        down, up = [None if value is None else _Move(constant, value, figures) for value in both]
-        for move in (down, up):
-            requests.update(move.requests() if move else ())
-        moves.append((down, up))
-    readings = measured(sorted(requests, key=repr), BRIEF, jobs)
-    results = []
-    for constant, (down, up) in zip(constants, moves, strict=True):
-        results.append(
-            Moved(
-                constant=constant,
-                lowered=down.value if down else None,
-                raised=up.value if up else None,
-                noticed_lowered=down.noticed(file.families, readings) if down else (),
-                noticed_raised=up.noticed(file.families, readings) if up else (),
-            )
+        for upwards in (False, True):
+            moves[constant, upwards] = constant.moved(upwards)
+    owners = {camera: stated_in(camera) for camera in cameras}
+    noticed: dict[tuple[Constant, bool], tuple[str, ...]] = dict.fromkeys(moves, ())
+    readings: dict[Request, Reading] = {}
+    for is_own in (True, False):
+        asked = {}
+        for (constant, upwards), value in moves.items():
+            is_noticed = noticed[constant, False] or noticed[constant, True]
+            if value is not None and not is_noticed:
+                figures = _figures(file, constant, owners, is_own)
+                asked[constant, upwards] = _Move(constant, value, figures)
+        requests = {request for move in asked.values() for request in move.requests()}
+        requests |= {request._replace(numbers=()) for request in requests}
+        readings |= measured(sorted(requests - readings.keys(), key=repr), BRIEF, jobs)
+        for key, move in asked.items():
+            noticed[key] = move.noticed(file.families, readings)
+    return [
+        Moved(
+            constant=constant,
+            lowered=moves[constant, False],
+            raised=moves[constant, True],
+            noticed_lowered=noticed[constant, False],
+            noticed_raised=noticed[constant, True],
         )
-    return results
+        for constant in constants
+    ]
+
+
+def _figures(
+    file: FiguresFile, constant: Constant, owners: Mapping[str, Mapping[str, str]], is_own: bool
+) -> tuple[Figure, ...]:
+    """Return the blind figures on which a constant can act: those of its camera, or those of the
+    cameras that inherit it. ``owners``: by camera, who states each number."""
+    figures = []
+    for figure in file.figures:
+        if figure.use != "blind" or (figure.camera == constant.camera) != is_own:
+            continue
+        uses = owners.get(figure.camera, {}).get(constant.key) == constant.camera
+        if uses and _acts(constant.key, figure.measures):
+            figures.append(figure)
+    return tuple(figures)
+
+
+def _acts(key: str, quantity: Quantity) -> bool:
+    """Return whether the effect by which a constant acts is on while a quantity is measured."""
+    for beginning, effect in EFFECT_OF.items():
+        if key.startswith(beginning):
+            return bool(getattr(quantity.effects, effect))
+    return True
 
 
 def untested(results: Sequence[Moved]) -> dict[str, list[str]]:

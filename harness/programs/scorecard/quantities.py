@@ -188,6 +188,8 @@ class Quantity:
     conditions: type[Config]
     """Conditions of a measurement, with their defaults."""
     measure: Measure
+    effects: EffectsConfig
+    """Effects of the camera that are on while it is measured."""
     says: str
     """Sentence for the page: what is measured."""
 
@@ -195,7 +197,9 @@ class Quantity:
 QUANTITIES: dict[str, Quantity] = {}
 
 
-def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
+def _quantity(
+    title: str, conditions: type[Config], effects: EffectsConfig = NOISE
+) -> Callable[[Measure], Measure]:
     """Register a measuring function. The ending of its name is the unit; the page quotes its
     docstring's start."""
 
@@ -205,7 +209,13 @@ def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measu
         ending = name.rpartition("_")[2]
         unit = ending if ending in ("mm", "px") else ""
         QUANTITIES[name] = Quantity(
-            name=name, title=title, unit=unit, conditions=conditions, measure=measure, says=says
+            name=name,
+            title=title,
+            unit=unit,
+            conditions=conditions,
+            measure=measure,
+            effects=effects,
+            says=says,
         )
         return measure
 
@@ -258,14 +268,14 @@ def temporal_sigma_mm(bench: Bench, c: PlaneConditions) -> Reading:
     return _deviation(plane_stack(bench, c))
 
 
-@_quantity("random error", PlaneConditions)
+@_quantity("random error", PlaneConditions, EffectsConfig())
 def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation of a pixel's z over frames, with whole-frame jitter and jumps, rms over
     pixels."""
     return _deviation(plane_stack(bench, c, EffectsConfig(), bench.effort.whole_frames))
 
 
-@_quantity("jitter of whole frames", PlaneConditions)
+@_quantity("jitter of whole frames", PlaneConditions, EffectsConfig())
 def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over frames of the mean z of 25,000 pixels, without frames that jumped."""
     stack = plane_stack(bench, c, EffectsConfig(), patch=PATTERN_PATCH)
@@ -335,7 +345,7 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
     return np.array(variances), np.array(products)
 
 
-@_quantity("deviation within patches", PatchConditions)
+@_quantity("deviation within patches", PatchConditions, PATTERNED)
 def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Standard deviation of a single frame about the patch's own plane, with noise and fixed
     pattern: median over patches, mean over units."""
@@ -343,7 +353,7 @@ def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(np.sqrt(np.median(variance, axis=1)))
 
 
-@_quantity("pattern within patches", PatchConditions)
+@_quantity("pattern within patches", PatchConditions, PATTERNED)
 def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Standard deviation about the patch's own plane that two averages of different frames share:
     rms over patches, mean over units."""
@@ -357,7 +367,7 @@ def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(deviations_mm)
 
 
-@_quantity("correlation within patches", PatchConditions)
+@_quantity("correlation within patches", PatchConditions, PATTERNED)
 def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
     """Correlation between pixels of a single frame about the patch's own plane, mean over rows and
     columns."""
@@ -365,7 +375,7 @@ def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(product.mean(axis=1) / variance.mean(axis=1))
 
 
-@_quantity("systematic error", PlaneConditions)
+@_quantity("systematic error", PlaneConditions, STEADY)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Largest absolute mean error of z among ten units, one hour after power-on, direct light
     only."""
@@ -377,7 +387,7 @@ def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     return Reading(float(np.fmax.reduce(errors)))
 
 
-@_quantity("fixed pattern", PlaneConditions)
+@_quantity("fixed pattern", PlaneConditions, PATTERNED)
 def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over pixels of the average minus a smooth surface and the remaining
     noise, mean of 5 units."""

@@ -9,6 +9,7 @@ import pytest
 
 from harness.evaluation.intervals import Interval
 from harness.programs.scorecard import power
+from harness.programs.scorecard.bench import BRIEF, Bench
 from harness.programs.scorecard.figures import Request, read_figures
 from harness.programs.scorecard.power import (
     POWER,
@@ -20,10 +21,11 @@ from harness.programs.scorecard.power import (
     untested,
     untested_text,
 )
+from harness.programs.scorecard.quantities import QUANTITIES
 from harness.stills.statistics import Reading
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from scenes.sensor.camera import camera_names, camera_of, stated_in
-from scenes.sensor.common.config import CameraConfig
+from scenes.sensor.common.config import CameraConfig, EffectsConfig
 
 AZURE = "azure_kinect_nfov"
 FIGURES = """
@@ -153,36 +155,78 @@ def test_a_change_of_grade_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
         {
             "photons.signal_electrons": 1.05,
             "photons.read_noise_electrons": 1.12,
+            "photons.band_nm": 1.3,
+            "photons.full_well_electrons": float("nan"),
             "unit.jitter_mm": 1.3,
-            "unit.offset_mm": float("nan"),
         },
     )
     assert rows["femto_bolt_nfov photons.signal_electrons"].verdict == "untested"
-    for key in ("photons.read_noise_electrons", "unit.jitter_mm", "unit.offset_mm"):
+    noticed = ("photons.read_noise_electrons", "photons.band_nm", "photons.full_well_electrons")
+    for key in noticed:
         row = rows[f"{AZURE} {key}"]
         assert row.names == ("bolt",), key
         assert row.noticed_lowered == row.noticed_raised == ("bolt",)
     # the file of the Femto states its own signal: the Azure's has no user among the figures
     assert rows[f"{AZURE} photons.signal_electrons"].verdict == "untested"
     assert rows[f"{AZURE} scatter.stray_share"].verdict == "not moved"
+    # the temporal deviation is measured without jitter, so that it is not even asked
+    assert rows[f"{AZURE} unit.jitter_mm"].verdict == "untested"
     keys = untested(list(rows.values()))
-    assert "unit.jitter_mm" not in keys[AZURE]
+    assert "photons.band_nm" not in keys[AZURE]
     assert {"photons.signal_electrons", "scatter.stray_share"} <= set(keys[AZURE])
+
+
+@pytest.mark.parametrize(
+    ("key", "quantity", "acts"),
+    [
+        ("unit.jitter_mm", "temporal_sigma_mm", False),
+        ("unit.jitter_mm", "random_error_mm", True),
+        ("unit.jump_rate", "systematic_error_mm", False),
+        ("unit.drift_min", "systematic_error_mm", True),
+        ("fixed_pattern.pixel_mm", "edge_gap_px", False),
+        ("fixed_pattern.pixel_mm", "patch_deviation_mm", True),
+        ("modulation.wiggling_residual", "patch_deviation_mm", False),
+        ("photons.band_nm", "temporal_sigma_mm", True),
+    ],
+)
+def test_a_constant_acts_only_by_its_effect(key: str, quantity: str, acts: bool) -> None:
+    """What is skipped would not change: with the effect off, the reading is the same."""
+    assert power._acts(key, QUANTITIES[quantity]) == acts
+
+
+def test_the_effects_of_a_quantity_are_those_it_is_measured_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each set of effects that a measurement hands to the bench is part of the declared one."""
+    for name, quantity in QUANTITIES.items():
+        used: list[EffectsConfig] = []
+
+        def taken(self: Any, view: Any, effects: EffectsConfig, *_: Any, **__: Any) -> None:
+            used.append(effects)  # noqa: B023
+            raise InterruptedError
+
+        monkeypatch.setattr(Bench, "taken", taken)
+        with pytest.raises(InterruptedError):
+            quantity.measure(Bench(AZURE, BRIEF), quantity.conditions())
+        (effects,) = used
+        on = {key for key, is_on in effects.to_data().items() if is_on}
+        declared = {key for key, is_on in quantity.effects.to_data().items() if is_on}
+        assert on <= declared, name
 
 
 def test_noise_is_not_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A change from 1 to 1.12 within the reading's interval of 0.15 either way."""
-    values = {"photons.read_noise_electrons": 1.12, "unit.jitter_mm": 1.3}
+    values = {"photons.read_noise_electrons": 1.12, "photons.band_nm": 1.3}
     rows = moved_with(tmp_path, monkeypatch, values, Interval(0.85, 1.15))
     assert rows[f"{AZURE} photons.read_noise_electrons"].verdict == "untested"
-    assert rows[f"{AZURE} unit.jitter_mm"].verdict == "noticed"
+    assert rows[f"{AZURE} photons.band_nm"].verdict == "noticed"
 
 
 def test_the_table_states_both_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = moved_with(tmp_path, monkeypatch, {"unit.jitter_mm": 1.3})
-    (row,) = POWER.data([rows[f"{AZURE} unit.jitter_mm"]])
-    assert row["constant"] == "unit.jitter_mm"
-    assert (row["lowered"], row["raised"]) == (pytest.approx(0.175), pytest.approx(0.325))
+    rows = moved_with(tmp_path, monkeypatch, {"photons.band_nm": 1.3})
+    (row,) = POWER.data([rows[f"{AZURE} photons.band_nm"]])
+    assert row["constant"] == "photons.band_nm"
+    assert (row["lowered"], row["raised"]) == (pytest.approx(14), pytest.approx(26))
     assert row["noticed_lowered"] == row["noticed_raised"] == ["bolt"]
     assert row["verdict"] == "noticed"
 
