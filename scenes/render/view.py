@@ -47,12 +47,14 @@ def render_view(
     target: Target,
     optics: Optics,
     config: RenderConfig,
+    region: Region | None = None,
 ) -> NoiseFreeView:
-    """Render the noise-free view of a target by a camera. Raises UserError as `target_region` and
-    `load_mitsuba` do."""
+    """Render the noise-free view of a target by a camera, on ``region`` or on that of the target.
+    Raises UserError as `target_region` and `load_mitsuba` do."""
     began = time.perf_counter()
     mi = load_mitsuba()
-    region = target_region(target, optics)
+    if region is None:
+        region = target_region(target, optics)
     lit = lit_scene(mi, target.parts, optics, face_triangles(target))
     slopes = optics.lens.region_slopes(region)
     inside = _inside_outline(target, optics.lens, region)

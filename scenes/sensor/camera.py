@@ -194,6 +194,22 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
     return paths
 
 
+def stated_in(name: str) -> dict[str, str]:
+    """Return the camera whose file states each number of a camera, by dotted keys: its own, or one
+    that `like` leads to. Raises UserError as `load_camera` does."""
+    owners: dict[str, str] = {}
+    owner = name
+    while True:
+        data = read_yaml(camera_file(owner)).data
+        for key in number_paths(data):
+            owners.setdefault(key, owner)
+        base = data.get("like")
+        if base is None:
+            break
+        owner = str(camera_file(owner).parent / base) if is_camera_path(base) else base
+    return {key: owners[key] for key in number_paths(load_camera(name).to_data())}
+
+
 def read_camera(path: Path) -> AnyCamera:
     """Read a camera file. Raises UserError that names the file and each key that is missing,
     unknown or impossible."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.vocabulary.geometry import Region
 from scenes.optics import NoiseFreeView
-from scenes.sensor.camera import AnyCamera, load_camera
+from scenes.sensor.camera import AnyCamera, camera_of
 from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.source import SimulatedUnit
 
@@ -36,6 +36,9 @@ class Effort:
 
 
 FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
+BRIEF = Effort(noise_frames=24, few_frames=3, whole_frames=100, units=10)
+"""For comparing a camera with itself: both are measured with the same noise, so that few frames
+suffice."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +47,18 @@ class Bench:
 
     camera_name: str
     effort: Effort
+    numbers: tuple[tuple[str, Any], ...] = ()
+    """Numbers of the camera file that are replaced, by their dotted keys."""
+
+    @property
+    def config(self) -> CameraConfig:
+        """The camera's declaration, with all effects."""
+        return CameraConfig(name=self.camera_name, numbers=dict(self.numbers))
 
     @property
     def camera(self) -> AnyCamera:
-        """The camera of the camera file."""
-        return load_camera(self.camera_name)
+        """The camera of the camera file, with the replaced numbers."""
+        return camera_of(self.config)
 
     def patch(self, height: int, width: int) -> Region:
         """Return pixels about the optical axis with the margin for the camera's own filter,
@@ -69,7 +79,7 @@ class Bench:
     ) -> FrameStack:
         """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels``
         select the noise."""
-        config = CameraConfig(name=self.camera_name, effects=effects, **settings)
+        config = self.config.model_copy(update={"effects": effects, **settings})
         unit = SimulatedUnit(self.camera, config, view)
         cut = unit.cut
         taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)

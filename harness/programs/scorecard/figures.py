@@ -8,13 +8,13 @@ others must pass."""
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -37,8 +37,21 @@ FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 # a figure of a real camera passes within this share of a published value; a published bound must
 # hold
 NEAR = 0.25
+FEWEST = 4  # figures of a family: with three, a slope has one degree of freedom
 PROGRESS_EVERY_S = 10.0
-Request = tuple[str, str, Config]  # the camera, the quantity and its conditions
+
+
+class Request(NamedTuple):
+    """A measurement of a simulated camera."""
+
+    camera: str
+    """Name of the camera."""
+    quantity: str
+    """Name of the quantity."""
+    conditions: Config
+    """All conditions of the measurement."""
+    numbers: tuple[tuple[str, Any], ...] = ()
+    """Numbers of the camera file that are replaced, by their dotted keys."""
 
 
 class Published(Config):
@@ -134,20 +147,57 @@ class Figure(Config):
     @cached_property
     def request(self) -> Request:
         """The camera, quantity and complete conditions of the measurement."""
-        return self.camera, self.quantity, self.measures.conditions.from_data(self.conditions)
+        conditions = self.measures.conditions.from_data(self.conditions)
+        return Request(self.camera, self.quantity, conditions)
 
     def what(self) -> str:
         """Return a text such as ``temporal deviation, 1.5 m, albedo 0.8``."""
-        return f"{self.measures.title}, {in_words(self.request[2])}"
+        return f"{self.measures.title}, {in_words(self.request.conditions)}"
+
+
+class Family(Config):
+    """Figures of one camera and quantity that differ in one condition."""
+
+    name: Annotated[
+        str,
+        Field(pattern=r"^[a-z0-9_]+$", description="small letters, digits and _; once in the file"),
+    ]
+    over: str
+    """The condition. An angle of incidence counts by 1 / cos, as the illuminated area does."""
+    figures: Annotated[tuple[str, ...], Field(min_length=FEWEST)]
+    """Names of the figures."""
+    note: str = ""
+    """What is known of the family."""
+    fails: str = ""
+    """Why the family is known to be off or to have a trend."""
+
+
+def _problem_of(family: Family, figures: Mapping[str, Figure]) -> str:
+    """Return what is wrong with a family's figures, by their names; empty if nothing is."""
+    unknown = [name for name in family.figures if name not in figures]
+    if unknown:
+        return f"the family {family.name} names no figure of the file: {', '.join(unknown)}"
+    members = [figures[name] for name in family.figures]
+    if len({(figure.camera, figure.quantity, figure.use) for figure in members}) > 1:
+        return f"the family {family.name} mixes cameras, quantities or uses"
+    if any(not figure.published.value for figure in members):
+        return f"the family {family.name} has a figure without a value, or with the value 0"
+    conditions = [figure.request.conditions.to_data().get(family.over) for figure in members]
+    if None in conditions or len(set(conditions)) == 1:
+        return f"the family {family.name} does not vary in {family.over}"
+    return ""
 
 
 class FiguresFile(Config):
-    """The file of figures, which holds a list."""
+    """The file of figures."""
 
     figures: Annotated[tuple[Figure, ...], Field(min_length=1)]
+    """All figures."""
+    families: tuple[Family, ...] = ()
+    """Families of some of them."""
 
 
-def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
+def read_figures(path: Path = FIGURES_FILE) -> FiguresFile:
     """Read a file of figures. Raises UserError with each missing, unknown or illegal key and its
     place."""
     source = read_yaml(path)
@@ -178,7 +228,13 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
     file, declared = validated(FiguresFile, source, splices)
     if problems or file is None:
         raise DeclarationError(str(path), [*problems, *declared])
-    return file.figures
+    by_name = {figure.name: figure for figure in file.figures}
+    for number, family in enumerate(file.families):
+        if fault := _problem_of(family, by_name):
+            problems.append(Problem(fault, source.place_of(("families", number, "figures"))))
+    if problems:
+        raise DeclarationError(str(path), problems)
+    return file
 
 
 @dataclass(frozen=True)
@@ -203,6 +259,15 @@ class Score:
         return bool(low <= self.simulated.value <= high)
 
     @property
+    def strict(self) -> bool | None:
+        """True if the simulated value lies within `NEAR` of the published value; None for bounds
+        and checks of the code."""
+        if self.figure.kind != "reality" or self.figure.published.value is None:
+            return None
+        low, high = self.figure.published.limits(NEAR)
+        return bool(low <= self.simulated.value <= high)
+
+    @property
     def passes_by_tolerance(self) -> bool:
         """True if a figure of a real camera passes only by the source's tolerance, which is wider
         than `NEAR`."""
@@ -210,6 +275,18 @@ class Score:
             return False
         low, high = self.figure.published.limits(NEAR)
         return not low <= self.simulated.value <= high
+
+    @property
+    def grade(self) -> int:
+        """3: within the source's own tolerance; 2: within `NEAR` of a value; 1: passes; 0: fails.
+        A bound is 1 or 0."""
+        published = self.figure.published
+        if not self.passes or published.value is None:
+            return int(self.passes)
+        own_low, own_high = published.limits(0.0, published.tolerance or 0.0)
+        if own_low <= self.simulated.value <= own_high:
+            return 3
+        return 2 if self.strict else 1
 
     @property
     def fell_behind(self) -> bool:
@@ -232,7 +309,8 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
     the order."""
     scenes: dict[str, list[Request]] = defaultdict(list)
     for request in requests:
-        scenes[canonical_json([request[0], *scene_of(request[2])])].append(request)
+        scene = [request.camera, request.numbers, *scene_of(request.conditions)]
+        scenes[canonical_json(scene)].append(request)
     groups = list(scenes.values())
     results: dict[Request, Reading] = {}
     last_s = time.monotonic()
@@ -252,10 +330,11 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
 
 def measure_group(group: Sequence[Request], effort: Effort) -> list[Reading]:
     """Measure quantities of a camera on a single scene, in this process."""
-    return [
-        QUANTITIES[name].measure(Bench(camera, effort), conditions)
-        for camera, name, conditions in group
-    ]
+    readings = []
+    for request in group:
+        bench = Bench(request.camera, effort, request.numbers)
+        readings.append(QUANTITIES[request.quantity].measure(bench, request.conditions))
+    return readings
 
 
 SCORE_FILE: dict[str, Any] = {"formats": ("csv",), "digits": "%.9g"}
@@ -318,6 +397,10 @@ def _named(score: Score) -> str:
     return f"{score.figure.what()}\n{score.figure.name}"
 
 
+def _yes_or_no(strict: bool | None) -> str:
+    return {True: "yes", False: "no", None: "–"}[strict]
+
+
 def _remarks(score: Score) -> str:
     why = f"Why it fails: {score.figure.fails}. " if score.figure.fails else ""
     return why + score.figure.note[:1].upper() + score.figure.note[1:]
@@ -359,6 +442,13 @@ SCORES = Table(
             "verdict",
             "whether it passes",
             tone=lambda score: "good" if score.passes else "bad",
+        ),
+        Column(
+            "strict",
+            "strict",
+            "strict",
+            "whether it lies within 25 % of the published value; empty for bounds and checks",
+            _yes_or_no,
         ),
         Column(
             "use",

@@ -7,23 +7,31 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from harness.programs.scorecard import figures as scoring
+from harness.programs.scorecard import power
 from harness.programs.scorecard.bench import FULL
+from harness.programs.scorecard.families import FAMILIES, OFF, FamilyScore, family_scores
 from harness.programs.scorecard.quantities import QUANTITIES
+from harness.programs.scorecard.standings import STANDINGS, standings
 from harness.records.schema import write_table
 from harness.report.blocks import (
     BLUE,
     GREY,
     RED,
+    bullets,
     command_of,
     figure,
+    fold,
     heading,
     note,
     page,
+    paragraph,
     plain,
     svg,
     tag,
@@ -42,7 +50,8 @@ HOW = (
     "Each quantity is measured on simulated frames as it was on the real camera, under the "
     "conditions of the source. A figure of a real camera passes if the simulated value lies "
     "within 25 % of the published value; if the source states a wider tolerance, that applies, "
-    "and the verdict says so. A bound must hold. Blind: nothing was fitted to the figure. "
+    "the verdict says so, and the column `strict` says no. A bound must hold. "
+    "Blind: nothing was fitted to the figure. "
     "Calibration: the camera file was, or may have been, fitted to it, so it is not a test. Tags "
     "of sources: R read for this project in the named public source, D derived from such a "
     "source, S a single secondary source, W measured on public captures, M from memory or a guess."
@@ -51,34 +60,45 @@ CHECKS = (
     "These checks compare the program with the arithmetic of a stated filter, gate or limit of "
     "the camera file. They say nothing about real cameras and pass only within their tolerance."
 )
+FAMILY_NOTE = (
+    f"Each family's figures differ in one condition. A family agrees if the geometric mean of its "
+    f"ratios lies within {100 * OFF:.0f} % of 1, and if it has no trend: the slope of the "
+    "logarithm of the ratio on that of the condition (of 1 / cos for an angle) has a 95 % "
+    f"interval that contains 0, or changes the ratio by less than {100 * OFF:.0f} % along the "
+    "family."
+)
+POWER_NOTE = " ".join((power.__doc__ or "").partition("\n\n")[2].split())
 CAPTION = (
     "Simulated divided by published value with its 95 % interval; the band extends 25 % to either "
     "side. Blue passes, red fails; hollow marks are figures to which the camera file was fitted. "
     "Bounds and values of 0 have no ratio."
 )
-FAMILIES = {
+GROUPS = {
     "azure": "Azure Kinect",
     "femto": "Femto",
     "kinect": "Kinect v2",
     "realsense": "RealSense L515",
 }
-"""Families of cameras by the first word of their names; the other cameras are counted together."""
+"""Groups of cameras by the first word of their names; the other cameras are counted together."""
 
 
 def run_scorecard(options: argparse.Namespace, command: str) -> int:
-    """Measure, print and write the scorecard. Returns 1 if a figure fails and its entry gives no
-    reason, else 0. Raises UserError for an unknown camera, a faulty file of figures, or a folder
-    that cannot be written."""
+    """Measure, print and write the scorecard. Returns 1 if a figure or family fails and its entry
+    gives no reason, or if the constants that nothing notices are not those on file; else 0. Raises
+    UserError for an unknown camera, a faulty file of figures, or a folder that cannot be
+    written."""
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
-    all_figures = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
-    names = dict.fromkeys(options.camera) or dict.fromkeys(figure.camera for figure in all_figures)
+    file = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
+    names = dict.fromkeys(options.camera) or dict.fromkeys(figure.camera for figure in file.figures)
     titles = {name: load_camera(name).title for name in names}
-    figures = [figure for figure in all_figures if figure.camera in titles]
+    figures = [figure for figure in file.figures if figure.camera in titles]
     readings = scoring.measured(
         dict.fromkeys(figure.request for figure in figures), FULL, options.jobs
     )
     scores = [scoring.Score(figure, readings[figure.request]) for figure in figures]
+    families = family_scores(file.families, scores)
+    moved = power.power_of(file, list(titles), options.jobs) if options.power else []
     provenance = {
         "results_version": RESULTS_VERSION,
         **record(command),
@@ -86,13 +106,25 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         "figures": str(options.figures or scoring.FIGURES_FILE),
         "seconds": round(time.perf_counter() - began, 1),
     }
-    answer = _answer(scores)
+    answer = " ".join([_answer(scores), *_family_answer(families), *_power_answer(moved)])
+    card = Scorecard(scores, families, moved, titles)
     write_table(options.out, scoring.SCORES, scoring.SCORES.frame(scores))
+    write_table(options.out, FAMILIES, FAMILIES.frame(families))
+    write_table(options.out, power.POWER, power.POWER.frame(moved))
     write_json(options.out / "provenance.json", provenance)
-    write_text(options.out / "scorecard.html", _page(answer, scores, titles, provenance, command))
-    show([scoring.SCORES.grid(scores, terminal=True)])
+    write_text(options.out / "scorecard.html", _page(answer, card, provenance, command))
+    grids = [
+        scoring.SCORES.grid(scores, terminal=True),
+        STANDINGS.grid(standings(scores)),
+        FAMILIES.grid(families, terminal=True),
+        power.POWER.grid(moved, terminal=True),
+    ]
+    show([grid for grid in grids if grid.rows])
     print(answer)
     print(f"wrote {options.out / 'scorecard.html'}")
+    is_as_filed = True
+    if options.power and options.figures is None and not options.camera:
+        is_as_filed = _compare_untested(moved, list(titles), options.out)
     for score in scores:
         if score.passes and score.figure.fails:
             print(f"{score.figure.name} passes now: remove `fails` from its entry", file=sys.stderr)
@@ -100,18 +132,56 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
             low, high = score.figure.limits
             text = f"simulated {score.simulated.value:.4g}, passes from {low:g} to {high:g}"
             print(f"{score.figure.name} ({score.figure.what()}) fails: {text}", file=sys.stderr)
-    return int(any(score.fell_behind for score in scores))
+    for family in families:
+        name = family.family.name
+        if family.passes and family.family.fails:
+            print(f"{name} agrees now: remove `fails` from its entry", file=sys.stderr)
+        if family.fell_behind:
+            text = f"mean ratio {family.mean:.3g}, last over first {family.change:.3g}"
+            print(f"{name} fails ({family.verdict}): {text}", file=sys.stderr)
+    score_fell_behind = any(score.fell_behind for score in scores)
+    family_fell_behind = any(family.fell_behind for family in families)
+    return int(score_fell_behind or family_fell_behind or not is_as_filed)
 
 
-def _page(
-    answer: str,
-    scores: Sequence[scoring.Score],
-    titles: dict[str, str],
-    provenance: dict[str, object],
-    command: str,
-) -> str:
-    """Return the page: the figure of ratios, figures of cameras, checks of the code, and the
-    quantities' meanings."""
+def _compare_untested(moved: Sequence[power.Moved], cameras: Sequence[str], out: Path) -> bool:
+    """Return whether the constants that nothing notices are those on file; otherwise write the
+    file that would agree and name the differences."""
+    keys = power.untested(moved)
+    stored = power.stored_untested(cameras)
+    if keys == stored:
+        return True
+    write_text(out / power.UNTESTED_FILE.name, power.untested_text(keys))
+    for camera in cameras:
+        for key in sorted(set(keys.get(camera, [])) ^ set(stored.get(camera, []))):
+            state = "untested" if key in keys.get(camera, []) else "noticed"
+            print(f"{camera}: {key} is {state} now", file=sys.stderr)
+    print(
+        f"the untested constants are not those of {power.UNTESTED_FILE.name}: see "
+        f"{out / power.UNTESTED_FILE.name}",
+        file=sys.stderr,
+    )
+    return False
+
+
+@dataclass(frozen=True)
+class Scorecard:
+    """All that the page shows."""
+
+    scores: Sequence[scoring.Score]
+    """All figures, judged."""
+    families: Sequence[FamilyScore]
+    """All families, judged."""
+    moved: Sequence[power.Moved]
+    """All moved constants; empty without ``--power``."""
+    titles: dict[str, str]
+    """Titles of the chosen cameras, by name."""
+
+
+def _page(answer: str, card: Scorecard, provenance: dict[str, object], command: str) -> str:
+    """Return the page: the figure of ratios, standings, families, power, figures of cameras, checks
+    of the code, and the quantities' meanings."""
+    scores = card.scores
     body = [heading("Simulated and published values")]
     real = [score for score in scores if score.figure.kind == "reality"]
     ratios = [
@@ -122,10 +192,21 @@ def _page(
         title = "Simulated over published value"
         drawn = svg("ratios", size, title, lambda canvas: _draw(canvas, ratios))
         body.append(figure({"ratios": drawn}, "ratios", CAPTION))
+    body += [heading("Blind figures by camera"), STANDINGS.grid(standings(scores)).html()]
+    if card.families:
+        body += [heading("Families of figures"), note(FAMILY_NOTE)]
+        body.append(FAMILIES.grid(card.families).html())
+    if card.moved:
+        body += [heading("Which figures notice a wrong constant"), note(POWER_NOTE)]
+        unnoticed = [row for row in card.moved if not row.names]
+        keys = power.untested(unnoticed)
+        lines = [f"{camera_title(camera)}: {', '.join(names)}" for camera, names in keys.items()]
+        body += [paragraph("Untested constants, which nothing notices:"), bullets(lines)]
+        body.append(fold("All constants", power.POWER.grid(card.moved).html()))
     if failing := [score for score in real if not score.passes]:
         body += [heading("Failures and their reasons"), scoring.SCORES.grid(failing).html()]
     scored = {score.figure.camera for score in real}
-    without = [title for camera, title in titles.items() if camera not in scored]
+    without = [title for camera, title in card.titles.items() if camera not in scored]
     if real:
         body += [heading("Figures of real cameras"), scoring.SCORES.grid(real).html()]
     if without:
@@ -188,20 +269,42 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     families: dict[str, list[scoring.Score]] = {}
     for score in blind:
         first_word = score.figure.camera.partition("_")[0]
-        families.setdefault(FAMILIES.get(first_word, "other cameras"), []).append(score)
+        families.setdefault(GROUPS.get(first_word, "other cameras"), []).append(score)
     by_family = ""
     if len(families) > 1:
         shares = [f"{name} {share(family)}" for name, family in families.items()]
         by_family = f" ({', '.join(shares)})"
-    values = [score for score in blind if score.figure.published.value is not None]
-    bounds = [score for score in blind if score.figure.published.value is None]
-    wide = sum(score.passes_by_tolerance for score in blind)
-    by_tolerance = f" ({wide} by a wider tolerance of the source)" if wide else ""
+    values = [score for score in blind if score.strict is not None]
+    bounds = [score for score in blind if score.strict is None]
+    strict = sum(score.strict is True for score in values)
+    wide = sum(score.passes_by_tolerance for score in values)
     text = f"{share(blind)} blind figures pass{by_family}: "
-    text += f"{share(values)} values within 25 %{by_tolerance}, {share(bounds)} bounds; "
+    text += f"{strict} of {len(values)} values within 25 %, {wide} by a wider tolerance of the "
+    text += f"source, {share(bounds)} bounds; "
     text += f"{share(by_use['calibration'])} figures that calibrated a camera pass; "
     text += f"{share(by_use['code'])} checks of the code pass."
     new = [score.figure.name for score in scores if score.fell_behind]
     if new:
         text += f" Failures without a stated reason: {', '.join(new)}."
     return text
+
+
+def _family_answer(families: Sequence[FamilyScore]) -> list[str]:
+    """Return how many families agree, as a sentence; nothing without families."""
+    if not families:
+        return []
+    agreeing = sum(family.passes for family in families)
+    trends = sum(family.has_trend for family in families)
+    return [f"{agreeing} of {len(families)} families agree, {trends} have a trend."]
+
+
+def _power_answer(moved: Sequence[power.Moved]) -> list[str]:
+    """Return how many constants are noticed, as a sentence; nothing if none was moved."""
+    movable = [row for row in moved if row.can_move]
+    if not movable:
+        return []
+    noticed = sum(bool(row.names) for row in movable)
+    return [
+        f"{noticed} of {len(movable)} constants are noticed when they are moved; "
+        f"{len(moved) - len(movable)} could not be moved."
+    ]

@@ -9,12 +9,13 @@ the optical axis.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from harness.programs.scorecard.bench import NOISE, PATTERNED, STEADY, Bench, FrameStack
+from harness.programs.scorecard.shadows import rendered_step
 from harness.stills.statistics import (
     FLAT_PX,
     Reading,
@@ -56,6 +57,9 @@ NEAREST_M = 0.1
 FARTHEST_M = 20.0
 STEP_OUT = 1.25
 HALVINGS = 5
+FLOOR_BELOW_M = 1.0
+# a frame whose mean lies farther from the median of all has jumped
+JUMP_M = 5e-3
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 Distance = Annotated[
@@ -116,8 +120,9 @@ class NearConditions(Config):
 
 class StepConditions(Config):
     """A straight edge of a matte plane in front of another, both frontal, 6 degrees off the pixel
-    grid. z steps along the image axis ``across``; with ``shadow``, the front is on the emitter's
-    side and casts its shadow on the back."""
+    grid. z steps along the image axis ``across``. With ``shadow``, the front is a square on the
+    emitter's side and casts its shadow on the back, and light between the surfaces and a floor is
+    rendered; without, both are infinite and lit directly."""
 
     distance_m: Distance = 0.75
     step_mm: Annotated[
@@ -126,6 +131,25 @@ class StepConditions(Config):
     albedo: Albedo = 0.6
     across: Literal["x", "y"] = "x"
     shadow: bool = False
+    front_mm: (
+        Annotated[
+            float, Field(ge=10.0, le=3e3, description="side of the square front, 10 to 3000 mm")
+        ]
+        | None
+    ) = None
+    back_albedo: Albedo | None = None
+    floor_below_m: Annotated[
+        float, Field(ge=0.05, le=10.0, description="floor below the lens, 0.05 to 10 m")
+    ] = FLOOR_BELOW_M
+
+    @model_validator(mode="after")
+    def _shadow_has_surroundings(self) -> Self:
+        is_complete = self.front_mm is not None and self.back_albedo is not None
+        if self.shadow and not is_complete:
+            raise ValueError("a shadow needs front_mm and back_albedo: its light is rendered")
+        if not self.shadow and (self.front_mm is not None or self.back_albedo is not None):
+            raise ValueError("front_mm and back_albedo belong to a shadow")
+        return self
 
 
 _WORDS: dict[str, Callable[[Any], str]] = {
@@ -138,6 +162,9 @@ _WORDS: dict[str, Callable[[Any], str]] = {
     "step_mm": "step {:g} mm".format,
     "across": "across {}".format,
     "shadow": lambda v: "shadowed" if v else "",
+    "front_mm": lambda v: f"front {v:g} mm" if v else "",
+    "back_albedo": lambda v: f"back of albedo {v:g}" if v else "",
+    "floor_below_m": lambda v: "" if v == FLOOR_BELOW_M else f"floor {v:g} m below",
     "patch_px": "patches of {:g} px".format,
     "apart_px": lambda v: f"{v:g} px apart" if v else "",
     "rounded_mm": lambda v: f"stored in steps of {v:g} mm" if v else "",
@@ -181,6 +208,8 @@ class Quantity:
     conditions: type[Config]
     """Conditions of a measurement, with their defaults."""
     measure: Measure
+    effects: EffectsConfig
+    """Effects of the camera that are on while it is measured."""
     says: str
     """Sentence for the page: what is measured."""
 
@@ -188,7 +217,9 @@ class Quantity:
 QUANTITIES: dict[str, Quantity] = {}
 
 
-def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
+def _quantity(
+    title: str, conditions: type[Config], effects: EffectsConfig = NOISE
+) -> Callable[[Measure], Measure]:
     """Register a measuring function. The ending of its name is the unit; the page quotes its
     docstring's start."""
 
@@ -198,7 +229,13 @@ def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measu
         ending = name.rpartition("_")[2]
         unit = ending if ending in ("mm", "px") else ""
         QUANTITIES[name] = Quantity(
-            name=name, title=title, unit=unit, conditions=conditions, measure=measure, says=says
+            name=name,
+            title=title,
+            unit=unit,
+            conditions=conditions,
+            measure=measure,
+            effects=effects,
+            says=says,
         )
         return measure
 
@@ -256,11 +293,20 @@ def temporal_sigma_mm(bench: Bench, c: PlaneConditions) -> Reading:
     return _deviation(plane_stack(bench, c))
 
 
-@_quantity("random error", PlaneConditions)
+@_quantity("random error", PlaneConditions, EffectsConfig())
 def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation of a pixel's z over frames, with whole-frame jitter and jumps, rms over
     pixels."""
     return _deviation(plane_stack(bench, c, EffectsConfig(), bench.effort.whole_frames))
+
+
+@_quantity("jitter of whole frames", PlaneConditions, EffectsConfig())
+def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
+    """Standard deviation over frames of the mean z of 25,000 pixels, without frames that jumped."""
+    stack = plane_stack(bench, c, EffectsConfig(), patch=PATTERN_PATCH)
+    means_m = np.nanmean(stack.z_m, axis=(1, 2))
+    steady_m = means_m[np.abs(means_m - np.median(means_m)) < JUMP_M]
+    return jackknifed(steady_m, lambda means: float(means.std(ddof=1)) / MM)
 
 
 @_quantity("noise correlation", LagConditions)
@@ -347,7 +393,7 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
     return np.array(variances), np.array(products)
 
 
-@_quantity("deviation within patches", PatchConditions)
+@_quantity("deviation within patches", PatchConditions, PATTERNED)
 def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Standard deviation of a single frame about the patch's own plane, with noise and fixed
     pattern: median over patches, mean over units."""
@@ -355,7 +401,7 @@ def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(np.sqrt(np.median(variance, axis=1)))
 
 
-@_quantity("pattern within patches", PatchConditions)
+@_quantity("pattern within patches", PatchConditions, PATTERNED)
 def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     """Standard deviation about the patch's own plane that two averages of different frames share:
     rms over patches, mean over units."""
@@ -369,7 +415,7 @@ def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(deviations_mm)
 
 
-@_quantity("correlation within patches", PatchConditions)
+@_quantity("correlation within patches", PatchConditions, PATTERNED)
 def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
     """Correlation between pixels of a single frame about the patch's own plane, mean over rows and
     columns."""
@@ -377,7 +423,7 @@ def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(product.mean(axis=1) / variance.mean(axis=1))
 
 
-@_quantity("systematic error", PlaneConditions)
+@_quantity("systematic error", PlaneConditions, STEADY)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Largest absolute mean error of z among ten units, one hour after power-on, direct light
     only."""
@@ -389,7 +435,7 @@ def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     return Reading(float(np.fmax.reduce(errors)))
 
 
-@_quantity("fixed pattern", PlaneConditions)
+@_quantity("fixed pattern", PlaneConditions, PATTERNED)
 def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over pixels of the average minus a smooth surface and the remaining
     noise, mean of 5 units."""
@@ -422,7 +468,26 @@ def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
 
     front = Plane(c.distance_m)
     back = Plane(c.distance_m + c.step_mm * MM)
-    view = layered_view(camera, region, front, back, lambda slopes: signed_px(slopes) < 0, c.albedo)
+    if c.front_mm is not None and c.back_albedo is not None:
+        view = rendered_step(
+            camera,
+            region,
+            axis=axis,
+            sign=sign,
+            slant=SLANT,
+            distance_m=c.distance_m,
+            step_mm=c.step_mm,
+            front_mm=c.front_mm,
+            front_albedo=c.albedo,
+            wall_albedo=c.back_albedo,
+            floor_below_m=c.floor_below_m,
+        )
+    else:
+
+        def covers(slopes: np.ndarray) -> np.ndarray:
+            return signed_px(slopes) < 0
+
+        view = layered_view(camera, region, front, back, covers, c.albedo)
     stack = bench.taken(view, NOISE, bench.effort.few_frames, "step", digest(c.to_data()))
     from_edge = signed_px(lens.region_slopes(stack.region))
     sigma_m = temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX)

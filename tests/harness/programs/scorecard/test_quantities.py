@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from harness.programs.scorecard import quantities
 from harness.programs.scorecard.bench import Bench, Effort, FrameStack
@@ -96,6 +97,15 @@ def test_the_deviation_of_single_pixels(units: list[tuple[int, int | None]]) -> 
     assert value("temporal_sigma_mm") == pytest.approx(2.0, rel=0.02)
     assert value("random_error_mm") == pytest.approx(2.0, rel=0.02)
     assert units == [(1, None), (1, 40)]
+
+
+def test_the_jitter_leaves_out_frames_that_jumped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means of 1, 2 and 3 mm beside 1 m, and one 20 mm off: a deviation of 1 mm."""
+    offsets_mm = np.array([1.0, 2.0, 3.0, 20.0])
+    z_m = 1.0 + offsets_mm[:, None, None] * MM * np.ones((4, 10, 10))
+    z_m[:, 0, 0] = np.nan
+    monkeypatch.setattr(quantities, "plane_stack", lambda *_, **__: stack_of(z_m))
+    assert value("frame_jitter_mm") == pytest.approx(1.0)
 
 
 def test_the_share_of_valid_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,8 +255,14 @@ def test_conditions_in_words_and_as_scenes() -> None:
     assert in_words(dim) == "0.5 m, 30°, amplitudes 20"
     sunny = PlaneConditions(ambient_uw_cm2_nm=7.0)
     assert in_words(sunny) == "1.5 m, albedo 0.8, ambient 7 µW/(cm² nm)"
-    step = StepConditions(across="y", shadow=True)
-    assert in_words(step) == "0.75 m, step 50 mm, albedo 0.6, across y, shadowed"
+    step = StepConditions(across="y", shadow=True, front_mm=80.0, back_albedo=0.5)
+    assert in_words(step) == (
+        "0.75 m, step 50 mm, albedo 0.6, across y, shadowed, front 80 mm, back of albedo 0.5"
+    )
+    with pytest.raises(ValidationError, match="a shadow needs front_mm and back_albedo"):
+        StepConditions(shadow=True, front_mm=80.0)
+    with pytest.raises(ValidationError, match="belong to a shadow"):
+        StepConditions(back_albedo=0.5)
     patch = PatchConditions(apart_px=2, rounded_mm=1.0)
     assert "patches of 38 px, 2 px apart, stored in steps of 1 mm" in in_words(patch)
     assert scene_of(patch) == scene_of(PlaneConditions())

@@ -14,17 +14,19 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from harness.evaluation.intervals import Interval
-from harness.programs.scorecard import program
+from harness.programs.scorecard import power, program
 from harness.programs.scorecard.bench import Effort
 from harness.programs.scorecard.figures import (
     SCORES,
     Published,
+    Request,
     Score,
     measured,
     number,
     read_figures,
 )
 from harness.programs.scorecard.quantities import QUANTITIES, in_words
+from harness.programs.scorecard.standings import standings
 from harness.programs.scorecard.validate import main
 from harness.stills.statistics import NOTHING, Reading
 from harness.vocabulary.errors import UserError
@@ -74,7 +76,7 @@ def refusal(folder: Path, old: str, new: str) -> str:
 
 
 def test_the_projects_figures_are_legal_and_every_camera_has_blind_figures():
-    figures = read_figures()
+    figures = read_figures().figures
     assert len({figure.name for figure in figures}) == len(figures)
     blind = {figure.camera for figure in figures if figure.use == "blind"}
     assert blind == {figure.camera for figure in figures}
@@ -83,8 +85,8 @@ def test_the_projects_figures_are_legal_and_every_camera_has_blind_figures():
 
 
 def test_defaults_fill_what_an_entry_leaves_out(tmp_path):
-    _, neighbours = read_figures(written(tmp_path))
-    assert neighbours.request[2].to_data() == {
+    _, neighbours = read_figures(written(tmp_path)).figures
+    assert neighbours.request.conditions.to_data() == {
         "distance_m": 1.5,
         "albedo": 0.8,
         "angle_deg": 0.0,
@@ -174,7 +176,7 @@ def test_a_negative_tolerance_is_refused():
 
 
 def test_verdicts(tmp_path):
-    wall, neighbours = read_figures(written(tmp_path))
+    wall, neighbours = read_figures(written(tmp_path)).figures
     failing = wall.model_copy(update={"fails": "the wall is not known"})
     for figure, simulated, verdict in (
         (wall, Reading(1.11), "pass"),
@@ -192,25 +194,27 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
     path = written(
         tmp_path, GOOD.replace("calibration: true", "calibration: false\n    kind: code", 1)
     )
-    check, reality = read_figures(path)
+    check, reality = read_figures(path).figures
     assert check.limits == pytest.approx((0.83, 0.95))
     assert check.use == "code"
     value = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.2}", 1)
-    _, wide = read_figures(written(tmp_path, value))
+    _, wide = read_figures(written(tmp_path, value)).figures
     assert wide.limits == pytest.approx((0.3, 0.7))
     assert wide.use == "blind"
     assert reality.limits == (0.5, float("inf"))
     assert Score(reality, Reading(0.4)).ratio == pytest.approx(0.8)
     score = Score(wide, Reading(0.35))
     assert score.verdict == "pass (tolerance)"
-    assert "1 of 1 values within 25 % (1 by a wider tolerance" in program._answer([score])
+    assert "0 of 1 values within 25 %, 1 by a wider tolerance of the source" in program._answer(
+        [score]
+    )
     answer = program._answer([Score(check, Reading(0.9)), Score(reality, Reading(0.4))])
     assert answer.startswith("0 of 1 blind figures pass: ")
     assert "1 of 1 checks of the code pass. Failures without a stated reason: neighbours." in answer
 
 
 def test_the_table_tells_value_interval_published_and_source(tmp_path):
-    figures = read_figures(written(tmp_path))
+    figures = read_figures(written(tmp_path)).figures
     readings = Reading(0.9, Interval(0.88, 0.92)), Reading(0.7)
     lines = SCORES.grid(list(map(Score, figures, readings))).lines()
     assert len(lines) == 3
@@ -249,7 +253,7 @@ def test_numbers_have_three_digits(value, text):
 
 
 def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
-    assert {figure.quantity for figure in read_figures()} == set(QUANTITIES)
+    assert {figure.quantity for figure in read_figures().figures} == set(QUANTITIES)
     for name, quantity in QUANTITIES.items():
         assert not quantity.unit or name.endswith(f"_{quantity.unit}")
         assert in_words(quantity.conditions())
@@ -258,8 +262,10 @@ def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
 @pytest.mark.slow  # processes of their own; the engine's tests compare them too
 def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
     quantity = QUANTITIES["temporal_sigma_mm"]
-    requests = [(AZURE, quantity.name, quantity.conditions(albedo=albedo)) for albedo in (0.1, 0.3)]
-    requests += [figure.request for figure in read_figures(written(tmp_path))]
+    requests = [
+        Request(AZURE, quantity.name, quantity.conditions(albedo=albedo)) for albedo in (0.1, 0.3)
+    ]
+    requests += [figure.request for figure in read_figures(written(tmp_path)).figures]
     in_one_process = measured(requests, QUICK, jobs=1)
     two = measured(tuple(reversed(requests)), QUICK, jobs=2)
     assert set(in_one_process) == set(two) == set(requests)
@@ -316,6 +322,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
         (["--figures", "absent.yaml"], "absent.yaml"),
         (["--mask", "m.png"], "--mask belongs to a capture"),
         (["--capture", "x", "--figures", "own.yaml"], "--figures belongs to the scorecard"),
+        (["--capture", "x", "--power"], "--power belongs to the scorecard"),
         (["--capture", "absent"], "absent: no such file or folder"),
         (
             ["--capture", "x", "--camera", "a", "--camera", "b"],
@@ -342,3 +349,54 @@ def test_help_is_instant():
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "usage: tofpod validate" in done.stdout
+
+
+# ---- strict values
+# -----------------------------------------------------------------------------------------------
+
+
+def test_strict_is_within_25_percent_whatever_the_tolerance(tmp_path):
+    value = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.2}", 1)
+    _, wide = read_figures(written(tmp_path, value)).figures
+    _, bound = read_figures(written(tmp_path)).figures
+    assert [Score(wide, Reading(x)).strict for x in (0.374, 0.376, 0.624, 0.626)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert Score(bound, Reading(0.7)).strict is None
+    assert [Score(wide, Reading(x)).grade for x in (0.31, 0.29)] == [3, 0]
+    narrow = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.05}", 1)
+    _, narrow_figure = read_figures(written(tmp_path, narrow)).figures
+    assert [Score(narrow_figure, Reading(x)).grade for x in (0.54, 0.56, 0.63)] == [3, 2, 0]
+    assert [Score(bound, Reading(x)).grade for x in (0.7, 0.3)] == [1, 0]
+    (standing,) = standings([Score(wide, Reading(0.35)), Score(bound, Reading(0.7))])
+    assert (standing.values, standing.strict, standing.by_tolerance) == (1, 0, 1)
+    assert (standing.bounds, standing.bounds_hold) == (1, 1)
+
+
+def test_power_compares_the_untested_constants_with_those_on_file(tmp_path, capsys, monkeypatch):
+    """Constants of one camera, readings that nothing changes: all are untested."""
+    stored = tmp_path / "untested.yaml"
+    stored.write_text("{}\n")
+    monkeypatch.setattr(power, "UNTESTED_FILE", stored)
+    monkeypatch.setattr(program, "FULL", QUICK)
+    monkeypatch.setattr(program.scoring, "FIGURES_FILE", written(tmp_path))
+    same = {"value": 0.89, "interval": Interval(0.88, 0.9)}
+    monkeypatch.setattr(
+        power, "measured", lambda requests, *_: dict.fromkeys(requests, Reading(**same))
+    )
+    out = tmp_path / "out"
+    options = ["--jobs", "1", "--power", "--out", str(out)]
+    assert main(options) == 1
+    printed = capsys.readouterr()
+    assert f"{AZURE}: photons.read_noise_electrons is untested now" in printed.err
+    assert "0 of " in printed.out
+    stored.write_text((out / "untested.yaml").read_text())
+    assert main(options) == 0
+    page = (out / "scorecard.html").read_text()
+    assert "Untested constants" in page
+    rows = list(csv.DictReader((out / "power.csv").open()))
+    assert {row["verdict"] for row in rows} == {"untested", "not moved"}
+    assert {row["camera"] for row in rows} == {AZURE}

@@ -122,7 +122,8 @@ def test_a_shadow_is_a_gap_of_its_width(bench):
     two on each side, the lens's blur half of one."""
     v2 = Bench("kinect_v2", bench.effort)
     lit = value(v2, "edge_gap_px", step_mm=500, shadow=False)
-    shadowed = value(v2, "edge_gap_px", step_mm=500, shadow=True)
+    dark = {"shadow": True, "front_mm": 600.0, "back_albedo": 0.1}
+    shadowed = value(v2, "edge_gap_px", step_mm=500, **dark)
     assert lit < 0.5
     assert 10.6 < shadowed < 15.6
     assert value(bench, "edge_gap_px", step_mm=20) == 0
