@@ -22,6 +22,7 @@ from harness.evaluation.study.curves import ChanceHits
 from harness.evaluation.study.limit import ALL_FOUND, SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.evaluation.study.surface import PodSurface, surface_of
+from harness.evaluation.study.unknowns import OverUnknowns, over_unknowns
 from harness.records.trials import ResultTables
 from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.seeds import canonical_json
@@ -468,6 +469,8 @@ class SetUpResult:
     """POD over diameter and depth; None if there is none."""
     surface_why: str
     """Reason why there is no surface; else empty."""
+    unknowns: OverUnknowns | None = None
+    """What unknowns do to the limit; None if the set-up draws none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -549,6 +552,7 @@ def _set_up(
         pixels=curves.pixel_curves(tables.pixels),
         surface=surface,
         surface_why=why,
+        unknowns=over_unknowns(record, draws),
     )
 
 
