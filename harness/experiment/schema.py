@@ -297,7 +297,7 @@ def declared_of(data: Any) -> shape.Declared:
 
 
 UNKNOWNS = "unknowns"
-"""Axis of a study that declares unknowns: whether its boards have the stated values or drawn ones."""
+"""Axis of a study with unknowns: whether its boards have the stated values or drawn ones."""
 STATED = "stated"
 DRAWN = "drawn"
 MAIN = "main"  # The set-up of an experiment without axes other than the number of frames

@@ -21,7 +21,7 @@ from harness.experiment.schema import (
     declared_of,
     point_of,
 )
-from harness.experiment.unknowns import UnknownConfig, is_same_fact
+from harness.experiment.unknowns import is_same_fact
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import (
@@ -488,9 +488,7 @@ def _drafts(
             texts[id(setting)] = setting.name or f"{names[setting.path]}={value}"
     chosen = list(product(*axes))
     if config.unknowns and config.study is None:
-        chosen = [
-            (*drawn, *settings) for drawn in _drawn_settings(config) for settings in chosen
-        ]
+        chosen = [(*drawn, *settings) for drawn in _drawn_settings(config) for settings in chosen]
         for drawn in chosen:
             for setting in drawn:
                 value = value_text(setting.path, setting.value)

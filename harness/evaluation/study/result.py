@@ -416,12 +416,13 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
     damages in view."""
     damage = _damage_words(facts)
     conditions = [damage] if damage else []
-    sweep = facts.get("sweep") or {}
+    varied_paths = [*(facts.get("sweep") or {})]
+    varied_paths += [unknown["key"] for unknown in facts.get("unknowns") or ()]
     has_threshold = False
     for path, words in CONDITIONS:
         value = _value_at(facts, path)
         is_threshold = path.startswith("threshold")
-        varied = any(path.startswith(axis) for axis in sweep)
+        varied = any(path.startswith(varied_path) for varied_path in varied_paths)
         if value is None or varied or (is_threshold and has_threshold):
             continue
         text = words.format(camera_title(value) if isinstance(value, str) else value)
