@@ -371,6 +371,10 @@ class Experiment:
             points if self.config.study is None else [self.config.study.to_data(), *points]
         )
 
+    def at_stated_values(self) -> Experiment:
+        """Return the experiment without the set-ups whose unknowns are drawn."""
+        return replace(self, points=tuple(point for point in self.points if not point.unknowns))
+
     def folder(self, results: Path) -> Path:
         """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads
         out of it."""

@@ -36,6 +36,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json, random_stream
 from harness.vocabulary.words import nearest
+from scenes.sensor.camera import camera_of
 
 OPTION = "--set"
 NOT_VARIED = ("sweep", "sensitivity", "unknowns")  # Keys that hold dotted paths themselves
@@ -223,14 +224,18 @@ def unfolded(
         if isinstance(values, list) and values
     ]
     variations = list(_written_variations(source.data))
+    unknowns = list(_written_unknowns(source.data))
     problems = [*_axis_problems(axes, source), *_variation_problems(variations, axes, source)]
+    for draft in {draft.settings[0].path: draft for draft in unknowns}.values():
+        position = source.place_of((*draft.named_at[:2], "key"))
+        problems += _path_problems(draft.settings[0].path, position, source, FIXED)
     switches, mistakes = (
         _switch_axis(config, source) if config is not None and config.switches else ([], [])
     )
     problems += mistakes
     for draft in (
         *(Draft(_label([s]), "", (s,), s.written_at) for axis in axes for s in axis),
-        *_written_unknowns(source.data),
+        *unknowns,
         *variations,
     ):
         if not any(
@@ -293,6 +298,17 @@ def source_of(point: Point, purpose: str, number: int) -> SimulatedSource:
         value = unknown.drawn(point.config.seed, purpose, number)
         data = set_path(data, key_path(unknown.key), value, declared_of(data))
     return SimulatedSource.from_data(data["source"])
+
+
+def stated_value(config: ExperimentConfig, key: str) -> Any:
+    """Return what an experiment states at a key, as plain data; of a number of the camera that it
+    does not replace, the camera file's."""
+    path = key_path(key)
+    stated = shape.get(config.to_data(), path)
+    if stated is None and path[: len(NUMBERS)] == NUMBERS:
+        facts = camera_of(config.simulated.camera).to_data()
+        stated = shape.get(facts, (*str(path[-1]).split("."), "value"))
+    return stated
 
 
 def _written_variations(data: Any) -> Iterator[Draft]:

@@ -60,7 +60,7 @@ def _draw_bar(axes: Axes, row: int, effect: UnknownEffect, most_mm: float) -> No
         ends = effect.intervals_mm[level]
         low_mm = min(ends.low, most_mm)
         high_mm = min(ends.high, most_mm)
-        axes.plot([low_mm, high_mm], [row + side * 0.12] * 2, color=GREY, lw=1.0)
+        axes.plot([low_mm, high_mm], [row + side * 0.2] * 2, color=GREY, lw=1.0)
         axes.annotate(
             plain(level_text(effect, level)),
             (sizes_mm[level], row),

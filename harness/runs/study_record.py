@@ -17,6 +17,7 @@ from harness.evaluation.study.record import (
     Unflawed,
 )
 from harness.experiment.schema import Experiment, Point, detector_version
+from harness.experiment.unfold import stated_value
 from harness.experiment.unknowns import UnknownConfig
 from harness.records.trials import ResultTables
 from harness.runs.jobs import Failure, Outcome
@@ -111,6 +112,7 @@ def _drawn(unknown: UnknownConfig, point: Point, group: Group) -> DrawnUnknown:
         drawn = [unknown.values.index(value) for value in drawn]
     return DrawnUnknown(
         key=unknown.key,
+        stated=stated_value(point.config, unknown.key),
         reason=unknown.reason,
         board=np.array(boards),
         level=np.array(drawn, float),

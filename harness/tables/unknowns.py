@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from harness.evaluation.study.limit import SetUpLimit
+from harness.evaluation.study.record import DrawnUnknown
 from harness.evaluation.study.result import SetUpResult, StudyResult
 from harness.evaluation.study.unknowns import UnknownEffect
 from harness.records.schema import Column, Estimate, Table
@@ -53,6 +54,15 @@ def level_text(effect: UnknownEffect, level: int) -> str:
 
 def _value_text(key: str, value: Any) -> str:
     return "none" if value is None else value_text(key, value)
+
+
+def stated_text(unknown: DrawnUnknown) -> str:
+    """Return the stated value in words; of a mapping, the keys that its values name."""
+    stated = unknown.stated
+    if isinstance(stated, dict):
+        named = [value for value in unknown.values or () if isinstance(value, dict)]
+        stated = {key: stated[key] for value in named for key in value if key in stated}
+    return _value_text(unknown.key, stated)
 
 
 def unknown_names(effects: Sequence[UnknownEffect]) -> dict[str, str]:
@@ -112,6 +122,15 @@ UNKNOWN_TABLE = Table(
             "whether an interval of that factor that allows for all pairs of values excludes 1",
             lambda beyond: "yes" if beyond else "no",
         ),
+        Column(
+            "stated",
+            "",
+            lambda row: stated_text(row.effect.unknown),
+            "value that the experiment states, in words",
+        ),
+        Column("variant", "", "limit.record.variant", "name of the set-up, without its frames"),
+        Column("frames", "", "limit.record.frames", "number of averaged frames"),
+        Column("detector", "", "limit.record.detector", "name of the detector"),
         Column("reason", "", "effect.unknown.reason", "reason for the values, by the experiment"),
     ),
     left=3,

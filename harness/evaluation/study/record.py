@@ -208,6 +208,8 @@ class DrawnUnknown:
     """The equally probable values; None for a range."""
     range: tuple[Real, Real] | None = None
     """Ends of the range; None for values."""
+    stated: Any = None
+    """What the experiment states, as plain data; None for nothing there."""
 
 
 @dataclass(frozen=True, eq=False)
