@@ -1,11 +1,10 @@
 """How far each unknown alone moves a90, from the boards of which each has unknowns of its own.
 
-One curve is fitted to all drawn boards: logit POD = b0 + b1 ln a + c x, where x (k,) codes the
-unknowns, each with mean 0 over its values. So every board tells of every unknown, and a90 at one
-value of an unknown is (logit 0.9 - b0 - c x) / b1 with the others at the middle of their effects:
-their average, not their stated values. Where hits say so, an unknown also changes the slope
-(a surface far behind a hole makes the curve flat as well as late). Intervals are percentiles over
-resampled boards.
+One model is fitted to all drawn boards: logit POD = (ln a - mu) / s, where mu and ln s are linear
+in the unknowns, each coded with mean 0 over its values. So every board tells of every unknown; an
+unknown multiplies a50 by a factor, and the width of the curve by another. a90 at one value of an
+unknown has the others at the middle of their effects: their average, not their stated values. Weak
+priors keep what hardly any board tells finite. Intervals are percentiles over resampled boards.
 
 Not modelled: interactions (blur may matter more where nothing stands behind), and effects that
 are not linear over a range, of which a monotone one is still seen."""
@@ -16,23 +15,23 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from harness.evaluation.intervals import CONFIDENCE, Interval, percentiles
-from harness.evaluation.pod.curve import HitsAndMisses, link_ppf, maxima
+from harness.evaluation.pod.curve import ascend, link_ppf, logs_of_link, slopes_of_link
 from harness.evaluation.pod.statement import POD
 from harness.evaluation.study.boards import DRAWS, Targets, targets_of, weights_in_blocks
 from harness.evaluation.study.record import DrawnUnknown, SetUpRecord
 
 LINK = "logit"
-LEVEL = 0.05
-"""An unknown has a slope of its own below this p-value, over the number of unknowns."""
-WEAK = 0.1
-"""Size of a column in its pseudo-observation, which is half a hit: a prior of standard deviation
-2 / 0.1 = 20 for a coefficient, which keeps those of separated data finite. A backing 1 m away
-instead of 20 mm moves the logit by some 9."""
+SHIFT = 1.0
+"""Standard deviation of the prior of what an unknown adds to mu: a factor of 2.7 of a50."""
+WIDTH = 0.5
+"""Standard deviation of the prior of what an unknown adds to ln s, and of ln s about its usual
+value. Curves of through-holes have widths of 0.05 (backing 20 mm) to 0.1 (1 m), a factor of two."""
+USUAL_WIDTH = float(np.log(0.1))
+"""ln s of a usual curve."""
 LEAST_BOARDS = 3
-"""Fewest boards for each coefficient."""
+"""Fewest boards for each coefficient of mu."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class UnknownEffect:
     levels: tuple[Any, ...]
     """Its values (m,), or the ends of its range."""
     a90_mm: np.ndarray
-    """a90 (m,) at each of them, averaged over the other unknowns; infinite if none."""
+    """a90 (m,) at each of them, averaged over the other unknowns."""
     intervals_mm: tuple[Interval, ...]
     """95 % interval (m,) of each of these over boards."""
     least: int
@@ -54,7 +53,7 @@ class UnknownEffect:
     factor: float
     """The largest a90 over the smallest."""
     factor_interval: Interval
-    """95 % interval of that ratio over boards; it can lie below 1."""
+    """95 % interval over boards of the ratio of these two, whose lower end may lie below 1."""
     beyond_chance: bool
     """True if its interval excludes 1 at a confidence that allows for all pairs of levels."""
 
@@ -91,35 +90,6 @@ class _Coded:
     """Codes (n, k) of the targets."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Curves (d,) of targets and unknowns."""
-
-    b: np.ndarray
-    """Coefficients (d, p)."""
-    shift: Sequence[np.ndarray]
-    """Of each unknown, its coefficients (d, k)."""
-    turn: Sequence[np.ndarray]
-    """Of each unknown, the coefficients (d, k) of its columns times z; 0 without a slope of its
-    own."""
-    middle: float
-    """Mean of ln a."""
-    spread: float
-    """Standard deviation of ln a."""
-
-    def a90_mm(self, codes: dict[int, np.ndarray]) -> np.ndarray:
-        """Return a90 (d,) at these codes (k,) of unknowns, by number, and the others at 0."""
-        level = float(link_ppf(LINK, np.array(POD)))
-        rise = level - self.b[:, 0]
-        slope = self.b[:, 1]
-        for number, code in codes.items():
-            rise = rise - self.shift[number] @ code
-            slope = slope + self.turn[number] @ code
-        with np.errstate(all="ignore"):
-            size_mm = np.exp(self.middle + self.spread * rise / slope)
-        return np.where(slope > 0, size_mm, np.inf)
-
-
 def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | None:
     """Return what the unknowns of a set-up do to a90; None for a set-up that draws none.
     Deterministic."""
@@ -130,17 +100,23 @@ def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | Non
     coded = [_coded(unknown, targets.board) for unknown in record.drawn]
     if why := _no_effects(targets, coded):
         return OverUnknowns((), np.nan, np.nan, why)
-    sloped = _with_own_slope(targets, coded)
-    one = np.ones((1, len(targets.board)))
-    fit = _fitted(targets, coded, sloped, one)
+    design = np.hstack([np.ones((len(targets.board), 1)), *(of.columns for of in coded)])
+    once = np.ones((1, len(targets.board)))
+    fitted = _fitted(targets, design, once, None)
     redrawn = []
     for (weights,) in weights_in_blocks(draws, (targets.board, "damaged")):
-        redrawn.append(_fitted(targets, coded, sloped, weights))
+        redrawn.append(_fitted(targets, design, weights, fitted))
+    drawn = np.concatenate(redrawn)
     pairs = sum(len(of.levels) * (len(of.levels) - 1) // 2 for of in coded)
     effects = []
-    for number, of in enumerate(coded):
-        effects.append(_effect(of, number, fit, redrawn, pairs))
-    lowest_mm, highest_mm = _range_mm(fit, coded, effects)
+    first = 1
+    for of in coded:
+        rows = np.zeros((len(of.levels), design.shape[1]))
+        rows[:, first : first + of.codes.shape[1]] = of.codes
+        rows[:, 0] = 1.0
+        first += of.codes.shape[1]
+        effects.append(_effect(of, _a90_mm(fitted, rows), _a90_mm(drawn, rows), pairs))
+    lowest_mm, highest_mm = _range_mm(fitted, coded, effects)
     effects.sort(key=lambda effect: -effect.factor)
     return OverUnknowns(tuple(effects), lowest_mm, highest_mm)
 
@@ -165,111 +141,95 @@ def _no_effects(targets: Targets, coded: Sequence[_Coded]) -> str:
         return "all damages had the same outcome"
     if np.ptp(targets.size_mm) == 0:
         return "the size does not vary"
-    coefficients = 2 + sum(of.codes.shape[1] for of in coded)
+    columns = 1 + sum(of.codes.shape[1] for of in coded)
     boards = len(np.unique(targets.board))
-    if boards < LEAST_BOARDS * coefficients:
-        needed = LEAST_BOARDS * coefficients
+    if boards < LEAST_BOARDS * columns:
+        needed = LEAST_BOARDS * columns
         return f"{boards} boards are too few to tell the unknowns apart; {needed} are needed"
     return ""
 
 
-def _with_own_slope(targets: Targets, coded: Sequence[_Coded]) -> list[int]:
-    """Return the numbers of the unknowns that change the slope, by likelihood ratio."""
-    repeats = float(targets.inspections.mean())
-    one = np.ones((1, len(targets.board)))
-    data, start = _data(targets, coded, [], one)
-    plain = float(data.value(maxima(data, start))[0])
-    sloped = []
-    for number, of in enumerate(coded):
-        data, start = _data(targets, coded, [number], one)
-        ratio = 2 * (float(data.value(maxima(data, start))[0]) - plain) / repeats
-        if chi2.sf(ratio, of.codes.shape[1]) < LEVEL / len(coded):
-            sloped.append(number)
-    return sloped
-
-
-def _data(
-    targets: Targets, coded: Sequence[_Coded], sloped: Sequence[int], weights: np.ndarray
-) -> tuple[HitsAndMisses, np.ndarray]:
-    """Return the likelihood of targets with ``weights`` (d, n), and the start of a search. A
-    pseudo-observation of half a hit and half a miss, with all else 0, stands for each column but
-    the constant."""
-    log_size = np.log(targets.size_mm)
-    z = (log_size - log_size.mean()) / log_size.std()
-    columns = [np.ones_like(z)[:, None], z[:, None]]
-    columns += [of.columns for of in coded]
-    columns += [coded[number].columns * z[:, None] for number in sloped]
-    design = np.hstack(columns)
-    weak = WEAK * np.eye(design.shape[1])[1:]
-    half = np.full((len(weights), len(weak)), 0.5)
-    misses = targets.inspections - targets.hits
-    data = HitsAndMisses(
-        design=np.vstack([design, weak]),
-        hits=np.hstack([weights * targets.hits, half]),
-        misses=np.hstack([weights * misses, half]),
-        link=LINK,
-    )
-    start = np.zeros(design.shape[1])
-    start[1] = 1.0
-    return data, start
-
-
 def _fitted(
-    targets: Targets, coded: Sequence[_Coded], sloped: Sequence[int], weights: np.ndarray
-) -> _Fit:
-    """Fit the curves of targets with ``weights`` (d, n)."""
-    data, start = _data(targets, coded, sloped, weights)
-    b = maxima(data, start)
-    shift = []
-    column = 2
-    for of in coded:
-        shift.append(b[:, column : column + of.codes.shape[1]])
-        column += of.codes.shape[1]
-    turn = [np.zeros_like(part) for part in shift]
-    for number in sloped:
-        width = coded[number].codes.shape[1]
-        turn[number] = b[:, column : column + width]
-        column += width
+    targets: Targets, design: np.ndarray, weights: np.ndarray, start: np.ndarray | None
+) -> np.ndarray:
+    """Return the likeliest middles and widths (d, 2 k) of targets with ``weights`` (d, n), given
+    the columns (n, k) of their unknowns: coefficients of mu, then of ln s. ``start``: those of all
+    targets (1, 2 k), from which the search begins."""
     log_size = np.log(targets.size_mm)
-    return _Fit(b, shift, turn, float(log_size.mean()), float(log_size.std()))
+    hits = weights * targets.hits
+    misses = weights * (targets.inspections - targets.hits)
+    columns = design.shape[1]
+    expected = np.zeros(2 * columns)
+    expected[columns] = USUAL_WIDTH
+    precision = np.full(2 * columns, 1 / SHIFT**2)
+    precision[0] = 0.0
+    precision[columns:] = 1 / WIDTH**2
+
+    def climb(b: np.ndarray, studies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return log-posteriors and scoring steps at b (d, 2 k), for `ascend`."""
+        shrunk = np.exp(-b[:, columns:] @ design.T)
+        predictor = (log_size - b[:, :columns] @ design.T) * shrunk
+        log_hit, log_miss, _ = logs_of_link(LINK, predictor)
+        value = (hits[studies] * log_hit + misses[studies] * log_miss).sum(axis=1)
+        value = value - 0.5 * (b - expected) ** 2 @ precision
+        up, down, _ = slopes_of_link(LINK, predictor)
+        residual = hits[studies] * up - misses[studies] * down
+        weight = (hits[studies] + misses[studies]) * up * down
+        slopes = np.concatenate(
+            [-shrunk[:, :, None] * design, -predictor[:, :, None] * design], axis=2
+        )
+        gradient = (residual[:, None, :] @ slopes)[:, 0] - precision * (b - expected)
+        information = slopes.transpose(0, 2, 1) @ (weight[:, :, None] * slopes)
+        information = information + np.diag(precision)
+        return value, np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+
+    if start is None:
+        start = expected[None].copy()
+        start[0, 0] = log_size.mean()
+        start[0, columns] = 0.0  # wide: every target tells something
+    begin = np.repeat(start, len(weights), axis=0)
+    fitted, _ = ascend(climb, begin, 1e-5)
+    return fitted
 
 
-def _effect(
-    of: _Coded, number: int, fit: _Fit, redrawn: Sequence[_Fit], pairs: int
-) -> UnknownEffect:
-    """Return the effect of the unknown of this number, one of several with so many ``pairs`` of
-    levels."""
-    a90_mm = []
-    draws_mm = []
-    for code in of.codes:
-        a90_mm.append(fit.a90_mm({number: code})[0])
-        draws_mm.append(np.concatenate([part.a90_mm({number: code}) for part in redrawn]))
-    least = int(np.argmin(a90_mm))
-    most = int(np.argmax(a90_mm))
-    with np.errstate(invalid="ignore"):
-        factor = float(np.divide(a90_mm[most], a90_mm[least]))
-        factors = draws_mm[most] / draws_mm[least]
+def _a90_mm(fitted: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return a90 (m, d) of fits (d, 2 k) at rows (m, k) of the design."""
+    columns = rows.shape[1]
+    middle = rows @ fitted[:, :columns].T
+    width = np.exp(rows @ fitted[:, columns:].T)
+    return np.asarray(np.exp(middle + width * float(link_ppf(LINK, np.array(POD)))))
+
+
+def _effect(of: _Coded, a90_mm: np.ndarray, draws_mm: np.ndarray, pairs: int) -> UnknownEffect:
+    """Return the effect of an unknown from a90 (m, 1) at its levels, and that of resampled boards
+    (m, draws); all unknowns together have so many ``pairs`` of levels."""
+    sizes_mm = a90_mm[:, 0]
+    least = int(np.argmin(sizes_mm))
+    most = int(np.argmax(sizes_mm))
+    factors = draws_mm[most] / draws_mm[least]
     cautious = percentiles(factors, 1 - (1 - CONFIDENCE) / pairs)
     return UnknownEffect(
         unknown=of.unknown,
         levels=of.levels,
-        a90_mm=np.array(a90_mm),
+        a90_mm=sizes_mm,
         intervals_mm=tuple(percentiles(draws) for draws in draws_mm),
         least=least,
         most=most,
-        factor=factor if least != most else 1.0,
+        factor=float(sizes_mm[most] / sizes_mm[least]),
         factor_interval=percentiles(factors),
         beyond_chance=cautious.above(1.0),
     )
 
 
 def _range_mm(
-    fit: _Fit, coded: Sequence[_Coded], effects: Sequence[UnknownEffect]
+    fitted: np.ndarray, coded: Sequence[_Coded], effects: Sequence[UnknownEffect]
 ) -> tuple[float, float]:
     """Return the smallest and largest a90 over all levels of the unknowns that move it beyond
     chance."""
-    deciding = [number for number, effect in enumerate(effects) if effect.beyond_chance]
-    sizes_mm = []
-    for codes in product(*(coded[number].codes for number in deciding)):
-        sizes_mm.append(float(fit.a90_mm(dict(zip(deciding, codes, strict=True)))[0]))
-    return min(sizes_mm), max(sizes_mm)
+    choices = []
+    for of, effect in zip(coded, effects, strict=True):
+        no_shift = np.zeros((1, of.codes.shape[1]))
+        choices.append(of.codes if effect.beyond_chance else no_shift)
+    rows = [np.concatenate([[1.0], *codes]) for codes in product(*choices)]
+    sizes_mm = _a90_mm(fitted, np.array(rows))
+    return float(sizes_mm.min()), float(sizes_mm.max())
