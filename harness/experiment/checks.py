@@ -17,6 +17,7 @@ from harness.experiment.schema import (
     recording_of,
     splices_of,
 )
+from harness.experiment.unknowns import is_same_fact
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
@@ -63,7 +64,21 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
             problems += check(config, config.source, source)
     else:
         problems += _capture_problems(config, config.source, source)
-    return config, [*problems, *_study_problems(config, source)]
+    return config, [*problems, *_study_problems(config, source), *_unknown_problems(config, source)]
+
+
+def _unknown_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
+    """Find unknowns that nothing draws, and two unknowns of one fact."""
+    if config.unknowns and config.study is None and config.draws is None:
+        fix = "add draws: 100, or make it a study of a family of boards"
+        yield Problem("nothing draws the unknowns", source.key_place_of(("unknowns",)), fix=fix)
+    for first, second in combinations(range(len(config.unknowns)), 2):
+        key = config.unknowns[first].key
+        other_key = config.unknowns[second].key
+        if is_same_fact(key, other_key):
+            message = f"the unknowns `{key}` and `{other_key}` set the same fact"
+            position = source.place_of(("unknowns", second, "key"))
+            yield Problem(message, position, fix="declare only one of them")
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:

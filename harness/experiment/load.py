@@ -10,6 +10,7 @@ from typing import Any
 from harness.experiment import checks
 from harness.experiment.schema import (
     DETECTOR_SETTINGS,
+    UNKNOWNS,
     Experiment,
     ValuesVariation,
     declared_of,
@@ -46,7 +47,7 @@ def load_experiment(
     """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises
     DeclarationError with all problems. The lens of a recording ``calibration`` replaces the camera
     file's nominal lens (`lens_numbers`). ``quick`` reduces repeats and boards and drops the
-    sensitivity study; ``overrides`` take precedence."""
+    sensitivity study and a study's unknowns; ``overrides`` take precedence."""
     recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
@@ -81,10 +82,13 @@ def load_experiment(
 
 def _quick(data: Any) -> list[str]:
     """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no
-    sensitivity."""
+    sensitivity, and no unknowns of a study."""
     title = shape.get(data, ("title",)) or shape.get(data, ("name",))
     overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
+    # a third of the boards is too few to tell unknowns apart
+    has_both = shape.get(data, ("study",)) and shape.get(data, (UNKNOWNS,))
+    overrides += [f"{UNKNOWNS}=[]"] if has_both else []
     calibration_path = "threshold.calibrate"
     for path in (
         "repeats",

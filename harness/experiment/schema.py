@@ -8,7 +8,7 @@ trials unchanged."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -19,6 +19,7 @@ from detectors import DETECTORS, detector_names, detector_type
 from detectors.averages.average import AverageConfig
 from detectors.averages.flat_field import FlatFieldConfig
 from detectors.views.mapping.settings import MappingConfig
+from harness.experiment.unknowns import UnknownConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import Source
@@ -250,7 +251,15 @@ class ExperimentConfig(Config):
     draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
         None,
         description=(
-            "number of set-ups of the sweep to run, drawn at random without duplicates; null: all"
+            "number of set-ups of the sweep to run, drawn at random without duplicates (null: "
+            "all); with unknowns, the number of their draws, each with all set-ups of the sweep"
+        ),
+    )
+    unknowns: Annotated[tuple[UnknownConfig, ...], Field(max_length=20)] = Field(
+        (),
+        description=(
+            "facts that nobody has measured; a study draws them for each board, "
+            "any other experiment for each of its draws"
         ),
     )
     switches: DottedPath | None = Field(
@@ -287,8 +296,22 @@ def declared_of(data: Any) -> shape.Declared:
     return shape.Declared(ExperimentConfig, data, splices_of(data))
 
 
+UNKNOWNS = "unknowns"
+"""Axis of a study with unknowns: whether its boards have the stated values or drawn ones."""
+STATED = "stated"
+DRAWN = "drawn"
 MAIN = "main"  # The set-up of an experiment without axes other than the number of frames
-NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches", "sensitivity")
+NO_NUMBERS = (
+    "name",
+    "title",
+    "repeats",
+    "study",
+    "sweep",
+    "draws",
+    "unknowns",
+    "switches",
+    "sensitivity",
+)
 """Keys that determine which trials run, but not the result of any trial."""
 
 
@@ -298,7 +321,7 @@ class Point:
     point. ``variant`` labels its set-up or variation, ``label`` the point. ``axes`` holds the
     values of all axes but the number of frames. ``reference`` is the set-up with the same ``axes``
     that a variation varies ("" for none), else the point's own. ``digest`` identifies the point's
-    results, ``frames_key`` those of its frames."""
+    results, ``frames_key`` those of its frames. ``unknowns`` are drawn for each of its boards."""
 
     label: str
     variant: str
@@ -309,6 +332,21 @@ class Point:
     axes: Mapping[str, Any] = field(default_factory=dict)
     is_variation: bool = False
     reference: str = MAIN
+    unknowns: tuple[UnknownConfig, ...] = ()
+
+    def with_unknowns(self, unknowns: tuple[UnknownConfig, ...], variant: str) -> Point:
+        """Return the point whose boards differ in these unknowns, under another name."""
+        drawn = [[unknown.key, unknown.to_data()["values"], unknown.range] for unknown in unknowns]
+        return replace(
+            self,
+            label=f"{self.label}, {UNKNOWNS}={DRAWN}",
+            variant=variant,
+            digest=digest([self.digest, drawn]),
+            frames_key=digest([self.frames_key, drawn]),
+            axes={**self.axes, UNKNOWNS: DRAWN},
+            reference=variant,
+            unknowns=unknowns,
+        )
 
 
 @dataclass(frozen=True)
@@ -332,6 +370,10 @@ class Experiment:
         return digest(
             points if self.config.study is None else [self.config.study.to_data(), *points]
         )
+
+    def at_stated_values(self) -> Experiment:
+        """Return the experiment without the set-ups whose unknowns are drawn."""
+        return replace(self, points=tuple(point for point in self.points if not point.unknowns))
 
     def folder(self, results: Path) -> Path:
         """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads

@@ -10,7 +10,18 @@ from math import prod
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.schema import MAIN, ExperimentConfig, Point, declared_of, point_of
+from harness.experiment.schema import (
+    DRAWN,
+    MAIN,
+    STATED,
+    UNKNOWNS,
+    ExperimentConfig,
+    Point,
+    SimulatedSource,
+    declared_of,
+    point_of,
+)
+from harness.experiment.unknowns import is_same_fact
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted, shown, unknown_key
 from harness.vocabulary.declaration.yaml_source import (
@@ -25,9 +36,12 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
 from harness.vocabulary.seeds import canonical_json, random_stream
 from harness.vocabulary.words import nearest
+from scenes.sensor.camera import camera_of
 
 OPTION = "--set"
-NOT_VARIED = ("sweep", "sensitivity")  # Keys that hold dotted paths themselves
+NOT_VARIED = ("sweep", "sensitivity", "unknowns")  # Keys that hold dotted paths themselves
+NUMBERS = ("source", "camera", "numbers")
+"""Path of a mapping whose keys have dots, such as ``scatter.blur_px``."""
 
 
 class PathError(UserError):
@@ -35,11 +49,14 @@ class PathError(UserError):
 
 
 def key_path(text: str) -> KeyPath:
-    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the
-    file."""
+    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` or after
+    ``source.camera.numbers.`` is a single key, as in the file."""
     head, _, inner = text.partition(".")
     if head == "sweep" and inner:
         return (head, inner)
+    before_number, _, number = text.partition(".".join(NUMBERS) + ".")
+    if number and not before_number:
+        return (*NUMBERS, number)
     return tuple(
         int(part) if part.isascii() and part.isdigit() else part for part in text.split(".")
     )
@@ -165,6 +182,7 @@ FIXED = (
     "study",
     "sweep",
     "draws",
+    UNKNOWNS,
     SWITCHES,
     "sensitivity",
 )  # the same for all points
@@ -206,13 +224,18 @@ def unfolded(
         if isinstance(values, list) and values
     ]
     variations = list(_written_variations(source.data))
+    unknowns = list(_written_unknowns(source.data))
     problems = [*_axis_problems(axes, source), *_variation_problems(variations, axes, source)]
+    for draft in {draft.settings[0].path: draft for draft in unknowns}.values():
+        position = source.place_of((*draft.named_at[:2], "key"))
+        problems += _path_problems(draft.settings[0].path, position, source, FIXED)
     switches, mistakes = (
         _switch_axis(config, source) if config is not None and config.switches else ([], [])
     )
     problems += mistakes
     for draft in (
         *(Draft(_label([s]), "", (s,), s.written_at) for axis in axes for s in axis),
+        *unknowns,
         *variations,
     ):
         if not any(
@@ -225,7 +248,67 @@ def unfolded(
         return (), problems
     axes = [switches, *axes] if switches else axes
     telling = [axis[0].path for axis in axes if len(axis) > 1 and axis[0].path != FRAMES]
-    return _points([*_drafts(axes, telling, variations, config)], telling, config, source)
+    if config.study is None:
+        telling = [unknown.key for unknown in config.unknowns] + telling
+    drafts = [*_drafts(axes, telling, variations, config)]
+    points, problems = _points(drafts, telling, config, source)
+    if config.study is not None and config.unknowns:
+        points = tuple(_stated_and_drawn(points, config))
+    return points, problems
+
+
+def _written_unknowns(data: Any) -> Iterator[Draft]:
+    """Yield a draft for each value of an unknown, or each end of its range, as the file states
+    them."""
+    unknowns = shape.child(data, UNKNOWNS)
+    for index, unknown in enumerate(unknowns if isinstance(unknowns, list) else ()):
+        key = shape.child(unknown, "key")
+        for name in ("values", "range"):
+            levels = shape.child(unknown, name)
+            if not isinstance(key, str) or not isinstance(levels, list):
+                continue
+            for number, level in enumerate(levels):
+                setting = Setting(key, level, (UNKNOWNS, index, name, number))
+                yield Draft(_label([setting]), "", (setting,), setting.written_at)
+
+
+def _stated_and_drawn(points: Sequence[Point], config: ExperimentConfig) -> Iterator[Point]:
+    """Yield the points of a study, and each of them again with its unknowns drawn for each board.
+    An unknown that an axis sets is not drawn."""
+    unknowns = tuple(
+        unknown
+        for unknown in config.unknowns
+        if not any(is_same_fact(unknown.key, axis) for axis in config.sweep)
+    )
+    for point in points:
+        yield replace(point, axes={**point.axes, UNKNOWNS: STATED})
+    for point in points if unknowns else ():
+        name = f"{UNKNOWNS}={DRAWN}"
+        variant = name if point.variant == MAIN else f"{point.variant}, {name}"
+        yield point.with_unknowns(unknowns, variant)
+
+
+def source_of(point: Point, purpose: str, number: int) -> SimulatedSource:
+    """Return the source that shows the board of a purpose and number, with the unknowns that are
+    drawn for it."""
+    if not point.unknowns:
+        return point.config.simulated
+    data = point.config.to_data()
+    for unknown in point.unknowns:
+        value = unknown.drawn(point.config.seed, purpose, number)
+        data = set_path(data, key_path(unknown.key), value, declared_of(data))
+    return SimulatedSource.from_data(data["source"])
+
+
+def stated_value(config: ExperimentConfig, key: str) -> Any:
+    """Return what an experiment states at a key, as plain data; of a number of the camera that it
+    does not replace, the camera file's."""
+    path = key_path(key)
+    stated = shape.get(config.to_data(), path)
+    if stated is None and path[: len(NUMBERS)] == NUMBERS:
+        facts = camera_of(config.simulated.camera).to_data()
+        stated = shape.get(facts, (*str(path[-1]).split("."), "value"))
+    return stated
 
 
 def _written_variations(data: Any) -> Iterator[Draft]:
@@ -420,7 +503,13 @@ def _drafts(
             )
             texts[id(setting)] = setting.name or f"{names[setting.path]}={value}"
     chosen = list(product(*axes))
-    if config.draws is not None:
+    if config.unknowns and config.study is None:
+        chosen = [(*drawn, *settings) for drawn in _drawn_settings(config) for settings in chosen]
+        for drawn in chosen:
+            for setting in drawn:
+                value = value_text(setting.path, setting.value)
+                texts.setdefault(id(setting), f"{names.get(setting.path)}={value}")
+    elif config.draws is not None:
         groups: dict[str, list[tuple[Setting, ...]]] = {}
         for settings in chosen:
             groups.setdefault(_label(s for s in settings if s.path != FRAMES), []).append(settings)
@@ -443,6 +532,17 @@ def _drafts(
             label = f"{variation.label}, {FRAMES}={frames.value}"
             settings = (frames, *variation.settings)
             yield replace(variation, label=label, variant=variation.label, settings=settings)
+
+
+def _drawn_settings(config: ExperimentConfig) -> Iterator[tuple[Setting, ...]]:
+    """Yield the settings of each draw of the unknowns."""
+    for number in range(config.draws or 0):
+        settings = []
+        for index, unknown in enumerate(config.unknowns):
+            value = unknown.drawn(config.seed, "set-up", number)
+            value = json.loads(json.dumps(value))  # lists, as in the file
+            settings.append(Setting(unknown.key, value, (UNKNOWNS, index)))
+        yield tuple(settings)
 
 
 def _points(

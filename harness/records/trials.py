@@ -495,6 +495,10 @@ POSTERIOR = Table(
             note="mean probability of the thesis' exact result with 1 and 50 frames",
         ),
         Column("posterior_share", "posterior", note="posterior probability"),
+        *_columns(
+            posterior_low="lower end of its 95 % interval over set-ups; empty for a set-up",
+            posterior_high="upper end of that interval",
+        ),
     ),
     formats=("csv",),
     left=2,

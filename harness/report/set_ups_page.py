@@ -184,8 +184,11 @@ class Layout:
 
 def _rows_of(set_ups: pd.DataFrame, paths: Sequence[str]) -> dict[str, list[str]]:
     """Return the set-ups that agree on all ``paths``, by the values as text."""
-    # a column that is empty for variations holds no integers
-    columns = [set_ups[path].convert_dtypes().tolist() for path in paths]
+    columns = []
+    for path in paths:
+        # a column that is empty for variations holds no integers; a fact may be null
+        column = set_ups[path].convert_dtypes().astype(object)
+        columns.append(column.where(column.notna(), None).tolist())
     rows: dict[str, list[str]] = {}
     for variant, *values in zip(set_ups["variant"], *columns, strict=True):
         settings = zip(paths, values, strict=True)

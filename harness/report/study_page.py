@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from harness.evaluation.study.result import SetUpResult, StudyResult
 from harness.evaluation.study.surface import depth_varies
 from harness.records.examples import StudyExample
@@ -20,6 +22,7 @@ from harness.report.study_figures import (
     overlay_figure,
     with_room,
 )
+from harness.report.tornado import tornado_figure
 from harness.tables import study
 from harness.tables.limits import (
     is_within_sizes,
@@ -27,6 +30,14 @@ from harness.tables.limits import (
     limits_grid,
     name_of,
     study_answer,
+)
+from harness.tables.unknowns import (
+    UNKNOWN_TABLE,
+    stated_of,
+    undetermined,
+    unknown_headline,
+    unknown_rows,
+    unknown_sentences,
 )
 from harness.vocabulary.text import Grid, unbroken
 
@@ -39,7 +50,17 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     notes = limit_notes(result.limits)
     if notes:
         parts += ["", *notes]
-    return [*parts, "", study_answer(result.limits)]
+    headline = unknown_headline(result)
+    others = [text for text in unknown_sentences(result) if text != headline]
+    parts += ["", *others] if others else []
+    return [*parts, "", _answer(result)]
+
+
+def _answer(result: StudyResult) -> str:
+    """Return the answer at the stated values and, of a study with unknowns, before it the range of
+    the best set-up over them."""
+    stated = [limit for limit in result.limits if not limit.record.drawn]
+    return f"{unknown_headline(result)} {study_answer(stated)}".strip()
 
 
 def study_html(
@@ -58,6 +79,7 @@ def study_html(
     shown = with_room(result.set_ups)
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
     figures |= _curves(shown)
+    figures |= _tornadoes(result)
     pictures = _pictures(shown, list(examples))
     figures |= {name: picture for name, (_, picture) in pictures.items()}
     warnings = [unbroken(text) for text in study.threshold_warnings(limits)]
@@ -67,7 +89,7 @@ def study_html(
 
     return template("study.html").render(
         title=title,
-        answer=unbroken(study_answer(limits)),
+        answer=unbroken(_answer(result)),
         conditions=result.conditions,
         rule=(
             f"Fixed in advance: a damage is found {result.record.hit_rule}, and no finding counts"
@@ -78,6 +100,7 @@ def study_html(
         set_ups=len(limits),
         most_curves=MOST_CURVES,
         scene=scene_svg(result.facts),
+        unknowns=_unknown_parts(result),
         axes=[_axis_part(name, group) for name, group in groups.items()],
         has_depths=any(
             inspected.limit_of != "depth" and depth_varies(inspected.depth_mm)
@@ -93,6 +116,7 @@ def study_html(
         operating=table(study.OPERATING),
         operating_notes=study.operating_notes(result.set_ups),
         examples=[(head, name) for name, (head, _) in pictures.items()],
+        undetermined=undetermined(result.facts),
         validity=result.validity,
         figures=figures,
         closing=joined(closing(provenance, resolved_yaml)),
@@ -132,6 +156,41 @@ def _pictures(
             by_limit = is_within_sizes(set_up.limit)
             pictures[name] = (head, examples_figure(name, of_set_up, head, by_limit=by_limit))
     return pictures
+
+
+def _tornadoes(result: StudyResult) -> dict[str, str]:
+    """Return the tornado chart of each set-up that has one, by the figure's name."""
+    figures: dict[str, str] = {}
+    for set_up in result.set_ups:
+        if set_up.unknowns is None or set_up.unknowns.why:
+            continue
+        name = f"tornado-{len(figures) + 1}"
+        stated = stated_of(result, set_up.limit)
+        stated_mm = np.nan if stated is None else stated.a90_mm
+        figures[name] = tornado_figure(name, set_up, stated_mm)
+    return figures
+
+
+def _unknown_parts(result: StudyResult) -> list[dict[str, Any]]:
+    """Return what the template shows of each set-up that draws unknowns: heading, sentence, figure
+    and table."""
+    parts: list[dict[str, Any]] = []
+    charts = 0
+    for set_up in result.set_ups:
+        if set_up.unknowns is None:
+            continue
+        rows = unknown_rows([set_up])
+        charts += bool(rows)
+        parts.append(
+            {
+                "title": name_of(set_up.limit),
+                "figure": f"tornado-{charts}" if rows else "",
+                "table": UNKNOWN_TABLE.grid(rows, heads={"set-up": ""}).html() if rows else None,
+            }
+        )
+    for part, sentence in zip(parts, unknown_sentences(result), strict=True):
+        part["sentence"] = unbroken(sentence)
+    return parts
 
 
 def _axis_part(name: str, group: study.AxisGroup) -> dict[str, Any]:

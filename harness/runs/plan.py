@@ -18,6 +18,7 @@ from typing import Any
 from detectors import DETECTORS
 from detectors.interface import Calibratable
 from harness.experiment.schema import Experiment, Point, SimulatedSource, StudyConfig
+from harness.experiment.unfold import source_of
 from harness.records.rows import Role
 from harness.runs.journal import JOURNAL_VERSION
 from harness.runs.shards import Shard
@@ -356,7 +357,7 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     config = points[0].config
     source = config.simulated
     if config.study is not None and isinstance(source.target, DrawnTargetConfig):
-        boards = _StudyBoards(source, source.target, config.study, config.seed, cache)
+        boards = _StudyBoards(points[0], config.study, cache)
         calibrate = config.threshold.calibrate
         calibrating = 0 if calibrate is None else calibrate.boards or 0
         learning = boards.batches("learning", LEARNING_BOARDS)
@@ -401,14 +402,10 @@ def _joined(role: Role, batches: Sequence[Batch]) -> Batch:
 class _StudyBoards:
     """Makes the batches of a study: one for each board."""
 
-    source: SimulatedSource
-    """The camera, its poses and the settings of renders."""
-    family: DrawnTargetConfig
-    """The family from which boards are drawn."""
+    point: Point
+    """The family of boards, the camera, and the unknowns that are drawn for each board."""
     study: StudyConfig
     """The number of units of the camera."""
-    seed: int
-    """Seed from which units are drawn."""
     cache: Path
     """The cache of renders."""
 
@@ -416,18 +413,21 @@ class _StudyBoards:
         """Return the batches of a role's first ``count`` boards."""
         batches = []
         for board in range(count):
-            target = _drawn(self.family, role, board)
-            units = self.units(role, board)
-            batches.append(batch_of(target, role, self.source, self.cache, board, units))
+            source = source_of(self.point, role, board)
+            assert isinstance(source.target, DrawnTargetConfig)
+            target = _drawn(source.target, role, board)
+            units = self._units(source.camera, role, board)
+            batches.append(batch_of(target, role, source, self.cache, board, units))
         return batches
 
-    def units(self, role: Role, board: int) -> tuple[CameraConfig, ...]:
+    def _units(self, camera: CameraConfig, role: Role, board: int) -> tuple[CameraConfig, ...]:
         """Return the units of the camera that inspect a board: all of the study's for a damaged
         board, one of its own for any other; none if the study does not draw units."""
         if not self.study.units:
             return ()
         numbers = range(self.study.units) if role == "damaged" else [board]
-        return tuple(unit_of(self.source.camera, self.seed, role, number) for number in numbers)
+        seed = self.point.config.seed
+        return tuple(unit_of(camera, seed, role, number) for number in numbers)
 
 
 # cameras, frames and detectors share boards

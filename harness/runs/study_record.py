@@ -5,16 +5,20 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from harness.evaluation.study.record import (
     Calibrated,
+    DrawnUnknown,
     Inspected,
     SetUpRecord,
     StudyRecord,
     Unflawed,
 )
 from harness.experiment.schema import Experiment, Point, detector_version
+from harness.experiment.unfold import stated_value
+from harness.experiment.unknowns import UnknownConfig
 from harness.records.trials import ResultTables
 from harness.runs.jobs import Failure, Outcome
 from harness.runs.plan import PACKAGES, Group, SweepPlan
@@ -96,6 +100,24 @@ def _set_up(
         frames_digest=digest(frames_decided_by),
         units=units,
         calibrated=_calibrated(calibrating),
+        drawn=tuple(_drawn(unknown, point, group) for unknown in point.unknowns),
+    )
+
+
+def _drawn(unknown: UnknownConfig, point: Point, group: Group) -> DrawnUnknown:
+    """Return an unknown with what each damaged board of a point has of it."""
+    boards = [batch.board or 0 for batch in group.then if batch.role == "damaged"]
+    drawn = [unknown.drawn(point.config.seed, "damaged", board) for board in boards]
+    if unknown.values is not None:
+        drawn = [unknown.values.index(value) for value in drawn]
+    return DrawnUnknown(
+        key=unknown.key,
+        stated=stated_value(point.config, unknown.key),
+        reason=unknown.reason,
+        board=np.array(boards),
+        level=np.array(drawn, float),
+        values=unknown.values,
+        range=unknown.range,
     )
 
 

@@ -24,6 +24,7 @@ from harness.tables.limits import (
     bound_text,
     name_of,
 )
+from harness.tables.unknowns import UNKNOWN_TABLE, unknown_rows
 from harness.vocabulary import text
 from harness.vocabulary.path_names import (
     camera_title,
@@ -465,7 +466,7 @@ DEPTH_LIMITS = Table(
         ),
     ),
 )
-STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
+STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS, UNKNOWN_TABLE)
 
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
@@ -479,4 +480,5 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
         OPERATING: list(set_ups),
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         DEPTH_LIMITS: depths_at(set_ups),
+        UNKNOWN_TABLE: unknown_rows(set_ups),
     }

@@ -192,6 +192,27 @@ class Calibrated:
 
 
 @dataclass(frozen=True, eq=False)
+class DrawnUnknown:
+    """A fact that nobody has measured, and what each damaged board had of it."""
+
+    __pydantic_config__ = FORM
+    key: Name
+    """Its dotted key in the experiment."""
+    reason: Name
+    """Reason for its values, by the experiment."""
+    board: Counts
+    """Board (b,)."""
+    level: Numbers
+    """The number (b,) that was drawn from the range, or the index of the value."""
+    values: tuple[Any, ...] | None = None
+    """The equally probable values; None for a range."""
+    range: tuple[Real, Real] | None = None
+    """Ends of the range; None for values."""
+    stated: Any = None
+    """What the experiment states, as plain data; None for nothing there."""
+
+
+@dataclass(frozen=True, eq=False)
 class SetUpRecord:
     """One set-up at one number of frames."""
 
@@ -229,6 +250,8 @@ class SetUpRecord:
     units: Annotated[Whole, Field(ge=1)] = 1
     """Number of units of the camera. If more than one, repeat r of a damaged board shows unit r
     modulo ``units``, and every other board has a unit of its own."""
+    drawn: tuple[Annotated[DrawnUnknown, AfterValidator(_one_table)], ...] = ()
+    """Unknowns that differ from board to board."""
 
     @property
     def label(self) -> str:

@@ -22,6 +22,7 @@ from harness.evaluation.study.curves import ChanceHits
 from harness.evaluation.study.limit import ALL_FOUND, SetUpLimit, limit_of
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.evaluation.study.surface import PodSurface, surface_of
+from harness.evaluation.study.unknowns import OverUnknowns, over_unknowns
 from harness.records.trials import ResultTables
 from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.seeds import canonical_json
@@ -415,12 +416,13 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
     damages in view."""
     damage = _damage_words(facts)
     conditions = [damage] if damage else []
-    sweep = facts.get("sweep") or {}
+    varied_paths = [*(facts.get("sweep") or {})]
+    varied_paths += [unknown["key"] for unknown in facts.get("unknowns") or ()]
     has_threshold = False
     for path, words in CONDITIONS:
         value = _value_at(facts, path)
         is_threshold = path.startswith("threshold")
-        varied = any(path.startswith(axis) for axis in sweep)
+        varied = any(path.startswith(varied_path) for varied_path in varied_paths)
         if value is None or varied or (is_threshold and has_threshold):
             continue
         text = words.format(camera_title(value) if isinstance(value, str) else value)
@@ -468,6 +470,8 @@ class SetUpResult:
     """POD over diameter and depth; None if there is none."""
     surface_why: str
     """Reason why there is no surface; else empty."""
+    unknowns: OverUnknowns | None = None
+    """What unknowns do to the limit; None if the set-up draws none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -549,6 +553,7 @@ def _set_up(
         pixels=curves.pixel_curves(tables.pixels),
         surface=surface,
         surface_why=why,
+        unknowns=over_unknowns(record, draws),
     )
 
 

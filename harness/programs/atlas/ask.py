@@ -269,6 +269,7 @@ def _answer(
             answer,
             ATLAS.grid(rows, heads=heads, terminal=True),
             _basis(rows, about),
+            *_assumed(kind, rows),
             *(f"not answered: {reason}" for reason in reasons),
             f"to compute the first row exactly: {exact}",
         ]
@@ -345,6 +346,19 @@ def _basis(rows: Sequence[Row], about: Mapping[str, Any]) -> str:
             f" {100 * max(errors):.0f} % (rms) at most"
         )
     return f"{text}."
+
+
+def _assumed(kind: str, rows: Sequence[Row]) -> list[str]:
+    """Say what the limits assume that nobody has measured, and how far that moves them, by the
+    study of unknowns that comes with tofpod."""
+    import pandas as pd
+
+    from harness.programs.atlas.assumptions import STORED_UNKNOWNS, assumed
+
+    table = pd.read_parquet(shipped("baselines") / STORED_UNKNOWNS)
+    frames = int(max(row.position["frames"] for row in rows))
+    axes = [axis for row in rows for axis in row.surface.grid]
+    return assumed(table, kind, rows[0].surface.detector, frames, axes)
 
 
 def _chosen(

@@ -113,7 +113,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.files import write_text
     from scenes.render.cache import in_use
 
-    experiment = load_experiment(options.experiment, options.overrides)
+    experiment = load_experiment(options.experiment, options.overrides).at_stated_values()
     config = experiment.config
     size_mm = _wanted_mm(options, experiment)
     given_poses, further_poses = _poses(options, declared(config)[1].distance_m)

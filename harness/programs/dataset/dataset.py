@@ -80,7 +80,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not FEWEST <= options.boards <= MOST or options.jobs < 1:
         fault = f"--boards {options.boards} --jobs {options.jobs}: out of range"
         raise UserError(fault, legal=f"{FEWEST} to {MOST} boards, 1 process or more")
-    experiment = load_experiment(options.experiment, options.overrides)
+    experiment = load_experiment(options.experiment, options.overrides).at_stated_values()
     out = options.out
     cache = options.results / ".cache" / "renders"
     samples = samples_of(experiment, options.boards, cache)

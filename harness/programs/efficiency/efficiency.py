@@ -1,6 +1,7 @@
 """``tofpod efficiency RESULTS``: compares every detector of a study with the ideal observer."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from harness.records.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
@@ -51,7 +52,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not run_options.shard.is_whole:
         raise UserError("--shard: efficiency needs the whole study", fix="leave it out")
     folder = options.results.resolve()
-    study = read_record(folder)
+    recorded = read_record(folder)
+    at_stated_values = tuple(set_up for set_up in recorded.set_ups if not set_up.drawn)
+    study = replace(recorded, set_ups=at_stated_values)
     if not (folder / EXPERIMENT.name).is_file():
         fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
         raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
@@ -72,7 +75,7 @@ def main(options: argparse.Namespace, command: str) -> int:
             fix=fix,
         )
     cache = folder.parents[1] / ".cache" / "renders"
-    plan = plan_of(experiment, cache)
+    plan = plan_of(experiment.at_stated_values(), cache)
     detectors = {point.config.detector.name for point in experiment.points}
     with in_use(cache), locked(folder), engine_of(run_options, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)

@@ -255,7 +255,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     """Compare and print; write capture.csv, capture.html and provenance.json. Returns 0. Raises
     UserError if the experiment declares no board in front of a simulated camera, or if the capture
     cannot be compared with it."""
-    experiment = load_experiment(options.board)
+    experiment = load_experiment(options.board).at_stated_values()
     points = list({point.frames_key: point for point in experiment.points}.values())
     detectors = {
         point.config.detector.name: point.config.detector.settings for point in experiment.points

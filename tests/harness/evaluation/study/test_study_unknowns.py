@@ -1,0 +1,135 @@
+"""What unknowns do to a90, on boards of known answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness.evaluation.study.record import read_record, record_text
+from harness.evaluation.study.unknowns import over_unknowns
+from tests.support.drawn_unknowns import (
+    BACKING,
+    BACKINGS,
+    BLUR,
+    BLUR_FACTOR,
+    BLUR_PX,
+    IDLE,
+    drawn_set_up,
+    true_a90_mm,
+)
+from tests.support.synthetic_study import study_record
+
+
+@pytest.fixture(scope="module")
+def many():
+    """1,200 boards: estimates within 2 %."""
+    return over_unknowns(drawn_set_up(boards=1200), draws=60)
+
+
+def test_every_value_has_its_own_a90_and_its_own_slope(many):
+    backing, blur, idle = many.effects
+    assert [effect.unknown.key for effect in many.effects] == [BACKING, BLUR, IDLE]
+    assert backing.levels == BACKINGS and blur.levels == BLUR_PX
+    truth_mm = [true_a90_mm(number) for number in range(3)]
+    assert backing.a90_mm == pytest.approx(truth_mm, rel=0.03)
+    assert (backing.least, backing.most) == (0, 1)
+    assert backing.factor == pytest.approx(truth_mm[1] / truth_mm[0], rel=0.03)
+    assert (blur.least, blur.most) == (0, 1)
+    assert blur.factor == pytest.approx(BLUR_FACTOR, rel=0.03)
+    assert blur.a90_mm[1] / blur.a90_mm[0] == pytest.approx(BLUR_FACTOR, rel=0.03)
+    assert idle.factor == pytest.approx(1.0, abs=0.03)
+    assert [effect.beyond_chance for effect in many.effects] == [True, True, False]
+    assert many.deciding == (backing, blur)
+
+
+def test_the_range_is_that_of_the_unknowns_that_matter(many):
+    assert many.lowest_mm == pytest.approx(true_a90_mm(0, BLUR_PX[0]), rel=0.03)
+    assert many.highest_mm == pytest.approx(true_a90_mm(1, BLUR_PX[1]), rel=0.03)
+
+
+def test_the_sign_of_an_effect_is_that_of_the_range(many):
+    """An unknown that is counted backwards has its ends exchanged, and nothing else."""
+    record = drawn_set_up(boards=1200)
+    blur = record.drawn[1]
+    turned = replace(blur, level=BLUR_PX[0] + BLUR_PX[1] - blur.level)
+    again = over_unknowns(replace(record, drawn=(record.drawn[0], turned)), draws=20)
+    by_key = {effect.unknown.key: effect for effect in again.effects}
+    assert (by_key[BLUR].least, by_key[BLUR].most) == (1, 0)
+    assert by_key[BLUR].factor == pytest.approx(BLUR_FACTOR, rel=0.03)
+
+
+def test_intervals_cover_the_truth():
+    """36 boards, 40 studies: each interval of a backing holds its a90, and that of the blur its
+    factor, in most of them (binomial: 33 or more of 40 at 95 %)."""
+    covered = np.zeros(4, int)
+    found = 0
+    for seed in range(40):
+        judged = over_unknowns(drawn_set_up(seed=seed), draws=150)
+        by_key = {effect.unknown.key: effect for effect in judged.effects}
+        for number, interval in enumerate(by_key[BACKING].intervals_mm):
+            covered[number] += interval.low <= true_a90_mm(number) <= interval.high
+        blur = by_key[BLUR]
+        interval = blur.factor_interval
+        factor = BLUR_FACTOR if blur.most == 1 else 1 / BLUR_FACTOR
+        covered[3] += interval.low <= factor <= interval.high
+        found += by_key[BACKING].beyond_chance
+    assert covered.min() >= 33
+    assert found >= 36
+
+
+def test_chance_is_seldom_said_to_matter():
+    """None of three unknowns does anything: one is named in 5 % of studies (6 or fewer of 40)."""
+    named = 0
+    for seed in range(40):
+        judged = over_unknowns(drawn_set_up(seed=seed, idle_only=True), draws=200)
+        named += bool(judged.deciding)
+        if not judged.deciding:
+            assert judged.lowest_mm == judged.highest_mm
+    assert named <= 6
+
+
+def test_the_same_numbers_each_time():
+    first, second = (over_unknowns(drawn_set_up(), draws=50) for _ in range(2))
+    for one, other in zip(first.effects, second.effects, strict=True):
+        assert one.a90_mm.tolist() == other.a90_mm.tolist()
+        assert one.factor_interval == other.factor_interval
+
+
+def test_repeats_of_the_noise_are_no_further_boards():
+    """Every inspection twice: the same sizes and intervals."""
+    record = drawn_set_up()
+    once = record.inspected
+    columns = {}
+    for name, column in vars(once).items():
+        if isinstance(column, np.ndarray):
+            columns[name] = np.concatenate([column, column])
+    columns["repeat"] = np.repeat([0, 1], len(once.hit))
+    twice = over_unknowns(replace(record, inspected=replace(once, **columns)), draws=50)
+    plain = over_unknowns(record, draws=50)
+    for one, other in zip(plain.effects, twice.effects, strict=True):
+        assert other.a90_mm == pytest.approx(one.a90_mm, rel=5e-3)
+        assert other.factor_interval.high == pytest.approx(one.factor_interval.high, rel=0.02)
+
+
+def test_without_unknowns_or_without_enough_boards():
+    assert over_unknowns(study_record().set_ups[0]) is None
+    few = over_unknowns(drawn_set_up(boards=17))
+    assert few.why == "17 boards are too few to tell the unknowns apart; 18 are needed"
+    assert few.effects == ()
+    assert over_unknowns(drawn_set_up(boards=18), draws=20).why == ""
+    record = drawn_set_up()
+    all_found = replace(record.inspected, hit=np.ones_like(record.inspected.hit))
+    assert over_unknowns(replace(record, inspected=all_found)).why
+
+
+def test_a_record_keeps_what_was_drawn(tmp_path):
+    study = study_record()
+    study = replace(study, set_ups=(*study.set_ups, drawn_set_up()))
+    (tmp_path / "study.json").write_text(record_text(study))
+    read = read_record(tmp_path / "study.json").set_ups[1]
+    for before, after in zip(study.set_ups[1].drawn, read.drawn, strict=True):
+        assert (before.key, before.values, before.range) == (after.key, after.values, after.range)
+        assert before.level.tolist() == after.level.tolist()
+        assert before.stated == after.stated
