@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
+from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized, wider_blurs
 from detectors.findings.hole_model import (
     HolePatch,
     normal_of,
@@ -25,7 +25,7 @@ from detectors.findings.shapes import Shape
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN
 from detectors.pixels.masks import grown, parts_with
-from detectors.pixels.noise import median_of, quantile_of, sigma_of
+from detectors.pixels.noise import median_of, noise_sides_at, quantile_of, sigma_of
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 
@@ -33,6 +33,7 @@ OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch with a larger residual that do not touch the detection belong to other
 damage."""
 FEWEST_AROUND = 12  # valid pixels around a detection
+PLANE_ROUNDS = 6  # of weighted least squares that approach least magnitudes
 EXPLAINED = 0.7
 """Least share of a detection's squared residual that its fit must explain: correlated noise may
 absorb a smooth dent, and a ragged damage has no shape."""
@@ -82,14 +83,18 @@ class HoleModelConfig(Config):
         return blur_px
 
 
-def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
-    """Return the sides, along columns and rows, of the rectangle over which the cloud is averaged,
-    in its own pixels or cells: the reach of a recording's noise, else ``config.blur_px``. A map's
-    interpolation between its views' pixels widens it to sqrt(blur^2 + 2) pixels. Cells larger than
-    a pixel are means themselves."""
+def blur_in_cells(
+    cloud: Cloud,
+    config: HoleModelConfig,
+    place: tuple[float, float] = (0.0, 0.0),
+) -> tuple[float, float]:
+    """Return the sides, along u and along v, of the rectangle over which the cloud is averaged at
+    a place (row, column), in its own pixels or cells: that of a recording's noise, else
+    ``config.blur_px``. A map's interpolation between its views' pixels widens it to sqrt(blur^2 +
+    2) pixels. Cells larger than a pixel are means themselves."""
     if cloud.map_views is None or not cloud.organised:
-        blur_px = cloud.noise_reach_px or float(config.blur_px)
-        return blur_px, blur_px
+        along_u, along_v = noise_sides_at(cloud, *place)
+        return along_u or float(config.blur_px), along_v or float(config.blur_px)
     pitch_u, pitch_v = cloud.map_views.pixel_m
     pixel_u = pitch_u / _cell_m(np.diff(cloud.points_m[..., 0], axis=1))
     pixel_v = pitch_v / _cell_m(np.diff(cloud.points_m[..., 1], axis=0))
@@ -320,7 +325,7 @@ def _surroundings(
     around. ``fine``: all pixels instead."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
-    blur_px = blur_in_cells(cloud, config)
+    blur_px = blur_in_cells(cloud, config, (float(rows.mean()), float(columns.mean())))
     tight = Region(
         int(rows.min()),
         int(rows.max()) + 1,
@@ -368,9 +373,12 @@ def _surroundings(
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
     near = grown(own, reach_px + 1)
-    ring_m = residual_m[finite & ~near]
-    if len(ring_m) < FEWEST_AROUND:
+    ring = finite & ~near
+    if ring.sum() < FEWEST_AROUND:
         return None
+    if cloud.noise_sides_px is not None:
+        residual_m = residual_m - _tilt_m(residual_m, ring)
+    ring_m = residual_m[ring]
     offset_m = median_of(ring_m)
     noise_m = sigma_of(ring_m - offset_m)
     # large residuals that do not touch the detection are other damage; the blur spreads it
@@ -409,9 +417,41 @@ def _surroundings(
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
-        # a simulated camera's blur is stated, a recording's is estimated
-        blurs=BLURS if cloud.noise_reach_px else BLURS[:1],
+        blurs=_blurs_of(cloud),
     )
+
+
+def _tilt_m(residual_m: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """Return the tilt (h, w) of the residuals around a detection: of the plane through those of
+    the ring (h, w) bool by least magnitudes, 0 at the ring's centroid.
+
+    Upsampling makes the camera's fixed pattern, and so its waves, as wide as the patch. On the
+    plate that `tests/harness/inspection/test_drilled_plate.py` judges, fits of wide shapes would
+    follow these waves: the ninth decile of the holes' diameters would be 19 mm instead of 15."""
+    u0, v0 = _centroid(ring)
+    rows, columns = np.indices(residual_m.shape, float)
+    columns -= u0
+    rows -= v0
+    values_m = residual_m[ring]
+    system = np.stack([np.ones(len(values_m)), columns[ring], rows[ring]], axis=1)
+    weights = np.ones(len(values_m))
+    plane = np.zeros(3)
+    for _ in range(PLANE_ROUNDS):
+        weighted = system * weights[:, None]
+        plane = np.linalg.lstsq(weighted, values_m * weights, rcond=None)[0]
+        sizes_m = np.abs(values_m - system @ plane)
+        # squares over sizes are magnitudes; below the typical size, squares again
+        weights = 1.0 / np.sqrt(np.maximum(sizes_m, median_of(sizes_m) + 1e-9))
+    return np.asarray(plane[1] * columns + plane[2] * rows)
+
+
+def _blurs_of(cloud: Cloud) -> tuple[tuple[float, bool, float], ...]:
+    """Return the blurs to try: one for a simulated camera, whose blur is stated; for upsampled
+    depth, whose noise is known at each place, those that are no narrower than it, because
+    interpolation blurs scene and noise alike; else all, for a recording's is estimated."""
+    if cloud.noise_sides_px is not None:
+        return wider_blurs()
+    return BLURS if cloud.noise_reach_px else BLURS[:1]
 
 
 def _means(picture: np.ndarray, side: int) -> np.ndarray:

@@ -25,6 +25,7 @@ def part_of_cloud(cloud: Cloud, rows: slice, columns: slice) -> Cloud:
         rgb=None,
         amplitude=None,
         map_views=None,
+        noise_sides_px=None,
     )
 
 

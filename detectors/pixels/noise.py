@@ -2,10 +2,12 @@
 shared noise."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from harness.vocabulary.geometry import Cloud, Frame
 
@@ -32,6 +34,11 @@ deviation of 0.1 step."""
 WIDEST_NATIVE_PX = 6.5
 """Noise that reaches farther was upsampled, aligned to another camera or smoothed: filters of known
 cameras average at most 5 pixels, and a measured reach scatters by one."""
+PART_PX = 160
+"""Side of the parts of a picture whose noise is compared: 40 to 200 squares of wide noise."""
+PHASE_PX = 9  # side of the square of the local mean that shows where between two steps it lies
+LEAST_GAIN = 1e-3  # terms of the gain of rounding that are left out
+SMALLEST_STEPS = 0.05  # deviation before the rounding below which it leaves no noise
 LEAST_FRAMES = 4  # fewest frames whose scatter shows noise
 SCATTER_PX = 7
 """Side of the square of its average: to 12 % from 49 x 3 differences."""
@@ -134,6 +141,27 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
 
 
 # --- the range of shared noise ---
+
+
+def with_noise(cloud: Cloud, frames: Sequence[Frame], z_step_m: float) -> Cloud:
+    """Return a cloud with what its first frames show of the noise: how far it reaches
+    (`noise_reach_px`), and where depth was upsampled, over which rectangle it is averaged at each
+    place (`noise_sides_px`). Frames that the cloud leaves out do not count."""
+    left_out = {frame.name for frame in cloud.left_out}
+    frames = [frame for frame in frames if frame.name not in left_out]
+    reach_px = noise_reach_px(frames, z_step_m)
+    sides_px = sides_if_upsampled(frames, reach_px, z_step_m)
+    return replace(cloud, noise_reach_px=reach_px, noise_sides_px=sides_px)
+
+
+def sides_if_upsampled(
+    frames: Sequence[Frame], reach_px: float, z_step_m: float
+) -> np.ndarray | None:
+    """Return the `noise_sides_px` of at least two frames whose reach shows that they were
+    upsampled; None for others."""
+    if reach_px <= WIDEST_NATIVE_PX or len(frames) < 2:
+        return None
+    return noise_sides_px(frames, z_step_m)
 
 
 def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
@@ -297,3 +325,129 @@ def _mean_product(noise: np.ndarray, usable: np.ndarray, lag: int) -> float:
     width = noise.shape[1] - lag
     pairs = (usable[:, lag:] & usable[:, :width]).sum()
     return float((noise[:, lag:] * noise[:, :width]).sum()) / max(pairs, 1)
+
+
+# --- the range of upsampled noise at each place ---
+
+
+def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | None:
+    """Return the sides (2, r, c), along rows and along columns, of the rectangle over which noise
+    is averaged in r x c equal parts of a picture; None if a part and all around do not show it.
+
+    Where a camera of another lens was upsampled, its pixels have different widths at each place.
+    Successive frames of at least two differ by noise alone. Rounding to ``z_step_m`` makes noise
+    look narrower, because it passes a change only where the mean lies between two steps: noise
+    before the rounding correlates the rounded one by the product of two `_gains`. Each side is the
+    median over the parts around: one part errs by a tenth."""
+    pictures = np.stack([frame.z_m.astype(np.float64) for frame in frames])
+    mean_m = pictures.mean(axis=0)
+    known = np.isfinite(mean_m)
+    means_m = mean_m - _levelled(mean_m, known, PHASE_PX)
+    noise_m = np.diff(pictures, axis=0) / np.sqrt(2.0)
+    rows = _parts(mean_m.shape[0])
+    columns = _parts(mean_m.shape[1])
+    sides_px = np.zeros((2, len(rows), len(columns)))
+    for i, part_rows in enumerate(rows):
+        for j, part_columns in enumerate(columns):
+            part = part_rows, part_columns
+            noise = noise_m[:, part_rows, part_columns]
+            sides_px[:, i, j] = _sides_of_part(noise, known[part], means_m[part], z_step_m)
+    sides_px[sides_px == 0.0] = np.nan
+    smooth_px = ndimage.generic_filter(
+        sides_px, np.nanmedian, size=(1, 3, 3), mode="constant", cval=np.nan
+    )
+    return smooth_px.astype(np.float32) if np.isfinite(smooth_px).all() else None
+
+
+def noise_sides_at(cloud: Cloud, row: float, column: float) -> tuple[float, float]:
+    """Return the sides, along rows and along columns, of the rectangle over which noise is averaged
+    at a pixel of a cloud's grid; 0 where they are unknown."""
+    if cloud.noise_sides_px is None:
+        return cloud.noise_reach_px, cloud.noise_reach_px
+    _, rows, columns = cloud.noise_sides_px.shape
+    height, width = cloud.valid.shape
+    at_row = np.array([[(row + 0.5) * rows / height - 0.5]], np.float32)
+    at_column = np.array([[(column + 0.5) * columns / width - 0.5]], np.float32)
+    along_rows, along_columns = (
+        cv2.remap(sides, at_column, at_row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for sides in cloud.noise_sides_px
+    )
+    return float(along_rows[0, 0]), float(along_columns[0, 0])
+
+
+def _parts(length: int) -> list[slice]:
+    """Return equal parts of some `PART_PX` pixels."""
+    count = max(1, round(length / PART_PX))
+    ends = np.round(np.linspace(0, length, count + 1)).astype(int).tolist()
+    return [slice(start, end) for start, end in pairwise(ends)]
+
+
+def _sides_of_part(
+    noise_m: np.ndarray,
+    known: np.ndarray,
+    means_m: np.ndarray,
+    z_step_m: float,
+) -> tuple[float, float]:
+    """Return the sides, along rows and along columns, that the noise (k, h, w) of differences of
+    frames shows; 0 where it shows none. ``means_m`` (h, w): local means before the rounding."""
+    nothing = 0.0, 0.0
+    if known.sum() < REACH_PIXELS:
+        return nothing
+    sizes_m = np.abs(np.where(known, noise_m, 0.0)).max(axis=0)
+    usable = known & (sizes_m < 8.0 * sizes_m[known].mean())
+    offsets_m = noise_m[:, usable].mean(axis=1)
+    noise = np.where(usable, noise_m - offsets_m[:, None, None], 0.0)
+    variance_m2 = _before_rounding_m2(float(np.square(noise[:, usable]).mean()), z_step_m)
+    if variance_m2 <= (SMALLEST_STEPS * z_step_m) ** 2:
+        return nothing
+    gains = _gains(means_m, variance_m2, z_step_m) * usable
+    pairs = len(noise) * variance_m2
+    along_rows = _end_of_correlation(noise, gains, pairs)
+    along_columns = _end_of_correlation(noise.transpose(0, 2, 1), gains.T, pairs)
+    return along_rows, along_columns
+
+
+def _before_rounding_m2(variance_m2: float, z_step_m: float) -> float:
+    """Return the variance of noise before rounding from the mean variance of rounded noise, which
+    is s^2 + q^2 / 12 minus the fixed pattern (`rounding_left_m2`); 0 if it is smaller."""
+    if z_step_m <= 0:
+        return variance_m2
+    low_m2 = 0.0
+    high_m2 = variance_m2
+    for _ in range(30):
+        middle_m2 = 0.5 * (low_m2 + high_m2)
+        fixed_m2 = rounding_left_m2(z_step_m, middle_m2)
+        if middle_m2 + z_step_m**2 / 12.0 - fixed_m2 > variance_m2:
+            high_m2 = middle_m2
+        else:
+            low_m2 = middle_m2
+    return low_m2
+
+
+def _gains(means_m: np.ndarray, variance_m2: float, z_step_m: float) -> np.ndarray:
+    """Return by how much the mean of rounded values changes with that of the values before, whose
+    means (h, w) and variance are known (Bussgang 1952): 1 on average over a step q, and 1 + 2
+    sum_k (-1)^k cos(2 pi k mean / q) exp(-2 (pi k s / q)^2)."""
+    gains = np.ones(means_m.shape)
+    if z_step_m <= 0:
+        return gains
+    cycles = 2.0 * np.pi * np.nan_to_num(means_m) / z_step_m
+    k = 1
+    factor = np.exp(-2.0 * np.pi**2 * variance_m2 / z_step_m**2)
+    while factor ** (k**2) > LEAST_GAIN:
+        gains += 2.0 * (-1) ** k * factor ** (k**2) * np.cos(k * cycles)
+        k += 1
+    return gains
+
+
+def _end_of_correlation(noise: np.ndarray, gains: np.ndarray, pairs_m2: float) -> float:
+    """Return the first lag along rows at which noise (k, h, w), over the product of the gains (h,
+    w), correlates less than `SHARED`; 0 if there is none. ``pairs_m2``: k times its variance before
+    the rounding."""
+    width = noise.shape[2]
+    for lag in range(1, min(FARTHEST_LAG_PX, width)):
+        product = float(np.einsum("kij,kij->", noise[..., lag:], noise[..., : width - lag]))
+        expected = float(np.einsum("ij,ij->", gains[:, lag:], gains[:, : width - lag]))
+        if product < SHARED * pairs_m2 * expected:
+            return float(lag)
+    return 0.0

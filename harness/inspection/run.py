@@ -19,7 +19,7 @@ from detectors.averages.flat_agreement import places_doubt, refuse_unfit
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
 from detectors.crop import Choice, described_text
 from detectors.interface import Detector, Evidence
-from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, with_noise
 from detectors.surfaces.pieces import part_text, piece_facts
 from detectors.views.view import View
 from harness.inspection import arguments as cli
@@ -288,8 +288,9 @@ def _averaged(
     """Average a recording's frames, and measure how far its noise reaches."""
     cloud = average(recording, RECORDED.model_copy(update={"method": arguments.average}))
     first_frames = list(islice(recording.frames(), REACH_FRAMES)) if cloud.organised else []
-    reach_px = noise_reach_px(first_frames, recording.z_step_m) if first_frames else 0.0
-    cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
+    cloud = replace(cloud, projection=recording.projection)
+    if first_frames:
+        cloud = with_noise(cloud, first_frames, recording.z_step_m)
     if flat_field is None:
         return cloud
     corrected_cloud = corrected(cloud, flat_field)

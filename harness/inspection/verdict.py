@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from detectors.interface import Detection, Evidence, MissingReturns
-from detectors.pixels.masks import grown, holes_filled
+from detectors.pixels.masks import holes_filled
+from detectors.pixels.noise import noise_sides_at
 from harness.report.findings import Finding, Judged, Remark
 from harness.vocabulary.geometry import MM, Cloud
 
@@ -27,7 +29,8 @@ CLASSES = {
 """The classes of findings, with their meaning."""
 FLAGS = {
     "faint": "noise, or what an object or print makes of the distance, may explain it",
-    "at_rim": "reaches the rim of the judged area: may be larger than stated",
+    "at_rim": "reaches the rim of the judged area, or to within half of the camera's blur: may be"
+    " larger than stated",
     "open_behind": "shows what lies far behind, or nothing: may be wider than stated by up to the"
     " noise's reach, where the camera's filter mixes the rim with what is behind",
     "size_from_contour": "no shape fits: its diameter is that of its outline at half depth",
@@ -45,6 +48,8 @@ threshold of 5, normal noise is rarer by a factor of exp(15.6), and noise that f
 exp(-score) by exp(2.5)."""
 OPEN_MM = 75.0
 """Depth beyond which a hole shows objects far behind it."""
+RIM_DEPTH_PX = 1.5
+"""Depth of the pixels that touch the rim, by a side or by a corner."""
 DENT_RATIO = 0.25
 """A dent is less deep than this share of its width; a hemisphere has 0.5."""
 FLOOR_FILTERS = 3.0
@@ -142,14 +147,24 @@ def pitch_mm(cloud: Cloud, evidence: Evidence) -> float:
 def _cut_by_the_rim(
     cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]
 ) -> tuple[bool, ...]:
-    """Return whether each detection reaches the rim of the judged area, so that the rest of it was
-    not seen; all False without a pixel grid."""
+    """Return whether each detection reaches the rim of the judged area, or lies so near that the
+    camera's blur, which carries it half of its width beyond what is seen, reaches it: the rest of
+    it may not have been seen. All False without a pixel grid."""
     if not cloud.organised:
         return (False,) * len(detections)
-    is_judged = holes_filled(np.isfinite(evidence.residual_m))
-    outside = np.pad(~is_judged, 1, constant_values=True)
-    is_rim = grown(outside, 1)[1:-1, 1:-1].ravel()
-    return tuple(bool(is_rim[detection.pixels].any()) for detection in detections)
+    # the picture's own edge is a rim too
+    inside = np.pad(holes_filled(np.isfinite(evidence.residual_m)), 1)
+    depths_px = ndimage.distance_transform_edt(inside)[1:-1, 1:-1].ravel()
+    return tuple(_is_cut(cloud, detection, depths_px) for detection in detections)
+
+
+def _is_cut(cloud: Cloud, detection: Detection, depths_px: np.ndarray) -> bool:
+    """Return whether a detection's pixel that is nearest to the rim lies within half of the blur
+    there. ``depths_px``: flat, distance of each pixel to the rim, 1 for those along it."""
+    nearest = int(detection.pixels[np.argmin(depths_px[detection.pixels])])
+    row, column = divmod(nearest, cloud.valid.shape[1])
+    half_px = 0.5 * max(noise_sides_at(cloud, row, column))
+    return bool(depths_px[nearest] <= max(half_px, RIM_DEPTH_PX))
 
 
 # ---------------------------------------------------------------- what was judged

@@ -304,7 +304,9 @@ class Cloud:
     through the origin (a camera) and "parallel" for equal cells in x and y. A map of several views
     is such a cloud, in a frame with z away from the viewer. ``mean_variance_m2`` (h, w), if
     stated, is the variance of each averaged z with its systematic parts. ``noise_reach_px`` is the
-    side of the square over which noise is blurred; 0 means unknown."""
+    side of the square over which noise is blurred; 0 means unknown. ``noise_sides_px`` (2, r, c)
+    are the sides, along rows and along columns, of the rectangle in r x c equal parts of the grid;
+    None means that they are not known to differ."""
 
     points_m: np.ndarray
     reason: np.ndarray
@@ -322,6 +324,7 @@ class Cloud:
     mean_variance_m2: np.ndarray | None = None
     map_views: MapViews | None = None
     noise_reach_px: float = 0.0
+    noise_sides_px: np.ndarray | None = None
 
     @cached_property
     def crops(self) -> dict[Any, Any]:

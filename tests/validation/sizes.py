@@ -10,7 +10,6 @@ within two standard errors. Depths are normal to the board."""
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from itertools import islice, product
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import pandas as pd
 
 from detectors import load_detector
 from detectors.averages.average import AverageConfig, average
-from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, with_noise
 from harness import api
 from harness.vocabulary.geometry import MM, Cloud, transform_points
 from scenes.target.custom import TargetConfig
@@ -92,8 +91,7 @@ def cloud_of(spec: dict[str, Any], camera: str, cache: Path) -> Cloud:
     unit = api.render(api.target(spec), camera, bounces=2, cache=cache)
     frames = api.frames(unit, FRAMES)
     first = list(islice(frames.frames(), REACH_FRAMES))
-    reach_px = noise_reach_px(first, frames.z_step_m)
-    return replace(average(frames, AverageConfig()), noise_reach_px=reach_px)
+    return with_noise(average(frames, AverageConfig()), first, frames.z_step_m)
 
 
 def rows_of(cloud: Cloud, spec: dict[str, Any], name: str) -> list[dict[str, Any]]:

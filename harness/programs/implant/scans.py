@@ -17,7 +17,7 @@ import pandas as pd
 from scipy import ndimage
 
 from detectors.averages.average import RECORDED, average
-from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, noise_reach_px, sides_if_upsampled
 from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
 from harness.records.rows import Origin, TrialRecord
@@ -72,7 +72,9 @@ class Scan:
         self.lens = recording.lens
         self.slopes = recording.slopes
         self.frames = list(recording.frames())
-        self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES], recording.z_step_m)
+        first_frames = self.frames[:REACH_FRAMES]
+        self.reach_px = noise_reach_px(first_frames, recording.z_step_m)
+        self.sides_px = sides_if_upsampled(first_frames, self.reach_px, recording.z_step_m)
         self.whole = self.averaged(self.frames)
         evidence = judge.detector_of(judging.detector, judging.settings_json).analyse(self.whole)
         self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
@@ -182,7 +184,12 @@ class Scan:
         cloud = average(
             replace(self.recording, read=lambda: iter(frames), selection=None), RECORDED
         )
-        return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
+        return replace(
+            cloud,
+            projection="central",
+            noise_reach_px=getattr(self, "reach_px", 0.0),
+            noise_sides_px=getattr(self, "sides_px", None),
+        )
 
     def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the surface's point (3,) above a place of the plane and the normal (3,) towards

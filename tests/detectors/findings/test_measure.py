@@ -551,6 +551,16 @@ def test_the_blur_of_a_map_counts_in_its_cells() -> None:
     assert blur_in_cells(frontal(8, 9, noise_reach_px=4.0), HoleModelConfig()) == (4.0, 4.0)
 
 
+def test_the_blur_of_upsampled_depth_is_that_of_the_place() -> None:
+    """Two columns of parts, whose middles are columns 1.5 and 5.5 of eight."""
+    sides_px = np.array([[[9.0, 21.0]], [[12.0, 14.0]]], np.float32)
+    cloud = frontal(8, 8, noise_reach_px=8.0, noise_sides_px=sides_px)
+    config = HoleModelConfig()
+    assert blur_in_cells(cloud, config, (4.0, 0.0)) == (9.0, 12.0)
+    assert blur_in_cells(cloud, config, (4.0, 3.5)) == pytest.approx((15.0, 13.0), abs=0.2)
+    assert blur_in_cells(cloud, config, (4.0, 7.0)) == (21.0, 14.0)
+
+
 def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
     cloud, evidence = Board(12.7, 0.0).seen(0.2, 7)
     m = measure_detection(

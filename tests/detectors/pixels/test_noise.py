@@ -14,14 +14,17 @@ from detectors.pixels.noise import (
     average_variance_m2,
     median_of,
     noise_reach_px,
+    noise_sides_at,
+    noise_sides_px,
     quantile_of,
     rounding_floor,
     rounding_left_m2,
     rounding_variances,
     sigma_of,
+    with_noise,
 )
 from harness.testing.synthetic_clouds import SHAPE, plane
-from harness.vocabulary.geometry import Cloud, Frame
+from harness.vocabulary.geometry import Cloud, Frame, LeftOut, Region
 
 STEP_M = 1e-3
 
@@ -220,3 +223,64 @@ def test_the_side_of_a_square_is_the_sum_of_its_correlation() -> None:
     white = np.random.default_rng(8).standard_normal((900, 900))
     noise = cv2.blur(white, (9, 9))[10:-10, 10:-10]
     assert _side_of_tent(noise, np.ones(noise.shape, bool)) == pytest.approx(9.0, abs=0.4)
+
+
+def upsampled_frames(noise_steps: float, step_m: float, count: int = 5) -> list[Frame]:
+    """Rounded frames of a tilted plane. A rectangle of 9 x 13 pixels (columns x rows) averages the
+    noise at the left, one of 21 x 13 at the right."""
+    rows, columns = np.indices((480, 960))
+    frames = []
+    for seed in range(count):
+        white = np.random.default_rng(seed).standard_normal(rows.shape)
+        noise = np.where(
+            columns < 480,
+            np.sqrt(9 * 13) * cv2.blur(white, (9, 13)),
+            np.sqrt(21 * 13) * cv2.blur(white, (21, 13)),
+        )
+        steps = 500.3 + 0.11 * rows + 0.05 * columns + noise_steps * noise
+        z_m = (1e-3 * steps).astype(np.float32)
+        if step_m > 0:
+            z_m = (np.round(steps * 1e-3 / step_m) * step_m).astype(np.float32)
+        frames.append(Frame(f"{seed}", z_m, np.zeros(z_m.shape, np.uint8)))
+    return frames
+
+
+@pytest.mark.parametrize(("noise_steps", "step_m"), [(0.2, 1e-3), (0.6, 1e-3), (0.3, 0.0)])
+def test_upsampled_noise_has_its_own_rectangle_at_each_place(
+    noise_steps: float, step_m: float
+) -> None:
+    sides_px = noise_sides_px(upsampled_frames(noise_steps, step_m), step_m)
+    assert sides_px is not None
+    assert sides_px.shape == (2, 3, 6)
+    assert np.median(sides_px[0][:, :2]) == pytest.approx(9.0, abs=1.0)
+    assert np.median(sides_px[0][:, 4:]) == pytest.approx(20.0, abs=2.0)
+    assert np.median(sides_px[1]) == pytest.approx(12.5, abs=1.5)
+
+
+def test_a_cloud_knows_the_sides_of_upsampled_noise_alone() -> None:
+    """A frame that the cloud leaves out does not count."""
+    frames = upsampled_frames(0.3, 0.0)
+    blank = np.zeros((480, 960))
+    cloud = Cloud(
+        points_m=np.zeros((480, 960, 3)),
+        reason=blank.astype(np.uint8),
+        count=blank,
+        variance_m2=blank,
+        region=Region(0, 480, 0, 960),
+        z_step_m=0.0,
+        n_frames=5,
+    )
+    known = with_noise(cloud, frames, 0.0)
+    assert noise_sides_at(known, 240, 100)[0] == pytest.approx(9.0, abs=1.0)
+    assert noise_sides_at(known, 240, 900)[0] == pytest.approx(20.0, abs=2.5)
+    between = noise_sides_at(known, 240, 480)[0]
+    assert 10.0 < between < 19.0
+    native = with_noise(cloud, frames_of(5, 5, shape=(480, 960)), 0.0)
+    assert native.noise_sides_px is None
+    assert noise_sides_at(native, 240, 100) == (5.0, 5.0)
+    torn = replace(frames[2], z_m=frames[2].z_m + np.float32(0.02))
+    spoilt = [*frames[:2], torn, *frames[3:]]
+    left_out = replace(cloud, left_out=(LeftOut("2", "it jumps"),))
+    kept = with_noise(left_out, spoilt, 0.0)
+    assert kept.noise_sides_px is not None
+    assert noise_sides_at(kept, 240, 100)[0] == pytest.approx(9.0, abs=1.0)

@@ -14,7 +14,7 @@ import pytest
 
 from detectors.averages.average import RECORDED, average
 from detectors.findings.null import behind, each_object_once
-from detectors.pixels.noise import REACH_FRAMES, noise_reach_px
+from detectors.pixels.noise import REACH_FRAMES, with_noise
 from detectors.recordings import open_capture
 from harness.inspection import arguments as cli
 from harness.inspection.choosing import Contender, candidate_of, chosen
@@ -100,8 +100,7 @@ def compared(cloud: Cloud) -> tuple[dict[str, Result], str]:
 def cloud_of(folder: Path, frames: slice | None = None) -> Cloud:
     recording = open_capture([folder], frames=frames)
     first_frames = list(islice(recording.frames(), REACH_FRAMES))
-    reach_px = noise_reach_px(first_frames, recording.z_step_m)
-    return replace(average(recording, RECORDED), noise_reach_px=reach_px)
+    return with_noise(average(recording, RECORDED), first_frames, recording.z_step_m)
 
 
 def one_frame(folder: Path, number: int, picture: np.ndarray) -> Cloud:

@@ -129,6 +129,20 @@ def test_a_finding_at_the_rim_is_of_its_own_class() -> None:
     assert [each.certainty for each in result.findings] == ["rim or blind", "sure"]
 
 
+def test_blur_carries_a_finding_to_the_rim_by_half_of_its_width() -> None:
+    """The fourth row is 4 pixels deep, the fifth 5."""
+    plain = judged_of(20.0, 20.0, rows=(3, 4))
+    native = with_remarks(plain, 5.0)
+    assert [each.flags for each in native.findings] == ["", ""]
+    blurred = replace(plain, cloud=replace(plain.cloud, noise_reach_px=8.0))
+    assert [each.flags for each in with_remarks(blurred, 5.0).findings] == ["at_rim", ""]
+    sides_px = np.full((2, 1, 1), 8.0, np.float32)
+    sides_px[1] = 10.0
+    wider = replace(plain.cloud, noise_reach_px=8.0, noise_sides_px=sides_px)
+    flags = [each.flags for each in with_remarks(replace(plain, cloud=wider), 5.0).findings]
+    assert flags == ["at_rim", "at_rim"]
+
+
 def test_flags_say_how_a_size_was_measured_and_what_shows_through() -> None:
     def flags(**fields: object) -> tuple[str, ...]:
         return flags_of(finding(**fields), is_cut=False, least_score=5.0)
