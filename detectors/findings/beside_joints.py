@@ -22,7 +22,7 @@ MARGIN_PX = 1  # by which a joint is cut out around its pixels
 
 
 @dataclass(frozen=True)
-class Beside:
+class TouchingDamage:
     """Damage that touches a joint."""
 
     joint: int
@@ -39,7 +39,7 @@ def damage_beside(
     detections: Sequence[Detection],
     measurements: Sequence[Measurement],
     feature: Joints,
-) -> tuple[Beside, ...]:
+) -> tuple[TouchingDamage, ...]:
     """Return the damage that the differing joints of a feature touch."""
     points_m = cloud.points_m.reshape(-1, 3)
     strongest = feature.members[0]
@@ -71,11 +71,11 @@ def damage_beside(
             centre_m=points_m[pixels].mean(axis=0),
         )
         without = replace(evidence, residual_m=np.where(joint, np.nan, evidence.residual_m))
-        beside.append(Beside(number, part, without))
+        beside.append(TouchingDamage(number, part, without))
     return tuple(beside)
 
 
-def without_damage(feature: Joints, beside: Sequence[Beside]) -> Joints:
+def without_damage(feature: Joints, beside: Sequence[TouchingDamage]) -> Joints:
     """Return the feature, of which the joints that damage touches are members: without it they do
     not differ."""
     touched = tuple(part.joint for part in beside if part.joint in feature.differing)

@@ -216,9 +216,12 @@ def picked(points: np.ndarray, most: int) -> np.ndarray:
 
 def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> Profile | None:
     """Return the profile, not yet fitted, along whose direction points (n, 3) depart least from a
-    smooth surface ``base``; None if no direction stands out.
+    smooth surface ``base``; None if no direction stands out, or if the points lie in one place or
+    in a plane through the camera.
 
     ``pitch``: distance of neighbouring pixels in x/z, or in metres where rays are parallel."""
+    if not pitch > 0.0:
+        return None
     sample = picked(points, COARSE_SEARCHED)
     on_base = sample.copy()
     on_base[:, 2] = base(sample)
@@ -227,8 +230,11 @@ def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> 
     # on the surface: what shows far behind through a hole would turn the mean plane
     normal = _normal(on_base, central)
     frame = _frame(normal, 0.0, pitch, central)
-    across = frame.slopes(sample)
-    along = frame.lengths(sample)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = frame.slopes(sample)
+        along = frame.lengths(sample)
+    if not np.isfinite([across, along]).all():
+        return None
     if max(np.ptp(across), np.ptp(along)) > MOST_STRIPS * FINE_PX * pitch:
         return None
     values = frame._curve_of(sample) - frame._curve_of(on_base)

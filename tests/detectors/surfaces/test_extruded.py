@@ -64,6 +64,19 @@ def test_a_plane_is_no_profile() -> None:
     assert directed is None or not explains_better(with_twist(directed, points), plane, points)
 
 
+@pytest.mark.parametrize("extent", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.2)])
+def test_points_in_one_place_or_in_a_plane_through_the_camera_have_no_direction(
+    extent: tuple[float, float],
+) -> None:
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (500, 3))
+    points = points * (*extent, 0.1) + (0.0, 0.0, 0.5)
+    if extent == (0.0, 0.0):
+        points[:] = (0.0, 0.0, 0.5)
+    base = polynomial(points, np.ones(500), degree=2)
+    pitch = max(extent) / 100
+    assert direction_of(points, base, pitch, True) is None
+
+
 def test_the_direction_of_grooves_is_found() -> None:
     points = cloud_of(grooved(2e-3)).points_m.reshape(-1, 3)
     plane = polynomial(points, np.ones(len(points)), degree=2)
