@@ -49,6 +49,9 @@ ROUNDED = 2.0
 SEEN = 0.5  # least departure from a smooth surface, as a share of a pixel's noise
 GAIN_SIGMAS = 4.0
 """Least significance of a profile's gain over a smooth surface."""
+OF_BANDS = 0.75
+"""Quantile of the bands at which a place of the profile is uncertain: damage is in fewer, and where
+the fit is a little off, a step is off in more."""
 BANDS = 10
 """Number of bands along the direction, of which every other one is predicted from the others."""
 
@@ -146,8 +149,8 @@ class Profile:
         """Return the profile with its own deviation beside steps, as points (n, 3) show it.
 
         A strip beside a step holds pixels of both of its sides, and its median is one of them. What
-        the residuals of a strip exceed a usual strip's by is counted, in half of the bands along
-        the direction, because damage is in few of them; and up to the bend of the curve over
+        the residuals of a strip exceed a usual strip's by is counted, at the quantile `OF_BANDS` of
+        the bands along the direction, and up to the bend of the curve over
         `STEP_KNOTS` beyond what a curvature over `CURVED_KNOTS` explains."""
         ahead_m = _filled(1.0 / self.curve if self.central else self.curve)
         share = (STEP_KNOTS / CURVED_KNOTS) ** 2
@@ -165,7 +168,7 @@ class Profile:
         means_m2 = np.where(numbers >= LEAST_POINTS, sums_m2, np.nan) / np.maximum(numbers, 1)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            variance_m2 = np.nanmedian(means_m2.reshape(BANDS, count), axis=0)
+            variance_m2 = np.nanquantile(means_m2.reshape(BANDS, count), OF_BANDS, axis=0)
         excess_m2 = np.nan_to_num(variance_m2 - usual_m2)
         limited_m2 = np.minimum(excess_m2, widest_m**2)
         is_large = limited_m2 > usual_m2
