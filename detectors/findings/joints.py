@@ -20,6 +20,7 @@ from scipy import special
 
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown
+from detectors.surfaces.surface import BISQUARE_TUNING, bisquare_weights, polynomial
 from harness.vocabulary.geometry import MM, Cloud
 
 LONG = 2.0
@@ -34,10 +35,10 @@ FOLLOWED = 0.5
 """Least share of the places to which a move leads, where they are seen, that hold a slot."""
 MOVES = 2  # that carry a lattice onto itself: along its rows and from row to row
 STARTS = 12  # strongest slots from which moves are tried
+TREND_FROM = 12  # slots from which a trend of their sizes is known: four for each coefficient
 SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
 LEAST_SCATTER = 0.03
 """Least scatter of widths, depths and areas, as a share of their median."""
-
 ERROR_SCATTER = 0.1
 """Least scatter of the errors of widths, which contain what no shape explains, as a share of their
 median."""
@@ -89,10 +90,11 @@ def joints_of(
     none without a pixel grid."""
     if not cloud.organised:
         return ()
-    slots = _slots(evidence, detections, measurements)
-    free = np.ones(len(slots.numbers), bool)
+    found = _slots(evidence, detections, measurements)
+    free = np.ones(len(found.numbers), bool)
     features = []
-    for seed in range(len(slots.numbers)):
+    for seed in range(len(found.numbers)):
+        slots = _with_ends(found, seed)
         if not free[seed] or not slots.whole[seed]:
             continue
         parallel = _parallel(slots, seed) & free
@@ -203,15 +205,22 @@ def _rim(evidence: Evidence) -> np.ndarray:
     return grown(outside, 1)[1:-1, 1:-1]
 
 
+def _with_ends(slots: _Slots, seed: int) -> _Slots:
+    """Return the slots, of which those at the rim that are less than `LONG` times as long as a seed
+    is wide are no whole ones: the rim leaves the end of a slot, of any direction and width."""
+    is_end = slots.cut & (slots.lengths_m < LONG * slots.widths_m[seed])
+    return replace(slots, whole=slots.whole & ~is_end)
+
+
 def _parallel(slots: _Slots, seed: int) -> np.ndarray:
-    """Return which slots (n,) run along a seed, as far as its width lets one tell, and are on the
+    """Return which slots (n,) run along a seed, as far as their widths let one tell, and are on the
     same side of the surface, and about as long or cut by the rim. An end has no direction."""
     cosines = np.abs(slots.along @ slots.along[seed])
-    angle = math.atan(slots.widths_m[seed] / slots.lengths_m[seed])
+    angles = np.arctan2(slots.widths_m, slots.lengths_m)
     same_side = np.sign(slots.depths_m) == np.sign(slots.depths_m[seed])
     ratio = slots.lengths_m / slots.lengths_m[seed]
     as_long = (ratio < ALIKE) & ((ratio > 1.0 / ALIKE) | slots.cut)
-    runs_along = (cosines >= math.cos(angle)) | ~slots.whole
+    runs_along = (cosines >= np.cos(np.maximum(angles, angles[seed]))) | ~slots.whole
     return runs_along & same_side & as_long
 
 
@@ -232,26 +241,48 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
     certain = members & slots.whole
     if not certain.any():
         return result
-    for column, sizes in enumerate((slots.widths_m, slots.depths_m)):
-        errors = slots.errors[:, column]
-        middle = float(np.median(sizes[certain]))
-        scatter = float(np.median(np.abs(sizes[certain] - middle))) / 0.6745
-        usual_error = float(np.median(errors[certain]))
-        further = np.sqrt(np.maximum(errors**2 - usual_error**2, 0.0))
-        limit = SCATTERS * np.hypot(max(scatter, LEAST_SCATTER * abs(middle)), further)
-        departs = np.abs(sizes - middle) > limit
-        result |= departs & slots.whole if sizes is slots.widths_m else departs
+    departures = []
+    for column, sizes_m in enumerate((slots.widths_m, slots.depths_m)):
+        errors_m = slots.errors[:, column]
+        usual_m = _usual(slots, sizes_m, certain)
+        usual_error_m = float(np.median(errors_m[certain]))
+        further_m = np.sqrt(np.maximum(errors_m**2 - usual_error_m**2, 0.0))
+        scatter_m = _scatter(sizes_m, usual_m, certain, LEAST_SCATTER)
+        departures.append(np.abs(sizes_m - usual_m) > SCATTERS * np.hypot(scatter_m, further_m))
+    result |= departures[0] & slots.whole
+    result |= departures[1]
     # damage that touches a joint is found with it: it shows in the area, and no slot explains it
-    middle_m2 = float(np.median(slots.areas_m2[certain]))
-    scatter_m2 = float(np.median(np.abs(slots.areas_m2[certain] - middle_m2))) / 0.6745
-    limit_m2 = SCATTERS * max(scatter_m2, LEAST_SCATTER * middle_m2)
-    result |= slots.areas_m2 > middle_m2 + limit_m2
+    usual_m2 = _usual(slots, slots.areas_m2, certain)
+    scatter_m2 = _scatter(slots.areas_m2, usual_m2, certain, LEAST_SCATTER)
+    result |= slots.areas_m2 > usual_m2 + SCATTERS * scatter_m2
     unexplained_m = slots.errors[:, 0]
-    middle_m = float(np.median(unexplained_m[certain]))
-    scatter_m = float(np.median(np.abs(unexplained_m[certain] - middle_m))) / 0.6745
-    limit_m = SCATTERS * max(scatter_m, ERROR_SCATTER * middle_m)
-    result |= ~slots.cut & (unexplained_m > middle_m + limit_m)
+    usual_m = _usual(slots, unexplained_m, certain)
+    scatter_m = _scatter(unexplained_m, usual_m, certain, ERROR_SCATTER)
+    result |= ~slots.cut & (unexplained_m > usual_m + SCATTERS * scatter_m)
     return result
+
+
+def _usual(slots: _Slots, sizes: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """Return what size (n,) is usual at the place of each slot, from the ``certain`` ones (n,):
+    perspective changes steadily across a picture what is seen of slots that are alike. It is the
+    same everywhere where fewer than `TREND_FROM` are certain."""
+    if certain.sum() < TREND_FROM:
+        return np.full(len(sizes), float(np.median(sizes[certain])))
+    points = np.column_stack([slots.centres_m[:, :2], sizes])
+    weights = certain.astype(float)
+    for _ in range(3):
+        usual = np.asarray(polynomial(points, weights, degree=1)(points))
+        off = sizes - usual
+        scatter = max(float(np.median(np.abs(off[certain]))) / 0.6745, 1e-9)
+        weights = certain * bisquare_weights(off, BISQUARE_TUNING * scatter)
+    return usual
+
+
+def _scatter(sizes: np.ndarray, usual: np.ndarray, certain: np.ndarray, least: float) -> np.ndarray:
+    """Return the scatter (n,) of the ``certain`` sizes about their ``usual`` ones, at least a share
+    ``least`` of these."""
+    scatter = float(np.median(np.abs(sizes - usual)[certain])) / 0.6745
+    return np.maximum(scatter, least * np.abs(usual))
 
 
 def chance_of_following(hits: int, trials: int, chance: float) -> float:

@@ -97,6 +97,8 @@ class LocalEvidence(Evidence):
     """(r, c): score of each cell of the picture, negative in front of the surface."""
     cell: np.ndarray = None  # type: ignore[assignment]
     """(h, w): flat index of each point's cell, -1 where there is no score."""
+    spread_m: np.ndarray = None  # type: ignore[assignment]
+    """(h, w): standard deviation of the surface itself, metres."""
 
 
 class LocalPicture(NamedTuple):
@@ -117,7 +119,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 4
+    version = 5
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings
@@ -140,7 +142,14 @@ class LocalDetector:
         shape = int(rows.max()) + 1, int(columns.max()) + 1
         cell = np.full(mask.shape, -1, dtype=np.int64)
         cell[judged] = rows * shape[1] + columns
-        return LocalPicture(ground, cell, _on_cells(cloud, ground.residual_m, cell, shape))
+        residuals = _on_cells(
+            cloud,
+            ground.residual_m,
+            spread_m=ground.spread_m,
+            cell=cell,
+            shape=shape,
+        )
+        return LocalPicture(ground, cell, residuals)
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop. Raises UserError on an empty crop, or if no surface can
@@ -160,6 +169,7 @@ class LocalDetector:
             unit=unit,
             signed=signed,
             cell=cell,
+            spread_m=ground.spread_m,
         )
 
     def rescored(
@@ -171,7 +181,13 @@ class LocalDetector:
         """Return the evidence for other residuals (h, w) from the same surface, on the same
         pixels: as `analyse`, without a fit."""
         assert isinstance(evidence, LocalEvidence)
-        residuals = _on_cells(cloud, residual_m, evidence.cell, evidence.signed.shape)
+        residuals = _on_cells(
+            cloud,
+            residual_m,
+            spread_m=evidence.spread_m,
+            cell=evidence.cell,
+            shape=evidence.signed.shape,
+        )
         signed, typical_m, unit = self.scored(*residuals)
         judged = evidence.cell >= 0
         scores = on_grid(signed.ravel()[evidence.cell[judged]], judged)
@@ -281,15 +297,22 @@ class LocalDetector:
 def _on_cells(
     cloud: Cloud,
     residual_m: np.ndarray,
+    *,
+    spread_m: np.ndarray,
     cell: np.ndarray,
     shape: tuple[int, ...],
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Return the ``residuals`` of a `LocalPicture` (r, c) = ``shape`` from those of points (h, w)
-    and the cell of each (h, w)."""
+    """Return the ``residuals`` of a `LocalPicture` (r, c) = ``shape`` from those of points (h, w),
+    the surface's own deviation at each (h, w) and the cell of each (h, w)."""
     judged = cell >= 0
     cells = cell[judged]
     size = shape[0] * shape[1]
-    share = _shares(cloud, judged, residual_m)
+    share = _shares(
+        cloud,
+        judged,
+        residual_m=residual_m[judged],
+        spread_m=spread_m[judged],
+    )
     weights = np.bincount(cells, share, size)
     typical = 1.0
     if not cloud.organised or np.bincount(cells).max() > 1:
@@ -304,20 +327,25 @@ def _on_cells(
 def _shares(
     cloud: Cloud,
     judged: np.ndarray,
+    *,
     residual_m: np.ndarray,
+    spread_m: np.ndarray,
 ) -> np.ndarray:
-    """Return the weight (n,) of each judged point: the median variance over its own, at most 4; 1
-    if variances are unknown. They come from the cloud's maker, or from the scatter of frames
-    nearby plus what is fixed in all frames."""
+    """Return the weight (n,) of each judged point: the median variance over its own, at most 4.
+    Variances come from the cloud's maker, or from the scatter of frames nearby plus what is fixed
+    in all frames; without either they are equal. That of the surface itself, of which ``spread_m``
+    (n,) is the root, is added. ``residual_m`` (n,)."""
+    variance_m2 = sigma_of(residual_m) ** 2
     if cloud.mean_variance_m2 is not None:
         variances = cloud.mean_variance_m2[judged]
     else:
         noise_m2 = average_variance_m2(cloud, judged)
         if noise_m2 is None:
-            return np.ones(int(judged.sum()))
-        random = noise_m2[judged]
-        variances = random + max(sigma_of(residual_m[judged]) ** 2 - median_of(random), 0.0)
-    variances = np.maximum(variances, 1e-18)
+            variances = np.full(len(residual_m), variance_m2)
+        else:
+            random = noise_m2[judged]
+            variances = random + max(variance_m2 - median_of(random), 0.0)
+    variances = np.maximum(variances + spread_m**2, 1e-18)
     return np.minimum(median_of(variances) / variances, 4.0)
 
 

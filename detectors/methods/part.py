@@ -41,6 +41,7 @@ def part_of_evidence(evidence: Evidence, rows: slice, columns: slice) -> Evidenc
     )
     if not isinstance(part, LocalEvidence):
         return part
+    part = replace(part, spread_m=part.spread_m[rows, columns])
     cell = part.cell[rows, columns]
     judged = cell >= 0
     if not judged.any():

@@ -75,6 +75,8 @@ class Background:
     residual_m: np.ndarray
     # standard deviation of the residuals nearby (h, w), without the surface's own misfit
     noise_m: np.ndarray
+    # standard deviation of the surface itself (h, w), metres: 0 but beside steps of a profile
+    spread_m: np.ndarray
     # the shape's name and limits, as programs print them
     description: str
     # width above which a free form follows shallow damage; None for other shapes
@@ -166,10 +168,11 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     if cells is None:
         return _of_few_points(points, mask, config, central)
     wavelength = None
+    profile = None
     if config.shape in STATED:
         name, fit = _stated(points, config, central)
     else:
-        shape, cells = _shape_of(points, cells, config, rounding_floor(cloud, mask))
+        shape, cells, profile = _shape_of(points, cells, config, rounding_floor(cloud, mask))
         name = shape.name
         fit = shape.fit
         wavelength = shape.wavelength
@@ -197,10 +200,12 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         if config.shape == "mesh":
             steep += " or at an edge of the mesh"
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
+    spread_m = np.zeros(len(points)) if profile is None else profile.spread_at(points)
     return Background(
         surface_z_m=on_grid(fitted, mask),
         residual_m=on_grid(points[:, 2] - fitted, mask),
-        noise_m=on_grid(_noise_of_points(cells), mask),
+        noise_m=on_grid(np.hypot(_noise_of_points(cells), spread_m), mask),
+        spread_m=on_grid(spread_m, mask),
         description=text,
         scale_m=scale_m,
         warning=warning,
@@ -225,6 +230,7 @@ def _of_few_points(
         surface_z_m=on_grid(fitted, mask),
         residual_m=on_grid(residuals, mask),
         noise_m=np.where(mask, noise_m, np.nan),
+        spread_m=np.where(mask, 0.0, np.nan),
         description=name,
         scale_m=None,
         warning=f"{len(points)} points are too few to tell whether the surface ({name}) fits",
@@ -234,9 +240,10 @@ def _of_few_points(
 
 def _shape_of(
     points: np.ndarray, cells: _Cells, config: SurfaceConfig, rounding_m: float
-) -> tuple[_Shape, _Cells]:
+) -> tuple[_Shape, _Cells, Profile | None]:
     """Choose the shape of points (n, 3), refine its fit with cells centred on it, and return
-    both. ``rounding_m``: deviation that rounding leaves in the points."""
+    both, and the profile that it contains. ``rounding_m``: deviation that rounding leaves in the
+    points."""
     sample = points[:: max(1, len(points) // 8192)]
     _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"))
     cells = cells.refreshed(points[:, 2] - start(points), start)
@@ -251,8 +258,8 @@ def _shape_of(
         cells = cells.refreshed(points[:, 2] - profile(points), profile)
         best = _extruded_shape(profile, cells)
         base = best
-    shape = _with_free_form(cells, best, base, config)
-    return _refined(points, cells, shape)
+    shape, cells = _refined(points, cells, _with_free_form(cells, best, base, config))
+    return shape, cells, profile
 
 
 def _profile(

@@ -11,9 +11,11 @@ joint; a profile that changes along the direction in other ways than by a move o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import warnings
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from detectors.pixels.medians import group_medians
 from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
@@ -38,11 +40,18 @@ LEAST_LENGTH_M = 0.04
 LEAST_POINTS = 12
 STEEP = 3.7  # tan(75 degrees): a steeper place is a step, beside which pixels mix both of its sides
 RIM_PX = 3  # knots on either side of a step that mix both of its sides, as at a target's rim
+STEP_KNOTS = 2
+"""Knots over which pixels beside a step may lie on its other side: their footprint is one knot, and
+the step's own place is known to one."""
+CURVED_KNOTS = 6  # over which a smooth curve bends like a parabola
 ROUNDED = 2.0
 """Deviations of rounding beyond which no rounding error lies: half a step is 1.73 of them."""
 SEEN = 0.5  # least departure from a smooth surface, as a share of a pixel's noise
 GAIN_SIGMAS = 4.0
 """Least significance of a profile's gain over a smooth surface."""
+OF_BANDS = 0.75
+"""Quantile of the bands at which a place of the profile is uncertain: damage is in fewer, and where
+the fit is a little off, a step is off in more."""
 BANDS = 10
 """Number of bands along the direction, of which every other one is predicted from the others."""
 
@@ -66,6 +75,8 @@ class Profile:
     it is unknown."""
     central: bool
     """Whether rays leave the origin, else they run along z."""
+    spread_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(k,): deviation of the surface itself at each knot, metres; empty until `with_spread`."""
     twist: Fit | None = None
     """Distance ahead, metres, by which a polynomial moves the surface."""
 
@@ -129,6 +140,40 @@ class Profile:
         rest = group_medians(values - result._curve_at(slopes), knots, count)[0]
         return replace(result, curve=curve + np.nan_to_num(rest))
 
+    def spread_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the deviation (n,) by which the surface may be wrong at points (n, 3), metres."""
+        knots = self.knots(self.slopes(points)).clip(0, len(self.curve) - 1)
+        return self.spread_m[knots]
+
+    def with_spread(self, points: np.ndarray) -> Profile:
+        """Return the profile with its own deviation beside steps, as points (n, 3) show it.
+
+        A strip beside a step holds pixels of both of its sides, and its median is one of them. What
+        the residuals of a strip exceed a usual strip's by is counted, at the quantile `OF_BANDS` of
+        the bands along the direction, and up to the bend of the curve over
+        `STEP_KNOTS` beyond what a curvature over `CURVED_KNOTS` explains."""
+        ahead_m = _filled(1.0 / self.curve if self.central else self.curve)
+        share = (STEP_KNOTS / CURVED_KNOTS) ** 2
+        bends_m = np.abs(_bends(ahead_m, STEP_KNOTS) - share * _bends(ahead_m, CURVED_KNOTS))
+        widest_m = maximum_filter1d(bends_m, 2 * STEP_KNOTS + 1)
+        count = len(self.curve)
+        knots = self.knots(self.slopes(points)).clip(0, count - 1)
+        residuals_m = np.nan_to_num(points[:, 2] - self(points))
+        strips = _bands(self.lengths(points)) * count + knots
+        numbers = np.bincount(strips, minlength=BANDS * count)
+        noise_m2 = group_medians(residuals_m**2, knots, count)[0] / 0.6745**2
+        usual_m2 = float(np.nanmedian(noise_m2))
+        squares_m2 = np.minimum(residuals_m**2, widest_m[knots] ** 2 + usual_m2)
+        sums_m2 = np.bincount(strips, squares_m2, BANDS * count)
+        means_m2 = np.where(numbers >= LEAST_POINTS, sums_m2, np.nan) / np.maximum(numbers, 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            variance_m2 = np.nanquantile(means_m2.reshape(BANDS, count), OF_BANDS, axis=0)
+        excess_m2 = np.nan_to_num(variance_m2 - usual_m2)
+        limited_m2 = np.minimum(excess_m2, widest_m**2)
+        is_large = limited_m2 > usual_m2
+        return replace(self, spread_m=np.sqrt(np.where(is_large, limited_m2, 0.0)))
+
     def trusted(self, points: np.ndarray) -> Profile:
         """Return the profile, unknown where points (n, 3) show less than `LEAST_LENGTH_M` of it,
         and beside steps."""
@@ -157,6 +202,13 @@ def _filled(curve: np.ndarray) -> np.ndarray:
     return np.interp(knots, knots[known], curve[known])
 
 
+def _bends(curve: np.ndarray, knots: int) -> np.ndarray:
+    """Return the sum of the curve's (k,) differences to both neighbours so many ``knots`` away; the
+    curve goes on straight beyond its ends."""
+    extended = np.pad(curve, knots, mode="reflect", reflect_type="odd")
+    return np.asarray(extended[2 * knots :] + extended[: -2 * knots] - 2.0 * curve)
+
+
 def picked(points: np.ndarray, most: int) -> np.ndarray:
     """Return at most this many of the points (n, 3): at random, because an even step would meet the
     same columns of the picture in every row."""
@@ -167,9 +219,12 @@ def picked(points: np.ndarray, most: int) -> np.ndarray:
 
 def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> Profile | None:
     """Return the profile, not yet fitted, along whose direction points (n, 3) depart least from a
-    smooth surface ``base``; None if no direction stands out.
+    smooth surface ``base``; None if no direction stands out, or if the points lie in one place or
+    in a plane through the camera.
 
     ``pitch``: distance of neighbouring pixels in x/z, or in metres where rays are parallel."""
+    if not pitch > 0.0:
+        return None
     sample = picked(points, COARSE_SEARCHED)
     on_base = sample.copy()
     on_base[:, 2] = base(sample)
@@ -178,8 +233,11 @@ def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> 
     # on the surface: what shows far behind through a hole would turn the mean plane
     normal = _normal(on_base, central)
     frame = _frame(normal, 0.0, pitch, central)
-    across = frame.slopes(sample)
-    along = frame.lengths(sample)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = frame.slopes(sample)
+        along = frame.lengths(sample)
+    if not np.isfinite([across, along]).all():
+        return None
     if max(np.ptp(across), np.ptp(along)) > MOST_STRIPS * FINE_PX * pitch:
         return None
     values = frame._curve_of(sample) - frame._curve_of(on_base)
@@ -343,6 +401,13 @@ def _turned(profile: Profile, angles: np.ndarray) -> Profile:
     return replace(profile, along=along, across=np.cross(along, ahead), ahead=ahead)
 
 
+def _bands(lengths: np.ndarray) -> np.ndarray:
+    """Return the band (n,) of places along the direction, from 0."""
+    extent = max(float(np.ptp(lengths)), 1e-12)
+    band = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
+    return np.minimum(band, BANDS - 1)
+
+
 def explains_better(
     profile: Profile, smooth: Fit, points: np.ndarray, rounding_m: float = 0.0
 ) -> bool:
@@ -354,10 +419,7 @@ def explains_better(
 
     ``rounding_m``: deviation that rounding leaves. Departures within `ROUNDED` of these do not
     count: the steps of a rounded plane without noise are extruded, too."""
-    lengths = profile.lengths(points)
-    extent = max(float(np.ptp(lengths)), 1e-12)
-    band = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
-    band = np.minimum(band, BANDS - 1)
+    band = _bands(profile.lengths(points))
     departures = points[:, 2] - smooth(points)
     gain = np.full(len(points), np.nan)
     for parity in (0, 1):
@@ -395,4 +457,4 @@ def profiled(
     profile = with_twist(profile, sample)
     if not explains_better(profile, smooth, sample, rounding_m):
         return None
-    return profile.fitted(points).trusted(points)
+    return profile.fitted(points).with_spread(points).trusted(points)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from detectors.findings.beside_joints import TouchingDamage, damage_beside, without_damage
 from detectors.findings.joints import joined, joints_facts, joints_of
 from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
@@ -48,6 +49,14 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     )
     joints = joints_of(cloud, evidence, detections, measurements)
     if joints:
+        further: list[TouchingDamage] = []
+        for feature in joints:
+            further += damage_beside(cloud, evidence, detections, measurements, feature)
+        joints = tuple(without_damage(feature, further) for feature in joints)
+        detections += tuple(part.detection for part in further)
+        measurements += tuple(
+            _measured(detector, cloud, part.evidence, part.detection) for part in further
+        )
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
         detections, measurements = joined(detections, measurements, joints)

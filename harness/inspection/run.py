@@ -518,7 +518,7 @@ def _page_html(
         sentence=run.verdict.sentence,
         conditions=_conditions(run),
         warnings=(*warnings_of(run), *further_warnings),
-        classes=CLASSES,
+        classes={name: CLASSES[name] for name in run.verdict.counts},
         flags=FLAGS,
         summary=tuple(_summary_rows(run.verdict)),
         judged=tuple(_judged_rows(run)),

@@ -20,11 +20,13 @@ from harness.vocabulary.geometry import MM, Cloud
 SURE = "sure"
 DOUBTFUL = "doubtful"
 RIM_OR_BLIND = "rim or blind"
+FEATURE = "feature"
 CLASSES = {
     SURE: "each is a false call with a probability below 0.05; where this is unknown, its score is"
     " at least 1.5 times the threshold",
     DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them",
     RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
+    FEATURE: "slots that repeat across the part, such as joints: no damage",
 }
 """The classes of findings, with their meaning."""
 FLAGS = {
@@ -107,6 +109,8 @@ def is_faint(finding: Finding, least_score: float) -> bool:
 
 def class_of(finding: Finding, flags: Sequence[str]) -> str:
     """Return the class of a finding with these flags."""
+    if finding.count > 1:
+        return FEATURE
     if "at_rim" in flags or finding.kind == "no return":
         return RIM_OR_BLIND
     return DOUBTFUL if "faint" in flags else SURE
@@ -303,7 +307,7 @@ class InspectionVerdict:
     sentence: str
     """It in one sentence."""
     counts: dict[str, int]
-    """Number of findings by class."""
+    """Number of findings by class; features of the part only where there are any."""
     sure_terms: dict[str, int]
     """Number of sure findings by term."""
     extent: Extent
@@ -333,18 +337,18 @@ def verdict_of(
 ) -> InspectionVerdict:
     """Return the answer. ``outline``: see `extent_of`."""
     findings = result.findings
-    counts = {name: 0 for name in CLASSES}
+    counts = {SURE: 0, DOUBTFUL: 0, RIM_OR_BLIND: 0}
     terms: dict[str, int] = {}
     false_sure = 0.0
     for finding in findings:
-        counts[finding.certainty] += 1
-        if finding.certainty == SURE and finding.term != JOINTS:
+        counts[finding.certainty] = counts.get(finding.certainty, 0) + 1
+        if finding.certainty == SURE:
             terms[finding.term] = terms.get(finding.term, 0) + 1
             false_sure += finding.noise_probability
     extent = extent_of(result, outline)
     expected = expected_calls(result.evidence, threshold)
-    damage = [finding for finding in findings if finding.term != JOINTS]
-    clauses = [_sure_clause(terms, extent.judged_m2, is_empty=not damage)]
+    damage = [finding for finding in findings if finding.certainty != FEATURE]
+    clauses = [_sure_clause(terms, extent, is_empty=not damage)]
     clauses += _other_clauses(damage, is_further=bool(terms))
     clauses += _joints_clauses(result.evidence.notes.get("joints", ()))
     clauses.append(_calls_clause(expected, false_sure if terms else math.nan))
@@ -366,8 +370,8 @@ def expected_calls(evidence: Evidence, threshold: float) -> float:
     return float(null["expected"])
 
 
-def _sure_clause(terms: dict[str, int], area_m2: float, *, is_empty: bool) -> str:
-    """Return the first clause. ``is_empty``: there is no finding of any class."""
+def _sure_clause(terms: dict[str, int], extent: Extent, *, is_empty: bool) -> str:
+    """Return the first clause. ``is_empty``: there is no damage of any class."""
     counted = []
     for term in PLURALS:
         if terms.get(term):
@@ -377,7 +381,7 @@ def _sure_clause(terms: dict[str, int], area_m2: float, *, is_empty: bool) -> st
         start = "no damage found"
     if counted:
         start = f"{joined_words(counted)} found"
-    return f"{start[0].upper()}{start[1:]} on {area_text(area_m2)}the part"
+    return f"{start[0].upper()}{start[1:]} on {extent_text(extent)}the part"
 
 
 def counted_text(count: int, term: str) -> str:
@@ -394,13 +398,22 @@ def joined_words(parts: Sequence[str]) -> str:
     return f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
+def extent_text(extent: Extent) -> str:
+    """Return ``0.12 m2, 97 % of ``, with as much as is known of how much was judged; empty where
+    nothing is."""
+    parts = []
+    if math.isfinite(extent.judged_m2) and extent.judged_m2 > 0:
+        parts.append(area_text(extent.judged_m2))
+    if math.isfinite(extent.judged_share):
+        parts.append(f"{100.0 * extent.judged_share:.0f} %")
+    return f"{', '.join(parts)} of " if parts else ""
+
+
 def area_text(area_m2: float) -> str:
-    """Return ``0.12 m2 of `` or ``45 cm2 of ``; empty where the area is unknown."""
-    if not (math.isfinite(area_m2) and area_m2 > 0):
-        return ""
+    """Return ``0.12 m2`` or ``45 cm2``."""
     if area_m2 < 0.01:
-        return f"{1e4 * area_m2:.2g} cm2 of "
-    return f"{area_m2:.2g} m2 of "
+        return f"{1e4 * area_m2:.2g} cm2"
+    return f"{area_m2:.2g} m2"
 
 
 def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str]:
@@ -433,12 +446,13 @@ def _joints_clauses(joints: Sequence[dict[str, Any]]) -> list[str]:
     clauses = []
     for facts in joints:
         size = f"{facts['length_mm']:.0f} x {facts['width_mm']:.0f} mm"
-        clause = f"{facts['count']} alike slots of {size} in rows are joints"
         differing = facts["differing"]
-        if differing:
+        clause = f"{facts['count'] + differing} joints of {size} in rows, "
+        if not differing:
+            clause += "all alike"
+        else:
             word = WORDS[differing] if differing < len(WORDS) else str(differing)
-            verb = "differs" if differing == 1 else "differ"
-            clause += f", from which {word} {verb}"
+            clause += f"{word} differs" if differing == 1 else f"{word} differ"
         clauses.append(clause)
     return clauses
 

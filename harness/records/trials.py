@@ -653,7 +653,7 @@ FINDINGS_OF_CAPTURE = Table(
             "",
             "certainty",
             "sure; doubtful (noise may explain it); rim or blind (its rest was not seen, or no"
-            " light came back)",
+            " light came back); feature (joints, no damage)",
         ),
         Column(
             "flags",

@@ -92,7 +92,7 @@ class Finding:
     """Probability that it is a false call: noise, or what an object or print makes of the measured
     distance. NaN if the capture does not set its own threshold."""
     certainty: str = ""
-    """``sure``, ``doubtful`` or ``rim or blind``; empty where nobody has judged it."""
+    """``sure``, ``doubtful``, ``rim or blind`` or ``feature``; empty where nobody has judged it."""
     flags: str = ""
     """Remarks on it, as words separated by spaces (`harness.inspection.verdict.FLAGS`)."""
     term: str = ""

@@ -140,8 +140,8 @@ def _spoil_tree(path: Path, rng: Rng) -> None:
         holder, key = holders[int(rng.integers(len(holders)))]
         try:
             _spoil_value(holder, key, rng)
-        except (KeyError, IndexError):
-            continue  # an earlier fault has taken it out
+        except (KeyError, IndexError, OverflowError):
+            continue  # an earlier fault has taken it out, or made it too large
     path.write_text(json.dumps(data) if is_json else _as_yaml(data))
 
 

@@ -94,7 +94,13 @@ def scored(
     if missed:
         shown = ", ".join(_shown(truth) for truth in missed[:3])
         why.append(f"{len(missed)} of {len(clear)} missed ({shown})")
-    unmatched = [r for r, truth in zip(rows, matched, strict=True) if truth is None]
+    # joints are named as features of the part, not as damage
+    is_damage = [row["certainty"] != "feature" for row in rows]
+    unmatched = [
+        row
+        for row, truth, damage in zip(rows, matched, is_damage, strict=True)
+        if truth is None and damage
+    ]
     elsewhere, false = _unmatched(
         stranger, view, [row for row in unmatched if row["certainty"] != "doubtful"]
     )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from detectors.findings.beside_joints import damage_beside, without_damage
 from detectors.findings.joints import chance_of_following, joined, joints_facts, joints_of
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.geometry import Cloud
@@ -83,6 +84,20 @@ def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
     assert len(joined(detections, measurements, [feature])[0]) == 2
 
 
+def test_a_trend_across_the_picture_is_no_difference_and_a_departure_from_it_is() -> None:
+    """Perspective makes joints shallower by 20 % from left to right; one departs by 15 %."""
+    detections, measurements = wall()
+    for number, measured in enumerate(measurements):
+        share = 1.0 - 0.2 * (BRICKS[number][1] - 20) / 260
+        measurements[number] = replace(measured, model_depth_m=share * measured.model_depth_m)
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert feature.differing == ()
+    deeper_m = 1.15 * measurements[11].model_depth_m
+    measurements[11] = replace(measurements[11], model_depth_m=deeper_m)
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert feature.differing == (11,)
+
+
 def test_a_slot_between_the_rows_stays_a_finding() -> None:
     detections, measurements = wall([*BRICKS, (45, 67)])
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
@@ -131,10 +146,52 @@ def test_the_end_of_a_joint_at_the_rim_belongs_to_it() -> None:
     measurements[last] = short
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
     assert last in feature.members
+    # an end that the rim leaves wider than long, too: its length and width are those of the joint's
+    across = replace(short, along=np.array([1.0, 0.0, 0.0]), width_m=0.0045, length_m=0.0096)
+    measurements[last] = across
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert last in feature.members
+    measurements[last] = short
     # a hole at the same place inside the picture does not
     detections[last] = replace(detections[last], pixels=pixels + 5 * SHAPE[1])
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
     assert last not in feature.members
+
+
+def test_damage_that_touches_a_joint_is_a_finding_of_its_own() -> None:
+    detections, measurements = wall()
+    row, column = BRICKS[7]
+    rows, columns = np.mgrid[row - 4 : row + 5, column + 2 : column + 8]
+    beside = np.sort((rows * SHAPE[1] + columns).ravel())
+    damaged = np.union1d(detections[7].pixels, beside)
+    detections[7] = replace(detections[7], pixels=damaged)
+    measurements[7] = replace(measurements[7], points=len(damaged))
+    score = np.zeros(SHAPE)
+    score.reshape(-1)[beside] = 20.0
+    evidence = replace(EVIDENCE, score=score)
+    (feature,) = joints_of(CLOUD, evidence, detections, measurements)
+    assert feature.differing == (7,)
+    (part,) = damage_beside(CLOUD, evidence, detections, measurements, feature)
+    assert part.detection.pixels.tolist() == beside.tolist()
+    assert part.detection.score == 20.0
+    assert part.detection.centre_m == pytest.approx(
+        CLOUD.points_m.reshape(-1, 3)[beside].mean(axis=0)
+    )
+    without = part.evidence.residual_m
+    assert np.isnan(without.reshape(-1)[detections[0].pixels]).sum() == 0
+    assert np.isnan(without[row - 10 : row + 10, column - 1 : column + 2]).all()
+    assert np.isfinite(without.reshape(-1)[beside]).all()
+    whole = without_damage(feature, [part])
+    assert sorted(whole.members) == list(range(len(BRICKS)))
+    assert whole.differing == ()
+
+
+def test_a_deeper_joint_has_no_damage_beside_it() -> None:
+    detections, measurements = wall()
+    deeper_m = 1.3 * measurements[7].model_depth_m
+    measurements[7] = replace(measurements[7], model_depth_m=deeper_m)
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert damage_beside(CLOUD, EVIDENCE, detections, measurements, feature) == ()
 
 
 def test_the_first_pair_of_slots_proves_nothing() -> None:

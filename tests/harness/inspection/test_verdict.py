@@ -296,10 +296,53 @@ def test_the_sentence_of_nothing_and_of_nothing_sure() -> None:
     assert doubtful.startswith("No damage is sure on 96 cm2 of the part; two places are doubtful;")
 
 
+def test_the_sentence_says_which_share_of_the_part_was_judged() -> None:
+    judged = judged_of(20.0)
+    outline = np.ones((40, 60), bool)
+    residual_m = np.zeros((40, 60))
+    residual_m[:, 45:] = np.nan
+    judged = replace(judged, evidence=replace(judged.evidence, residual_m=residual_m))
+    said = verdict_of(with_remarks(judged, 5.0), 5.0, outline).sentence
+    assert said.startswith("One hole found on 72 cm2, 75 % of the part; ")
+
+
+@pytest.mark.parametrize(
+    ("differing", "clause"),
+    [
+        (0, "6 joints of 76 x 9 mm in rows, all alike;"),
+        (1, "7 joints of 76 x 9 mm in rows, one differs;"),
+        (2, "8 joints of 76 x 9 mm in rows, two differ;"),
+    ],
+)
+def test_joints_are_a_feature_and_no_damage(differing: int, clause: str) -> None:
+    judged = judged_of(20.0, 20.0, 5.1)
+    features = replace(judged.detections[0], count=6)
+    facts = {"count": 6, "differing": differing, "length_mm": 76.0, "width_mm": 9.0}
+    notes = {"own_null": NULL, "joints": [facts]}
+    only = replace(
+        judged,
+        evidence=replace(judged.evidence, notes=notes),
+        detections=(features,),
+        measurements=judged.measurements[:1],
+    )
+    said = verdict_of(with_remarks(only, 5.0), 5.0)
+    assert said.sentence.startswith(f"No damage found on 96 cm2 of the part; {clause}")
+    assert said.counts == {"sure": 0, "doubtful": 0, "rim or blind": 0, "feature": 1}
+    assert said.sure_terms == {}
+    beside = replace(
+        only,
+        detections=(features, *judged.detections[1:]),
+        measurements=judged.measurements,
+    )
+    said = verdict_of(with_remarks(beside, 5.0), 5.0)
+    assert said.sentence.startswith("One hole found on 96 cm2 of the part; one further place")
+    assert said.counts == {"sure": 1, "doubtful": 1, "rim or blind": 0, "feature": 1}
+
+
 def test_numbers_are_words_up_to_twelve_and_terms_have_plurals() -> None:
     assert counted_text(1, "hole or dent") == "one small hole or dent"
     assert counted_text(12, "hole or dent") == "twelve small holes or dents"
     assert counted_text(13, "bump") == "13 bumps"
     assert verdict.joined_words(["a", "b", "c"]) == "a, b and c"
-    assert verdict.area_text(0.1234) == "0.12 m2 of " and verdict.area_text(math.nan) == ""
+    assert verdict.area_text(0.1234) == "0.12 m2" and verdict.area_text(0.0096) == "96 cm2"
     assert verdict.calls_text(0.3) == "0.3" and verdict.calls_text(0.004) == "0.004"

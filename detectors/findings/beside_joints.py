@@ -1,0 +1,111 @@
+"""Separates damage from the joint that it touches, with which it was found as one.
+
+The joints of a feature are alike, so what lies outside the largest outline of the others is damage.
+It is measured there: within the outline, the depths of both add up. Not modelled: damage within a
+joint's own outline, which remains a joint that differs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from detectors.findings.joints import Joints
+from detectors.interface import Detection, Evidence, Measurement
+from detectors.pixels.masks import grown
+from harness.vocabulary.geometry import Cloud
+
+FEWEST_OUTSIDE = 9  # pixels outside a joint's outline that are damage
+MARGIN_PX = 1  # by which a joint is cut out around its pixels
+
+
+@dataclass(frozen=True)
+class TouchingDamage:
+    """Damage that touches a joint."""
+
+    joint: int
+    """Number of the joint's detection."""
+    detection: Detection
+    """The damage."""
+    evidence: Evidence
+    """The evidence without the joint, in which the damage is measured."""
+
+
+def damage_beside(
+    cloud: Cloud,
+    evidence: Evidence,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+    feature: Joints,
+) -> tuple[TouchingDamage, ...]:
+    """Return the damage that the differing joints of a feature touch."""
+    points_m = cloud.points_m.reshape(-1, 3)
+    strongest = feature.members[0]
+    along = measurements[strongest].along
+    across = np.cross(along, detections[strongest].centre_m)
+    plane = np.column_stack([along, across / np.linalg.norm(across)])
+    half_m = np.zeros(2)
+    for number in feature.members:
+        places_m = points_m[detections[number].pixels] @ plane
+        middle_m = 0.5 * (places_m.min(axis=0) + places_m.max(axis=0))
+        half_m = np.maximum(half_m, np.abs(places_m - middle_m).max(axis=0))
+    beside = []
+    for number in feature.differing:
+        detection = detections[number]
+        places_m = points_m[detection.pixels] @ plane
+        off_m = places_m - _middle(places_m, half_m)
+        outside = (np.abs(off_m) > half_m).any(axis=1)
+        pixels = _largest(cloud, detection.pixels[outside])
+        if len(pixels) < FEWEST_OUTSIDE:
+            continue
+        joint = np.zeros(cloud.valid.shape, bool)
+        joint.reshape(-1)[detection.pixels] = True
+        joint = grown(joint, MARGIN_PX)
+        joint.reshape(-1)[pixels] = False
+        part = replace(
+            detection,
+            score=float(evidence.score.reshape(-1)[pixels].max()),
+            pixels=pixels,
+            centre_m=points_m[pixels].mean(axis=0),
+        )
+        without = replace(evidence, residual_m=np.where(joint, np.nan, evidence.residual_m))
+        beside.append(TouchingDamage(number, part, without))
+    return tuple(beside)
+
+
+def without_damage(feature: Joints, beside: Sequence[TouchingDamage]) -> Joints:
+    """Return the feature, of which the joints that damage touches are members: without it they do
+    not differ."""
+    touched = tuple(part.joint for part in beside if part.joint in feature.differing)
+    differing = tuple(number for number in feature.differing if number not in touched)
+    return Joints(feature.members + touched, differing)
+
+
+def _middle(places_m: np.ndarray, half_m: np.ndarray) -> np.ndarray:
+    """Return the middle (2,) of a joint among places (n, 2) that damage widens: along each axis,
+    that of the extent of a joint that holds the most places."""
+    middle_m = np.zeros(2)
+    for axis in (0, 1):
+        ordered_m = np.sort(places_m[:, axis])
+        ends = np.searchsorted(ordered_m, ordered_m + 2.0 * half_m[axis], side="right")
+        first = int((ends - np.arange(len(ordered_m))).argmax())
+        last = int(ends[first]) - 1
+        middle_m[axis] = 0.5 * (ordered_m[first] + ordered_m[last])
+    return middle_m
+
+
+def _largest(cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+    """Return the largest connected part of pixels (n,), and those within its own extent of it: a
+    joint parts damage that it crosses."""
+    mask = np.zeros(cloud.valid.shape, np.uint8)
+    mask.reshape(-1)[pixels] = 1
+    _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if len(stats) < 2:
+        return pixels[:0]
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    extent_px = float(max(stats[largest, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1]))
+    near = np.hypot(*(centres - centres[largest]).T) <= 2.0 * extent_px
+    near[0] = False
+    return pixels[near[labels.reshape(-1)[pixels]]]
