@@ -70,6 +70,17 @@ def test_a_quick_run_has_few_repeats_or_boards_and_says_that_it_is_a_first_look(
     assert boards == [[36, 36, 60], [12, 12, 20]] and study.repeats == config.repeats == 1
 
 
+def test_a_quick_run_keeps_the_boards_that_its_threshold_needs() -> None:
+    quick = load_experiment(FOLDER / "detectors.yaml", quick=True).config
+    assert quick.threshold.calibrate is not None
+    assert quick.threshold.calibrate.boards == 20  # a third of 38 is 13, which cannot show the rate
+
+
+@pytest.mark.parametrize("file", sorted(FOLDER.glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_shipped_experiment_has_a_quick_run(file: Path) -> None:
+    assert load_experiment(file, quick=True).points
+
+
 def test_every_variation_of_averaging_changes_something() -> None:
     points = points_of("averaging")
     main = {point.digest for point in points if point.variant == MAIN}
