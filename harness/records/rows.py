@@ -56,6 +56,11 @@ class RunRow:
     ]
     frames_used: Annotated[int, "number of frames in the average"]
     left_out: Annotated[int, "number of frames left out as disturbed"]
+    exposure_share: Annotated[
+        float | None,
+        "mean exposure time that the camera chose for its pixels, over its longest; empty for "
+        "real frames",
+    ] = None
     detections: Annotated[int, "number of findings"]
     false_calls: Annotated[int, "number of findings that match no damage"]
     inspected_m2: Annotated[float | None, "in a study: judged area of the face"] = None

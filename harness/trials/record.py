@@ -33,14 +33,16 @@ def add_judgement(
     origin: Origin,
     role: Role,
     seconds_frames: float,
+    exposure_share: float | None = None,
     map_facts: MapFacts = NO_MAP,
 ) -> None:
     """Add the rows of one judgement. An origin with a board belongs to a study, which records
     findings, signals and counts over grids of thresholds as well."""
     in_study = origin.board is not None
-    record.runs.append(
-        run_row(judgement, point, origin, role, seconds_frames=seconds_frames, map_facts=map_facts)
+    run = run_row(
+        judgement, point, origin, role, seconds_frames=seconds_frames, map_facts=map_facts
     )
+    record.runs.append(replace(run, exposure_share=exposure_share))
     if judgement.criteria.threshold is None:
         return
     if judgement.labelled.damaged:

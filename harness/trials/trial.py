@@ -78,6 +78,7 @@ def run_trial(trial: Trial) -> TrialRecord:
                 origin=origin,
                 role=trial.role,
                 seconds_frames=seconds_frames,
+                exposure_share=exposure_share_of(boards, point),
                 map_facts=clouds.map_facts(point),
             )
             record.registrations += clouds.registration_rows(point, origin, trial.role)
@@ -85,6 +86,15 @@ def run_trial(trial: Trial) -> TrialRecord:
                 record.probes.append(clouds.probes_row(point, origin))
                 record.noise += clouds.noise_rows(point, origin)
     return record
+
+
+def exposure_share_of(boards: Sequence[Board], point: TrialPoint) -> float:
+    """Return the mean exposure time of a point's views over the camera's longest."""
+    shares = []
+    for number, board in enumerate(boards):
+        if uses_view(point, number):
+            shares.append(board.unit.exposure_share)
+    return sum(shares) / len(shares)
 
 
 def sharing_averages(points: Sequence[TrialPoint]) -> list[list[TrialPoint]]:

@@ -14,6 +14,7 @@ from harness.vocabulary.geometry import Frame, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.amcw.at_once import AtOnce, at_once
+from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import AnyCamera
 from scenes.sensor.common.config import CameraConfig
@@ -48,6 +49,15 @@ class SimulatedUnit:
     def exposure(self) -> Any:
         """The noise-free input that all frames share; its type depends on the model."""
         return self.model.expose(self.view)
+
+    @cached_property
+    def exposure_share(self) -> float:
+        """The mean exposure time of the region's pixels over the camera's longest, chosen once for
+        the view; 1 for kinds of camera without exposures."""
+        if not isinstance(self.exposure, AmcwExposure):
+            return 1.0
+        shares = self.exposure.time_share.reshape(self.exposure.shape)
+        return float(shares[self.cut].mean())
 
     @cached_property
     def at_once(self) -> AtOnce | None:

@@ -20,7 +20,7 @@ class AmcwExposure(NamedTuple):
     """(n,) float32: largest sample that wells and converter hold; infinite if saturation is off.
     """
     time_share: np.ndarray
-    """(n,) float32: exposure time over the longest."""
+    """(n,) float32: exposure time over the longest, as it was chosen or ended early."""
     shape: tuple[int, int]
     """(h, w) of the view."""
 

@@ -5,11 +5,11 @@ Modelled: shot and read noise, the harmonics that the number of phases aliases, 
 companding, saturation, fixed pattern and drift, the phase-space joint bilateral filter, unwrapping
 of one to three frequencies, the engine's gates, the correction for the emitter beside the lens,
 rounding, the lens's natural fall-off of light and, if the camera's file has them, its blur, stray
-light and exposures that end early. Not modelled: dark current, motion, light that changes during a
-frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps in
-which exposures end, phase errors that differ between frequencies (except harmonics), any further
-post-processing. Errors of a unit's tables of lens, emitter and phase offsets are part of its fixed
-pattern and offset."""
+light, exposure control, or exposures that end early. Not modelled: dark current, motion, light that
+changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain
+switching, the coarser rounding of a sample that is scaled to the longest exposure, phase errors
+that differ between frequencies (except harmonics), any further post-processing. Errors of a unit's
+tables of lens, emitter and phase offsets are part of its fixed pattern and offset."""
 
 from dataclasses import replace
 from functools import cached_property

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,14 @@ from harness.records.rows import TrialRecord
 from harness.trials import trial as trials
 from harness.trials.board import Board
 from harness.trials.judge import Criteria, Judgement, LabelledCloud, judge
-from harness.trials.trial import Trial, capture_of, cloud_of, run_trial, uses_view
+from harness.trials.trial import (
+    Trial,
+    capture_of,
+    cloud_of,
+    exposure_share_of,
+    run_trial,
+    uses_view,
+)
 from harness.vocabulary.geometry import MM
 from tests.support.board_in_closed_form import (
     BACKING_M,
@@ -58,7 +67,7 @@ def test_a_damaged_board_gives_a_run_and_a_row_of_its_hole(inspected: TrialRecor
     assert (run.point, run.role, run.origin.variant) == ("digest", "damaged", "main")
     assert (run.origin.frames, run.origin.repeat, run.origin.board) == (5, 3, None)
     assert (run.threshold, run.detections, run.false_calls) == (6.0, 1, 0)
-    assert (run.frames_used, run.left_out) == (5, 0)
+    assert (run.frames_used, run.left_out, run.exposure_share) == (5, 0, 1.0)
     assert np.isnan(run.quiet_threshold)
     assert run.seconds_frames > 0 and run.seconds_detect > 0
     assert (row.hole, row.detected, row.state, row.threshold) == ("7", True, "found", 6.0)
@@ -182,6 +191,13 @@ def test_trials_and_views_have_streams_of_their_own(damaged: Board) -> None:
     assert replace(trial, board=2).labels == ("damaged", 3, "board", 2)
     assert capture_of(trial, 0, damaged, 1).labels == trial.labels
     assert capture_of(trial, 2, damaged, 1).labels == (*trial.labels, "view", 2)
+
+
+def test_the_exposure_of_a_point_is_the_mean_over_its_views() -> None:
+    boards: Any = [SimpleNamespace(unit=SimpleNamespace(exposure_share=s)) for s in (1.0, 0.5, 0.1)]
+    point = replace(point_of(), mapping=MappingConfig(views=2))
+    assert exposure_share_of(boards, point) == 0.75
+    assert exposure_share_of(boards[:1], point_of()) == 1.0
 
 
 def test_a_mapping_of_fewer_views_does_not_use_the_last() -> None:

@@ -56,19 +56,26 @@ def control(
     return ExposuresFacts.from_data(data)
 
 
-def exposed(
-    exposures: ExposuresFacts | None, distance_m: float, **effects: bool
-) -> tuple[AmcwExposure, np.ndarray]:
-    """The exposure of a facing plane of albedo 0.5, and the electrons (n,) of the emitter in both
-    wells in the longest exposure."""
+def unit_with(
+    exposures: ExposuresFacts | None, distance_m: float, slope_x: float = 0.0, **effects: bool
+) -> SimulatedUnit:
+    """A unit before a plane of albedo 0.5."""
     only = NO_EFFECTS.model_copy(update={"saturation": True, "noise": True, **effects})
     config = CameraConfig(effects=only, numbers=NUMBERS, ambient_uw_cm2_nm=AMBIENT)
     camera = camera_of(config)
     assert isinstance(camera, AmcwCamera)
     camera = camera.model_copy(update={"exposures": exposures})
-    view = plane_view(camera, REGION, distance_m, 0.5)
-    unit = SimulatedUnit(camera, config, view)
-    electrons = ELECTRONS * unit.model.gathered * view.intensity
+    view = plane_view(camera, REGION, distance_m, 0.5, slope_x)
+    return SimulatedUnit(camera, config, view)
+
+
+def exposed(
+    exposures: ExposuresFacts | None, distance_m: float, **effects: bool
+) -> tuple[AmcwExposure, np.ndarray]:
+    """The exposure of a facing plane of albedo 0.5, and the electrons (n,) of the emitter in both
+    wells in the longest exposure."""
+    unit = unit_with(exposures, distance_m, **effects)
+    electrons = ELECTRONS * unit.model.gathered * unit.view.intensity
     return unit.exposure, electrons.ravel()
 
 
@@ -145,6 +152,17 @@ def test_the_choice_depends_on_light_only():
     without, _ = exposed(chosen, 0.5, noise=False, saturation=False)
     assert with_noise.time_share.max() < 0.7
     assert np.array_equal(with_noise.time_share, without.time_share)
+
+
+def test_a_unit_states_the_mean_exposure_of_its_own_pixels():
+    """Not of the margin for the filter's window. The plane comes nearer to the right, so that the
+    columns there take the shorter exposure."""
+    unit = unit_with(control((1.0, 0.25)), 0.604, slope_x=-0.5)
+    shares = unit.exposure.time_share.reshape(unit.exposure.shape)
+    assert 0.3 < unit.exposure_share < 0.9
+    assert unit.exposure_share == pytest.approx(shares[unit.cut].mean())
+    assert unit.exposure_share != pytest.approx(shares.mean(), rel=1e-3)
+    assert unit_before_plane(load_camera("realsense_l515"), 0.4, 0.9).exposure_share == 1.0
 
 
 @pytest.mark.parametrize("name", CONTROLLED)
