@@ -1,7 +1,10 @@
 """The rule for the claim on cameras (C11), judged at each place of an experiment.
 
 A place is a value of every axis but the camera and its unit. There, a camera's number of holes
-found is a range over its units and variations, and over the holes that are undecided."""
+found is a range over its units and variations, and over the holes that are undecided. The L515 is
+not judged beyond 1 m: its noise is calibrated at 0.65 and 0.945 m, and by its model it grows with
+the square of the range (1.1 mm at 2 m, 3.2 at 3.5), while a published evaluation has less than
+0.5 mm up to 3.5 m (Breitbarth, SPIE 11782)."""
 
 from collections.abc import Sequence
 
@@ -16,6 +19,9 @@ from harness.vocabulary.path_names import value_text
 CAMERA = "source.camera.name"
 BEST = "azure_kinect_nfov"
 OTHERS = ("kinect_v2", "realsense_l515")
+DISTANCE = "source.target.distance_m"
+KNOWN_TO_M = {"realsense_l515": 1.0}
+"""Distance up to which a camera's noise is known."""
 
 CountsByConditions = dict[str, dict[str, HoleCount]]
 """The count of each camera (by name) at each place (as text)."""
@@ -35,8 +41,9 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]
     if rows.empty:
         return verdict_of("C11", "undecided", f"Not judged: no trial has {MANY} frames.")
+    rows, withdrawn = _with_known_noise(rows)
     counts = _counts_by_conditions(rows, axes)
-    evidence = []
+    evidence = withdrawn
     units = rows.groupby(CAMERA)[CAMERA_UNIT].nunique().min() if CAMERA_UNIT in axes else 1
     if units < FEWEST_UNITS:
         evidence.append(
@@ -56,6 +63,23 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
             evidence.append(f"Against {camera}: {'; '.join(texts)}.")
     answer = decide(answers) if units >= FEWEST_UNITS else "undecided"
     return verdict_of("C11", answer, " ".join(evidence))
+
+
+def _with_known_noise(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Return the rows of places where the camera's noise is known, and a sentence for each camera
+    that lost some."""
+    sentences: list[str] = []
+    if DISTANCE not in rows:
+        return rows, sentences
+    for camera, farthest_m in KNOWN_TO_M.items():
+        is_beyond = (rows[CAMERA] == camera) & (rows[DISTANCE] > farthest_m)
+        if is_beyond.any():
+            rows = rows[~is_beyond]
+            sentences.append(
+                f"Withdrawn for {camera} beyond {farthest_m:g} m, where its noise is not known: "
+                "the model's grows with the square of the range, a published evaluation's hardly."
+            )
+    return rows, sentences
 
 
 def _counts_by_conditions(rows: pd.DataFrame, axes: Sequence[str]) -> CountsByConditions:

@@ -12,10 +12,10 @@ that differ between frequencies (except harmonics), any further post-processing.
 tables of lens, emitter and phase offsets are part of its fixed pattern and offset."""
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, optimize, special
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, UW_CM2, Lens, Region
 from scenes.optics import NoiseFreeView
@@ -35,6 +35,7 @@ from scenes.sensor.common.normals import standard_normals
 from scenes.sensor.common.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
+WIDE_PX = 1.5  # deviation from which samples of a Gaussian blur as it does, within 1 %
 HIGHEST_HARMONIC = 31  # higher harmonics change the phase by less than 0.1 mrad in total
 
 
@@ -79,11 +80,43 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
 
 
 def _spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Return light (..., h, w) after a Gaussian blur."""
+    """Return light (..., h, w), averaged over pixels, after a Gaussian blur of this deviation."""
     if sigma_px == 0:
         return light
-    blurred = ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1))
-    return np.asarray(blurred)
+    if sigma_px >= WIDE_PX:
+        blurred = ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1))
+        return np.asarray(blurred)
+    weights = blur_weights(sigma_px)
+    along_rows = ndimage.correlate1d(light, weights, axis=-1, mode="nearest")
+    return np.asarray(ndimage.correlate1d(along_rows, weights, axis=-2, mode="nearest"))
+
+
+@lru_cache
+def blur_weights(sigma_px: float) -> np.ndarray:
+    """Return the weights (2 n + 1,), 0 or more and symmetric, that blur pixels most like a Gaussian
+    blurs the light before pixels average it: by least squares over all places of a sharp edge.
+
+    Samples of a narrow Gaussian do not: an edge blurred by those of 0.45 pixels looks as if blurred
+    by 0.25. From `WIDE_PX` on, the two agree.
+    """
+    reach_px = int(np.ceil(4 * sigma_px))
+    places_px = np.linspace(-reach_px - 1, reach_px + 1, 200 * (reach_px + 1) + 1)
+
+    def sharp(distance_px: np.ndarray) -> np.ndarray:
+        return np.clip(distance_px + 0.5, 0, 1)
+
+    def until(distance_px: np.ndarray) -> np.ndarray:
+        """Integral of the Gaussian's step up to this distance."""
+        x = distance_px / sigma_px
+        return sigma_px * (x * special.ndtr(x) + np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi))
+
+    blurred = until(places_px + 0.5) - until(places_px - 0.5)
+    changes = []
+    for n in range(1, reach_px + 1):
+        pair = sharp(places_px - n) + sharp(places_px + n)
+        changes.append(pair - 2 * sharp(places_px))
+    outer, _ = optimize.nnls(np.stack(changes, axis=1), blurred - sharp(places_px))
+    return np.concatenate([outer[::-1], [1 - 2 * outer.sum()], outer])
 
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:

@@ -353,7 +353,8 @@ def test_the_scanner_is_rid_of_all_indirect_light_too():
 def test_saturated_neighbours_do_not_count():
     """Beside a saturated half of the picture at the same distance a pixel keeps its range and its
     amplitude."""
-    settings = config(saturation=True, multipath=True)
+    sharp = {"scatter.blur_px": 0.0}
+    settings = config(numbers=sharp, saturation=True, multipath=True)
     plain = unit_of(settings)
     columns = np.arange(plain.view.intensity.shape[1])
     bright = np.where(columns < 30, 1.0, 2000.0)

@@ -7,7 +7,7 @@ import pytest
 
 from harness.vocabulary.geometry import Region
 from scenes.closed_form import Plane, layered_view, plane_view
-from scenes.sensor.amcw.imager import scattered
+from scenes.sensor.amcw.imager import WIDE_PX, blur_weights, scattered
 from scenes.sensor.camera import camera_of
 from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
@@ -24,11 +24,12 @@ def z_of(view_of, **scatter: float) -> np.ndarray:
 
 
 def test_a_point_keeps_its_light_and_gets_the_declared_width():
-    facts = camera_of(
-        CameraConfig(
-            numbers={"scatter.blur_px": 1.5, "scatter.stray_share": 0.2, "scatter.stray_px": 8.0}
-        )
-    ).scatter
+    numbers = {
+        "scatter.blur_px": 1.5,
+        "scatter.stray_share": 0.2,
+        "scatter.stray_px": 8.0,
+    }
+    facts = camera_of(CameraConfig(numbers=numbers)).scatter
     point = np.zeros((2, 101, 121), np.complex64)
     point[0, 50, 60] = 1.0
     point[1, 40, 70] = 2.0j
@@ -38,6 +39,21 @@ def test_a_point_keeps_its_light_and_gets_the_declared_width():
     for coordinate, centre in ((u, 60), (v, 50)):
         variance = (spread[0].real * (coordinate - centre) ** 2).sum()
         assert variance == pytest.approx(0.8 * 1.5**2 + 0.2 * 8.0**2, rel=0.01)
+
+
+def test_a_narrow_blur_takes_and_gives_light_once():
+    for blur_px in (0.15, 0.45, 0.6, 1.4):
+        weights = blur_weights(blur_px)
+        assert weights.min() >= 0
+        assert weights.sum() == pytest.approx(1.0, abs=1e-12)
+        assert (weights == weights[::-1]).all()
+
+
+def test_narrow_and_wide_blurs_meet():
+    just_below = blur_weights(WIDE_PX - 1e-6)
+    from_centre_px = np.arange(len(just_below)) - len(just_below) // 2
+    samples = np.exp(-(from_centre_px**2) / (2 * WIDE_PX**2))
+    assert just_below == pytest.approx(samples / samples.sum(), abs=0.002)
 
 
 def test_stray_light_draws_a_near_patch_towards_its_surroundings():

@@ -130,11 +130,11 @@ def test_a_part_of_sums_is_theirs_on_those_pixels():
 
 
 def test_a_unit_leaves_out_the_margin_but_at_the_sensors_border():
-    """The filter's window of 5 pixels reaches 2 beyond a pixel."""
+    """The filter's window of 5 pixels reaches 2 beyond a pixel, and the lens's blur 2 further."""
     outer = Region(0, 40, 100, 150)
     unit = SimulatedUnit(AZURE, CameraConfig(), plane_view(AZURE, outer, 1.0, 0.6))
     margin = AZURE.optics.margin_px
-    assert margin == 2
+    assert margin == 4
     assert unit.region == Region(0, 40 - margin, 100 + margin, 150 - margin)
     corner = Region(540, 576, 600, 640)
     unit = SimulatedUnit(AZURE, CameraConfig(), plane_view(AZURE, corner, 1.0, 0.6))

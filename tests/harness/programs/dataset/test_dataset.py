@@ -151,8 +151,10 @@ def test_truth_depth_and_validity_agree_with_the_cloud(home):
     mask = cv2.imread(str(board_folder / f"{'mask'}.png"), cv2.IMREAD_UNCHANGED)
     z_m = arrays["points_m"][..., 2]
     np.testing.assert_array_equal(valid > 0, np.isfinite(z_m))
-    assert np.abs(depth[valid > 0] / 5000 - z_m[valid > 0]).max() <= 1.01e-4
-    assert not depth[valid == 0].any()
+    # 16 bits hold 13.1 m; noise alone may look farther away
+    is_stored = (valid > 0) & (z_m < 65535 / 5000)
+    assert np.abs(depth[is_stored] / 5000 - z_m[is_stored]).max() <= 1.01e-4
+    assert (depth[~is_stored] == 0).all()
     bright = intensity / 65535 * truth["intensity_at_65535"]
     assert (
         np.abs(bright - np.minimum(arrays["intensity"], truth["intensity_at_65535"])).max()

@@ -71,7 +71,7 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
     board without it."""
     camera = camera_of(NOISE)
     target = board(
-        90.0,
+        100.0,
         custom.PoseConfig(distance_m=0.7, tilt_x_deg=12.0, tilt_y_deg=-7.0, offset_x_mm=20.0),
         **damage,
     )

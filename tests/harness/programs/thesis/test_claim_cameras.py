@@ -121,6 +121,18 @@ def test_a_variation_by_another_camera_takes_no_units_away():
     assert claim_c11(with_fourth, AXES).verdict == "borne out"
 
 
+def test_the_l515_is_not_judged_where_its_noise_is_not_known():
+    far = (0.5, 2.0)
+    smallest = {"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 3)}
+    answer = judged(cameras(smallest, far))
+    # the L515 is ahead at 2 m only
+    assert answer.verdict == "borne out"
+    assert "Withdrawn for realsense_l515 beyond 1 m" in answer.evidence
+    assert "Against realsense_l515: ahead at 0.5 m." in answer.evidence
+    assert "2 m 8 / 7 / –" in answer.evidence
+    assert judged(cameras(smallest)).verdict == "not borne out"
+
+
 def test_not_judged_without_the_three_cameras_or_without_fifty_frames():
     results = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
     summary = summarise_holes(results.holes, AXES[:2])

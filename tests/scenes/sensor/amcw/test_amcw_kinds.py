@@ -52,6 +52,7 @@ def fourth_camera(**changes: Any) -> dict[str, Any]:
         "modulation__wiggling_residual": [0.1],
         "photons__signal_electrons": 50_000.0,
         "photons__electrons_per_unit": 0.1,
+        "scatter__blur_px": 0.0,
         "converter__knee_units": 2**20,
         "converter__full_scale_units": 2**20,
         "engine__window_px": 3,

@@ -26,6 +26,7 @@ def exposure_of(numbers: dict, distance_m: float = 1.0, **effects: bool):
     declared = {
         "photons.signal_electrons": ELECTRONS,
         "photons.electrons_per_unit": 2.0,
+        "scatter.blur_px": 0.0,
         **numbers,
     }
     only = NO_EFFECTS.model_copy(update=effects)
