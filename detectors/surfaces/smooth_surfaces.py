@@ -124,7 +124,15 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     seen_m = np.where(valid[..., None], points, np.nan)
     masks = _with_pieces(masks, small, seen_m, contact_m, reach)
     unbroken = components(valid, right, down)[0]
-    masks = _with_faces(masks, unbroken, seen_m, contact_m, crease_deg, central)
+    masks = _with_faces(
+        masks,
+        unbroken,
+        seen_m,
+        apart_m=contact_m,
+        crease_deg=crease_deg,
+        central=central,
+        reach=reach,
+    )
     filled = masks.copy()
     for number, mask in enumerate(masks):
         filled[number] = holes_filled(mask)
@@ -166,10 +174,14 @@ def _with_faces(
     apart_m: float,
     crease_deg: float,
     central: bool,
+    reach: int,
 ) -> np.ndarray:
     """Return the surfaces, each with all faces of the extruded part of which it is one: a sheet's
     flats and webs. ``unbroken`` (h, w): numbers of the areas without a step, which end no surface
-    at a crease."""
+    at a crease.
+
+    Faces no wider than the smoothing's reach on both sides are none: beside a rim, the lens's blur
+    and the camera's filter make such a ramp to a strip of what lies a little behind."""
     surfaces = list(masks)
     for number in _areas_of(masks, unbroken):
         area = unbroken == number
@@ -178,7 +190,11 @@ def _with_faces(
         if np.count_nonzero(area) <= FACES_FROM * max(shared):
             continue
         part = extruded_faces(area, largest, points_m, apart_m, crease_deg, central)
-        if part is not None:
+        if part is None:
+            continue
+        # the picture's edge cuts a strip no wider
+        added = np.pad(part & ~largest, 1)
+        if shrunk(added, 2 * reach + 1)[1:-1, 1:-1].any():
             part = part | largest
             surfaces = [part, *[surface for surface in surfaces if not _lies_in(surface, part)]]
     return np.array(surfaces).reshape(-1, *unbroken.shape)

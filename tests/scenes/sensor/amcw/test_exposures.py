@@ -64,7 +64,7 @@ def unit_with(
     config = CameraConfig(effects=only, numbers=NUMBERS, ambient_uw_cm2_nm=AMBIENT)
     camera = camera_of(config)
     assert isinstance(camera, AmcwCamera)
-    camera = camera.model_copy(update={"exposures": exposures})
+    camera = camera.model_copy(update={"exposures": exposures, "scatter": None})
     view = plane_view(camera, REGION, distance_m, 0.5, slope_x)
     return SimulatedUnit(camera, config, view)
 
