@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from detectors.surfaces import smooth_surfaces
 from detectors.surfaces.background import background
 from detectors.surfaces.extruded import (
     MOST_STRIPS,
@@ -190,3 +191,28 @@ def test_the_steps_of_a_rounded_plane_are_no_profile_where_rounding_is_known() -
     profile = with_twist(directed, points)
     assert explains_better(profile, plane, points)
     assert not explains_better(profile, plane, points, rounding_m=1e-3 / np.sqrt(12))
+
+
+@pytest.mark.parametrize(("width_px", "is_face"), [(16, False), (30, True)])
+def test_a_strip_beside_a_rim_is_no_face(
+    width_px: int, is_face: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blur and filter make a ramp of a small step: with what lies behind, it looks like a profile.
+    The strip ends at the picture's edge."""
+    height = 120
+    surface = np.zeros((height, 100 + width_px), bool)
+    surface[:, :100] = True
+    unbroken = np.ones(surface.shape, np.int32)
+    points_m = np.ones((*surface.shape, 3))
+    monkeypatch.setattr(smooth_surfaces, "extruded_faces", lambda *_: unbroken > 0)
+    (part,) = smooth_surfaces._with_faces(
+        surface[None],
+        unbroken,
+        points_m,
+        apart_m=0.005,
+        crease_deg=35.0,
+        central=True,
+        reach=9,
+    )
+    assert part.all() == is_face
+    assert part[:, :100].all()
