@@ -278,8 +278,8 @@ class Score:
 
     @property
     def grade(self) -> int:
-        """The narrowest band that holds the value: 3, the source's own tolerance; 2, `NEAR`; 0, none.
-        A bound that holds has 1."""
+        """The narrowest band that holds a value: 3 the source's own tolerance, 2 `NEAR`, 0 none; 1
+        for a bound that holds."""
         published = self.figure.published
         if not self.passes or published.value is None:
             return int(self.passes)
