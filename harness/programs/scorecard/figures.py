@@ -278,15 +278,15 @@ class Score:
 
     @property
     def grade(self) -> int:
-        """3: within the source's own tolerance; 2: within `NEAR` of a value; 1: passes; 0: fails.
-        A bound is 1 or 0."""
+        """The narrowest band that holds a value: 3 the source's own tolerance, 2 `NEAR`, 0 none; 1
+        for a bound that holds."""
         published = self.figure.published
         if not self.passes or published.value is None:
             return int(self.passes)
         own_low, own_high = published.limits(0.0, published.tolerance or 0.0)
         if own_low <= self.simulated.value <= own_high:
             return 3
-        return 2 if self.strict else 1
+        return 2
 
     @property
     def fell_behind(self) -> bool:

@@ -125,6 +125,14 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     is_as_filed = True
     if options.power and options.figures is None and not options.camera:
         is_as_filed = _compare_untested(moved, list(titles), options.out)
+    _name_failures(scores, families)
+    score_fell_behind = any(score.fell_behind for score in scores)
+    family_fell_behind = any(family.fell_behind for family in families)
+    return int(score_fell_behind or family_fell_behind or not is_as_filed)
+
+
+def _name_failures(scores: Sequence[scoring.Score], families: Sequence[FamilyScore]) -> None:
+    """Name on standard error what fails without a reason, and what passes in spite of one."""
     for score in scores:
         if score.passes and score.figure.fails:
             print(f"{score.figure.name} passes now: remove `fails` from its entry", file=sys.stderr)
@@ -139,9 +147,6 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         if family.fell_behind:
             text = f"mean ratio {family.mean:.3g}, last over first {family.change:.3g}"
             print(f"{name} fails ({family.verdict}): {text}", file=sys.stderr)
-    score_fell_behind = any(score.fell_behind for score in scores)
-    family_fell_behind = any(family.fell_behind for family in families)
-    return int(score_fell_behind or family_fell_behind or not is_as_filed)
 
 
 def _compare_untested(moved: Sequence[power.Moved], cameras: Sequence[str], out: Path) -> bool:
@@ -198,10 +203,12 @@ def _page(answer: str, card: Scorecard, provenance: dict[str, object], command: 
         body.append(FAMILIES.grid(card.families).html())
     if card.moved:
         body += [heading("Which figures notice a wrong constant"), note(POWER_NOTE)]
-        unnoticed = [row for row in card.moved if not row.names]
-        keys = power.untested(unnoticed)
+        keys = power.untested(card.moved)
         lines = [f"{camera_title(camera)}: {', '.join(names)}" for camera, names in keys.items()]
-        body += [paragraph("Untested constants, which nothing notices:"), bullets(lines)]
+        body += [
+            paragraph("Untested constants, which nothing notices or which could not be moved:"),
+            bullets(lines),
+        ]
         body.append(fold("All constants", power.POWER.grid(card.moved).html()))
     if failing := [score for score in real if not score.passes]:
         body += [heading("Failures and their reasons"), scoring.SCORES.grid(failing).html()]

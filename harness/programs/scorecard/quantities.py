@@ -40,6 +40,9 @@ from scenes.sensor.common.config import CameraConfig, EffectsConfig
 # 6 % to either side on the coarsest camera, and the mean deviation by less than 1 %.
 PATCH = (40, 24)
 PATTERN_PATCH = (140, 180)
+FLOOR_BELOW_M = 1.0
+# a frame whose mean lies farther from the median of all has jumped
+JUMP_M = 5e-3
 # slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step
 # occur
 LEAST_TILT = (0.05, 0.02)
@@ -57,9 +60,6 @@ NEAREST_M = 0.1
 FARTHEST_M = 20.0
 STEP_OUT = 1.25
 HALVINGS = 5
-FLOOR_BELOW_M = 1.0
-# a frame whose mean lies farther from the median of all has jumped
-JUMP_M = 5e-3
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 Distance = Annotated[
