@@ -146,11 +146,11 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
 def with_noise(cloud: Cloud, frames: Sequence[Frame], z_step_m: float) -> Cloud:
     """Return a cloud with what its first frames show of the noise: how far it reaches
     (`noise_reach_px`), and where depth was upsampled, over which rectangle it is averaged at each
-    place (`noise_sides_px`). Frames that the cloud leaves out do not count."""
-    left_out = {frame.name for frame in cloud.left_out}
-    frames = [frame for frame in frames if frame.name not in left_out]
+    place (`noise_sides_px`), by the frames that the cloud does not leave out."""
     reach_px = noise_reach_px(frames, z_step_m)
-    sides_px = sides_if_upsampled(frames, reach_px, z_step_m)
+    left_out = {frame.name for frame in cloud.left_out}
+    kept = [frame for frame in frames if frame.name not in left_out]
+    sides_px = sides_if_upsampled(kept, reach_px, z_step_m)
     return replace(cloud, noise_reach_px=reach_px, noise_sides_px=sides_px)
 
 
