@@ -365,7 +365,7 @@ def noise_sides_at(cloud: Cloud, row: float, column: float) -> tuple[float, floa
     if cloud.noise_sides_px is None:
         return cloud.noise_reach_px, cloud.noise_reach_px
     _, rows, columns = cloud.noise_sides_px.shape
-    height, width = cloud.valid.shape
+    height, width = cloud.points_m.shape[:2]
     at_row = np.array([[(row + 0.5) * rows / height - 0.5]], np.float32)
     at_column = np.array([[(column + 0.5) * columns / width - 0.5]], np.float32)
     along_rows, along_columns = (
