@@ -38,6 +38,9 @@ PART_PX = 160
 """Side of the parts of a picture whose noise is compared: 40 to 200 squares of wide noise."""
 PHASE_PX = 9  # side of the square of the local mean that shows where between two steps it lies
 LEAST_GAIN = 1e-3  # terms of the gain of rounding that are left out
+LEAST_PASSED = 0.25
+"""Mean product of two gains below which a correlation is not judged: means half a step apart pass
+little of what they share."""
 SMALLEST_STEPS = 0.05  # deviation before the rounding below which it leaves no noise
 LEAST_FRAMES = 4  # fewest frames whose scatter shows noise
 SCATTER_PX = 7
@@ -442,12 +445,16 @@ def _gains(means_m: np.ndarray, variance_m2: float, z_step_m: float) -> np.ndarr
 
 def _end_of_correlation(noise: np.ndarray, gains: np.ndarray, pairs_m2: float) -> float:
     """Return the first lag along rows at which noise (k, h, w), over the product of the gains (h,
-    w), correlates less than `SHARED`; 0 if there is none. ``pairs_m2``: k times its variance before
+    w), correlates less than `SHARED`; 0 if there is none. Lags are left out at which rounding
+    passes less than `LEAST_PASSED` of the correlation. ``pairs_m2``: k times its variance before
     the rounding."""
     width = noise.shape[2]
+    usable = gains != 0.0
     for lag in range(1, min(FARTHEST_LAG_PX, width)):
+        count = int((usable[:, lag:] & usable[:, : width - lag]).sum())
         product = float(np.einsum("kij,kij->", noise[..., lag:], noise[..., : width - lag]))
         expected = float(np.einsum("ij,ij->", gains[:, lag:], gains[:, : width - lag]))
-        if product < SHARED * pairs_m2 * expected:
+        is_passed = expected >= LEAST_PASSED * count
+        if is_passed and product < SHARED * pairs_m2 * expected:
             return float(lag)
     return 0.0
