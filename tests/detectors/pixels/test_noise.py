@@ -258,6 +258,15 @@ def test_upsampled_noise_has_its_own_rectangle_at_each_place(
     assert np.median(sides_px[1][:, 4:]) == pytest.approx(12.5, abs=1.5)
 
 
+def test_wide_noise_far_below_a_step_is_not_judged_where_rounding_hides_it() -> None:
+    """Of noise of 0.12 steps, rounding passes hardly any between means half a step apart: 10
+    columns or 5 rows."""
+    sides_px = noise_sides_px(upsampled_frames(0.12, 1e-3), 1e-3)
+    assert sides_px is not None
+    assert np.median(sides_px[0][:, 4:]) == pytest.approx(20.0, abs=2.0)
+    assert np.median(sides_px[1][:, 4:]) == pytest.approx(12.5, abs=1.5)
+
+
 def test_a_cloud_knows_the_sides_of_upsampled_noise_alone() -> None:
     """A frame that the cloud leaves out does not count."""
     frames = upsampled_frames(0.3, 0.0)
