@@ -38,6 +38,9 @@ PART_PX = 160
 """Side of the parts of a picture whose noise is compared: 40 to 200 squares of wide noise."""
 PHASE_PX = 9  # side of the square of the local mean that shows where between two steps it lies
 LEAST_GAIN = 1e-3  # terms of the gain of rounding that are left out
+LEAST_PASSED = 0.25
+"""Mean product of two gains below which a correlation is not judged: means half a step apart pass
+little of what they share."""
 SMALLEST_STEPS = 0.05  # deviation before the rounding below which it leaves no noise
 LEAST_FRAMES = 4  # fewest frames whose scatter shows noise
 SCATTER_PX = 7
@@ -146,11 +149,11 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
 def with_noise(cloud: Cloud, frames: Sequence[Frame], z_step_m: float) -> Cloud:
     """Return a cloud with what its first frames show of the noise: how far it reaches
     (`noise_reach_px`), and where depth was upsampled, over which rectangle it is averaged at each
-    place (`noise_sides_px`). Frames that the cloud leaves out do not count."""
-    left_out = {frame.name for frame in cloud.left_out}
-    frames = [frame for frame in frames if frame.name not in left_out]
+    place (`noise_sides_px`), by the frames that the cloud does not leave out."""
     reach_px = noise_reach_px(frames, z_step_m)
-    sides_px = sides_if_upsampled(frames, reach_px, z_step_m)
+    left_out = {frame.name for frame in cloud.left_out}
+    kept = [frame for frame in frames if frame.name not in left_out]
+    sides_px = sides_if_upsampled(kept, reach_px, z_step_m)
     return replace(cloud, noise_reach_px=reach_px, noise_sides_px=sides_px)
 
 
@@ -365,7 +368,7 @@ def noise_sides_at(cloud: Cloud, row: float, column: float) -> tuple[float, floa
     if cloud.noise_sides_px is None:
         return cloud.noise_reach_px, cloud.noise_reach_px
     _, rows, columns = cloud.noise_sides_px.shape
-    height, width = cloud.valid.shape
+    height, width = cloud.points_m.shape[:2]
     at_row = np.array([[(row + 0.5) * rows / height - 0.5]], np.float32)
     at_column = np.array([[(column + 0.5) * columns / width - 0.5]], np.float32)
     along_rows, along_columns = (
@@ -442,12 +445,16 @@ def _gains(means_m: np.ndarray, variance_m2: float, z_step_m: float) -> np.ndarr
 
 def _end_of_correlation(noise: np.ndarray, gains: np.ndarray, pairs_m2: float) -> float:
     """Return the first lag along rows at which noise (k, h, w), over the product of the gains (h,
-    w), correlates less than `SHARED`; 0 if there is none. ``pairs_m2``: k times its variance before
+    w), correlates less than `SHARED`; 0 if there is none. Lags are left out at which rounding
+    passes less than `LEAST_PASSED` of the correlation. ``pairs_m2``: k times its variance before
     the rounding."""
     width = noise.shape[2]
+    usable = gains != 0.0
     for lag in range(1, min(FARTHEST_LAG_PX, width)):
+        count = int((usable[:, lag:] & usable[:, : width - lag]).sum())
         product = float(np.einsum("kij,kij->", noise[..., lag:], noise[..., : width - lag]))
         expected = float(np.einsum("ij,ij->", gains[:, lag:], gains[:, : width - lag]))
-        if product < SHARED * pairs_m2 * expected:
+        is_passed = expected >= LEAST_PASSED * count
+        if is_passed and product < SHARED * pairs_m2 * expected:
             return float(lag)
     return 0.0

@@ -61,7 +61,12 @@ def print_capture(
             "the depth was upsampled, aligned to another camera or smoothed; sizes are measured "
             "with that blur"
         )
-        print(f"note: {cloud.noise_reach_px:.0f} pixels share their noise: {why}")
+        pixels = f"{cloud.noise_reach_px:.0f}"
+        if cloud.noise_sides_px is not None:
+            least_px = float(cloud.noise_sides_px.min())
+            pixels = f"{least_px:.0f} to {cloud.noise_sides_px.max():.0f}"
+            why += " at each place"
+        print(f"note: {pixels} pixels share their noise: {why}")
     for left_out in cloud.left_out:
         print(f"left out: {left_out.name}: {left_out.why}")
     print(f"crop: {crop} keeps {kept.sum()} of {cloud.valid.sum()} valid points")

@@ -166,7 +166,7 @@ def _is_cut(cloud: Cloud, detection: Detection, depths_px: np.ndarray) -> bool:
     """Return whether a detection's pixel that is nearest to the rim lies within half of the blur
     there. ``depths_px``: flat, distance of each pixel to the rim, 1 for those along it."""
     nearest = int(detection.pixels[np.argmin(depths_px[detection.pixels])])
-    row, column = divmod(nearest, cloud.valid.shape[1])
+    row, column = divmod(nearest, cloud.points_m.shape[1])
     half_px = 0.5 * max(noise_sides_at(cloud, row, column))
     return bool(depths_px[nearest] <= max(half_px, RIM_DEPTH_PX))
 

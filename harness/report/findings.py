@@ -32,6 +32,8 @@ OTHER_GREY = 160
 """Grey of the points of a cloud without colours."""
 ELONGATED = 2.0
 """Least ratio of length to width of a long finding."""
+ROUND = ("disc", "cap", "bowl")
+"""Shapes that are as long as wide."""
 LEAST_WIDTH_MM = 1.0
 """A width below this, which is noise, counts as this."""
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
@@ -102,7 +104,11 @@ class Finding:
 
     @property
     def is_long(self) -> bool:
-        """True if it is `ELONGATED`, so that its diameter is of little use."""
+        """True if it is `ELONGATED`, so that its diameter is of little use. A round shape that fits
+        it better than a slot decides against length and width, which are noise where blur hides
+        them."""
+        if self.shape in ROUND:
+            return False
         return self.length_mm > ELONGATED * max(self.width_mm, LEAST_WIDTH_MM)
 
     @property

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from detectors.findings.family import BLURS
 from detectors.findings.hole_model import HolePatch, pictures, sight
 from detectors.findings.measure import (
     HoleModelConfig,
+    _blurs_of,
     _modelled,
     _surroundings,
+    _tilt_m,
     blur_in_cells,
     extents,
     measure_detection,
@@ -577,3 +580,23 @@ def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
 def test_an_even_blur_is_refused() -> None:
     with pytest.raises(ValidationError, match="odd"):
         HoleModelConfig(blur_px=4)
+
+
+def test_the_tilt_around_a_detection_ignores_other_damage_and_the_level() -> None:
+    rows, columns = np.indices((15, 17), float)
+    plane_m = 2e-3 + 1e-4 * columns - 3e-4 * rows
+    ring = np.hypot(rows - 7, columns - 8) > 4
+    seen_m = plane_m + np.random.default_rng(0).normal(0.0, 5e-5, plane_m.shape)
+    seen_m[~ring] += 5e-3
+    seen_m[2:5, 1:4] += 4e-3
+    tilt_m = _tilt_m(seen_m, ring)
+    assert (tilt_m - plane_m).std() < 5e-5
+    assert tilt_m[ring].mean() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_upsampled_depth_is_blurred_at_least_as_widely_as_its_noise() -> None:
+    sides_px = np.full((2, 1, 1), 9.0, np.float32)
+    upsampled = frontal(8, 8, noise_reach_px=8.0, noise_sides_px=sides_px)
+    assert {ratio for ratio, _, _ in _blurs_of(upsampled)} == {1.0, 1.4, 1.5}
+    assert _blurs_of(frontal(8, 8, noise_reach_px=5.0)) == BLURS
+    assert _blurs_of(frontal(8, 8)) == BLURS[:1]

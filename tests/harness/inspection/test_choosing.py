@@ -190,9 +190,12 @@ def test_the_first_is_taken_where_nothing_can_be_implanted(cloud: Cloud) -> None
 def test_a_difference_must_exceed_chance() -> None:
     found = np.zeros(60, bool)
     by_other = found.copy()
-    found[:4] = True
+    found[:5] = True
     assert _is_better(found, by_other)
-    by_other[4:6] = True  # 4 to 2: 2 is less than the root of 6
+    found[4] = False  # 4 to 0: 4 is no more than twice the root of 4
+    assert not _is_better(found, by_other)
+    found[:9] = True
+    by_other[9:12] = True  # 9 to 3: 6 is less than twice the root of 12
     assert not _is_better(found, by_other)
     assert not _is_better(found, found)
 
