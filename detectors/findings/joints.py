@@ -38,10 +38,8 @@ STARTS = 12  # strongest slots from which moves are tried
 TREND_FROM = 12  # slots from which a trend of their sizes is known: four for each coefficient
 SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
 LEAST_SCATTER = 0.03
-"""Least scatter of widths, depths and areas, as a share of their median."""
-ERROR_SCATTER = 0.1
-"""Least scatter of the errors of widths, which contain what no shape explains, as a share of their
-median."""
+"""Least scatter of widths, depths and areas, as a share of what is usual."""
+DEEPEST = 0.95  # quantile of the residuals of a slot's pixels that shows damage within it
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Joints:
     members: tuple[int, ...]
     """Numbers of the detections that are alike, strongest first."""
     differing: tuple[int, ...]
-    """Numbers of those in the same rows that depart in width, depth, area or shape."""
+    """Numbers of those in the same rows that depart in width, depth, area or deepest place."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +72,8 @@ class _Slots:
     """(n,): across the line of sight, but for a factor common to all of them."""
     errors: np.ndarray
     """(n, 2): standard errors of width and depth, metres; 0 if unknown."""
+    deepest_m: np.ndarray
+    """(n,): size of the residual at the quantile `DEEPEST` of the pixels."""
     cut: np.ndarray
     """(n,) bool: reaches the rim of the judged area, so that its length is not known."""
     whole: np.ndarray
@@ -174,6 +174,8 @@ def _slots(
             numbers.append(number)
             whole.append(is_long)
     chosen = [measurements[number] for number in numbers]
+    sizes_m = np.abs(np.nan_to_num(evidence.residual_m)).ravel()
+    deepest_m = [np.quantile(sizes_m[detections[number].pixels], DEEPEST) for number in numbers]
     widths_m = np.array([max(measured.width_m, 1.0 * MM) for measured in chosen])
     diameters_m = np.array([measured.model_diameter_m for measured in chosen])
     diameter_errors_m = np.array([measured.model_diameter_se_m for measured in chosen])
@@ -188,6 +190,7 @@ def _slots(
         depths_m=np.array([measured.normal_depth_m for measured in chosen]),
         areas_m2=np.array([measured.points * _centre(measured)[2] ** 2 for measured in chosen]),
         errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
+        deepest_m=np.array(deepest_m),
         cut=np.array([bool(rim[detections[number].pixels].any()) for number in numbers], bool),
         whole=np.array(whole, bool),
     )
@@ -234,9 +237,9 @@ def _alike(slots: _Slots, seed: int) -> np.ndarray:
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
-    """Return which slots (n,) depart from the members (n,) in width, depth, area or fit by more
-    than these scatter and than what is less certain about them, as about a slot that the rim cuts.
-    An end has no width."""
+    """Return which slots (n,) depart from the members (n,) in width, depth, area or deepest
+    place by more than these scatter and than what is less certain about them, as about a slot that
+    the rim cuts. An end has no width."""
     result = np.zeros(len(slots.numbers), bool)
     certain = members & slots.whole
     if not certain.any():
@@ -247,18 +250,23 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
         usual_m = _usual(slots, sizes_m, certain)
         usual_error_m = float(np.median(errors_m[certain]))
         further_m = np.sqrt(np.maximum(errors_m**2 - usual_error_m**2, 0.0))
-        scatter_m = _scatter(sizes_m, usual_m, certain, LEAST_SCATTER)
+        scatter_m = _scatter(sizes_m, usual_m, certain)
         departures.append(np.abs(sizes_m - usual_m) > SCATTERS * np.hypot(scatter_m, further_m))
     result |= departures[0] & slots.whole
     result |= departures[1]
-    # damage that touches a joint is found with it: it shows in the area, and no slot explains it
+    # damage that touches a joint is found with it: it shows in the area, or deepens a part of it
     usual_m2 = _usual(slots, slots.areas_m2, certain)
-    scatter_m2 = _scatter(slots.areas_m2, usual_m2, certain, LEAST_SCATTER)
+    scatter_m2 = _scatter(slots.areas_m2, usual_m2, certain)
     result |= slots.areas_m2 > usual_m2 + SCATTERS * scatter_m2
+    # less of it leaves an error that no slot explains; alone, that is a fit that was not determined
     unexplained_m = slots.errors[:, 0]
     usual_m = _usual(slots, unexplained_m, certain)
-    scatter_m = _scatter(unexplained_m, usual_m, certain, ERROR_SCATTER)
-    result |= ~slots.cut & (unexplained_m > usual_m + SCATTERS * scatter_m)
+    limit_m = usual_m + SCATTERS * _scatter(unexplained_m, usual_m, certain)
+    is_larger = slots.areas_m2 > usual_m2 + scatter_m2
+    result |= ~slots.cut & is_larger & (unexplained_m > limit_m)
+    usual_m = _usual(slots, slots.deepest_m, certain)
+    scatter_m = _scatter(slots.deepest_m, usual_m, certain)
+    result |= slots.deepest_m > usual_m + SCATTERS * scatter_m
     return result
 
 
@@ -278,11 +286,11 @@ def _usual(slots: _Slots, sizes: np.ndarray, certain: np.ndarray) -> np.ndarray:
     return usual
 
 
-def _scatter(sizes: np.ndarray, usual: np.ndarray, certain: np.ndarray, least: float) -> np.ndarray:
-    """Return the scatter (n,) of the ``certain`` sizes about their ``usual`` ones, at least a share
-    ``least`` of these."""
+def _scatter(sizes: np.ndarray, usual: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """Return the scatter (n,) of the ``certain`` sizes about their ``usual`` ones, at least
+    `LEAST_SCATTER` of these."""
     scatter = float(np.median(np.abs(sizes - usual)[certain])) / 0.6745
-    return np.maximum(scatter, least * np.abs(usual))
+    return np.maximum(scatter, LEAST_SCATTER * np.abs(usual))
 
 
 def chance_of_following(hits: int, trials: int, chance: float) -> float:

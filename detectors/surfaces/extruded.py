@@ -232,8 +232,8 @@ def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> 
         on_base[:, :2] *= (on_base[:, 2] / sample[:, 2])[:, None]
     # on the surface: what shows far behind through a hole would turn the mean plane
     normal = _normal(on_base, central)
-    frame = _frame(normal, 0.0, pitch, central)
     with np.errstate(divide="ignore", invalid="ignore"):
+        frame = _frame(normal, 0.0, pitch, central)
         across = frame.slopes(sample)
         along = frame.lengths(sample)
     if not np.isfinite([across, along]).all():

@@ -132,9 +132,9 @@ def piece_facts(
 
 
 def part_text(pieces: list[dict[str, Any]]) -> str:
-    """Return how many pieces a part has, and the share of it that was judged."""
+    """Return how many pieces a part has, and the share that was judged of what returned light."""
     area_m2 = sum(piece["area_m2"] for piece in pieces)
     judged_m2 = sum(piece["area_m2"] * piece["share"] for piece in pieces)
     plural = "" if len(pieces) == 1 else "s"
     share = 100.0 * judged_m2 / max(area_m2, 1e-12)
-    return f"part: {len(pieces)} piece{plural}, {area_m2:.2g} m2, {share:.0f} % of it judged"
+    return f"part: {len(pieces)} piece{plural}, {area_m2:.2g} m2 seen, {share:.0f} % of it judged"

@@ -550,7 +550,7 @@ def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
     rows = [(name, str(count)) for name, count in verdict.counts.items()]
     extent = verdict.extent
     if np.isfinite(extent.judged_m2):
-        rows.append(("judged", f"{1e4 * extent.judged_m2:.4g} cm2"))
+        rows.append(("judged", _area_text(extent.judged_m2)))
     if np.isfinite(extent.judged_share):
         rows.append(("share of the part", f"{100 * extent.judged_share:.0f} %"))
     if np.isfinite(extent.blind_m2):
@@ -563,6 +563,11 @@ def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
     return rows
 
 
+def _area_text(area_m2: float) -> str:
+    """Return an area to four digits, in cm2 below a square metre."""
+    return f"{1e4 * area_m2:.4g} cm2" if area_m2 < 1.0 else f"{area_m2:.4g} m2"
+
+
 def _judged_rows(run: Inspection) -> list[tuple[str, str]]:
     """Return what was judged and what not."""
     extent = run.verdict.extent
@@ -571,7 +576,7 @@ def _judged_rows(run: Inspection) -> list[tuple[str, str]]:
         share = ""
         if np.isfinite(extent.judged_share):
             share = f", {100 * extent.judged_share:.0f} % of the part's outline"
-        rows.append(("judged", f"{1e4 * extent.judged_m2:.4g} cm2{share}"))
+        rows.append(("judged", f"{_area_text(extent.judged_m2)}{share}"))
     missing = run.result.missing
     if missing is not None:
         blind = f"{1e4 * extent.blind_m2:.3g} cm2, {100 * missing.blind:.2g} % of the outline"

@@ -388,7 +388,7 @@ def test_a_hole_to_the_room_behind_is_flagged(
     pit, through = sorted(rows, key=lambda row: float(row["u_px"]))
     assert "open_behind" in through["flags"].split()
     assert "open_behind" not in pit["flags"].split()
-    assert capsys.readouterr().out.startswith("Two holes found on 0.059 m2 of the part; ")
+    assert capsys.readouterr().out.startswith("Two holes found on 0.059 m2, 100 % of the part; ")
 
 
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

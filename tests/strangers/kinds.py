@@ -232,6 +232,15 @@ def tilted(rng: Rng) -> Stranger:
 
 
 @kind
+def smooth_craters(rng: Rng) -> Stranger:
+    """Bowls of 24 to 60 mm without an edge, seen at about 45 degrees."""
+    cam = camera(rng, *CAMERAS[:3])
+    target = board(rng, cam, (0.55, 0.8), tilt=(42, 48), share=(0.7, 0.95))
+    target = damaged(rng, cam, target, 4, ("bowl", "cosine"), radius_mm=(12, 30), depth_mm=(4, 10))
+    return Stranger([target, wall(target, rng.uniform(0.4, 1.0))], cam, usual(rng))
+
+
+@kind
 def fills_view(rng: Rng) -> Stranger:
     cam = camera(rng)
     return Stranger([damaged(rng, cam, filling(rng, cam, tilt=40), 5)], cam, usual(rng))

@@ -71,17 +71,38 @@ def test_head_joints_are_one_feature() -> None:
     assert len(facts["places_px"]) == len(BRICKS)
 
 
-@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points", "model_diameter_se_m"])
+@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points"])
 def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
     detections, measurements = wall()
     usual = getattr(measurements[7], field)
-    factor = 2.0 if field == "model_diameter_se_m" else 1.3
-    larger = type(usual)(factor * usual)
+    larger = type(usual)(1.3 * usual)
     measurements[7] = replace(measurements[7], **{field: larger})
     (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
     assert feature.differing == (7,)
     assert 7 not in feature.members
     assert len(joined(detections, measurements, [feature])[0]) == 2
+
+
+def test_a_joint_that_is_deeper_in_a_part_of_it_differs_and_an_uncertain_width_does_not() -> None:
+    detections, measurements = wall()
+    residual_m = np.full(SHAPE, 5e-3)
+    residual_m.reshape(-1)[detections[7].pixels[:6]] = 7e-3
+    evidence = replace(EVIDENCE, residual_m=residual_m)
+    error_m = 50.0 * measurements[9].model_diameter_se_m
+    measurements[9] = replace(measurements[9], model_diameter_se_m=error_m)
+    (feature,) = joints_of(CLOUD, evidence, detections, measurements)
+    assert feature.differing == (7,)
+
+
+def test_a_joint_that_no_slot_explains_differs_if_it_is_larger_too() -> None:
+    detections, measurements = wall()
+    measured = measurements[7]
+    points = round(1.07 * measured.points)
+    error_m = 3.0 * measured.model_diameter_se_m
+    measurements[7] = replace(measured, points=points, model_diameter_se_m=error_m)
+    measurements[9] = replace(measurements[9], points=points)
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert feature.differing == (7,)
 
 
 def test_a_trend_across_the_picture_is_no_difference_and_a_departure_from_it_is() -> None:

@@ -123,7 +123,7 @@ def test_the_share_of_a_part_is_weighted_by_area() -> None:
         {"area_m2": 0.3, "share": 1.0, "fit": "plane"},
         {"area_m2": 0.1, "share": 0.6, "fit": "plane"},
     ]
-    assert part_text(pieces) == "part: 2 pieces, 0.4 m2, 90 % of it judged"
+    assert part_text(pieces) == "part: 2 pieces, 0.4 m2 seen, 90 % of it judged"
 
 
 def test_what_shows_far_behind_through_a_hole_does_not_turn_the_frame() -> None:
