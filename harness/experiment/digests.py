@@ -15,6 +15,8 @@ KINDS = ("scenes/sensor/amcw", "scenes/sensor/empirical", "scenes/sensor/lidar")
 """Rooms of one kind of camera each, which no other kind imports."""
 ONLY_OF_CAPTURES = ("detectors/recordings",)
 ONLY_OF_SEVERAL_VIEWS = ("detectors/views",)
+EXPERIMENT = "experiment "
+"""Begins the name of the part that stands for an experiment's own settings."""
 NO_NUMBERS = ("name", "title")
 """Keys of an experiment on which no number hangs."""
 
@@ -29,7 +31,7 @@ def experiment_digests(experiment: Experiment) -> Digests:
         several_views=any(source.views is not None for source in simulated),
     )
     settings = {key: value for key, value in experiment.data.items() if key not in NO_NUMBERS}
-    digests[f"experiment {experiment.config.name}"] = digest(_stated(settings))[:DIGITS]
+    digests[f"{EXPERIMENT}{experiment.config.name}"] = digest(_stated(settings))[:DIGITS]
     return digests
 
 
