@@ -41,8 +41,8 @@ def simulation_digests(
     """Return the digests of the code that simulates and judges with these detectors and cameras,
     and of the cameras' numbers. Rooms of which such a run uses nothing are left out."""
     modules = [DETECTORS.offer(name).target.partition(":")[0] for name in detectors]
-    loaded = {name: load_camera(name) for name in cameras}
-    kinds = {type(camera).__module__.rpartition(".")[0] for camera in loaded.values()}
+    names = set(cameras)
+    kinds = {type(load_camera(name)).__module__.rpartition(".")[0] for name in names}
     unused = [room for room in KINDS if room.replace("/", ".") not in kinds]
     unused += ONLY_OF_CAPTURES
     unused += () if several_views else ONLY_OF_SEVERAL_VIEWS
@@ -51,9 +51,13 @@ def simulation_digests(
         for room, value in code_digests([*ROOTS, *modules]).items()
         if not room.startswith(tuple(unused))
     }
-    for name, camera in loaded.items():
-        digests[f"camera {name}"] = digest(_values(camera.to_data()))[:DIGITS]
-    return digests
+    return digests | camera_digests(names)
+
+
+def camera_digests(names: Iterable[str]) -> Digests:
+    """Return the digest of each camera's numbers, without their tags and sources."""
+    data = {name: _values(load_camera(name).to_data()) for name in sorted(names)}
+    return {f"camera {name}": digest(numbers)[:DIGITS] for name, numbers in data.items()}
 
 
 def _values(data: Any) -> Any:

@@ -1,0 +1,98 @@
+"""Makes artefacts again: runs their commands, stores their files, and keeps the ledger."""
+
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+
+from harness.programs.artefacts.declaration import artefact_named, data_file
+from harness.programs.artefacts.ledger import (
+    Made,
+    edited_files,
+    made_now,
+    reasons_it_is_older,
+    write_ledger,
+)
+from harness.programs.artefacts.quoted import stored_rows
+from harness.vocabulary import provenance
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_bytes, write_text
+
+
+def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> list[str]:
+    """Make those of the named artefacts that are due, and print the seconds of each. The ledger is
+    stored after each, so that a run that is killed goes on where it was. Returns the names of
+    those that fail."""
+    named = list(names)
+    due = [name for name in named if is_due(name, ledger, quick=quick)]
+    expected_s = {name: _expected_s(name, ledger) for name in due}
+    print(f"{len(due)} of {len(named)} artefacts are to be made, in about", end=" ")
+    print(f"{sum(expected_s.values()) / 60:.0f} min on two idle cores", flush=True)
+    failed = []
+    for name in due:
+        print(f"{name}: {artefact_named(name).about}; about {expected_s[name]:.0f} s", flush=True)
+        began = time.monotonic()
+        try:
+            _make(name, quick=quick)
+        except UserError as mistake:
+            print(f"{name}: not made: {mistake}", file=sys.stderr)
+            failed.append(name)
+            continue
+        seconds = round(time.monotonic() - began, 1)
+        ledger[name] = made_now(name, seconds, quick=quick)
+        write_ledger(ledger)
+        print(f"{name}: made in {seconds:.0f} s", flush=True)
+    return failed
+
+
+def is_due(name: str, ledger: dict[str, Made], *, quick: bool) -> bool:
+    """Return whether an artefact is to be made: it is older than the code, was edited, or comes
+    from a quick run and this one is not."""
+    artefact = artefact_named(name)
+    if artefact.by_hand or not artefact.commands or artefact.prints:
+        return False
+    if reasons_it_is_older(name, ledger) or edited_files(name, ledger):
+        return True
+    return ledger[name].quick and not quick
+
+
+def _expected_s(name: str, ledger: dict[str, Made]) -> float:
+    """Return the seconds that the last whole run took, or else the declared ones."""
+    made = ledger.get(name)
+    if made is None or made.seconds is None or made.quick:
+        return artefact_named(name).seconds
+    return made.seconds
+
+
+def _make(name: str, *, quick: bool) -> None:
+    """Run an artefact's commands and store its files. Raises UserError if something that it needs
+    is absent, or if a command fails."""
+    artefact = artefact_named(name)
+    for needed in artefact.needs:
+        if shutil.which(needed) is None and not (provenance.ROOT / needed).exists():
+            raise UserError(f"needs {needed}, which is not here")
+    for command in artefact.commands:
+        _run(command, quick=quick)
+    for file, source in artefact.stores.items():
+        write_bytes(provenance.ROOT / file, (provenance.ROOT / source).read_bytes())
+    if artefact.table is not None:
+        write_text(provenance.ROOT / data_file(name), stored_rows(artefact.table, artefact.rows))
+
+
+def _run(command: str, *, quick: bool) -> None:
+    """Run a command in the repository; its output goes to this terminal. Raises UserError if it
+    ends with an error."""
+    program, *words = shlex.split(command)
+    called = [program, *words]
+    if program == "tofpod":
+        called = [sys.executable, "-m", "harness", *words]
+        called += ["--quick"] if quick and words[0] == "sweep" else []
+    if program == "python":
+        called = [sys.executable, *words]
+    code = subprocess.run(called, cwd=provenance.ROOT, check=False).returncode
+    if code == 130:
+        raise KeyboardInterrupt
+    if code:
+        raise UserError(f"{command}: ended with exit code {code}")
