@@ -1,4 +1,4 @@
-"""What the results of an experiment hang on: code, cameras and the experiment's own settings."""
+"""Digests of what an experiment's results hang on: code, cameras and its own settings."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a stored number hangs on: digests of its code by room, and of its inputs.
+"""Digests of what a stored number hangs on: its code by room, and its inputs.
 
 A source counts by its syntax tree without docstrings, so that a comment, a layout or a docstring
 ages nothing. Rooms that write tables, pages and messages do not count, as no number hangs on them;
@@ -11,8 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ruamel.yaml import YAML
+
 from harness.vocabulary import provenance
-from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.seeds import digest
 
 COUNTED = (
@@ -72,17 +73,25 @@ def _together(paths: Iterable[Path]) -> str:
     return digest([[path.name, _of_file(path)] for path in sorted(paths)])[:DIGITS]
 
 
-@cache
 def _of_file(path: Path) -> str:
-    """Return the digest of a file's content, as this process first read it."""
+    """Return the digest of a file's content."""
+    if path.suffix == ".py":
+        return _of_source(path)
     if not path.is_file():
         return "absent"
+    content = path.read_bytes()
     if path.suffix == ".yaml":
-        return digest(read_yaml(path).data)[:DIGITS]
-    content = provenance._content(path)
-    if path.suffix == ".py":
-        content = " ".join(_syntax(ast.parse(content))).encode()
+        # not by `read_yaml`, whose room imports this one's
+        return digest(YAML(typ="safe", pure=True).load(content))[:DIGITS]
     return hashlib.blake2b(content).hexdigest()[:DIGITS]
+
+
+@cache
+def _of_source(path: Path) -> str:
+    """Return the digest of a Python source, as this process first read it: what a process makes
+    comes from the code that it runs."""
+    syntax = _syntax(ast.parse(provenance._content(path)))
+    return hashlib.blake2b(" ".join(syntax).encode()).hexdigest()[:DIGITS]
 
 
 def _syntax(node: Any) -> Iterator[str]:

@@ -126,11 +126,13 @@ def files_of(name: str) -> tuple[str, ...]:
     return (*artefact.stores, *artefact.writes, *data)
 
 
-@lru_cache
 def digests_today(name: str) -> Digests:
-    """Return today's digests of all that an artefact hangs on."""
+    """Return today's digests of all that an artefact hangs on, with the files of the artefacts
+    that it is made of."""
     artefact = artefact_named(name)
     digests = code_digests(artefact.modules) | file_digests(artefact.inputs)
+    for source in artefact.of:
+        digests |= file_digests(files_of(source))
     digests |= camera_digests(camera_names()) if artefact.every_camera else {}
     for command in artefact.commands:
         for part, value in _of_command(command).items():
@@ -140,6 +142,7 @@ def digests_today(name: str) -> Digests:
     return digests
 
 
+@lru_cache
 def _of_command(command: str) -> Digests:
     """Return the digests of the experiment that a command runs; none for other commands."""
     program, *words = shlex.split(command)

@@ -1,4 +1,4 @@
-"""When each artefact was made, by which code, and how old it is."""
+"""The ledger of artefacts: when each was made, by which code, and how old it is."""
 
 import datetime
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ LEDGER = "artefacts.json"
 
 
 class Made(Config):
-    """How an artefact was made."""
+    """An entry of the ledger."""
 
     made: str
     """Date."""
@@ -70,19 +70,25 @@ def made_now(name: str, seconds: float | None, *, quick: bool = False) -> Made:
     )
 
 
-def reasons_it_is_older(name: str, ledger: Ledger) -> list[str]:
-    """Return why an artefact is older than what it hangs on; nothing if it is not."""
+def changed_since(name: str, ledger: Ledger) -> list[str]:
+    """Return the parts that an artefact hangs on and that have changed since it was made."""
     made = ledger.get(name)
     if made is None:
         return ["it was never made"]
     if made.digests is None:
-        reasons = ["it does not state its code"]
-    else:
-        reasons = changed_parts(made.digests, digests_today(name))
-    for source in artefact_named(name).of:
-        if reasons_it_is_older(source, ledger):
-            reasons.append(f"the older artefact {source}")
-    return reasons
+        return ["it does not state its code"]
+    return changed_parts(made.digests, digests_today(name))
+
+
+def reasons_it_is_older(name: str, ledger: Ledger) -> list[str]:
+    """Return what has changed since an artefact was made, and the older artefacts that it is made
+    of; nothing if it is not older."""
+    older_sources = [
+        f"artefact {source}"
+        for source in artefact_named(name).of
+        if reasons_it_is_older(source, ledger)
+    ]
+    return changed_since(name, ledger) + older_sources
 
 
 def edited_files(name: str, ledger: Ledger) -> list[str]:

@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from harness.programs.artefacts.declaration import artefact_named, data_file
 from harness.programs.artefacts.ledger import (
     Made,
+    changed_since,
     edited_files,
     made_now,
-    reasons_it_is_older,
     write_ledger,
 )
 from harness.programs.artefacts.quoted import stored_rows
@@ -26,7 +26,7 @@ def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> l
     stored after each, so that a run that is killed goes on where it was. Returns the names of
     those that fail."""
     named = list(names)
-    due = [name for name in named if is_due(name, ledger, quick=quick)]
+    due = due_of(named, ledger, quick=quick)
     expected_s = {name: _expected_s(name, ledger) for name in due}
     print(f"{len(due)} of {len(named)} artefacts are to be made, in about", end=" ")
     print(f"{sum(expected_s.values()) / 60:.0f} min on two idle cores", flush=True)
@@ -47,15 +47,19 @@ def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> l
     return failed
 
 
-def is_due(name: str, ledger: dict[str, Made], *, quick: bool) -> bool:
-    """Return whether an artefact is to be made: it is older than the code, was edited, or comes
-    from a quick run and this one is not."""
-    artefact = artefact_named(name)
-    if artefact.by_hand or not artefact.commands or artefact.prints:
-        return False
-    if reasons_it_is_older(name, ledger) or edited_files(name, ledger):
-        return True
-    return ledger[name].quick and not quick
+def due_of(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> list[str]:
+    """Return those of the named artefacts that are to be made: what they hang on has changed, or
+    what they are made of is made before them, or a file was edited, or they come from a quick run
+    and this one is not."""
+    due: list[str] = []
+    for name in names:
+        artefact = artefact_named(name)
+        if artefact.by_hand or artefact.prints:
+            continue
+        is_older = bool(changed_since(name, ledger)) or any(source in due for source in artefact.of)
+        if is_older or edited_files(name, ledger) or (ledger[name].quick and not quick):
+            due.append(name)
+    return due
 
 
 def _expected_s(name: str, ledger: dict[str, Made]) -> float:

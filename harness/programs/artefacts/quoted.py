@@ -1,4 +1,4 @@
-"""What documents quote of artefacts: a table from its data, a printed answer, and its age.
+"""Quotations of artefacts in documents: a table from its data, a printed answer, and its age.
 
 A quotation stands between two comments, ``<!-- artefact: NAME -->`` and ``<!-- end: NAME -->``,
 and is written by `tofpod artefacts`, not by hand."""
@@ -34,7 +34,7 @@ class _Missing(Exception):
     """A value that a format names is missing."""
 
 
-class _Cells(Formatter):
+class _Formats(Formatter):
     """Formats cells from columns whose names may contain dots."""
 
     def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -183,7 +183,7 @@ def _cell(text: str, row: Row, table: QuotedTable) -> str:
     """Return a formatted cell; if a number is missing, the text for that."""
     for form in (text, table.absent):
         try:
-            return _Cells().vformat(form, (), row).replace("|", "\\|")
+            return _Formats().vformat(form, (), row).replace("|", "\\|")
         except _Missing:
             continue
     return "–"

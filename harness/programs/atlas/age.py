@@ -1,5 +1,4 @@
-"""Whether an atlas is older than the code: by the digests that it stores, and by the versions of
-its detectors."""
+"""The age of an atlas, by the digests that it stores and by the versions of its detectors."""
 
 from collections.abc import Mapping
 from typing import Any

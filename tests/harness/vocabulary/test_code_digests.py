@@ -42,7 +42,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def forget() -> None:
-    for cached in (provenance.reached_sources, provenance._content, digests_module._of_file):
+    for cached in (provenance.reached_sources, provenance._content, digests_module._of_source):
         cached.cache_clear()
 
 

@@ -64,10 +64,10 @@ TABLE = """| camera | a90, frames: 1 | a90, frames: 50 |
 | Kinect v2 | 4.0 mm | none |"""
 CACHED = (
     declaration.declared_artefacts,
-    declaration.digests_today,
+    declaration._of_command,
     provenance._content,
     provenance.reached_sources,
-    digests_module._of_file,
+    digests_module._of_source,
 )
 
 
@@ -151,11 +151,23 @@ def test_one_alone(checkout: Path):
 def test_a_file_that_was_edited_is_made_again(checkout: Path):
     run()
     (checkout / "docs/copy.csv").write_text("1")
-    assert ledger.edited_files("copy", read_ledger()) == []  # as this process first read it
-    forget()
     assert ledger.edited_files("copy", read_ledger()) == ["docs/copy.csv"]
     run()
     assert (checkout / "docs/copy.csv").read_text().startswith("camera")
+    assert ledger.edited_files("copy", read_ledger()) == []
+
+
+def test_what_is_made_of_another_follows_it(checkout: Path, capsys: pytest.CaptureFixture[str]):
+    run()
+    (checkout / "code.py").write_text("K = 2\n")
+    (checkout / "make.py").write_text(MAKE.replace("4.04", "5.05"))
+    run("--only", "copy")
+    assert "0 of 1" in capsys.readouterr().out  # it would be as old as before
+    run("--only", "numbers")
+    assert "older" in page(checkout)["copy"].lower()
+    run("--only", "copy")
+    assert "5.05" in (checkout / "docs/copy.csv").read_text()
+    assert page(checkout)["copy"] == ""
 
 
 def test_a_quick_run_says_so_and_a_whole_one_replaces_it(checkout: Path):
