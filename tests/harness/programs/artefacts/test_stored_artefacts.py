@@ -13,7 +13,10 @@ import pytest
 from harness.__main__ import main
 from harness.programs.artefacts.declaration import data_file, declared_artefacts
 from harness.programs.artefacts.ledger import edited_files, read_ledger
-from harness.programs.artefacts.quoted import documents, quotation, quoted_in
+from harness.programs.artefacts.quoted import documents, quotation, quoted_in, read_rows
+from harness.programs.scorecard.figures import SCORES
+from harness.records.trials import SUMMARISED
+from harness.tables.study import STUDY_TABLES
 
 ROOT = Path(__file__).resolve().parents[4]
 TEXTS = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
@@ -107,3 +110,17 @@ def test_ls_lists_every_artefact_with_what_has_changed(capsys: pytest.CaptureFix
     printed = capsys.readouterr().out
     for name in declared_artefacts():
         assert re.search(rf"^{name} ", printed, re.MULTILINE)
+
+
+def test_the_columns_that_tables_quote_are_written():
+    """So that a renamed column is noticed before an artefact has been computed for an hour."""
+    tables = {table.name: table for table in (*STUDY_TABLES, *SUMMARISED, SCORES)}
+    for name, artefact in declared_artefacts().items():
+        if artefact.table is None:
+            continue
+        written = {"experiment", "frames"}
+        for rows in artefact.rows:
+            columns = tables[Path(rows).stem].stored
+            written |= {column for stored in columns for column in stored.names}
+        quoted = {column for column in read_rows(name)[0] if not column.startswith("source.")}
+        assert quoted <= written, name
