@@ -169,6 +169,11 @@ def test_what_is_made_of_another_follows_it(checkout: Path, capsys: pytest.Captu
     assert "5.05" in (checkout / "docs/copy.csv").read_text()
     assert page(checkout)["copy"] == ""
 
+    (checkout / "code.py").write_text("K = 3\n")
+    (checkout / "make.py").write_text(MAKE.replace("4.04", "6.06"))
+    run()
+    assert "6.06" in (checkout / "docs/copy.csv").read_text()
+
 
 def test_a_quick_run_says_so_and_a_whole_one_replaces_it(checkout: Path):
     run("--quick")
