@@ -4,6 +4,7 @@ documents quote of them."""
 import argparse
 import sys
 
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 
@@ -42,6 +43,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         ledger[name] = made_now(name, None)
     failed = []
     if not options.ages and not options.made:
+        for name in options.only or ():
+            _refuse_by_hand(name)
         names = options.only or list(declared_artefacts())
         failed = make_all(names, ledger, quick=options.quick)
     write_ledger(ledger)
@@ -50,6 +53,19 @@ def main(options: argparse.Namespace, command: str) -> int:
     if failed:
         print(f"not made: {', '.join(failed)}", file=sys.stderr)
     return int(bool(failed))
+
+
+def _refuse_by_hand(name: str) -> None:
+    """Raise UserError for an artefact that no command makes as a whole, and for an unknown name."""
+    from harness.programs.artefacts.declaration import artefact_named
+
+    artefact = artefact_named(name)
+    if artefact.by_hand:
+        how = "; ".join(artefact.commands) or "as its document describes"
+        raise UserError(
+            f"{name}: is made by hand",
+            fix=f"make it again ({how}), then run tofpod artefacts --made {name}",
+        )
 
 
 if __name__ == "__main__":

@@ -91,6 +91,13 @@ def reasons_it_is_older(name: str, ledger: Ledger) -> list[str]:
     return changed_since(name, ledger) + older_sources
 
 
+def is_quick(name: str, ledger: Ledger) -> bool:
+    """Return whether an artefact, or one that it is made of, comes from a quick run."""
+    made = ledger.get(name)
+    sources = artefact_named(name).of
+    return bool(made and made.quick) or any(is_quick(source, ledger) for source in sources)
+
+
 def edited_files(name: str, ledger: Ledger) -> list[str]:
     """Return the files of an artefact that are not as they were made."""
     made = ledger.get(name)
@@ -107,6 +114,6 @@ def age_sentence(name: str, ledger: Ledger) -> str:
     if reasons_it_is_older(name, ledger):
         by = f" by tofpod {made.tofpod}" if made.tofpod else ""
         return f"*Older than the code: computed on {made.made}{by}.*"
-    if made.quick:
+    if is_quick(name, ledger):
         return "*From a quick run with fewer boards, so with wider intervals.*"
     return ""

@@ -20,6 +20,8 @@ from harness.vocabulary import provenance
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
 
+SWEEP = ["tofpod", "sweep"]
+
 
 def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> list[str]:
     """Make those of the named artefacts that are due, and print the seconds of each. The ledger is
@@ -41,7 +43,7 @@ def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> l
             failed.append(name)
             continue
         seconds = round(time.monotonic() - began, 1)
-        ledger[name] = made_now(name, seconds, quick=quick)
+        ledger[name] = made_now(name, seconds, quick=quick and _has_quick_form(name))
         write_ledger(ledger)
         print(f"{name}: made in {seconds:.0f} s", flush=True)
     return failed
@@ -85,6 +87,11 @@ def _make(name: str, *, quick: bool) -> None:
         write_text(provenance.ROOT / data_file(name), stored_rows(artefact.table, artefact.rows))
 
 
+def _has_quick_form(name: str) -> bool:
+    """Return whether `--quick` changes one of an artefact's commands: sweeps have that option."""
+    return any(shlex.split(command)[:2] == SWEEP for command in artefact_named(name).commands)
+
+
 def _run(command: str, *, quick: bool) -> None:
     """Run a command in the repository; its output goes to this terminal. Raises UserError if it
     ends with an error."""
@@ -92,7 +99,7 @@ def _run(command: str, *, quick: bool) -> None:
     called = [program, *words]
     if program == "tofpod":
         called = [sys.executable, "-m", "harness", *words]
-        called += ["--quick"] if quick and words[0] == "sweep" else []
+        called += ["--quick"] if quick and [program, words[0]] == SWEEP else []
     if program == "python":
         called = [sys.executable, *words]
     code = subprocess.run(called, cwd=provenance.ROOT, check=False).returncode

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.programs.artefacts import declaration, ledger
+from harness.programs.artefacts import declaration, ledger, making
 from harness.programs.artefacts.artefacts import main
 from harness.programs.artefacts.ledger import read_ledger
 from harness.programs.artefacts.quoted import quoted_in
@@ -141,11 +141,14 @@ def test_a_change_of_code_is_said_and_then_repaired(checkout: Path):
     assert "Older" in now["person"]  # no command makes it
 
 
-def test_one_alone(checkout: Path):
+def test_one_alone(checkout: Path, capsys: pytest.CaptureFixture[str]):
     run("--only", "numbers")
     assert page(checkout)["numbers"] == TABLE
     assert "Not yet" in page(checkout)["copy"]
     run("--only", "numbres", code=2)
+    assert "did you mean 'numbers'?" in capsys.readouterr().err
+    run("--only", "person", code=2)
+    assert "person: is made by hand" in capsys.readouterr().err
 
 
 def test_a_file_that_was_edited_is_made_again(checkout: Path):
@@ -175,14 +178,21 @@ def test_what_is_made_of_another_follows_it(checkout: Path, capsys: pytest.Captu
     assert "6.06" in (checkout / "docs/copy.csv").read_text()
 
 
-def test_a_quick_run_says_so_and_a_whole_one_replaces_it(checkout: Path):
+def test_a_quick_run_says_so_and_a_whole_one_replaces_it(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(making, "SWEEP", ["python", "make.py"])
     run("--quick")
-    assert "*From a quick run with fewer boards" in page(checkout)["numbers"]
+    quick = page(checkout)
+    assert "*From a quick run with fewer boards" in quick["numbers"]
+    assert "*From a quick run with fewer boards" in quick["copy"]  # made of it
+    assert read_ledger()["copy"].quick is False  # its own command has no quick form
     run("--quick")
     assert times_made(checkout) == 1
     run()
     assert times_made(checkout) == 2
     assert page(checkout)["numbers"] == TABLE
+    assert page(checkout)["copy"] == ""
 
 
 def test_what_fails_is_named_and_the_rest_is_made(
