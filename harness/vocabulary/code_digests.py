@@ -22,6 +22,7 @@ COUNTED = (
     "harness/trials/",
     "harness/evaluation/",
     "harness/stills/",
+    "harness/inspection/",
     "harness/programs/",
     "harness/runs/calibration.py",
     "harness/vocabulary/geometry.py",

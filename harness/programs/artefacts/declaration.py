@@ -69,7 +69,8 @@ class Artefact(Config):
     table: QuotedTable | None = None
     """The table that the documents quote."""
     prints: bool = False
-    """The documents quote the command with all that it prints; it takes a second."""
+    """The documents quote the command with all that it prints, each time they are written; it takes
+    a second."""
     of: tuple[str, ...] = ()
     """Artefacts that it is made of; it is as old as they are."""
     modules: tuple[str, ...] = ()

@@ -71,7 +71,10 @@ def made_now(name: str, seconds: float | None, *, quick: bool = False) -> Made:
 
 
 def changed_since(name: str, ledger: Ledger) -> list[str]:
-    """Return the parts that an artefact hangs on and that have changed since it was made."""
+    """Return the parts that an artefact hangs on and that have changed since it was made; none of
+    what is printed whenever documents are written."""
+    if artefact_named(name).prints:
+        return []
     made = ledger.get(name)
     if made is None:
         return ["it was never made"]
