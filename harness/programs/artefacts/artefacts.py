@@ -33,22 +33,20 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if a command fails, 2 for a user's mistake, 130 after
     Ctrl-C."""
     from harness.programs.artefacts.declaration import declared_artefacts, refuse_without_checkout
-    from harness.programs.artefacts.ledger import made_now, read_ledger, write_ledger
+    from harness.programs.artefacts.ledger import made_now, read_ledger, store_entry
     from harness.programs.artefacts.making import make_all
     from harness.programs.artefacts.quoted import write_quotations
 
     refuse_without_checkout()
-    ledger = read_ledger()
     for name in options.made:
-        ledger[name] = made_now(name, None)
+        store_entry(name, made_now(name, None))
     failed = []
     if not options.ages and not options.made:
         for name in options.only or ():
             _refuse_by_hand(name)
         names = options.only or list(declared_artefacts())
-        failed = make_all(names, ledger, quick=options.quick)
-    write_ledger(ledger)
-    for document in write_quotations(ledger):
+        failed = make_all(names, quick=options.quick)
+    for document in write_quotations(read_ledger()):
         print(f"wrote {document}")
     if failed:
         print(f"not made: {', '.join(failed)}", file=sys.stderr)

@@ -52,8 +52,9 @@ def read_ledger() -> dict[str, Made]:
     return {name: Made.from_data(made) for name, made in data.items()}
 
 
-def write_ledger(ledger: Ledger) -> None:
-    """Store the ledger, in the order of the declared artefacts."""
+def store_entry(name: str, made: Made) -> None:
+    """Store how an artefact was made, beside the entries that other processes may have stored."""
+    ledger = read_ledger() | {name: made}
     known = [name for name in declared_artefacts() if name in ledger]
     write_json(ledger_path(), {name: ledger[name].to_data() for name in known})
 
@@ -118,5 +119,5 @@ def age_sentence(name: str, ledger: Ledger) -> str:
         by = f" by tofpod {made.tofpod}" if made.tofpod else ""
         return f"*Older than the code: computed on {made.made}{by}.*"
     if is_quick(name, ledger):
-        return "*From a quick run with fewer boards, so with wider intervals.*"
+        return "*From a quick run: fewer boards or repeats, so wider intervals.*"
     return ""

@@ -9,11 +9,12 @@ from collections.abc import Iterable
 
 from harness.programs.artefacts.declaration import artefact_named, data_file
 from harness.programs.artefacts.ledger import (
-    Made,
+    Ledger,
     changed_since,
     edited_files,
     made_now,
-    write_ledger,
+    read_ledger,
+    store_entry,
 )
 from harness.programs.artefacts.quoted import stored_rows
 from harness.vocabulary import provenance
@@ -23,10 +24,11 @@ from harness.vocabulary.files import write_bytes, write_text
 SWEEP = ["tofpod", "sweep"]
 
 
-def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> list[str]:
-    """Make those of the named artefacts that are due, and print the seconds of each. The ledger is
-    stored after each, so that a run that is killed goes on where it was. Returns the names of
-    those that fail."""
+def make_all(names: Iterable[str], *, quick: bool) -> list[str]:
+    """Make those of the named artefacts that are due, and print the seconds of each. Each is
+    stored in the ledger at once, so that a run that is killed goes on where it was. Returns the
+    names of those that fail."""
+    ledger = read_ledger()
     named = list(names)
     due = due_of(named, ledger, quick=quick)
     expected_s = {name: _expected_s(name, ledger) for name in due}
@@ -43,13 +45,12 @@ def make_all(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> l
             failed.append(name)
             continue
         seconds = round(time.monotonic() - began, 1)
-        ledger[name] = made_now(name, seconds, quick=quick and _has_quick_form(name))
-        write_ledger(ledger)
+        store_entry(name, made_now(name, seconds, quick=quick and _has_quick_form(name)))
         print(f"{name}: made in {seconds:.0f} s", flush=True)
     return failed
 
 
-def due_of(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> list[str]:
+def due_of(names: Iterable[str], ledger: Ledger, *, quick: bool) -> list[str]:
     """Return those of the named artefacts that are to be made: what they hang on has changed, or
     what they are made of is made before them, or a file was edited, or they come from a quick run
     and this one is not."""
@@ -64,7 +65,7 @@ def due_of(names: Iterable[str], ledger: dict[str, Made], *, quick: bool) -> lis
     return due
 
 
-def _expected_s(name: str, ledger: dict[str, Made]) -> float:
+def _expected_s(name: str, ledger: Ledger) -> float:
     """Return the seconds that the last whole run took, or else the declared ones."""
     made = ledger.get(name)
     if made is None or made.seconds is None or made.quick:

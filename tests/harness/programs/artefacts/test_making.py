@@ -184,8 +184,8 @@ def test_a_quick_run_says_so_and_a_whole_one_replaces_it(
     monkeypatch.setattr(making, "SWEEP", ["python", "make.py"])
     run("--quick")
     quick = page(checkout)
-    assert "*From a quick run with fewer boards" in quick["numbers"]
-    assert "*From a quick run with fewer boards" in quick["copy"]  # made of it
+    assert "*From a quick run: fewer boards" in quick["numbers"]
+    assert "*From a quick run: fewer boards" in quick["copy"]  # made of it
     assert read_ledger()["copy"].quick is False  # its own command has no quick form
     run("--quick")
     assert times_made(checkout) == 1
